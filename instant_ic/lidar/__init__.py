@@ -1,0 +1,1 @@
+"""Velodyne VLP-16: packets, captures, decoding, scans."""

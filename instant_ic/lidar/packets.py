@@ -1,0 +1,190 @@
+"""VLP-16 wire format: data packets (1206 bytes) and position packets (512 bytes), both ways.
+
+Source: Velodyne VLP-16 User Manual (63-9243), chapters 9 and 12.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+DATA_PACKET_BYTES = 1206
+POSITION_PACKET_BYTES = 512
+BLOCKS = 12
+FIRINGS = 2
+"""Firing sequences in one block."""
+LASERS = 16
+
+DISTANCE_UNIT_M = 0.002
+LASER_PERIOD_US = 2.304
+FIRING_PERIOD_US = 55.296
+BLOCK_PERIOD_US = 110.592
+PACKET_PERIOD_US = BLOCKS * BLOCK_PERIOD_US
+"""From one single-return packet to the next; half of it in dual return mode."""
+HOUR_US = 3_600_000_000
+
+RETURN_STRONGEST = 0x37
+RETURN_LAST = 0x38
+RETURN_DUAL = 0x39
+PRODUCT_VLP16 = 0x22
+PRODUCT_PUCK_HI_RES = 0x24
+
+LASER_ELEVATION_DEG: NDArray[np.float64] = np.array(
+    [-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0]
+)
+"""Elevation of each laser by its id, degrees, (16,)."""
+LASER_VERTICAL_OFFSET_M: NDArray[np.float64] = 1e-3 * np.array(
+    [11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]
+)
+"""What is added to z of each laser's points by its id, metres, (16,)."""
+LASER_RING: NDArray[np.uint16] = np.argsort(np.argsort(LASER_ELEVATION_DEG)).astype(np.uint16)
+"""Rank of each laser by elevation, 0 is the lowest, (16,)."""
+
+BLOCK_FLAG = 0xEEFF
+"""The two bytes FF EE read as a little-endian number."""
+
+RETURN_DTYPE = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
+BLOCK_DTYPE = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", RETURN_DTYPE, (FIRINGS, LASERS))])
+PACKET_DTYPE = np.dtype(
+    [("blocks", BLOCK_DTYPE, (BLOCKS,)), ("timestamp_us", "<u4"), ("return_mode", "u1"), ("product", "u1")]
+)
+
+
+class PacketError(ValueError):
+    """A payload that is not the packet it should be; the text says why."""
+
+
+def encode_data_packet(
+    azimuth_cdeg: ArrayLike,
+    distance_mm2: ArrayLike,
+    reflectivity: ArrayLike,
+    timestamp_us: int,
+    return_mode: int = RETURN_STRONGEST,
+    product: int = PRODUCT_VLP16,
+) -> bytes:
+    """Bytes of one data packet.
+
+    In dual return mode (0x39) blocks come in pairs of one azimuth: even ones the last return, odd ones the
+    strongest, or the second strongest where the strongest is also the last (manual, page 57).
+
+    Args:
+        azimuth_cdeg: azimuth of each block's first laser, 0.01 degrees, clockwise, (12,).
+        distance_mm2: distances in units of 2 mm by block, firing and laser id; 0 is no return; (12, 2, 16).
+        reflectivity: 0-255, (12, 2, 16).
+        timestamp_us: microseconds past the hour of the first firing.
+        return_mode: 0x37 strongest, 0x38 last, 0x39 dual.
+        product: 0x22 VLP-16, 0x24 Puck Hi-Res.
+
+    Returns:
+        1206 bytes, the UDP payload.
+
+    Raises:
+        PacketError: a value that the format cannot hold, or arrays of another shape.
+    """
+    azimuth = np.asarray(azimuth_cdeg)
+    distance = np.asarray(distance_mm2)
+    reflection = np.asarray(reflectivity)
+    for key, array, shape, top in (
+        ("azimuth_cdeg", azimuth, (BLOCKS,), 35999),
+        ("distance_mm2", distance, (BLOCKS, FIRINGS, LASERS), 0xFFFF),
+        ("reflectivity", reflection, (BLOCKS, FIRINGS, LASERS), 0xFF),
+    ):
+        if array.shape != shape:
+            raise PacketError(f"{key} must have the shape {shape} (got {array.shape})")
+        if array.min() < 0 or array.max() > top:
+            raise PacketError(f"{key} must be in 0..{top} (got {array.min()}..{array.max()})")
+    if not 0 <= timestamp_us < HOUR_US:
+        raise PacketError(
+            f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})"
+        )
+    packet = np.zeros((), PACKET_DTYPE)
+    packet["blocks"]["flag"] = BLOCK_FLAG
+    packet["blocks"]["azimuth"] = azimuth
+    packet["blocks"]["returns"]["distance"] = distance
+    packet["blocks"]["returns"]["reflectivity"] = reflection
+    packet["timestamp_us"] = timestamp_us
+    packet["return_mode"] = return_mode
+    packet["product"] = product
+    return packet.tobytes()
+
+
+@dataclass(frozen=True)
+class PositionPacket:
+    """What a position packet tells of the sensor's clock.
+
+    Attributes:
+        timestamp_us: microseconds past the hour.
+        pps: 0 absent, 1 synchronising, 2 locked, 3 error.
+        nmea: the sentence that the GPS receiver sent last, without CR LF; empty when there is no receiver.
+    """
+
+    timestamp_us: int
+    pps: int
+    nmea: str
+
+    @property
+    def utc_seconds_of_day(self) -> float | None:
+        """Time of day of the ``$GPRMC`` sentence in seconds; None without a valid fix (status A)."""
+        fields = self.nmea.split(",")
+        if len(fields) < 3 or fields[0] != "$GPRMC" or fields[2] != "A":
+            return None
+        clock = fields[1]
+        if len(clock) < 6 or not clock[:6].isdigit():
+            return None
+        try:
+            return int(clock[:2]) * 3600 + int(clock[2:4]) * 60 + float(clock[4:])
+        except ValueError:
+            return None
+
+
+_POSITION_TIME = 0xC6
+_POSITION_PPS = 0xCA
+_POSITION_NMEA = 0xCE
+
+
+def encode_position_packet(timestamp_us: int, pps: int = 0, nmea: str = "") -> bytes:
+    """Bytes of one position packet (512), see `PositionPacket` for the fields.
+
+    Raises:
+        PacketError: a value that the format cannot hold.
+    """
+    if not 0 <= timestamp_us < HOUR_US:
+        raise PacketError(
+            f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})"
+        )
+    if pps not in (0, 1, 2, 3):
+        raise PacketError(f"pps must be 0, 1, 2 or 3 (got {pps})")
+    sentence = f"{nmea}\r\n".encode("ascii", "strict") if nmea else b""
+    if len(sentence) > POSITION_PACKET_BYTES - _POSITION_NMEA:
+        raise PacketError(
+            f"nmea is too long: {len(sentence)} bytes of {POSITION_PACKET_BYTES - _POSITION_NMEA}"
+        )
+    packet = bytearray(POSITION_PACKET_BYTES)
+    packet[_POSITION_TIME : _POSITION_TIME + 4] = timestamp_us.to_bytes(4, "little")
+    packet[_POSITION_PPS] = pps
+    packet[_POSITION_NMEA : _POSITION_NMEA + len(sentence)] = sentence
+    return bytes(packet)
+
+
+def decode_position_packet(payload: bytes) -> PositionPacket:
+    """Read one position packet.
+
+    Raises:
+        PacketError: not 512 bytes, or a time past the hour.
+    """
+    if len(payload) != POSITION_PACKET_BYTES:
+        raise PacketError(f"a position packet has {POSITION_PACKET_BYTES} bytes (got {len(payload)})")
+    timestamp_us = int.from_bytes(payload[_POSITION_TIME : _POSITION_TIME + 4], "little")
+    if timestamp_us >= HOUR_US:
+        raise PacketError(f"position packet's time is {timestamp_us} us, past the hour")
+    text = payload[_POSITION_NMEA:].split(b"\0", 1)[0].split(b"\r\n", 1)[0]
+    return PositionPacket(timestamp_us, payload[_POSITION_PPS], text.decode("ascii", "replace"))
+
+
+def check_data_packet(payload: bytes | memoryview) -> str | None:
+    """Why the payload is not a VLP-16 data packet, or None when it is one."""
+    if len(payload) != DATA_PACKET_BYTES:
+        return f"{len(payload)} bytes instead of {DATA_PACKET_BYTES}"
+    if bytes(payload[:2]) != b"\xff\xee":
+        return f"first block starts with {bytes(payload[:2]).hex()} instead of ffee"
+    return None
