@@ -1,0 +1,1 @@
+"""Instant IC: teleoperation that passes between a real robot and an instantly built virtual one."""

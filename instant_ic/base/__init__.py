@@ -1,0 +1,1 @@
+"""Tracked base: RoboClaw packet serial, skid-steer odometry, limits."""
