@@ -1,0 +1,162 @@
+"""Rigid transforms as 4×4 float64 matrices and planar poses as ``(x, y, yaw)`` arrays.
+
+A pose is named ``target_from_source``: ``p_target = target_from_source @ p_source``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Matrix = NDArray[np.float64]
+Pose2 = NDArray[np.float64]
+
+
+def rotation_matrix(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Matrix:
+    """Rotation about the fixed axes x, y, z in this order (REP-103), radians, (3, 3)."""
+    cr, sr = math.cos(roll), math.sin(roll)
+    cp, sp = math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def pose_matrix(
+    x: float = 0.0, y: float = 0.0, z: float = 0.0, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0
+) -> Matrix:
+    """Pose from a translation in metres and fixed-axis angles in radians, (4, 4)."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrix(roll, pitch, yaw)
+    matrix[:3, 3] = (x, y, z)
+    return matrix
+
+
+def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
+    """Pose from a quaternion (x, y, z, w), which need not be of unit length, and a translation.
+
+    Raises:
+        ValueError: the quaternion is zero or not finite.
+    """
+    x, y, z, w = (float(value) for value in np.asarray(xyzw, dtype=np.float64))
+    norm2 = x * x + y * y + z * z + w * w
+    if not math.isfinite(norm2) or norm2 < 1e-12:
+        raise ValueError(f"quaternion ({x}, {y}, {z}, {w}) has no direction")
+    s = 2.0 / norm2
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+        [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+        [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+    ]
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def quaternion_from_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternion (x, y, z, w), w ≥ 0, of a pose or a rotation matrix."""
+    r = np.asarray(matrix, dtype=np.float64)[:3, :3]
+    # The largest of the four squared components is the divisor: no loss of precision near 180°.
+    squares = np.array(
+        [
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+        ]
+    )
+    largest = int(np.argmax(squares))
+    d = squares[largest]
+    if largest == 0:
+        q = np.array([d, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]])
+    elif largest == 1:
+        q = np.array([r[0, 1] + r[1, 0], d, r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]])
+    elif largest == 2:
+        q = np.array([r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], d, r[1, 0] - r[0, 1]])
+    else:
+        q = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], d])
+    q /= np.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def inverse(matrix: Matrix) -> Matrix:
+    """Inverse of a rigid transform."""
+    rotation = matrix[:3, :3].T
+    result = np.eye(4)
+    result[:3, :3] = rotation
+    result[:3, 3] = -rotation @ matrix[:3, 3]
+    return result
+
+
+def transform_points(target_from_source: Matrix, points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Points (..., 3) of the source frame in the target frame, in the points' own float type."""
+    rotation = target_from_source[:3, :3].astype(points.dtype)
+    translation = target_from_source[:3, 3].astype(points.dtype)
+    result: NDArray[np.floating] = points @ rotation.T + translation
+    return result
+
+
+def yaw_of(matrix: Matrix) -> float:
+    """Yaw of a pose, radians."""
+    return math.atan2(matrix[1, 0], matrix[0, 0])
+
+
+def interpolate(matrix0: Matrix, matrix1: Matrix, alpha: float) -> Matrix:
+    """Pose between two poses: straight in translation, shortest arc in rotation (slerp).
+
+    ``alpha`` outside 0..1 extrapolates.
+    """
+    q0, q1 = quaternion_from_matrix(matrix0), quaternion_from_matrix(matrix1)
+    dot = float(q0 @ q1)
+    if dot < 0:
+        q1, dot = -q1, -dot
+    if dot > 0.9995:
+        q = q0 + alpha * (q1 - q0)
+    else:
+        angle = math.acos(min(dot, 1.0))
+        q = (math.sin((1 - alpha) * angle) * q0 + math.sin(alpha * angle) * q1) / math.sin(angle)
+    translation = (1 - alpha) * matrix0[:3, 3] + alpha * matrix1[:3, 3]
+    return matrix_from_quaternion(q, translation)
+
+
+def wrap_angle(angle_rad: float) -> float:
+    """The same angle in (−π, π]."""
+    wrapped = math.remainder(angle_rad, 2 * math.pi)
+    return math.pi if wrapped == -math.pi else wrapped
+
+
+def pose2_from_matrix(matrix: Matrix) -> Pose2:
+    """Planar part ``(x, y, yaw)`` of a pose."""
+    return np.array([matrix[0, 3], matrix[1, 3], yaw_of(matrix)])
+
+
+def matrix_from_pose2(pose: ArrayLike) -> Matrix:
+    """Pose on the plane z = 0 from ``(x, y, yaw)``."""
+    x, y, yaw = (float(value) for value in np.asarray(pose))
+    return pose_matrix(x=x, y=y, yaw=yaw)
+
+
+def compose2(a: ArrayLike, b: ArrayLike) -> Pose2:
+    """Planar ``a ∘ b``: ``b``, given in ``a``'s frame, in the frame that ``a`` is given in."""
+    ax, ay, ayaw = (float(value) for value in np.asarray(a))
+    bx, by, byaw = (float(value) for value in np.asarray(b))
+    c, s = math.cos(ayaw), math.sin(ayaw)
+    return np.array([ax + c * bx - s * by, ay + s * bx + c * by, wrap_angle(ayaw + byaw)])
+
+
+def inverse2(a: ArrayLike) -> Pose2:
+    """Inverse of a planar pose."""
+    x, y, yaw = (float(value) for value in np.asarray(a))
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([-c * x - s * y, s * x - c * y, wrap_angle(-yaw)])
+
+
+def relative2(a: ArrayLike, b: ArrayLike) -> Pose2:
+    """``b`` seen from ``a``: ``inverse2(a) ∘ b``."""
+    return compose2(inverse2(a), b)

@@ -1,0 +1,144 @@
+"""A buffer of time-stamped transforms between named frames, as ROS users know it from tf2."""
+
+from __future__ import annotations
+
+import bisect
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .poses import Matrix, interpolate, inverse
+
+
+class TransformError(LookupError):
+    """No such frame, no path between two frames, or no value for the time asked."""
+
+
+@dataclass
+class _Edge:
+    """What is known of one child frame: its parent, and its poses over time."""
+
+    parent: str
+    static: bool
+    stamps_ns: list[int] = field(default_factory=list)
+    matrices: list[Matrix] = field(default_factory=list)
+
+
+class TransformBuffer:
+    """Keeps the last seconds of a tree of frames and answers for the pose between any two of them.
+
+    Args:
+        cache_s: how much of the past is kept for moving frames.
+        tolerance_s: how far beyond the newest value a look-up may reach; the newest value is given then.
+            Drivers stamp data a little later than the last odometry that arrived.
+    """
+
+    def __init__(self, cache_s: float = 30.0, tolerance_s: float = 0.2) -> None:
+        self._cache_ns = int(cache_s * 1e9)
+        self._tolerance_ns = int(tolerance_s * 1e9)
+        self._edges: dict[str, _Edge] = {}
+        self._lock = threading.Lock()
+
+    def set(
+        self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False
+    ) -> None:
+        """Adds one value; a stamp already held is replaced, an older one is sorted in.
+
+        Raises:
+            TransformError: the matrix is not a finite (4, 4) array, or a frame would be its own ancestor.
+        """
+        matrix = np.array(parent_from_child, dtype=np.float64)
+        if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+            raise TransformError(f"transform {parent} → {child} is not a finite 4×4 matrix")
+        with self._lock:
+            ancestor: str | None = parent
+            while ancestor is not None:
+                if ancestor == child:
+                    raise TransformError(f"transform {parent} → {child} would make a loop")
+                edge = self._edges.get(ancestor)
+                ancestor = edge.parent if edge else None
+            edge = self._edges.get(child)
+            if edge is None or edge.parent != parent or edge.static != static or static:
+                edge = self._edges[child] = _Edge(parent, static)
+            if not edge.stamps_ns or stamp_ns > edge.stamps_ns[-1]:
+                edge.stamps_ns.append(stamp_ns)
+                edge.matrices.append(matrix)
+            else:
+                at = bisect.bisect_left(edge.stamps_ns, stamp_ns)
+                if edge.stamps_ns[at] == stamp_ns:
+                    edge.matrices[at] = matrix
+                else:
+                    edge.stamps_ns.insert(at, stamp_ns)
+                    edge.matrices.insert(at, matrix)
+            oldest = edge.stamps_ns[-1] - self._cache_ns
+            keep = bisect.bisect_left(edge.stamps_ns, oldest)
+            if keep > 64:  # in blocks: deleting from the front of a list is linear
+                del edge.stamps_ns[:keep], edge.matrices[:keep]
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix:
+        """``target_from_source`` at a time, interpolated; without a time, by each frame's newest value.
+
+        Raises:
+            TransformError: unknown frame, no path, or the time is outside what is held.
+        """
+        with self._lock:
+            up_source = self._chain(source)
+            up_target = self._chain(target)
+            common = next((frame for frame in up_source if frame in up_target), None)
+            if common is None:
+                known = ", ".join(sorted(self._frames())) or "none"
+                raise TransformError(f"no path from {source} to {target} (frames known: {known})")
+            common_from_source = self._product(up_source[: up_source.index(common)], stamp_ns)
+            common_from_target = self._product(up_target[: up_target.index(common)], stamp_ns)
+        return inverse(common_from_target) @ common_from_source
+
+    def frames(self) -> set[str]:
+        """Names of all frames known."""
+        with self._lock:
+            return self._frames()
+
+    def newest_ns(self, child: str) -> int | None:
+        """Stamp of the newest value of a frame against its parent; None for an unknown frame."""
+        with self._lock:
+            edge = self._edges.get(child)
+            return edge.stamps_ns[-1] if edge else None
+
+    def _frames(self) -> set[str]:
+        return set(self._edges) | {edge.parent for edge in self._edges.values()}
+
+    def _chain(self, frame: str) -> list[str]:
+        chain = [frame]
+        while (edge := self._edges.get(chain[-1])) is not None:
+            chain.append(edge.parent)
+        return chain
+
+    def _product(self, chain: list[str], stamp_ns: int | None) -> Matrix:
+        ancestor_from_frame = np.eye(4)
+        for frame in chain:
+            ancestor_from_frame = self._at(frame, stamp_ns) @ ancestor_from_frame
+        return ancestor_from_frame
+
+    def _at(self, frame: str, stamp_ns: int | None) -> Matrix:
+        edge = self._edges[frame]
+        if edge.static or stamp_ns is None:
+            return edge.matrices[-1]
+        at = bisect.bisect_left(edge.stamps_ns, stamp_ns)
+        if at < len(edge.stamps_ns) and edge.stamps_ns[at] == stamp_ns:
+            return edge.matrices[at]
+        if at == 0:
+            late = (edge.stamps_ns[0] - stamp_ns) / 1e9
+            if late * 1e9 <= self._tolerance_ns:
+                return edge.matrices[0]
+            raise TransformError(f"{edge.parent} → {frame}: asked for {late:.3f} s before the oldest value")
+        if at == len(edge.stamps_ns):
+            ahead_ns = stamp_ns - edge.stamps_ns[-1]
+            if ahead_ns <= self._tolerance_ns:
+                return edge.matrices[-1]
+            raise TransformError(
+                f"{edge.parent} → {frame}: asked for {ahead_ns / 1e9:.3f} s after the newest value"
+            )
+        before, after = edge.stamps_ns[at - 1], edge.stamps_ns[at]
+        return interpolate(
+            edge.matrices[at - 1], edge.matrices[at], (stamp_ns - before) / (after - before)
+        )

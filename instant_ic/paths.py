@@ -1,0 +1,41 @@
+"""Where launch files, configuration, models and the run directory are, in a checkout and in an installed wheel."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def share_dir(name: str) -> Path:
+    """Folder ``launch``, ``config`` or ``models``.
+
+    Raises:
+        FileNotFoundError: the installation lacks it.
+    """
+    for candidate in (_PACKAGE / "share" / name, _PACKAGE.parent / name):
+        if candidate.is_dir():
+            return candidate
+    raise FileNotFoundError(f"{name}/ is missing beside the package at {_PACKAGE}: install instant-ic again")
+
+
+def shipped_file(folder: str, name: str) -> Path:
+    """A file of ``launch``, ``config`` or ``models`` by name, with a clear error when it is not there."""
+    path = share_dir(folder) / name
+    if not path.is_file():
+        have = ", ".join(sorted(entry.name for entry in share_dir(folder).iterdir())) or "nothing"
+        raise FileNotFoundError(f"{path} does not exist ({folder}/ holds: {have})")
+    return path
+
+
+def run_dir() -> Path:
+    """The run directory: registry of the bus, logs, simulated devices.
+
+    ``INSTANT_IC_RUN_DIR``, else ``XDG_RUNTIME_DIR/instant_ic``, else ``/tmp/instant_ic-UID``.
+    """
+    if explicit := os.environ.get("INSTANT_IC_RUN_DIR"):
+        return Path(explicit)
+    if runtime := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(runtime) / "instant_ic"
+    return Path(f"/tmp/instant_ic-{os.getuid()}")  # noqa: S108 - created with mode 0700 and owner checked
