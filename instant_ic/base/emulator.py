@@ -1,0 +1,185 @@
+"""A RoboClaw that exists in memory only: real bytes in, real bytes out.
+
+It is pure: no clock, no port. Whoever holds it feeds it bytes and moves its time with `RoboclawEmulator.advance`.
+"""
+
+import struct
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.base.protocol import (
+    ACKNOWLEDGE,
+    ADDRESSES,
+    INTER_BYTE_GAP_S,
+    WRITE_DATA_BYTES,
+    Command,
+    crc16,
+    encode_reply,
+)
+
+
+class RoboclawEmulator:
+    """State of the controller and of two motors with encoders.
+
+    The motors follow `setpoint_pps` exactly unless ``ideal_motors`` is False: then whoever simulates the robot
+    writes `speed_pps` and `encoder` itself.
+
+    Attributes:
+        target_speed_pps: what the last command asked for, pulses/s, (2,) M1 and M2.
+        acceleration_pps2: ramp of the last command, pulses/s^2; 0 is none, the set point jumps.
+        setpoint_pps: target after the ramp, pulses/s, (2,).
+        speed_pps: speed that the encoders measure, pulses/s, (2,).
+        encoder: pulses counted, (2,); replies carry them modulo 2^32.
+        battery_v: main battery, volts.
+        status: bits of command 90; bit 0 (emergency stop of the 4-byte form) keeps the motors still.
+        status_bytes: 4, or 2 as old firmware replies.
+        timeout_s: serial watchdog, 0 is off.
+        watchdog_fired: motors were stopped by the watchdog; false again with the next valid packet.
+        bad_packets: frames dropped for their CRC, an unknown command or a gap between bytes.
+        packets: frames understood.
+    """
+
+    def __init__(self, address: int = 0x80, max_speed_pps: float = 4000.0, ideal_motors: bool = True) -> None:
+        if address not in ADDRESSES:
+            raise ValueError(f"address must be in 0x80..0x87 (got 0x{address:02x})")
+        self.address = address
+        self.max_speed_pps = max_speed_pps
+        self.ideal_motors = ideal_motors
+        self.target_speed_pps: NDArray[np.float64] = np.zeros(2)
+        self.setpoint_pps: NDArray[np.float64] = np.zeros(2)
+        self.speed_pps: NDArray[np.float64] = np.zeros(2)
+        self.encoder: NDArray[np.float64] = np.zeros(2)
+        self.acceleration_pps2 = 0.0
+        self.battery_v = 24.1
+        self.status = 0
+        self.status_bytes = 4
+        self.timeout_s = 0.0
+        self.version = "USB Roboclaw 2x15a v4.2.4"
+        self.watchdog_fired = False
+        self.bad_packets = 0
+        self.packets = 0
+        self._received = bytearray()
+        self._silent_s = 0.0
+        self._since_packet_s = 0.0
+
+    def feed(self, data: bytes) -> bytes:
+        """Take bytes from the line; returns what the controller sends back, in order."""
+        if data:
+            self._silent_s = 0.0
+        self._received += data
+        sent = bytearray()
+        while (reply := self._next_reply()) is not None:
+            sent += reply
+        return bytes(sent)
+
+    def advance(self, dt_s: float) -> None:
+        """Move the controller's time: byte gap, watchdog, speed ramps and, for ideal motors, the encoders."""
+        self._silent_s += dt_s
+        if self._received and self._silent_s > INTER_BYTE_GAP_S:
+            self._received.clear()
+            self.bad_packets += 1
+        self._since_packet_s += dt_s
+        if self.timeout_s > 0.0 and self._since_packet_s > self.timeout_s and not self.watchdog_fired:
+            self.watchdog_fired = True
+            self._stop()
+        if self._emergency_stopped:
+            self._stop()
+        before = self.setpoint_pps.copy()
+        step = self.acceleration_pps2 * dt_s if self.acceleration_pps2 > 0.0 else np.inf
+        self.setpoint_pps += np.clip(self.target_speed_pps - self.setpoint_pps, -step, step)
+        if self.ideal_motors:
+            self.speed_pps[:] = self.setpoint_pps
+            self.encoder += 0.5 * (before + self.setpoint_pps) * dt_s
+
+    @property
+    def _emergency_stopped(self) -> bool:
+        return bool(self.status & (0x1 if self.status_bytes == 4 else 0x4))
+
+    def _stop(self) -> None:
+        self.target_speed_pps[:] = 0.0
+        self.setpoint_pps[:] = 0.0
+
+    def _next_reply(self) -> bytes | None:
+        """Consume one frame; None when there is no whole one."""
+        received = self._received
+        if len(received) < 2:
+            return None
+        address, command = received[0], received[1]
+        if address != self.address:
+            # Another controller's packet, or noise: its end cannot be known, so wait for the next one.
+            received.clear()
+            self.bad_packets += 1
+            return None
+        if command in WRITE_DATA_BYTES:
+            size = 2 + WRITE_DATA_BYTES[command] + 2
+            if len(received) < size:
+                return None
+            frame = bytes(received[:size])
+            if crc16(frame[:-2]) != int.from_bytes(frame[-2:], "big"):
+                received.clear()
+                self.bad_packets += 1
+                return None
+            del received[:size]
+            self._write(command, frame[2:-2])
+            self._understood()
+            return ACKNOWLEDGE
+        data = self._read(command)
+        if data is None:
+            received.clear()
+            self.bad_packets += 1
+            return None
+        del received[:2]
+        self._understood()
+        return encode_reply(address, command, data)
+
+    def _understood(self) -> None:
+        self.packets += 1
+        self._since_packet_s = 0.0
+        self.watchdog_fired = False
+
+    def _write(self, command: int, data: bytes) -> None:
+        if command == Command.SET_TIMEOUT:
+            self.timeout_s = data[0] * 0.1
+        elif command == Command.RESET_ENCODERS:
+            self.encoder[:] = 0.0
+        elif command == Command.DUTY_BOTH:
+            duty = np.array(struct.unpack(">hh", data)) / 32767.0
+            self._drive(duty * self.max_speed_pps, 0.0)
+        elif command == Command.SPEED_BOTH:
+            self._drive(np.array(struct.unpack(">ii", data), float), 0.0)
+        elif command == Command.SPEED_ACCELERATION_BOTH:
+            acceleration, *speeds = struct.unpack(">Iii", data)
+            self._drive(np.array(speeds, float), float(acceleration))
+
+    def _drive(self, speed_pps: NDArray[np.float64], acceleration_pps2: float) -> None:
+        if self._emergency_stopped:
+            return
+        self.target_speed_pps[:] = np.clip(speed_pps, -self.max_speed_pps, self.max_speed_pps)
+        self.acceleration_pps2 = acceleration_pps2
+
+    def _read(self, command: int) -> bytes | None:
+        """Data of the reply to a command that reads; None for an unknown command."""
+        if command == Command.READ_TIMEOUT:
+            return bytes((round(self.timeout_s * 10),))
+        if command in (Command.READ_ENCODER_1, Command.READ_ENCODER_2):
+            motor = command - Command.READ_ENCODER_1
+            backwards = self.speed_pps[motor] < 0.0
+            return struct.pack(">IB", self._encoder_u32(motor), 0b10 if backwards else 0)
+        if command in (Command.READ_SPEED_1, Command.READ_SPEED_2):
+            speed = self.speed_pps[command - Command.READ_SPEED_1]
+            return struct.pack(">IB", abs(round(speed)), 1 if speed < 0.0 else 0)
+        if command == Command.READ_SPEEDS:
+            return struct.pack(">ii", *(round(speed) for speed in self.speed_pps))
+        if command == Command.READ_ENCODERS:
+            return struct.pack(">II", self._encoder_u32(0), self._encoder_u32(1))
+        if command == Command.READ_VERSION:
+            return self.version.encode("ascii") + b"\n\0"
+        if command == Command.READ_MAIN_BATTERY:
+            return struct.pack(">H", round(self.battery_v * 10))
+        if command == Command.READ_STATUS:
+            return self.status.to_bytes(self.status_bytes, "big")
+        return None
+
+    def _encoder_u32(self, motor: int) -> int:
+        return int(np.floor(self.encoder[motor])) & 0xFFFFFFFF

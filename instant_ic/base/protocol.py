@@ -1,0 +1,159 @@
+"""RoboClaw packet serial: frames and their CRC.
+
+Source: Basicmicro, RoboClaw User Manual, chapter "Packet Serial".
+"""
+
+import struct
+from enum import IntEnum
+from functools import cache
+
+BAUD_RATES = (2400, 9600, 19200, 38400, 57600, 115200, 230400, 460800)
+ADDRESSES = range(0x80, 0x88)
+ACKNOWLEDGE = b"\xff"
+INTER_BYTE_GAP_S = 0.010
+"""The controller drops a packet whose bytes lie further apart than this."""
+
+
+class Command(IntEnum):
+    """The commands this package speaks; the name says what, the manual's number is the value."""
+
+    SET_TIMEOUT = 14
+    READ_TIMEOUT = 15
+    READ_ENCODER_1 = 16
+    READ_ENCODER_2 = 17
+    READ_SPEED_1 = 18
+    READ_SPEED_2 = 19
+    RESET_ENCODERS = 20
+    READ_VERSION = 21
+    READ_MAIN_BATTERY = 24
+    DUTY_BOTH = 34
+    SPEED_BOTH = 37
+    SPEED_ACCELERATION_BOTH = 40
+    READ_ENCODERS = 78
+    READ_STATUS = 90
+    READ_SPEEDS = 108
+
+
+WRITE_DATA_BYTES: dict[int, int] = {
+    Command.SET_TIMEOUT: 1,
+    Command.RESET_ENCODERS: 0,
+    Command.DUTY_BOTH: 4,
+    Command.SPEED_BOTH: 8,
+    Command.SPEED_ACCELERATION_BOTH: 12,
+}
+"""Commands that write (acknowledged with 0xFF) and the bytes of data that each carries."""
+
+STATUS_FAULTS: dict[int, str] = {
+    0x0001: "emergency stop",
+    0x0002: "temperature error",
+    0x0004: "temperature 2 error",
+    0x0008: "main voltage high",
+    0x0010: "logic voltage high",
+    0x0020: "logic voltage low",
+    0x0040: "driver fault M1",
+    0x0080: "driver fault M2",
+    0x1000: "over-current M1",
+    0x2000: "over-current M2",
+}
+"""Error bits of the 4-byte status (command 90)."""
+STATUS_WARNING_MASK = 0xFFFF0000
+
+STATUS_FAULTS_2_BYTES: dict[int, str] = {
+    0x0001: "over-current warning M1",
+    0x0002: "over-current warning M2",
+    0x0004: "emergency stop",
+    0x0008: "temperature error",
+    0x0010: "temperature 2 error",
+    0x0020: "main voltage high",
+    0x0040: "logic voltage high",
+    0x0080: "logic voltage low",
+    0x0100: "driver fault M1",
+    0x0200: "driver fault M2",
+    0x0400: "main voltage high warning",
+    0x0800: "main voltage low warning",
+    0x1000: "temperature warning",
+    0x2000: "temperature 2 warning",
+}
+"""Bits of the 2-byte status of older firmware."""
+_WARNINGS_2_BYTES = 0x0001 | 0x0002 | 0x3C00
+
+
+class ProtocolError(Exception):
+    """A reply that is missing, cut or damaged; the text says which command and what came."""
+
+
+@cache
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 8
+        for _ in range(8):
+            crc = ((crc << 1) ^ 0x1021 if crc & 0x8000 else crc << 1) & 0xFFFF
+        table.append(crc)
+    return tuple(table)
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/XMODEM: polynomial 0x1021, initial 0, most significant bit first."""
+    table = _crc_table()
+    crc = 0
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ table[(crc >> 8) ^ byte]
+    return crc
+
+
+def write_frame(address: int, command: int, data: bytes = b"") -> bytes:
+    """Frame of a command that writes: address, command, data, CRC."""
+    body = bytes((address, command)) + data
+    return body + struct.pack(">H", crc16(body))
+
+
+def read_request(address: int, command: int) -> bytes:
+    """Frame of a command that reads; it has no CRC."""
+    return bytes((address, command))
+
+
+def encode_reply(address: int, command: int, data: bytes) -> bytes:
+    """The controller's reply to a read: data and the CRC over address, command and data."""
+    return data + struct.pack(">H", crc16(bytes((address, command)) + data))
+
+
+def decode_reply(address: int, command: int, reply: bytes) -> bytes:
+    """Data of a reply.
+
+    Raises:
+        ProtocolError: the CRC does not fit.
+    """
+    if len(reply) < 2:
+        raise ProtocolError(f"command {command}: reply of {len(reply)} bytes has no CRC")
+    data, received = reply[:-2], int.from_bytes(reply[-2:], "big")
+    expected = crc16(bytes((address, command)) + data)
+    if received != expected:
+        raise ProtocolError(
+            f"command {command}: CRC 0x{received:04x} instead of 0x{expected:04x} ({reply.hex(' ')})"
+        )
+    return data
+
+
+def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str]]:
+    """Faults and warnings in words.
+
+    Args:
+        status: value of command 90.
+        status_bytes: 2 or 4, the length it came in; the two have different bits.
+
+    Returns:
+        (faults, warnings): motors do not run, or not reliably, with a fault.
+    """
+    if status_bytes == 2:
+        named = [(bit, text) for bit, text in STATUS_FAULTS_2_BYTES.items() if status & bit]
+        return (
+            [text for bit, text in named if not bit & _WARNINGS_2_BYTES],
+            [text for bit, text in named if bit & _WARNINGS_2_BYTES],
+        )
+    faults = [text for bit, text in STATUS_FAULTS.items() if status & bit]
+    unnamed = status & ~STATUS_WARNING_MASK & ~sum(STATUS_FAULTS)
+    if unnamed:
+        faults.append(f"error bits 0x{unnamed:04x}")
+    warning = status & STATUS_WARNING_MASK
+    return faults, [f"warning bits 0x{warning:08x}"] if warning else []
