@@ -38,4 +38,4 @@ def run_dir() -> Path:
         return Path(explicit)
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "instant_ic"
-    return Path(f"/tmp/instant_ic-{os.getuid()}")  # noqa: S108 - created with mode 0700 and owner checked
+    return Path(f"/tmp/instant_ic-{os.getuid()}")

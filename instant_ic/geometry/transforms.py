@@ -139,6 +139,4 @@ class TransformBuffer:
                 f"{edge.parent} → {frame}: asked for {ahead_ns / 1e9:.3f} s after the newest value"
             )
         before, after = edge.stamps_ns[at - 1], edge.stamps_ns[at]
-        return interpolate(
-            edge.matrices[at - 1], edge.matrices[at], (stamp_ns - before) / (after - before)
-        )
+        return interpolate(edge.matrices[at - 1], edge.matrices[at], (stamp_ns - before) / (after - before))

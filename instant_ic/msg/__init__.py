@@ -1,0 +1,83 @@
+"""Typed messages: every ROS 2 (Jazzy) type and our own, by short name, with numpy on both sides.
+
+>>> from instant_ic.msg import LaserScan, scan_message, stamp_ns
+>>> scan = scan_message([1.0, 2.0], -0.1, 0.2, 0.1, 30.0, "velodyne", 1_500_000_000)
+>>> stamp_ns(scan), scan.ranges.dtype.name
+(1500000000, 'float32')
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .convert import (
+    POINT_DTYPE,
+    cloud_array,
+    cloud_message,
+    cloud_xyz,
+    compressed_image_message,
+    grid_array,
+    grid_message,
+    header,
+    image_array,
+    image_message,
+    odometry_message,
+    path_array,
+    path_message,
+    pose_matrix,
+    pose_message,
+    pose_stamped,
+    scan_message,
+    stamp_ns,
+    to_time,
+    transform_matrix,
+    transform_message,
+    twist_message,
+    twist_stamped,
+    twist_values,
+)
+from .types import MessageError, deserialize, message_type, serialize, type_hash, type_name, typestore
+
+__all__ = [
+    "POINT_DTYPE",
+    "MessageError",
+    "cloud_array",
+    "cloud_message",
+    "cloud_xyz",
+    "compressed_image_message",
+    "deserialize",
+    "grid_array",
+    "grid_message",
+    "header",
+    "image_array",
+    "image_message",
+    "message_type",
+    "odometry_message",
+    "path_array",
+    "path_message",
+    "pose_matrix",
+    "pose_message",
+    "pose_stamped",
+    "scan_message",
+    "serialize",
+    "stamp_ns",
+    "to_time",
+    "transform_matrix",
+    "transform_message",
+    "twist_message",
+    "twist_stamped",
+    "twist_values",
+    "type_hash",
+    "type_name",
+    "typestore",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Message classes by their short name: ``from instant_ic.msg import Odometry``."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    try:
+        return message_type(name)
+    except MessageError as error:
+        raise AttributeError(str(error)) from None
