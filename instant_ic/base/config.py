@@ -13,7 +13,7 @@ def _require(ok: bool, key: str, value: object, rule: str) -> None:
 
 @dataclass(frozen=True)
 class SkidSteerConfig:
-    """Geometry of a skid-steered base, by the model of instantaneous centres of rotation (Martinez et al., 2005).
+    """Geometry of a skid-steered base, by instantaneous centres of rotation (Martinez et al., 2005).
 
     Attributes:
         track_width: distance between the tracks' centre lines, metres.
@@ -82,7 +82,7 @@ class OdometryNoiseConfig:
     Attributes:
         position_per_metre: variance of the position gained with each metre driven, m^2/m.
         yaw_per_metre: variance of the yaw gained with each metre driven, rad^2/m.
-        yaw_per_radian: variance of the yaw gained with each radian turned (tracks slip as they turn), rad^2/rad.
+        yaw_per_radian: variance of the yaw gained with each radian turned (tracks slip), rad^2/rad.
         v_floor: standard deviation of the speed at rest, m/s.
         w_floor: standard deviation of the turn rate at rest, rad/s.
     """

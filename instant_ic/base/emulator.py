@@ -1,6 +1,7 @@
 """A RoboClaw that exists in memory only: real bytes in, real bytes out.
 
-It is pure: no clock, no port. Whoever holds it feeds it bytes and moves its time with `RoboclawEmulator.advance`.
+It is pure: no clock, no port. Whoever holds it feeds it bytes and moves its time with
+`RoboclawEmulator.advance`.
 """
 
 import struct
@@ -22,8 +23,8 @@ from instant_ic.base.protocol import (
 class RoboclawEmulator:
     """State of the controller and of two motors with encoders.
 
-    The motors follow `setpoint_pps` exactly unless ``ideal_motors`` is False: then whoever simulates the robot
-    writes `speed_pps` and `encoder` itself.
+    The motors follow `setpoint_pps` exactly unless ``ideal_motors`` is False: then whoever simulates the
+    robot writes `speed_pps` and `encoder` itself.
 
     Attributes:
         target_speed_pps: what the last command asked for, pulses/s, (2,) M1 and M2.

@@ -129,9 +129,7 @@ def decode_reply(address: int, command: int, reply: bytes) -> bytes:
     data, received = reply[:-2], int.from_bytes(reply[-2:], "big")
     expected = crc16(bytes((address, command)) + data)
     if received != expected:
-        raise ProtocolError(
-            f"command {command}: CRC 0x{received:04x} instead of 0x{expected:04x} ({reply.hex(' ')})"
-        )
+        raise ProtocolError(f"command {command}: CRC 0x{received:04x} instead of 0x{expected:04x} ({reply.hex(' ')})")
     return data
 
 

@@ -1,0 +1,56 @@
+"""Velocity and acceleration limits of a planar base."""
+
+import math
+
+from instant_ic.base.config import LimitsConfig
+
+
+class TwistLimiter:
+    """Brings a wanted twist within speed and acceleration limits, step by step.
+
+    Attributes:
+        v: speed along x that was given out last, m/s.
+        w: turn rate that was given out last, rad/s.
+    """
+
+    def __init__(self, config: LimitsConfig) -> None:
+        self.config = config
+        self.v = 0.0
+        self.w = 0.0
+
+    def step(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
+        """Next twist towards (v, w) after ``dt_s`` seconds.
+
+        Too fast a twist is scaled as a whole, so that the curve that was asked for is kept; accelerations are
+        limited one by one.
+
+        Raises:
+            ValueError: v or w is not finite, or dt_s is negative.
+        """
+        if not (math.isfinite(v) and math.isfinite(w)):
+            raise ValueError(f"twist must be finite (got v={v}, w={w})")
+        if dt_s < 0.0:
+            raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
+        v, w = clamp_twist(v, w, self.config)
+        self.v = _towards(self.v, v, self.config.max_v_acceleration * dt_s)
+        self.w = _towards(self.w, w, self.config.max_w_acceleration * dt_s)
+        return self.v, self.w
+
+    def reset(self, v: float = 0.0, w: float = 0.0) -> None:
+        """Start anew from a twist, as after an emergency stop."""
+        self.v = v
+        self.w = w
+
+
+def clamp_twist(v: float, w: float, config: LimitsConfig) -> tuple[float, float]:
+    """The twist scaled down, both parts by one factor, until it is within the speed limits."""
+    scale = 1.0
+    if abs(v) > config.max_v:
+        scale = config.max_v / abs(v)
+    if abs(w) * scale > config.max_w:
+        scale = config.max_w / abs(w)
+    return v * scale, w * scale
+
+
+def _towards(value: float, target: float, step: float) -> float:
+    return value + min(max(target - value, -step), step)

@@ -1,0 +1,142 @@
+"""Dead reckoning from track encoders."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from instant_ic.base.config import OdometryNoiseConfig, SkidSteerConfig
+from instant_ic.base.kinematics import SkidSteer
+
+UNMEASURED_VARIANCE = 1e6
+"""Variance of z, roll and pitch, which encoders tell nothing about."""
+
+
+@dataclass(frozen=True)
+class OdometryEstimate:
+    """Pose and twist by the encoders at one instant.
+
+    Attributes:
+        stamp_ns: time of measurement.
+        pose: base_link in odom, (x, y, yaw), metres and radians, (3,).
+        twist: (v_x, v_y, w) in base_link, m/s and rad/s, (3,).
+        pose_covariance: order x y z rx ry rz, in odom, (6, 6).
+        twist_covariance: the same order, in base_link, (6, 6).
+    """
+
+    stamp_ns: int
+    pose: NDArray[np.float64]
+    twist: NDArray[np.float64]
+    pose_covariance: NDArray[np.float64]
+    twist_covariance: NDArray[np.float64]
+
+
+class WheelOdometry:
+    """Integrates encoder counts to a pose with covariance.
+
+    Attributes:
+        rejected: readings too far from the one before to be true (a controller that lost its counts); the
+            pose stays, and counting goes on from the new reading.
+    """
+
+    def __init__(
+        self,
+        geometry: SkidSteerConfig,
+        noise: OdometryNoiseConfig | None = None,
+        max_track_speed: float = 3.0,
+    ) -> None:
+        """Start at the origin of odom.
+
+        Args:
+            geometry: tracks and encoders.
+            noise: growth of the uncertainty.
+            max_track_speed: a reading that asks for a faster track, m/s, is not believed.
+        """
+        self.kinematics = SkidSteer(geometry)
+        self.noise = noise or OdometryNoiseConfig()
+        self.max_track_speed = max_track_speed
+        self.rejected = 0
+        self._pose = np.zeros(3)
+        self._covariance = np.zeros((3, 3))
+        self._last: tuple[NDArray[np.int64], int] | None = None
+
+    def update(self, encoders: ArrayLike, stamp_ns: int) -> OdometryEstimate | None:
+        """Take one reading.
+
+        Args:
+            encoders: counts of M1 and M2 modulo 2^32, (2,).
+            stamp_ns: when they were read.
+
+        Returns:
+            The new estimate; None for the first reading, one that is not newer, and one that was rejected.
+        """
+        counts = np.asarray(encoders, np.int64)
+        last, self._last = self._last, (counts, stamp_ns)
+        if last is None:
+            return None
+        dt_s = (stamp_ns - last[1]) * 1e-9
+        if dt_s <= 0.0:
+            self._last = last
+            return None
+        tracks = self.kinematics.tracks_from_motors(unwrap_counts(last[0], counts))
+        if np.abs(tracks).max() > self.max_track_speed * dt_s:
+            self.rejected += 1
+            return None
+        step = self.kinematics.twist_from_tracks(tracks)
+        self._integrate(step)
+        return OdometryEstimate(
+            stamp_ns=stamp_ns,
+            pose=self._pose.copy(),
+            twist=step / dt_s,
+            pose_covariance=_six(self._covariance),
+            twist_covariance=self._twist_covariance(step, dt_s),
+        )
+
+    def _integrate(self, step: NDArray[np.float64]) -> None:
+        """Move by a body displacement (x, y, yaw) along its arc, and let the covariance grow."""
+        dx, dy, dyaw = step
+        # Exponential map of SE(2); the series keeps it exact where the turn is too small to divide by.
+        if abs(dyaw) > 1e-6:
+            a, b = np.sin(dyaw) / dyaw, (1.0 - np.cos(dyaw)) / dyaw
+        else:
+            a, b = 1.0 - dyaw * dyaw / 6.0, 0.5 * dyaw
+        local = np.array([a * dx - b * dy, b * dx + a * dy])
+        c, s = np.cos(self._pose[2]), np.sin(self._pose[2])
+        rotation = np.array([[c, -s], [s, c]])
+        moved = rotation @ local
+
+        jacobian = np.eye(3)
+        jacobian[:2, 2] = (-moved[1], moved[0])
+        gained = np.zeros((3, 3))
+        distance = float(np.hypot(dx, dy))
+        gained[:2, :2] = np.eye(2) * self.noise.position_per_metre * distance
+        gained[2, 2] = self.noise.yaw_per_metre * distance + self.noise.yaw_per_radian * abs(dyaw)
+        self._covariance = jacobian @ self._covariance @ jacobian.T + gained
+
+        self._pose[:2] += moved
+        self._pose[2] = (self._pose[2] + dyaw + np.pi) % (2.0 * np.pi) - np.pi
+
+    def _twist_covariance(self, step: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
+        """Variances of the mean twist over the step: what the pose gained, by time, on top of a floor."""
+        distance, turn = abs(float(step[0])), abs(float(step[2]))
+        planar = np.diag(
+            [
+                self.noise.v_floor**2 + self.noise.position_per_metre * distance / dt_s,
+                self.noise.v_floor**2 + self.noise.position_per_metre * distance / dt_s,
+                self.noise.w_floor**2 + (self.noise.yaw_per_metre * distance + self.noise.yaw_per_radian * turn) / dt_s,
+            ]
+        )
+        return _six(planar)
+
+
+def unwrap_counts(before: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Signed pulses from one unsigned 32-bit count to the next, by the shorter way round."""
+    return (now - before + 2**31) % 2**32 - 2**31
+
+
+def _six(planar: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A (3, 3) covariance of x, y, yaw as the (6, 6) one of x, y, z, rx, ry, rz."""
+    full = np.diag(np.full(6, UNMEASURED_VARIANCE))
+    rows = np.array([0, 1, 5])
+    full[np.ix_(rows, rows)] = planar
+    return full
