@@ -40,9 +40,7 @@ class TransformBuffer:
         self._edges: dict[str, _Edge] = {}
         self._lock = threading.Lock()
 
-    def set(
-        self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False
-    ) -> None:
+    def set(self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False) -> None:
         """Adds one value; a stamp already held is replaced, an older one is sorted in.
 
         Raises:
@@ -93,7 +91,7 @@ class TransformBuffer:
             common_from_target = self._product(up_target[: up_target.index(common)], stamp_ns)
         return inverse(common_from_target) @ common_from_source
 
-    def frames(self) -> set[str]:
+    def frames(self) -> frozenset[str]:
         """Names of all frames known."""
         with self._lock:
             return self._frames()
@@ -104,8 +102,8 @@ class TransformBuffer:
             edge = self._edges.get(child)
             return edge.stamps_ns[-1] if edge else None
 
-    def _frames(self) -> set[str]:
-        return set(self._edges) | {edge.parent for edge in self._edges.values()}
+    def _frames(self) -> frozenset[str]:
+        return frozenset(self._edges) | {edge.parent for edge in self._edges.values()}
 
     def _chain(self, frame: str) -> list[str]:
         chain = [frame]
@@ -135,8 +133,6 @@ class TransformBuffer:
             ahead_ns = stamp_ns - edge.stamps_ns[-1]
             if ahead_ns <= self._tolerance_ns:
                 return edge.matrices[-1]
-            raise TransformError(
-                f"{edge.parent} → {frame}: asked for {ahead_ns / 1e9:.3f} s after the newest value"
-            )
+            raise TransformError(f"{edge.parent} → {frame}: asked for {ahead_ns / 1e9:.3f} s after the newest value")
         before, after = edge.stamps_ns[at - 1], edge.stamps_ns[at]
         return interpolate(edge.matrices[at - 1], edge.matrices[at], (stamp_ns - before) / (after - before))

@@ -180,9 +180,7 @@ def cloud_array(message: Any) -> NDArray[Any]:
     count = message.width * message.height
     data = np.asarray(message.data)
     if data.size < count * dtype.itemsize:
-        raise MessageError(
-            f"point cloud of {count} points × {dtype.itemsize} bytes has only {data.size} bytes"
-        )
+        raise MessageError(f"point cloud of {count} points × {dtype.itemsize} bytes has only {data.size} bytes")
     return np.ascontiguousarray(data[: count * dtype.itemsize]).view(dtype)
 
 
@@ -314,9 +312,7 @@ def transform_matrix(message: Any) -> Matrix:
 def twist_message(v: float = 0.0, w: float = 0.0) -> Any:
     """geometry_msgs/Twist of a planar robot: m/s forward, rad/s counter-clockwise."""
     vector = message_type("Vector3")
-    return message_type("Twist")(
-        linear=vector(x=float(v), y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=float(w))
-    )
+    return message_type("Twist")(linear=vector(x=float(v), y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=float(w)))
 
 
 def twist_stamped(v: float, w: float, stamp: int, frame_id: str = "base_link") -> Any:

@@ -97,9 +97,7 @@ def deserialize(data: bytes | bytearray | memoryview, name: str) -> Any:
     view = data if isinstance(data, (bytes, memoryview)) else memoryview(data)
     try:
         return typestore().deserialize_cdr(view, full)
-    except (
-        Exception
-    ) as error:  # whatever generated code raises on foreign bytes: struct, index, unicode, value
+    except Exception as error:  # whatever generated code raises on foreign bytes: struct, index, unicode, value
         raise MessageError(f"{len(data)} bytes are not a {full}: {type(error).__name__}: {error}") from error
 
 

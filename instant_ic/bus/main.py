@@ -1,0 +1,135 @@
+"""Starts one node as a process: command line, parameters, signals, registry."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from .. import paths
+from ..msg import MessageError
+from . import params, registry
+from .clock import Clock, ManualClock, SystemClock
+from .node import Node, NodeError
+from .zmq_transport import ZmqTransport
+
+
+def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
+    """Command line of a node."""
+    parser = argparse.ArgumentParser(
+        prog=f"ic run {node_class.name}",
+        description=(sys.modules[node_class.__module__].__doc__ or "").strip(),
+        epilog=f"example: ic run {node_class.name} --params-file config/sim.yaml -p use_sim_time:=true",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--name", default=node_class.name, help="name of this node (default: %(default)s)")
+    parser.add_argument("--namespace", default="", help="put before every topic")
+    parser.add_argument(
+        "--params-file", action="append", default=[], type=Path, metavar="FILE", help="ROS 2 parameter file; repeatable"
+    )
+    parser.add_argument(
+        "-p", "--param", action="append", default=[], metavar="KEY:=VALUE", help="one parameter; repeatable"
+    )
+    parser.add_argument(
+        "-r", "--remap", action="append", default=[], metavar="FROM:=TO", help="other name for a topic; repeatable"
+    )
+    parser.add_argument("--run-dir", type=Path, default=None, help="run directory (default: $INSTANT_IC_RUN_DIR)")
+    parser.add_argument(
+        "--log-level", default="info", choices=["debug", "info", "warning", "error"], help="default: %(default)s"
+    )
+    return parser
+
+
+def load_config(
+    node_class: type[Node[Any]], name: str, files: Sequence[Path], overrides: Sequence[str]
+) -> tuple[Any, bool]:
+    """Typed configuration of a node, and whether it uses simulated time.
+
+    Raises:
+        ParameterError: something in the files or words is wrong; the message says where.
+    """
+    values: params.Values = {}
+    for path in files:
+        values.update(params.load_file(path, name))
+    values.update(params.parse_override(word) for word in overrides)
+    sim_time = values.pop("use_sim_time", params.Value(False, ""))
+    if not isinstance(sim_time.value, bool):
+        raise params.ParameterError(f"{sim_time.where}: use_sim_time must be true or false")
+    return params.build(node_class.config_class(), values), sim_time.value
+
+
+def parse_remaps(words: Sequence[str]) -> dict[str, str]:
+    """``from:=to`` words.
+
+    Raises:
+        ParameterError: no ``:=``.
+    """
+    remaps = {}
+    for word in words:
+        source, separator, target = word.partition(":=")
+        if not separator or not source or not target:
+            raise params.ParameterError(f"-r {word}: expected from:=to")
+        remaps[source] = target
+    return remaps
+
+
+def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None:
+    """Runs a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters."""
+    sys.exit(run(node_class, argv))
+
+
+def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
+    """As :func:`main`, and returns the exit status."""
+    args = argument_parser(node_class).parse_args(argv)
+    logging.basicConfig(
+        level=args.log_level.upper(),
+        format=f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s",
+        datefmt="%H:%M:%S",
+        stream=sys.stderr,
+    )
+    log = logging.getLogger(args.name)
+    try:
+        config, use_sim_time = load_config(node_class, args.name, args.params_file, args.param)
+        remaps = parse_remaps(args.remap)
+        registry.check_node_name(args.name)
+    except (params.ParameterError, registry.RegistryError) as error:
+        log.error("%s", error)
+        return 2
+    clock: Clock = ManualClock() if use_sim_time else SystemClock()
+    run_dir = args.run_dir or paths.run_dir()
+    try:
+        transport = ZmqTransport(run_dir, args.name, clock.now_ns)
+        claim = registry.Claim(run_dir / "nodes" / args.name, f"node {args.name}")
+    except registry.RegistryError as error:
+        log.error("%s", error)
+        return 1
+    node = node_class(config, transport, clock, args.name, args.namespace, remaps, use_sim_time=use_sim_time)
+    started_ns = time.time_ns()
+    # Signals only set a flag: the loop sees it within half a second, and teardown runs on the node's own thread.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: node.stop())
+    status = 0
+    try:
+        node.on_registry_change = lambda: claim.write({**node.describe(), "started_ns": started_ns})
+        node.start()
+        claim.write({**node.describe(), "started_ns": started_ns})
+        log.info("running")
+        node.spin()
+        log.info("stopping")
+    except (NodeError, registry.RegistryError, MessageError) as error:
+        log.error("%s", error)
+        status = 1
+    except Exception:  # the last line of defence: told with its trace, then teardown still runs
+        log.exception("failed")
+        status = 1
+    finally:
+        try:
+            node.close()
+        finally:
+            claim.release()
+    return status

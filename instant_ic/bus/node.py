@@ -1,0 +1,639 @@
+"""The node: parameters, topics, timers, clock, transforms, heartbeat and diagnostics around a call into the library."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, ClassVar, Generic, TypeVar, get_args
+
+from ..geometry.poses import Matrix
+from ..geometry.transforms import TransformBuffer, TransformError
+from ..msg import (
+    MessageError,
+    deserialize,
+    header,
+    message_type,
+    serialize,
+    stamp_ns,
+    to_time,
+    transform_matrix,
+    transform_message,
+    type_name,
+)
+from . import params
+from .clock import Clock, ManualClock
+from .qos import LATCHED, RELIABLE, SENSOR, QoS
+from .transport import RawPublisher, RawSubscription, Received, Transport
+
+OK, WARN, ERROR, STALE = 0, 1, 2, 3
+"""Levels of a diagnosis (diagnostic_msgs/DiagnosticStatus)."""
+
+ConfigT = TypeVar("ConfigT")
+
+_HEARTBEAT_S = 0.5
+_DIAGNOSTICS_S = 1.0
+_IDLE_S = 0.5  # longest sleep of the loop, so that a stop flag set by a signal is seen
+
+
+class NodeError(RuntimeError):
+    """A fault that plain words explain; ends the process without a trace when it comes out of ``setup``."""
+
+
+class Publisher:
+    """Typed publisher; :meth:`publish` may be called from any thread."""
+
+    def __init__(self, raw: RawPublisher) -> None:
+        self.raw = raw
+        self.topic = raw.topic
+
+    @property
+    def subscriber_count(self) -> int:
+        """How many readers there are now; pictures that nobody watches need not be made."""
+        return self.raw.subscriber_count
+
+    def publish(self, message: Any) -> None:
+        """Sends one message.
+
+        Raises:
+            MessageError: it is of another type, or a field does not fit.
+        """
+        if type_name(message) != self.raw.type_name:
+            raise MessageError(f"{self.topic} carries {self.raw.type_name}, not {type_name(message)}")
+        self.raw.send(serialize(message))
+
+    def publish_bytes(self, payload: bytes | memoryview) -> None:
+        """Sends CDR bytes as they are."""
+        self.raw.send(payload)
+
+
+class Subscription:
+    """A topic and the callback it goes to."""
+
+    def __init__(self, callback: Callable[[Received], None]) -> None:
+        self.callback = callback
+        self.raw: RawSubscription  # set by the node right after making it
+
+    def close(self) -> None:
+        """No more messages from now on."""
+        self.raw.close()
+
+
+class Latest:
+    """The newest message of a topic, for as long as it is fresh."""
+
+    def __init__(self, clock: Clock, max_age_s: float) -> None:
+        self._clock = clock
+        self.max_age_s = max_age_s
+        self._message: Any = None
+        self._received_ns = 0
+
+    def put(self, message: Any, received_ns: int) -> None:
+        """Takes a newer message."""
+        self._message, self._received_ns = message, received_ns
+
+    @property
+    def message(self) -> Any:
+        """The newest message, or None when there is none younger than ``max_age_s``."""
+        return self._message if self.age_s <= self.max_age_s else None
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it came; inf before the first."""
+        if self._message is None:
+            return float("inf")
+        return (self._clock.now_ns() - self._received_ns) / 1e9
+
+
+class Worker:
+    """Runs slow work beside the node's thread, newest item only; inline in lockstep."""
+
+    def __init__(self, node: Node[Any], work: Callable[[Any], Any], on_result: Callable[[Any], None] | None) -> None:
+        self._node = node
+        self._work = work
+        self._on_result = on_result
+        self._condition = threading.Condition()
+        self._item: list[Any] = []
+        self._stopped = False
+        self.busy = False
+        self.skipped = 0
+        self._thread: threading.Thread | None = None
+        if not node.lockstep:
+            self._thread = threading.Thread(target=self._run, name=getattr(work, "__name__", "work"), daemon=True)
+            self._thread.start()
+
+    def submit(self, item: Any) -> None:
+        """Hands over an item; one that still waits is replaced and counted in ``skipped``."""
+        if self._thread is None:
+            self._do(item)
+            return
+        with self._condition:
+            self.skipped += len(self._item)
+            self._item = [item]
+            self._condition.notify()
+
+    def stop(self, timeout_s: float = 3.0) -> None:
+        """Ends the thread after the item in hand; waits for it at most ``timeout_s``."""
+        with self._condition:
+            self._stopped = True
+            self._item = []
+            self._condition.notify()
+        if self._thread is not None:
+            self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                self.busy = False
+                while not self._item and not self._stopped:
+                    self._condition.wait()
+                if self._stopped:
+                    return
+                item = self._item.pop()
+                self.busy = True
+            self._do(item)
+
+    def _do(self, item: Any) -> None:
+        try:
+            result = self._work(item)
+        except Exception as error:  # noqa: BLE001 - a node outlives a bad item; told with its trace
+            self._node.call_soon(self._node.fault, f"background {getattr(self._work, '__name__', 'work')}", error)
+            return
+        if self._on_result is not None:
+            self._node.call_soon(self._on_result, result)
+
+
+class _Timer:
+    def __init__(self, period_ns: int, due_ns: int, callback: Callable[[], None]) -> None:
+        self.period_ns = period_ns
+        self.due_ns = due_ns
+        self.callback = callback
+        self.cancelled = False
+
+    def cancel(self) -> None:
+        """Never fires again."""
+        self.cancelled = True
+
+
+class Node(Generic[ConfigT]):
+    """Base of every process of the stack; see docs/architecture.md for how one is written.
+
+    Args:
+        config: typed parameters.
+        transport: topics.
+        clock: time; a :class:`ManualClock` where ``/clock`` or a test sets it.
+        name: instead of the class's own name.
+        namespace: put before every topic.
+        remaps: topic → topic, applied before the namespace.
+        lockstep: no threads, no heartbeat; the bus drives the node.
+        use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
+    """
+
+    name: ClassVar[str] = "node"
+
+    def __init__(
+        self,
+        config: ConfigT,
+        transport: Transport,
+        clock: Clock,
+        name: str | None = None,
+        namespace: str = "",
+        remaps: dict[str, str] | None = None,
+        lockstep: bool = False,
+        use_sim_time: bool = False,
+    ) -> None:
+        self.config = config
+        self.clock = clock
+        self.node_name = name or type(self).name
+        self.namespace = namespace.strip("/")
+        self.lockstep = lockstep
+        self.use_sim_time = use_sim_time
+        self.log = logging.getLogger(self.node_name)
+        self.publishers: list[Publisher] = []
+        self.subscriptions: list[Subscription] = []
+        self._transport = transport
+        self._remaps = dict(remaps or {})
+        self._timers: list[tuple[int, int, _Timer]] = []
+        self._timer_orders = itertools.count()
+        self._soon: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
+        self._wake = threading.Event()
+        self._stop = threading.Event()
+        self._workers: list[Worker] = []
+        self._diagnoses: dict[str, tuple[int, str, dict[str, Any]]] = {}
+        self._faults = 0
+        self._tf: TransformBuffer | None = None
+        self._tf_out: Publisher | None = None
+        self._tf_static_out: Publisher | None = None
+        self._tf_static: dict[str, Any] = {}
+        self._state = "STARTING"
+        self.on_registry_change: Callable[[], None] | None = None
+
+    # -- for the node's author -------------------------------------------------------------------
+
+    def setup(self) -> None:
+        """Makes publishers, subscriptions and timers; overridden by each node."""
+
+    def teardown(self) -> None:
+        """Leaves devices safe; called once, also after an error in ``setup``."""
+
+    @classmethod
+    def config_class(cls) -> type[Any]:
+        """The dataclass named in ``class X(Node[Config])``."""
+        for base in getattr(cls, "__orig_bases__", ()):
+            arguments = get_args(base)
+            if arguments and isinstance(arguments[0], type):
+                return arguments[0]
+        raise TypeError(f"{cls.__name__} must derive from Node[ItsConfig]")
+
+    def resolve(self, topic: str) -> str:
+        """A topic's name after remaps and namespace."""
+        topic = self._remaps.get(topic, topic)
+        return f"/{self.namespace}{topic}" if self.namespace else topic
+
+    def publisher(self, topic: str, message_class: Any, qos: QoS = SENSOR) -> Publisher:
+        """A typed publisher."""
+        return self.publisher_raw(topic, type_name(message_class), qos)
+
+    def publisher_raw(self, topic: str, type_name: str, qos: QoS = SENSOR) -> Publisher:
+        """A publisher by type name, for bytes that are not decoded here."""
+        publisher = Publisher(self._transport.advertise(self.resolve(topic), type_name, qos))
+        self.publishers.append(publisher)
+        self._registry_changed()
+        return publisher
+
+    def subscribe(
+        self, topic: str, message_class: Any, callback: Callable[[Any], None], qos: QoS = SENSOR
+    ) -> Subscription:
+        """Calls ``callback(message)`` on the node's thread."""
+        name = type_name(message_class)
+
+        def decode(received: Received) -> None:
+            callback(deserialize(received.payload, name))
+
+        return self._subscribe(topic, name, decode, qos)
+
+    def subscribe_raw(
+        self, topic: str, callback: Callable[[str, str, bytes | memoryview, int], None], qos: QoS = RELIABLE
+    ) -> Subscription:
+        """Calls ``callback(topic, type_name, payload, publish_ns)`` with bytes of whatever type comes."""
+
+        def forward(received: Received) -> None:
+            callback(received.topic, received.type_name, received.payload, received.publish_ns)
+
+        return self._subscribe(topic, None, forward, qos)
+
+    def latest(self, topic: str, message_class: Any, max_age_s: float, qos: QoS = SENSOR) -> Latest:
+        """Keeps the newest message of a topic at hand."""
+        latest = Latest(self.clock, max_age_s)
+        name = type_name(message_class)
+
+        def keep(received: Received) -> None:
+            latest.put(deserialize(received.payload, name), received.received_ns)
+
+        self._subscribe(topic, name, keep, qos)
+        return latest
+
+    def timer(self, period_s: float, callback: Callable[[], None]) -> _Timer:
+        """Calls back each period of the node's clock; missed periods are not made up for."""
+        if period_s <= 0:
+            raise ValueError(f"timer period must be > 0 (got {period_s})")
+        period = int(period_s * 1e9)
+        timer = _Timer(period, self.clock.now_ns() + period, callback)
+        heapq.heappush(self._timers, (timer.due_ns, next(self._timer_orders), timer))
+        self._wake.set()
+        return timer
+
+    def background(self, work: Callable[[Any], Any], on_result: Callable[[Any], None] | None = None) -> Worker:
+        """A worker thread for slow work on the newest item; ``on_result`` runs on the node's thread."""
+        worker = Worker(self, work, on_result)
+        self._workers.append(worker)
+        return worker
+
+    def call_soon(self, function: Callable[..., None], *args: Any) -> None:
+        """Runs a function on the node's thread; may be called from any thread."""
+        self._soon.append((function, args))
+        self._wake.set()
+
+    def diagnose(self, name: str, level: int, message: str, **values: Any) -> None:
+        """Sets a named diagnosis, shown until the next of that name."""
+        before = self._diagnoses.get(name)
+        self._diagnoses[name] = (level, message, values)
+        if level >= WARN and (before is None or before[0] != level):
+            self.log.log(logging.WARNING if level == WARN else logging.ERROR, "%s: %s", name, message)
+        elif level == OK and before is not None and before[0] >= WARN:
+            self.log.info("%s: %s", name, message)
+
+    def stop(self) -> None:
+        """Ends the loop; may be called from any thread and from a signal handler."""
+        self._stop.set()
+        self._wake.set()
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the loop is to end."""
+        return self._stop.is_set()
+
+    # -- transforms ------------------------------------------------------------------------------
+
+    @property
+    def tf(self) -> TransformBuffer:
+        """The transform buffer, fed from ``/tf`` and ``/tf_static`` since the first use."""
+        if self._tf is None:
+            self._tf = TransformBuffer()
+            transforms = message_type("TFMessage")
+            self.subscribe("/tf", transforms, lambda m: self._on_tf(m, False), RELIABLE)
+            self.subscribe("/tf_static", transforms, lambda m: self._on_tf(m, True), LATCHED)
+        return self._tf
+
+    def _on_tf(self, message: Any, static: bool) -> None:
+        assert self._tf is not None
+        for transform in message.transforms:
+            try:
+                self._tf.set(
+                    transform.header.frame_id,
+                    transform.child_frame_id,
+                    stamp_ns(transform),
+                    transform_matrix(transform),
+                    static,
+                )
+            except (TransformError, MessageError) as error:
+                self.diagnose("tf", ERROR, str(error))
+
+    def tf_broadcast(self, parent: str, child: str, parent_from_child: Matrix, stamp: int) -> None:
+        """Sends one transform on ``/tf``."""
+        transforms = message_type("TFMessage")
+        if self._tf_out is None:
+            self._tf_out = self.publisher("/tf", transforms, RELIABLE)
+        self._tf_out.publish(transforms([transform_message(parent_from_child, parent, child, stamp)]))
+
+    def tf_broadcast_static(self, parent: str, child: str, parent_from_child: Matrix) -> None:
+        """Sends a fixed transform on ``/tf_static``; all of a node's fixed transforms go together."""
+        transforms = message_type("TFMessage")
+        if self._tf_static_out is None:
+            self._tf_static_out = self.publisher("/tf_static", transforms, LATCHED)
+        self._tf_static[child] = transform_message(parent_from_child, parent, child, self.clock.now_ns())
+        self._tf_static_out.publish(transforms(list(self._tf_static.values())))
+
+    # -- the loop --------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Runs ``setup``; called once by whoever drives the node."""
+        if not self.lockstep:
+            self._rosout = self.publisher("/rosout", message_type("Log"), RELIABLE)
+            handler = _RosoutHandler(self)
+            self.log.addHandler(handler)
+            self._heartbeat = self.publisher("/heartbeat", message_type("NodeStatus"), RELIABLE)
+            self._diagnostics = self.publisher("/diagnostics", message_type("DiagnosticArray"), RELIABLE)
+            self._beat()
+        if self.use_sim_time:
+            self.subscribe("/clock", message_type("Clock"), self._on_clock, RELIABLE)
+        self.setup()
+        self._state = "RUNNING"
+
+    def _on_clock(self, message: Any) -> None:
+        assert isinstance(self.clock, ManualClock)
+        self.clock.set(stamp_ns(message.clock))
+
+    def spin(self) -> None:
+        """Runs callbacks until :meth:`stop`."""
+        next_beat = next_diagnostics = 0.0
+        while not self._stop.is_set():
+            self._wake.clear()
+            self.spin_once()
+            now = time.monotonic()
+            if now >= next_beat:
+                next_beat = now + _HEARTBEAT_S
+                self._beat()
+            if now >= next_diagnostics:
+                next_diagnostics = now + _DIAGNOSTICS_S
+                self._publish_diagnostics()
+            wait = min(_IDLE_S, next_beat - now, next_diagnostics - now)
+            if self._timers:
+                due = (self._timers[0][0] - self.clock.now_ns()) / 1e9
+                # Simulated time may run slower or faster than the machine's: its timers are looked at often.
+                wait = min(wait, 0.01 if self.use_sim_time else due)
+            if self._soon:
+                continue
+            self._wake.wait(max(0.0, wait))
+
+    def spin_once(self) -> bool:
+        """Runs what is due now: results of workers, messages in order of arrival, timers. True if anything ran."""
+        ran = False
+        while self._soon:
+            function, args = self._soon.popleft()
+            self._guard(getattr(function, "__qualname__", "callback"), function, *args)
+            ran = True
+        pending: list[tuple[int, Subscription, Received]] = []
+        for subscription in list(self.subscriptions):
+            pending += [(received.order, subscription, received) for received in subscription.raw.take()]
+        pending.sort(key=lambda entry: entry[0])
+        for _, subscription, received in pending:
+            self._guard(f"callback of {received.topic}", subscription.callback, received)
+            ran = True
+        return self._fire_timers() or ran
+
+    def _fire_timers(self) -> bool:
+        fired = False
+        now = self.clock.now_ns()
+        if self.use_sim_time and now == 0:
+            return False
+        while self._timers and self._timers[0][0] <= now:
+            _, _, timer = heapq.heappop(self._timers)
+            if timer.cancelled:
+                continue
+            # On the grid of periods: no drift, no burst after a pause.
+            timer.due_ns += timer.period_ns * ((now - timer.due_ns) // timer.period_ns + 1)
+            heapq.heappush(self._timers, (timer.due_ns, next(self._timer_orders), timer))
+            self._guard(f"timer {getattr(timer.callback, '__qualname__', '')}", timer.callback)
+            fired = True
+        return fired
+
+    def next_timer_ns(self) -> int | None:
+        """When the next timer is due; for the lockstep bus."""
+        while self._timers and self._timers[0][2].cancelled:
+            heapq.heappop(self._timers)
+        return self._timers[0][0] if self._timers else None
+
+    def _guard(self, what: str, function: Callable[..., None], *args: Any) -> None:
+        try:
+            function(*args)
+        except NodeError as error:
+            self._faults += 1
+            self.diagnose(what, ERROR, str(error))
+        except Exception as error:  # noqa: BLE001 - one bad message must not end a node that moves a robot
+            self.fault(what, error)
+
+    def fault(self, what: str, error: Exception) -> None:
+        """Tells an exception with its trace, and counts it."""
+        self._faults += 1
+        self.log.error("%s: %s: %s", what, type(error).__name__, error, exc_info=error)
+        self._diagnoses[what] = (ERROR, f"{type(error).__name__}: {error}", {"faults": self._faults})
+        if self.lockstep:
+            raise error
+
+    def close(self) -> None:
+        """Runs ``teardown`` and lets go of topics and threads."""
+        self._state = "STOPPING"
+        self._stop.set()
+        try:
+            self.teardown()
+        finally:
+            for worker in self._workers:
+                worker.stop()
+            if not self.lockstep:
+                for handler in [h for h in self.log.handlers if isinstance(h, _RosoutHandler)]:
+                    self.log.removeHandler(handler)
+            self._transport.close()
+
+    # -- what every node tells -------------------------------------------------------------------
+
+    @property
+    def level(self) -> int:
+        """The worst level of the present diagnoses."""
+        return max((level for level, _, _ in self._diagnoses.values()), default=OK)
+
+    def diagnoses(self) -> dict[str, tuple[int, str, dict[str, Any]]]:
+        """The present diagnoses by name: level, message, values."""
+        return dict(self._diagnoses)
+
+    def _beat(self) -> None:
+        now = self.clock.now_ns()
+        status = message_type("NodeStatus")
+        state = "DEGRADED" if self._state == "RUNNING" and self.level >= ERROR else self._state
+        worst = max(self._diagnoses.values(), default=(OK, "", {}), key=lambda d: d[0])
+        inputs = [s.raw for s in self.subscriptions]
+        outputs = [p.raw for p in self.publishers]
+        process = _process()
+        self._heartbeat.publish(
+            status(
+                header=header("", time.time_ns()),
+                node=self.node_name,
+                pid=os.getpid(),
+                state=getattr(status, state),
+                message=worst[1] if worst[0] >= WARN else "",
+                cpu_percent=float(process.cpu_percent()),
+                rss_mb=float(process.memory_info().rss / 1e6),
+                inputs=[s.topic for s in inputs],
+                input_rates_hz=_f32(s.stats.rate_hz(now) for s in inputs),
+                input_ages_s=_f32(s.stats.age_s(now) for s in inputs),
+                input_lost=_u64(s.stats.lost for s in inputs),
+                outputs=[p.topic for p in outputs],
+                output_rates_hz=_f32(p.stats.rate_hz(now) for p in outputs),
+            )
+        )
+
+    def _publish_diagnostics(self) -> None:
+        array, status = message_type("DiagnosticArray"), message_type("DiagnosticStatus")
+        entries = [
+            status(
+                level=level,
+                name=f"{self.node_name}: {name}",
+                message=message,
+                hardware_id="",
+                values=_key_values(values),
+            )
+            for name, (level, message, values) in self._diagnoses.items()
+        ]
+        now = self.clock.now_ns()
+        for subscription in self.subscriptions:
+            raw = subscription.raw
+            if raw.stats.lost or raw.stats.rejected:
+                entries.append(
+                    status(
+                        level=ERROR if raw.stats.rejected else WARN,
+                        name=f"{self.node_name}: input {raw.topic}",
+                        message=f"{raw.stats.lost} messages lost, {raw.stats.rejected} refused",
+                        hardware_id="",
+                        values=_key_values(
+                            {
+                                "lost": raw.stats.lost,
+                                "refused": raw.stats.rejected,
+                                "rate_hz": round(raw.stats.rate_hz(now), 2),
+                                "age_s": round(raw.stats.age_s(now), 3),
+                            }
+                        ),
+                    )
+                )
+        self._diagnostics.publish(array(header=header("", time.time_ns()), status=entries))
+
+    # -- internals -------------------------------------------------------------------------------
+
+    def _subscribe(self, topic: str, name: str | None, callback: Callable[[Received], None], qos: QoS) -> Subscription:
+        subscription = Subscription(callback)
+        subscription.raw = self._transport.subscribe(self.resolve(topic), name, qos, self._wake.set)
+        self.subscriptions.append(subscription)
+        self._registry_changed()
+        return subscription
+
+    def _registry_changed(self) -> None:
+        if self.on_registry_change is not None:
+            self.on_registry_change()
+
+    def describe(self) -> dict[str, Any]:
+        """What the registry tells of this node."""
+        return {
+            "name": self.node_name,
+            "module": f"instant_ic.nodes.{type(self).name}",
+            "pid": os.getpid(),
+            "params": {"use_sim_time": self.use_sim_time, **params.to_dict(self.config)},
+            "publishes": {p.topic: p.raw.type_name for p in self.publishers},
+            "subscribes": {s.raw.topic: s.raw.type_name or "any" for s in self.subscriptions},
+        }
+
+
+class _RosoutHandler(logging.Handler):
+    """Sends a node's log lines to ``/rosout``."""
+
+    _LEVELS: ClassVar = {logging.DEBUG: 10, logging.INFO: 20, logging.WARNING: 30, logging.ERROR: 40}
+
+    def __init__(self, node: Node[Any]) -> None:
+        super().__init__(logging.INFO)
+        self._node = node
+        self._log_type = message_type("Log")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._node._rosout.publish(
+            self._log_type(
+                stamp=to_time(int(record.created * 1e9)),
+                level=self._LEVELS.get(record.levelno, 50),
+                name=self._node.node_name,
+                msg=record.getMessage(),
+                file=record.pathname,
+                function=record.funcName or "",
+                line=record.lineno,
+            )
+        )
+
+
+def _process() -> Any:
+    global _PROCESS
+    if _PROCESS is None:
+        import psutil
+
+        _PROCESS = psutil.Process()
+    return _PROCESS
+
+
+_PROCESS: Any = None
+
+
+def _f32(values: Any) -> Any:
+    import numpy as np
+
+    return np.array(list(values), np.float32)
+
+
+def _u64(values: Any) -> Any:
+    import numpy as np
+
+    return np.array(list(values), np.uint64)
+
+
+def _key_values(values: dict[str, Any]) -> list[Any]:
+    key_value = message_type("diagnostic_msgs/KeyValue")
+    return [key_value(key=str(key), value=str(value)) for key, value in values.items()]

@@ -1,0 +1,94 @@
+"""What a node needs of a transport; ZeroMQ and the lockstep bus implement it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from .qos import QoS
+
+
+@dataclass(frozen=True)
+class Received:
+    """One message as it came."""
+
+    topic: str
+    type_name: str
+    payload: bytes | memoryview
+    publish_ns: int
+    received_ns: int
+    order: int
+    """Place in the order of arrival over all subscriptions of a node."""
+
+
+class Stats:
+    """Counts, rate, age and losses of one direction of a topic."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.lost = 0
+        self.rejected = 0
+        self.bytes = 0
+        self.newest_ns = 0
+        self._arrivals: deque[int] = deque(maxlen=50)
+
+    def add(self, now_ns: int, size: int) -> None:
+        """Counts one message."""
+        self.count += 1
+        self.bytes += size
+        self.newest_ns = now_ns
+        self._arrivals.append(now_ns)
+
+    def rate_hz(self, now_ns: int) -> float:
+        """Messages a second over the last 50 or 5 s, whichever is shorter."""
+        recent = [t for t in list(self._arrivals) if now_ns - t < 5_000_000_000]
+        if len(recent) < 2 or recent[-1] <= recent[0]:
+            return 0.0
+        # The silence since the last message counts too: a topic that stopped must not keep its old rate.
+        span = max(recent[-1] - recent[0], (now_ns - recent[0]) * (len(recent) - 1) // len(recent))
+        return (len(recent) - 1) * 1e9 / span
+
+    def age_s(self, now_ns: int) -> float:
+        """Seconds since the newest message; inf before the first."""
+        return (now_ns - self.newest_ns) / 1e9 if self.count else float("inf")
+
+
+class RawPublisher(Protocol):
+    """Sends CDR bytes."""
+
+    topic: str
+    type_name: str
+    qos: QoS
+    stats: Stats
+
+    @property
+    def subscriber_count(self) -> int: ...
+    def send(self, payload: bytes | memoryview) -> None: ...
+    def close(self) -> None: ...
+
+
+class RawSubscription(Protocol):
+    """Receives CDR bytes."""
+
+    topic: str
+    type_name: str | None
+    qos: QoS
+    stats: Stats
+
+    def take(self) -> list[Received]:
+        """What came since the last call, in the order of arrival; with ``sensor`` the newest of each publisher."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Transport(Protocol):
+    """Topics in and out of one node."""
+
+    def advertise(self, topic: str, type_name: str, qos: QoS) -> RawPublisher: ...
+    def subscribe(
+        self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]
+    ) -> RawSubscription: ...
+    def close(self) -> None: ...

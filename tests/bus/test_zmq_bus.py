@@ -1,0 +1,207 @@
+"""The bus over real sockets, most of it between processes."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, registry
+from instant_ic.bus.node import Node, Publisher
+from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.msg import String, deserialize, serialize
+
+TALKER = Path(__file__).with_name("talker_node.py")
+
+
+@pytest.fixture
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("r")
+
+
+def start_talker(run_dir: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(run_dir)}
+    return subprocess.Popen(
+        [sys.executable, str(TALKER), *arguments], env=environment, stderr=subprocess.PIPE, text=True
+    )
+
+
+def wait_for(condition, timeout_s: float = 30.0):
+    deadline = time.monotonic() + timeout_s
+    while not (value := condition()):
+        assert time.monotonic() < deadline, "waited too long"
+        time.sleep(0.01)
+    return value
+
+
+class Inbox:
+    """Collects the strings of one topic."""
+
+    def __init__(self, transport: ZmqTransport, topic: str, qos=RELIABLE):
+        self.event = threading.Event()
+        self.raw = transport.subscribe(topic, "std_msgs/msg/String", qos, self.event.set)
+        self.texts: list[str] = []
+
+    def poll(self) -> list[str]:
+        self.texts += [deserialize(m.payload, m.type_name).data for m in self.raw.take()]
+        return self.texts
+
+
+@pytest.fixture
+def transport(run_dir: Path):
+    transport = ZmqTransport(run_dir, "tester", time.time_ns)
+    yield transport
+    transport.close()
+
+
+@pytest.fixture
+def talker(run_dir: Path):
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: str) -> subprocess.Popen[str]:
+        processes.append(start_talker(run_dir, *arguments))
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait(10)
+        process.stderr.close()
+
+
+def test_messages_latched_values_and_clean_exit(transport, talker, run_dir):
+    inbox, greeting = Inbox(transport, "/chatter"), Inbox(transport, "/greeting", LATCHED)
+    process = talker("-p", "text:=bonjour")
+    wait_for(lambda: len(inbox.poll()) >= 5)
+    numbers = [int(text.split()[1]) for text in inbox.texts]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    assert wait_for(greeting.poll) == ["bonjour"]
+    # A late joiner gets the latched value; who was there before gets it no second time.
+    late = Inbox(transport, "/greeting", LATCHED)
+    assert wait_for(late.poll) == ["bonjour"]
+    assert greeting.poll() == ["bonjour"]
+    assert [n.name for n in registry.list_nodes(run_dir)] == ["talker"]
+    assert {t.topic for t in registry.list_topics(run_dir)} >= {"/chatter", "/greeting", "/heartbeat"}
+    process.send_signal(signal.SIGINT)
+    assert process.wait(10) == 0
+    assert registry.list_nodes(run_dir) == []
+    assert registry.list_topics(run_dir) == []
+    assert list(run_dir.glob("topics/*/*.sock")) == []
+
+
+def test_publisher_killed_and_restarted_is_heard_again(transport, talker, run_dir):
+    inbox = Inbox(transport, "/chatter")
+    first = talker()
+    wait_for(lambda: len(inbox.poll()) >= 3)
+    first.kill()
+    first.wait(10)
+    assert registry.list_topics(run_dir) == []  # dead, though its files are still there
+    assert list(run_dir.glob("topics/chatter/*.sock")) != []
+    heard = len(inbox.poll())
+    talker("-p", "text:=again")
+    wait_for(lambda: [t for t in inbox.poll()[heard:] if t.startswith("again")])
+    assert inbox.raw.stats.lost == 0
+
+
+def test_sweep_clears_what_the_dead_left_and_nothing_else(transport, talker, run_dir):
+    process = talker()
+    wait_for(lambda: len(registry.list_topics(run_dir)) >= 5)
+    assert registry.sweep(run_dir) == 0
+    process.kill()
+    process.wait(10)
+    assert registry.sweep(run_dir) >= 5
+    assert list(run_dir.glob("topics/*/*.sock")) == []
+
+
+def test_second_node_of_a_name_is_refused(talker, run_dir):
+    talker()
+    wait_for(lambda: registry.list_nodes(run_dir))
+    second = talker()
+    assert second.wait(30) == 1
+    assert "node talker is already there" in second.stderr.read()
+
+
+def test_wrong_parameter_names_the_place(talker, tmp_path):
+    path = tmp_path / "p.yaml"
+    path.write_text("talker:\n  ros__parameters:\n    text: hi\n    perod_s: 1.0\n")
+    process = talker("--params-file", str(path))
+    assert process.wait(30) == 2
+    error = process.stderr.read()
+    assert f"{path}:4: unknown parameter 'perod_s'; did you mean 'period_s'?" in error
+
+
+def test_sensor_keeps_the_newest_and_reliable_everything(transport):
+    publisher = transport.advertise("/numbers", "std_msgs/msg/String", SENSOR)
+    newest, every = Inbox(transport, "/numbers", SENSOR), Inbox(transport, "/numbers", RELIABLE)
+    wait_for(lambda: publisher.subscriber_count == 2)
+    for i in range(20):
+        publisher.send(serialize(String(data=str(i))))
+    wait_for(lambda: newest.raw.stats.count == 20 and every.raw.stats.count == 20)
+    assert newest.poll() == ["19"]
+    assert every.poll() == [str(i) for i in range(20)]
+
+
+def test_gaps_are_counted(transport):
+    publisher = transport.advertise("/numbers", "std_msgs/msg/String", SENSOR)
+    inbox = Inbox(transport, "/numbers")
+    wait_for(lambda: publisher.subscriber_count == 1)
+    publisher.send(serialize(String(data="1")))
+    publisher._sequence += 3  # three messages that never reached the wire
+    publisher.send(serialize(String(data="5")))
+    wait_for(lambda: len(inbox.poll()) == 2)
+    assert inbox.raw.stats.lost == 3
+
+
+def test_other_type_on_a_topic_is_refused_and_counted(transport, caplog):
+    publisher = transport.advertise("/numbers", "std_msgs/msg/Bool", SENSOR)
+    inbox = Inbox(transport, "/numbers")
+    wait_for(lambda: publisher.subscriber_count == 1)
+    publisher.send(b"\x00\x01\x00\x00\x01")
+    wait_for(lambda: inbox.raw.stats.rejected == 1)
+    assert inbox.poll() == []
+    assert "/numbers: a publisher sends std_msgs/msg/Bool, std_msgs/msg/String expected" in caplog.text
+
+
+def test_topic_that_is_a_prefix_of_another_is_separate(transport):
+    a = transport.advertise("/map", "std_msgs/msg/String", SENSOR)
+    b = transport.advertise("/map_updates", "std_msgs/msg/String", SENSOR)
+    inbox = Inbox(transport, "/map")
+    wait_for(lambda: a.subscriber_count == 1)
+    b.send(serialize(String(data="no")))
+    a.send(serialize(String(data="yes")))
+    assert wait_for(inbox.poll) == ["yes"]
+    assert b.subscriber_count == 0
+
+
+def test_path_too_long_for_a_socket(tmp_path):
+    long = tmp_path / ("x" * 100)
+    transport = ZmqTransport(long, "tester", time.time_ns)
+    try:
+        with pytest.raises(RegistryError, match="set INSTANT_IC_RUN_DIR to a shorter folder"):
+            transport.advertise("/a", "std_msgs/msg/String", SENSOR)
+    finally:
+        transport.close()
+
+
+def test_run_directory_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RegistryError, match="set INSTANT_IC_RUN_DIR"):
+        ZmqTransport(tmp_path / "file" / "run", "tester", time.time_ns)
+
+
+def test_publish_checks_the_type(transport):
+    node = Node[None](None, transport, _Clock(), name="tester")
+    publisher: Publisher = node.publisher("/text", String)
+    from instant_ic.msg import Bool, MessageError
+
+    with pytest.raises(MessageError, match="/text carries std_msgs/msg/String, not std_msgs/msg/Bool"):
+        publisher.publish(Bool(data=True))
+
+
+class _Clock:
+    def now_ns(self) -> int:
+        return time.time_ns()
