@@ -1,0 +1,1 @@
+"""The `ic` command."""

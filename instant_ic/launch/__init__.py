@@ -1,0 +1,22 @@
+"""Launch files: read, check, start, supervise, stop (docs/launch.md)."""
+
+from instant_ic.launch.description import (
+    LaunchArgument,
+    LaunchDescription,
+    NodeSpec,
+    find_launch_file,
+    read_arguments,
+    read_launch_file,
+)
+from instant_ic.launch.source import LaunchFileError, Problem
+
+__all__ = [
+    "LaunchArgument",
+    "LaunchDescription",
+    "LaunchFileError",
+    "NodeSpec",
+    "Problem",
+    "find_launch_file",
+    "read_arguments",
+    "read_launch_file",
+]
