@@ -1,0 +1,1 @@
+"""Simulated worlds, rendering, robot dynamics, and devices that speak the real wire protocols."""

@@ -1,0 +1,355 @@
+"""Compiled loops of the renderer: adaptive ray casting, filtered texture lookup, shading. They release the GIL."""
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+F32 = npt.NDArray[np.float32]
+I32 = npt.NDArray[np.int32]
+U8 = npt.NDArray[np.uint8]
+
+#: Entries of the tone table, which maps radiance 0..TONE_MAX to sRGB.
+TONE_SIZE = 8192
+TONE_MAX = 4.0
+
+_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "reassoc"}, error_model="numpy")
+
+
+@_jit
+def rotate(directions: F32, rotation: F32, out: F32) -> None:
+    """out (N, 3) = rotation (3, 3) applied to directions (N, 3)."""
+    for i in range(directions.shape[0]):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        for k in range(3):
+            out[i, k] = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z
+
+
+@_jit
+def surfaces_of(face: I32, face_surface: I32) -> None:
+    """Replaces face numbers by surface numbers, in place; -1 stays."""
+    for i in range(face.shape[0]):
+        if face[i] >= 0:
+            face[i] = face_surface[face[i]]
+
+
+@_jit
+def refine(
+    surface: I32, range_m: F32, directions: F32, origin: F32, normal: F32, offset: F32, step: int, wraps: bool, todo: I32
+) -> int:
+    """Fills in the pixels between those of a coarse grid.
+
+    ``surface`` and ``range_m`` (H, W) are known where both row and column are multiples of ``2 * step`` (and in the last
+    row and column where they are not). A pixel at multiples of ``step`` whose known neighbours all lie on one surface
+    lies on it too (surfaces are planar and convex), so its range is worked out; others are listed in ``todo`` (flat
+    indices).
+
+    Returns:
+        Number of pixels listed.
+    """
+    height, width = surface.shape
+    coarse = 2 * step
+    count = 0
+    for row in range(0, height, step):
+        above = row - row % coarse
+        below = above if row % coarse == 0 else min(above + coarse, height - 1)
+        # The last rows have no coarse row under them: they are cast.
+        row_open = below != above and below % coarse != 0
+        for column in range(0, width, step):
+            left = column - column % coarse
+            right = left if column % coarse == 0 else left + coarse
+            if above == row and left == column:
+                continue
+            column_open = False
+            if right >= width:
+                right = 0
+                column_open = not wraps
+            s = surface[above, left]
+            if (
+                row_open
+                or column_open
+                or s < 0
+                or surface[above, right] != s
+                or surface[below, left] != s
+                or surface[below, right] != s
+            ):
+                todo[count] = row * width + column
+                count += 1
+                continue
+            i = row * width + column
+            nx, ny, nz = normal[s, 0], normal[s, 1], normal[s, 2]
+            along = nx * directions[i, 0] + ny * directions[i, 1] + nz * directions[i, 2]
+            height_over = offset[s] - (nx * origin[0] + ny * origin[1] + nz * origin[2])
+            surface[row, column] = s
+            range_m[row, column] = height_over / along
+    return count
+
+
+@_jit
+def _bilinear(
+    texels: npt.NDArray[np.uint32], first: int, width: int, height: int, u: float, v: float, clamp: bool
+) -> tuple[float, float, float]:
+    """Square-root-coded colour 0..255 squared (linear · 65025) at texture coordinates 0..1."""
+    x = np.float32(u * width - 0.5)
+    y = np.float32(v * height - 0.5)
+    x0 = int(np.floor(x))
+    y0 = int(np.floor(y))
+    fx = x - np.float32(x0)
+    fy = y - np.float32(y0)
+    x1 = x0 + 1
+    y1 = y0 + 1
+    if clamp:
+        x0 = min(max(x0, 0), width - 1)
+        x1 = min(max(x1, 0), width - 1)
+        y0 = min(max(y0, 0), height - 1)
+        y1 = min(max(y1, 0), height - 1)
+    else:
+        if x0 < 0:
+            x0 += width
+        if y0 < 0:
+            y0 += height
+        if x1 >= width:
+            x1 -= width
+        if y1 >= height:
+            y1 -= height
+    r = np.float32(0.0)
+    g = np.float32(0.0)
+    b = np.float32(0.0)
+    for k in range(4):
+        if k == 0:
+            texel, weight = texels[first + y0 * width + x0], (np.float32(1) - fx) * (np.float32(1) - fy)
+        elif k == 1:
+            texel, weight = texels[first + y0 * width + x1], fx * (np.float32(1) - fy)
+        elif k == 2:
+            texel, weight = texels[first + y1 * width + x0], (np.float32(1) - fx) * fy
+        else:
+            texel, weight = texels[first + y1 * width + x1], fx * fy
+        cr = np.float32(texel & np.uint32(255))
+        cg = np.float32((texel >> np.uint32(8)) & np.uint32(255))
+        cb = np.float32((texel >> np.uint32(16)) & np.uint32(255))
+        r += weight * cr * cr
+        g += weight * cg * cg
+        b += weight * cb * cb
+    return r, g, b
+
+
+@_jit
+def _albedo(
+    texels: npt.NDArray[np.uint32],
+    level_offset: npt.NDArray[np.int64],
+    level_size: I32,
+    levels: I32,
+    clamps: U8,
+    t: int,
+    u: float,
+    v: float,
+    lod: float,
+) -> tuple[float, float, float]:
+    """Linear albedo of texture ``t``, trilinear."""
+    clamp = clamps[t] != 0
+    if clamp:
+        u = min(max(u, np.float32(0.0)), np.float32(1.0))
+        v = min(max(v, np.float32(0.0)), np.float32(1.0))
+    else:
+        u -= np.floor(u)
+        v -= np.floor(v)
+    top = levels[t] - 1
+    lod = min(max(lod, np.float32(0.0)), np.float32(top))
+    level = int(lod)
+    part = lod - np.float32(level)
+    r, g, b = _bilinear(
+        texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp
+    )
+    if part > np.float32(0.02) and level < top:
+        level += 1
+        r1, g1, b1 = _bilinear(
+            texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp
+        )
+        r += part * (r1 - r)
+        g += part * (g1 - g)
+        b += part * (b1 - b)
+    scale = np.float32(1.0 / 65025.0)
+    return r * scale, g * scale, b * scale
+
+
+@_jit
+def _irradiance(
+    s: int, x: float, y: float, z: float, light_at: npt.NDArray[np.int64], light_uv: F32, light_linear: F32, light: F32
+) -> tuple[float, float, float]:
+    """Baked light at a point of surface ``s``, bilinear in its light map."""
+    width, height = light_at[s, 1], light_at[s, 2]
+    if width == 0:
+        e = light_linear[s, 0] * x + light_linear[s, 1] * y + light_linear[s, 2] * z + light_linear[s, 3]
+        e = max(e, np.float32(0.02))
+        return e, e, e
+    a = light_uv[s, 0, 0] * x + light_uv[s, 0, 1] * y + light_uv[s, 0, 2] * z + light_uv[s, 0, 3]
+    b = light_uv[s, 1, 0] * x + light_uv[s, 1, 1] * y + light_uv[s, 1, 2] * z + light_uv[s, 1, 3]
+    a = min(max(a, np.float32(0.0)), np.float32(width - 1.001))
+    b = min(max(b, np.float32(0.0)), np.float32(height - 1.001))
+    i = int(a)
+    j = int(b)
+    fa = a - np.float32(i)
+    fb = b - np.float32(j)
+    at = light_at[s, 0] + j * width + i
+    w00 = (np.float32(1) - fa) * (np.float32(1) - fb)
+    w10 = fa * (np.float32(1) - fb)
+    w01 = (np.float32(1) - fa) * fb
+    w11 = fa * fb
+    r = w00 * light[at, 0] + w10 * light[at + 1, 0] + w01 * light[at + width, 0] + w11 * light[at + width + 1, 0]
+    g = w00 * light[at, 1] + w10 * light[at + 1, 1] + w01 * light[at + width, 1] + w11 * light[at + width + 1, 1]
+    bl = w00 * light[at, 2] + w10 * light[at + 1, 2] + w01 * light[at + width, 2] + w11 * light[at + width + 1, 2]
+    return r, g, bl
+
+
+@_jit
+def shade(
+    surface: I32,
+    range_m: F32,
+    directions: F32,
+    origin: F32,
+    pixel_rad: float,
+    normal: F32,
+    uv: F32,
+    texture: I32,
+    tint: F32,
+    emission: F32,
+    texel_per_m: F32,
+    texels: npt.NDArray[np.uint32],
+    level_offset: npt.NDArray[np.int64],
+    level_size: I32,
+    levels: I32,
+    clamps: U8,
+    light_at: npt.NDArray[np.int64],
+    light_uv: F32,
+    light_linear: F32,
+    light: F32,
+    out: F32,
+) -> None:
+    """Radiance (N, 3) of rays whose surface (N,) and range (N,) are known; ``pixel_rad`` is the angle of a pixel.
+
+    The texture is averaged over the pixel's footprint on the surface: two trilinear lookups along its long axis where
+    the surface is seen aslant, one elsewhere.
+    """
+    for i in range(surface.shape[0]):
+        s = surface[i]
+        dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+        if s < 0:
+            # Open sky for worlds that are not closed.
+            up = max(dz, np.float32(0.0))
+            out[i, 0] = np.float32(0.62) - np.float32(0.30) * up
+            out[i, 1] = np.float32(0.72) - np.float32(0.22) * up
+            out[i, 2] = np.float32(0.85) - np.float32(0.05) * up
+            continue
+        r = range_m[i]
+        x, y, z = origin[0] + r * dx, origin[1] + r * dy, origin[2] + r * dz
+        u = uv[s, 0, 0] * x + uv[s, 0, 1] * y + uv[s, 0, 2] * z + uv[s, 0, 3]
+        v = uv[s, 1, 0] * x + uv[s, 1, 1] * y + uv[s, 1, 2] * z + uv[s, 1, 3]
+        cosine = abs(normal[s, 0] * dx + normal[s, 1] * dy + normal[s, 2] * dz)
+        minor = r * np.float32(pixel_rad)
+        stretch = min(np.float32(1.0) / max(cosine, np.float32(0.02)), np.float32(16.0))
+        t = texture[s]
+        if stretch < np.float32(1.5):
+            lod = np.log2(minor * stretch * texel_per_m[s])
+            cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u, v, lod)
+        else:
+            side = normal[s, 0] * dx + normal[s, 1] * dy + normal[s, 2] * dz
+            px, py, pz = dx - side * normal[s, 0], dy - side * normal[s, 1], dz - side * normal[s, 2]
+            reach = np.float32(0.25) * minor * stretch / np.sqrt(px * px + py * py + pz * pz)
+            du = (uv[s, 0, 0] * px + uv[s, 0, 1] * py + uv[s, 0, 2] * pz) * reach
+            dv = (uv[s, 1, 0] * px + uv[s, 1, 1] * py + uv[s, 1, 2] * pz) * reach
+            lod = np.log2(minor * max(stretch * np.float32(0.5), np.float32(1.0)) * texel_per_m[s])
+            cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u + du, v + dv, lod)
+            r2, g2, b2 = _albedo(texels, level_offset, level_size, levels, clamps, t, u - du, v - dv, lod)
+            cr = np.float32(0.5) * (cr + r2)
+            cg = np.float32(0.5) * (cg + g2)
+            cb = np.float32(0.5) * (cb + b2)
+        if emission[s] > 0:
+            er = eg = eb = emission[s]
+        else:
+            er, eg, eb = _irradiance(s, x, y, z, light_at, light_uv, light_linear, light)
+        out[i, 0] = cr * tint[s, 0] * er
+        out[i, 1] = cg * tint[s, 1] * eg
+        out[i, 2] = cb * tint[s, 2] * eb
+
+
+@_jit
+def edges(surface: I32, range_m: F32, normal: F32, texture: I32, wraps: bool, out: I32) -> int:
+    """Lists (flat indices) the pixels whose right or lower neighbour shows something else; returns their number.
+
+    Two surfaces of the same texture that continue each other (one wall in two pieces, the triangles of a smooth mesh)
+    make no edge.
+    """
+    height, width = surface.shape
+    count = 0
+    for row in range(height):
+        for column in range(width):
+            s = surface[row, column]
+            r = range_m[row, column]
+            found = False
+            for k in range(4):
+                a, b = row, column
+                if k == 0:
+                    b = column + 1
+                elif k == 1:
+                    a = row + 1
+                elif k == 2:
+                    b = column - 1
+                else:
+                    a = row - 1
+                if a < 0 or a >= height:
+                    continue
+                if b < 0 or b >= width:
+                    if not wraps:
+                        continue
+                    b = b % width
+                o = surface[a, b]
+                if o == s:
+                    continue
+                if s < 0 or o < 0 or texture[s] != texture[o]:
+                    found = True
+                    break
+                bend = normal[s, 0] * normal[o, 0] + normal[s, 1] * normal[o, 1] + normal[s, 2] * normal[o, 2]
+                q = range_m[a, b]
+                if bend < np.float32(0.95) or abs(r - q) > np.float32(0.08) * min(r, q):
+                    found = True
+                    break
+            if found:
+                out[count] = row * width + column
+                count += 1
+    return count
+
+
+@_jit
+def tone(radiance: F32, table: U8, out: U8) -> None:
+    """sRGB bytes (N, 3) of radiance (N, 3) by the tone table."""
+    scale = np.float32((TONE_SIZE - 1) / TONE_MAX)
+    for i in range(radiance.shape[0]):
+        for k in range(3):
+            out[i, k] = table[int(min(max(radiance[i, k], np.float32(0.0)), np.float32(TONE_MAX)) * scale)]
+
+
+@_jit
+def light_at_hits(
+    surface: I32,
+    range_m: F32,
+    origins: F32,
+    directions: F32,
+    light_at: npt.NDArray[np.int64],
+    light_uv: F32,
+    light_linear: F32,
+    light: F32,
+    albedo: F32,
+    out: F32,
+) -> None:
+    """Light (N, 3) that surfaces hit by rays send back (irradiance · albedo); nothing where the range is negative."""
+    for i in range(surface.shape[0]):
+        r = range_m[i]
+        if r < 0:
+            continue
+        s = surface[i]
+        x = origins[i, 0] + r * directions[i, 0]
+        y = origins[i, 1] + r * directions[i, 1]
+        z = origins[i, 2] + r * directions[i, 2]
+        er, eg, eb = _irradiance(s, x, y, z, light_at, light_uv, light_linear, light)
+        out[i, 0] = er * albedo[s, 0]
+        out[i, 1] = eg * albedo[s, 1]
+        out[i, 2] = eb * albedo[s, 2]

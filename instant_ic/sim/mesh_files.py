@@ -1,0 +1,155 @@
+"""Worlds from mesh files (GLB, glTF, OBJ and what else trimesh reads)."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic.sim.lighting import bake_mesh
+from instant_ic.sim.textures import srgb_to_linear, texture_set
+from instant_ic.sim.world import World
+
+_Y_UP = {".glb", ".gltf"}
+#: glTF has y up and looks along z: (x, y, z) becomes (x, -z, y).
+_Z_UP_FROM_Y_UP = np.asarray([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+
+
+def _look(material: Any) -> tuple[npt.NDArray[np.float32] | None, tuple[float, float, float]]:
+    """sRGB picture (H, W, 3) in 0..1 or None, and linear colour factor, of a trimesh material."""
+    image = getattr(material, "baseColorTexture", None)
+    if image is None:
+        image = getattr(material, "image", None)
+    factor = getattr(material, "baseColorFactor", None)
+    if factor is None:
+        factor = getattr(material, "diffuse", None) if image is None else None
+    colour = np.ones(3)
+    if factor is not None:
+        factor = np.asarray(factor)
+        # trimesh keeps integer factors for 0..255 and floats for 0..1.
+        colour = factor[:3] / 255.0 if factor.dtype.kind in "ui" else factor[:3].astype(float)
+    picture = None if image is None else np.asarray(image.convert("RGB"), np.float32) / 255.0
+    return picture, (float(colour[0]), float(colour[1]), float(colour[2]))
+
+
+def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(F, 2, 4) affine maps from points on triangles (F, 3, 3) to their texture coordinates (F, 3, 2)."""
+    edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)
+    change = np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], axis=1)
+    gram = np.einsum("nij,nkj->nik", edges, edges)
+    gram += (1e-9 * np.trace(gram, axis1=1, axis2=2) + 1e-18)[:, None, None] * np.eye(2)
+    weights = np.linalg.solve(gram, edges)
+    result = np.zeros((len(triangles), 2, 4))
+    result[:, :, :3] = np.einsum("nij,nik->nkj", weights, change)
+    result[:, :, 3] = uv[:, 0] - np.einsum("nkj,nj->nk", result[:, :, :3], triangles[:, 0])
+    return result
+
+
+def _spawn(world: World) -> tuple[float, float, float]:
+    """Centre of the largest free place of the floor plan that has a floor and something overhead."""
+    mask = world.occupied(0.05, 1.9, 0.05)
+    clearance = mask.distance_m()
+    candidates = np.argwhere(clearance > 0.3)
+    rng = np.random.default_rng(0)
+    candidates = candidates[rng.permutation(len(candidates))[:4000]]
+    xy = mask.centre(candidates)
+    start = np.column_stack([xy, np.full(len(xy), 1.0)])
+    down, _ = world.caster.cast(start, np.repeat([[0.0, 0.0, -1.0]], len(xy), axis=0))
+    up, _ = world.caster.cast(start, np.repeat([[0.0, 0.0, 1.0]], len(xy), axis=0))
+    indoors = np.isfinite(up) & (np.abs(down - 1.0) < 0.1)
+    if not indoors.any():
+        indoors = np.abs(down - 1.0) < 0.1
+    if not indoors.any():
+        return (0.0, 0.0, 0.0)
+    best = np.flatnonzero(indoors)[np.argmax(clearance[tuple(candidates[indoors].T)])]
+    return (float(xy[best, 0]), float(xy[best, 1]), 0.0)
+
+
+def load_world(path: str | Path, y_up: bool | None = None) -> World:
+    """World from a mesh file: node transforms applied, textures repeated, soft light baked in.
+
+    Args:
+        path: the file.
+        y_up: whether the file has y up (default: glTF has, others have z up).
+
+    Raises:
+        ValueError: the file cannot be read or holds no triangles.
+    """
+    import trimesh
+
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"world {path}: no such file")
+    try:
+        scene = trimesh.load_scene(str(path))
+    except (ValueError, KeyError, OSError, AttributeError) as error:
+        raise ValueError(f"world {path}: trimesh cannot read it ({error})") from error
+    if y_up is None:
+        y_up = path.suffix.lower() in _Y_UP
+    turn = _Z_UP_FROM_Y_UP if y_up else np.eye(3)
+
+    sources: list[str | npt.NDArray[np.floating]] = []
+    known: dict[int, int] = {}
+    parts: list[dict[str, npt.NDArray[Any]]] = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if not hasattr(mesh, "faces") or len(mesh.faces) == 0:
+            continue
+        vertices = (np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]) @ turn.T
+        material = getattr(mesh.visual, "material", None)
+        uv = getattr(mesh.visual, "uv", None)
+        picture, colour = _look(material) if material is not None else (None, (0.7, 0.7, 0.7))
+        if picture is None or uv is None:
+            key, source = -1, np.ones((1, 1, 3), np.float32)
+            corner_uv = np.zeros((len(mesh.faces), 3, 2))
+        else:
+            key, source = id(material), srgb_to_linear(picture)
+            corner_uv = np.asarray(uv, float)[mesh.faces]
+            # Rows of a picture run downwards, trimesh's v upwards.
+            corner_uv[..., 1] = 1.0 - corner_uv[..., 1]
+        if key not in known:
+            known[key] = len(sources)
+            sources.append(source)
+        triangles = vertices[mesh.faces]
+        parts.append(
+            {
+                "triangles": triangles,
+                "uv": _affine_uv(triangles, corner_uv),
+                "texture": np.full(len(triangles), known[key], np.int32),
+                "tint": np.repeat(np.asarray([colour], np.float32), len(triangles), axis=0),
+            }
+        )
+    if not parts:
+        raise ValueError(f"world {path}: the file holds no triangles")
+    joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    cross = np.cross(
+        joined["triangles"][:, 1] - joined["triangles"][:, 0], joined["triangles"][:, 2] - joined["triangles"][:, 0]
+    )
+    twice_area = np.linalg.norm(cross, axis=1)
+    keep = twice_area > 1e-10
+    joined = {key: value[keep] for key, value in joined.items()}
+    normal = cross[keep] / twice_area[keep, None]
+    triangles = joined["triangles"]
+    count = len(triangles)
+    world = World(
+        name=path.name,
+        vertices=triangles.reshape(-1, 3).astype(np.float32),
+        faces=np.arange(3 * count, dtype=np.int32).reshape(-1, 3),
+        face_surface=np.arange(count, dtype=np.int32),
+        normal=normal.astype(np.float32),
+        offset=np.einsum("ni,ni->n", normal, triangles[:, 0]).astype(np.float32),
+        uv=joined["uv"].astype(np.float32),
+        texture=joined["texture"],
+        tint=joined["tint"],
+        emission=np.zeros(count, np.float32),
+        textures=texture_set(sources, [False] * len(sources)),
+        light_at=np.zeros((count, 3), np.int64),
+        light_uv=np.zeros((count, 2, 4), np.float32),
+        light_linear=np.tile(np.asarray([0, 0, 0, 1], np.float32), (count, 1)),
+        light=np.ones((1, 3), np.float32),
+        two_sided=True,
+    )
+    world.spawn = _spawn(world)
+    bake_mesh(world)
+    return world

@@ -1,0 +1,237 @@
+"""A world: a triangle mesh of planar surfaces with filtered textures and baked light."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic.sim.contact import OccupancyMask, occupied_mask
+from instant_ic.sim.raycast import RayCaster
+from instant_ic.sim.textures import TextureSet, is_clamped, texture_set
+
+FloatArray = npt.NDArray[np.floating]
+
+
+@dataclass
+class World:
+    """Everything that the renderer, the LiDAR and the contact test need to know of a place (metres, z up, floor 0).
+
+    A *surface* is a planar convex piece with one texture: a rectangle of a procedural world, or one triangle of a mesh
+    file. Texture and light coordinates are affine in the hit point, so no barycentric coordinates are kept.
+
+    Attributes:
+        name: as given to ``make_world``.
+        vertices: (V, 3) float32.
+        faces: (F, 3) int32, counter-clockwise seen from the visible side.
+        face_surface: (F,) int32, surface of each face.
+        normal: (S, 3) float32 unit normals.
+        offset: (S,) float32, normal · p on the surface.
+        uv: (S, 2, 4) float32; (u, v) = uv @ (x, y, z, 1) in texture repeats, v downwards.
+        texture: (S,) int32, index into ``textures``.
+        tint: (S, 3) float32, multiplies the texture's albedo.
+        emission: (S,) float32; over 0: the surface shines by itself with this radiance, and light does not matter.
+        two_sided: whether surfaces are seen (and lit) from both sides.
+        light_at: (S, 3) int64: first texel, width and height in ``light`` (width 0: ``light_linear`` is used).
+        light_uv: (S, 2, 4) float32; light texel coordinates of a point.
+        light_linear: (S, 4) float32; light of a point where there is no map (meshes from files).
+        light: (L, 3) float32 baked irradiance (times albedo = radiance).
+        spawn: (x, y, yaw) where a robot starts.
+        zones: rectangles (x0, y0, x1, y1, height) of free space the world was made of, if it was made so.
+    """
+
+    name: str
+    vertices: npt.NDArray[np.float32]
+    faces: npt.NDArray[np.int32]
+    face_surface: npt.NDArray[np.int32]
+    normal: npt.NDArray[np.float32]
+    offset: npt.NDArray[np.float32]
+    uv: npt.NDArray[np.float32]
+    texture: npt.NDArray[np.int32]
+    tint: npt.NDArray[np.float32]
+    emission: npt.NDArray[np.float32]
+    textures: TextureSet
+    light_at: npt.NDArray[np.int64]
+    light_uv: npt.NDArray[np.float32]
+    light_linear: npt.NDArray[np.float32]
+    light: npt.NDArray[np.float32]
+    spawn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    two_sided: bool = False
+    zones: list[tuple[float, float, float, float, float]] = field(default_factory=list)
+
+    @cached_property
+    def caster(self) -> RayCaster:
+        """Ray caster of the mesh, built on first use."""
+        return RayCaster(self.vertices, self.faces)
+
+    @cached_property
+    def texel_per_m(self) -> npt.NDArray[np.float32]:
+        """(S,) texels of the finest level per metre, the larger of u and v."""
+        gradient = np.linalg.norm(self.uv[:, :, :3], axis=2)
+        return np.asarray((gradient * self.textures.level_size[self.texture, 0]).max(axis=1), np.float32)
+
+    @property
+    def bounds(self) -> FloatArray:
+        """(2, 3) lowest and highest corner."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
+
+    def occupied(self, low_m: float = 0.03, high_m: float = 0.9, cell_m: float = 0.02) -> OccupancyMask:
+        """Cells (seen from above) in which some surface lies between two heights; kept after the first call."""
+        key = (low_m, high_m, cell_m)
+        if key not in self._masks:
+            self._masks[key] = occupied_mask(self.vertices, self.faces, low_m, high_m, cell_m)
+        return self._masks[key]
+
+    @cached_property
+    def _masks(self) -> dict[tuple[float, float, float], OccupancyMask]:
+        return {}
+
+    def sample_free_poses(
+        self, rng: np.random.Generator, n: int, clearance_m: float = 0.35, up_to_m: float = 1.9
+    ) -> npt.NDArray[np.float64]:
+        """Random poses (n, 3) x, y, yaw that can be reached from the spawn pose.
+
+        Args:
+            rng: source of randomness.
+            n: number of poses.
+            clearance_m: distance to everything between 0.03 m and ``up_to_m`` above the floor.
+            up_to_m: height under which things count.
+
+        Raises:
+            ValueError: nowhere is there that much clearance.
+        """
+        mask = self.occupied(0.03, up_to_m, 0.05)
+        cells = mask.reachable(self.spawn[:2], clearance_m)
+        if len(cells) == 0:
+            raise ValueError(f"world {self.name!r} has no place with {clearance_m} m of clearance")
+        chosen = cells[rng.integers(0, len(cells), n)]
+        xy = mask.centre(chosen) + rng.uniform(-0.5, 0.5, (n, 2)) * mask.cell_m
+        return np.column_stack([xy, rng.uniform(-np.pi, np.pi, n)])
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface looks: a procedural texture, its size in metres (0 = stretched over the surface), a tint."""
+
+    texture: str
+    size_m: float = 2.0
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    emission: float = 0.0
+
+
+@dataclass
+class _Panel:
+    origin: FloatArray
+    along_u: FloatArray
+    along_v: FloatArray
+    material: Material
+
+
+class WorldBuilder:
+    """Collects rectangles and makes them a ``World`` (without light: see ``lighting.bake``)."""
+
+    def __init__(self) -> None:
+        self.panels: list[_Panel] = []
+
+    def panel(self, origin: FloatArray, along_u: FloatArray, along_v: FloatArray, material: Material) -> None:
+        """Rectangle seen from its front: ``origin`` top left, ``along_u`` to the right, ``along_v`` down."""
+        self.panels.append(
+            _Panel(np.asarray(origin, float), np.asarray(along_u, float), np.asarray(along_v, float), material)
+        )
+
+    def wall(
+        self, start: tuple[float, float], end: tuple[float, float], low: float, high: float, material: Material
+    ) -> None:
+        """Upright rectangle whose front is on the right of start → end (left to right as one looks at it)."""
+        a, b = np.asarray(start, float), np.asarray(end, float)
+        self.panel(
+            np.asarray([a[0], a[1], high]),
+            np.asarray([b[0] - a[0], b[1] - a[1], 0.0]),
+            np.asarray([0.0, 0.0, low - high]),
+            material,
+        )
+
+    def box(
+        self,
+        centre: tuple[float, float],
+        size: tuple[float, float, float],
+        low: float = 0.0,
+        yaw: float = 0.0,
+        side: Material | None = None,
+        top: Material | None = None,
+        front: Material | None = None,
+    ) -> None:
+        """Box standing on z = ``low``; ``front`` is the side at +x of its own frame."""
+        side = side or Material("white")
+        c, s = np.cos(yaw), np.sin(yaw)
+        x = np.asarray([c, s, 0.0]) * size[0] / 2
+        y = np.asarray([-s, c, 0.0]) * size[1] / 2
+        z = np.asarray([0.0, 0.0, size[2]])
+        base = np.asarray([centre[0], centre[1], low])
+        for normal, right, material in (
+            (x, y, front or side),
+            (-x, -y, side),
+            (y, -x, side),
+            (-y, x, side),
+        ):
+            self.panel(base + z + normal - right, 2 * right, -z, material)
+        self.panel(base + z + x + y, -2 * y, -2 * x, top or side)
+        if low > 0.01:
+            self.panel(base + x - y, 2 * y, -2 * x, side)
+
+    def build(self, name: str, light_cell_m: float, spawn: tuple[float, float, float]) -> World:
+        """World with light maps of about ``light_cell_m`` a texel, all 1."""
+        panels = self.panels
+        count = len(panels)
+        origin = np.stack([p.origin for p in panels])
+        du = np.stack([p.along_u for p in panels])
+        dv = np.stack([p.along_v for p in panels])
+        width = np.linalg.norm(du, axis=1)
+        height = np.linalg.norm(dv, axis=1)
+        unit_u, unit_v = du / width[:, None], dv / height[:, None]
+        normal = np.cross(unit_v, unit_u)
+        corners = np.stack([origin, origin + du, origin + du + dv, origin + dv], axis=1)
+        base = 4 * np.arange(count)[:, None]
+        faces = np.concatenate([base + [0, 3, 2], base + [0, 2, 1]], axis=1).reshape(-1, 3)
+
+        names = sorted({p.material.texture for p in panels})
+        textures = texture_set(list(names), [is_clamped(n) for n in names])
+        index = np.asarray([names.index(p.material.texture) for p in panels], np.int32)
+        uv = np.zeros((count, 2, 4))
+        for i, panel in enumerate(panels):
+            size = panel.material.size_m
+            if size > 0:
+                # Anchored to the world, so that neighbouring panels of one wall continue each other.
+                level = textures.level_size[index[i], 0]
+                uv[i, 0, :3] = unit_u[i] / size
+                uv[i, 1, :3] = unit_v[i] / (size * level[1] / level[0])
+            else:
+                uv[i, 0, :3] = unit_u[i] / width[i]
+                uv[i, 1, :3] = unit_v[i] / height[i]
+                uv[i, :, 3] = -(uv[i, :, :3] @ origin[i])
+
+        cells = np.stack([np.maximum(2, np.ceil(s / light_cell_m).astype(int) + 1) for s in (width, height)], axis=1)
+        texels = cells.prod(axis=1)
+        first = np.concatenate([[0], np.cumsum(texels)[:-1]])
+        light_uv = np.zeros((count, 2, 4))
+        for axis, (unit, size_m) in enumerate(((unit_u, width), (unit_v, height))):
+            light_uv[:, axis, :3] = unit / size_m[:, None] * (cells[:, axis, None] - 1)
+            light_uv[:, axis, 3] = -np.einsum("si,si->s", light_uv[:, axis, :3], origin)
+        return World(
+            name=name,
+            vertices=corners.reshape(-1, 3).astype(np.float32),
+            faces=faces.astype(np.int32),
+            face_surface=np.repeat(np.arange(count, dtype=np.int32), 2),
+            normal=normal.astype(np.float32),
+            offset=np.einsum("si,si->s", normal, origin).astype(np.float32),
+            uv=uv.astype(np.float32),
+            texture=index,
+            tint=np.asarray([p.material.tint for p in panels], np.float32),
+            emission=np.asarray([p.material.emission for p in panels], np.float32),
+            textures=textures,
+            light_at=np.column_stack([first, cells]).astype(np.int64),
+            light_uv=light_uv.astype(np.float32),
+            light_linear=np.zeros((count, 4), np.float32),
+            light=np.ones((int(texels.sum()), 3), np.float32),
+            spawn=spawn,
+        )
