@@ -110,7 +110,8 @@ def image_array(message: Any) -> NDArray[Any]:
     data = np.asarray(message.data)
     if message.step < row or data.size < message.step * message.height:
         raise MessageError(
-            f"image {message.width}×{message.height} {message.encoding} with step {message.step} has only {data.size} bytes"
+            f"image {message.width}×{message.height} {message.encoding} with step {message.step} "
+            f"has only {data.size} bytes"
         )
     rows = data[: message.step * message.height].reshape(message.height, message.step)[:, :row]
     array = np.ascontiguousarray(rows).view(dtype)

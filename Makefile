@@ -1,0 +1,44 @@
+# make run    set everything up in .venv/ and start the simulated stack
+# make test   format, lint, types and all tests
+# make check  format, lint and types alone
+# make clean  take away what these made
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+ARGS   ?=
+
+.PHONY: run test check clean install chromium
+
+run: $(STAMP)
+	@exec $(BIN)/ic launch sim $(ARGS)
+
+test: check chromium
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+check: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+install: $(STAMP)
+
+# torch first and by its exact pin: asked for by a range, pip would fetch the CUDA build of several gigabytes.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 run")'
+	@echo "Setting up $(VENV)/ (about three minutes, once)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt pip
+	@echo "  torch (CPU build) ..."
+	@scripts/install_torch.sh $(BIN)/python
+	@echo "  the other packages ..."
+	@$(BIN)/python -m pip install -q --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[dev]'
+	@touch $@
+
+# The browser test drives Debian's Chromium. Without root it must be there already, else those tests say they skip.
+chromium:
+	@scripts/ensure_chromium.sh
+
+clean:
+	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,25 @@
+#!/usr/bin/env bash
+# Installs the pinned torch as a CPU build, never the CUDA build of several gigabytes.
+#   install_torch.sh PYTHON
+# TORCH_SPEC=torch==2.13.0+cu130 (say) chooses another build, for a machine with a GPU.
+set -euo pipefail
+python=$1
+pin=$(grep -E '^torch==' "$(dirname "$0")/../constraints.txt")
+spec=${TORCH_SPEC:-$pin}
+if "$python" - "${spec#torch==}" <<'PY'
+import importlib.metadata as metadata, sys
+try:
+    have = metadata.version("torch")
+except metadata.PackageNotFoundError:
+    sys.exit(1)
+want = sys.argv[1]
+sys.exit(0 if have == want or have.split("+")[0] == want else 1)
+PY
+then exit 0; fi
+pip=("$python" -m pip install -q --disable-pip-version-check --progress-bar off)
+if [ -n "${TORCH_SPEC:-}" ]; then exec "${pip[@]}" "$spec"; fi
+# A dry run tells which build the index would give; only a CPU build is taken from it.
+report=$("$python" -m pip install -q --disable-pip-version-check --dry-run --no-deps --report - "$spec" 2>/dev/null || true)
+if printf '%s' "$report" | grep -q '%2Bcpu\|+cpu'; then exec "${pip[@]}" "$spec"; fi
+# --no-deps: what torch needs comes from the ordinary index with the other packages.
+exec "${pip[@]}" --no-deps --index-url https://download.pytorch.org/whl/cpu "$spec"
