@@ -33,10 +33,11 @@ LASER_ELEVATION_DEG: NDArray[np.float64] = np.array(
     [-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0]
 )
 """Elevation of each laser by its id, degrees, (16,)."""
-LASER_VERTICAL_OFFSET_M: NDArray[np.float64] = 1e-3 * np.array(
-    [11.2, -0.7, 9.7, -2.2, 8.1, -3.7, 6.6, -5.1, 5.1, -6.6, 3.7, -8.1, 2.2, -9.7, 0.7, -11.2]
-)
-"""What is added to z of each laser's points by its id, metres, (16,)."""
+LASER_VERTICAL_OFFSET_M: NDArray[np.float64] = 0.04191 * np.tan(np.radians(-LASER_ELEVATION_DEG))
+"""What is added to z of each laser's points by its id, metres, (16,).
+
+The lasers meet 41.91 mm in front of the axis; the manual's table is this, rounded to 0.1 mm.
+"""
 LASER_RING: NDArray[np.uint16] = np.argsort(np.argsort(LASER_ELEVATION_DEG)).astype(np.uint16)
 """Rank of each laser by elevation, 0 is the lowest, (16,)."""
 
@@ -94,9 +95,7 @@ def encode_data_packet(
         if array.min() < 0 or array.max() > top:
             raise PacketError(f"{key} must be in 0..{top} (got {array.min()}..{array.max()})")
     if not 0 <= timestamp_us < HOUR_US:
-        raise PacketError(
-            f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})"
-        )
+        raise PacketError(f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})")
     packet = np.zeros((), PACKET_DTYPE)
     packet["blocks"]["flag"] = BLOCK_FLAG
     packet["blocks"]["azimuth"] = azimuth
@@ -149,16 +148,12 @@ def encode_position_packet(timestamp_us: int, pps: int = 0, nmea: str = "") -> b
         PacketError: a value that the format cannot hold.
     """
     if not 0 <= timestamp_us < HOUR_US:
-        raise PacketError(
-            f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})"
-        )
+        raise PacketError(f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})")
     if pps not in (0, 1, 2, 3):
         raise PacketError(f"pps must be 0, 1, 2 or 3 (got {pps})")
     sentence = f"{nmea}\r\n".encode("ascii", "strict") if nmea else b""
     if len(sentence) > POSITION_PACKET_BYTES - _POSITION_NMEA:
-        raise PacketError(
-            f"nmea is too long: {len(sentence)} bytes of {POSITION_PACKET_BYTES - _POSITION_NMEA}"
-        )
+        raise PacketError(f"nmea is too long: {len(sentence)} bytes of {POSITION_PACKET_BYTES - _POSITION_NMEA}")
     packet = bytearray(POSITION_PACKET_BYTES)
     packet[_POSITION_TIME : _POSITION_TIME + 4] = timestamp_us.to_bytes(4, "little")
     packet[_POSITION_PPS] = pps

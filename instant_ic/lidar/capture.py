@@ -1,0 +1,208 @@
+"""UDP payloads out of captures: pcap (either endianness, micro- and nanoseconds) and pcapng.
+
+Source: the pcap and pcapng drafts of the IETF opsawg (draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng).
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+LINK_NULL, LINK_ETHERNET, LINK_RAW, LINK_LINUX_SLL, LINK_LINUX_SLL2 = 0, 1, 101, 113, 276
+
+_PCAP_MAGIC = {
+    b"\xd4\xc3\xb2\xa1": ("<", 1000),
+    b"\xa1\xb2\xc3\xd4": (">", 1000),
+    b"\x4d\x3c\xb2\xa1": ("<", 1),
+    b"\xa1\xb2\x3c\x4d": (">", 1),
+}
+_PCAPNG_MAGIC = b"\x0a\x0d\x0d\x0a"
+
+
+class CaptureError(ValueError):
+    """A file that is no capture; the text says which file and what it starts with."""
+
+
+class Datagram(NamedTuple):
+    """One UDP payload of a capture."""
+
+    stamp_ns: int
+    """When it was captured, since the epoch."""
+    port: int
+    """Destination port."""
+    payload: bytes
+
+
+@dataclass
+class CaptureCounters:
+    """What a capture held.
+
+    Attributes:
+        records: frames read.
+        datagrams: UDP payloads given out.
+        skipped: what was left out, by reason.
+    """
+
+    records: int = 0
+    datagrams: int = 0
+    skipped: Counter[str] = field(default_factory=Counter)
+
+
+class CaptureReader:
+    """Iterates over the UDP payloads of a capture file; what is not one is counted by reason, never raised.
+
+    Example:
+        >>> reader = CaptureReader("recording.pcap")        # doctest: +SKIP
+        >>> for stamp_ns, port, payload in reader: ...      # doctest: +SKIP
+        >>> reader.counters.skipped                         # doctest: +SKIP
+        Counter({'not IP': 1, 'cut record': 1})
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open and read the file.
+
+        Raises:
+            CaptureError: it is neither pcap nor pcapng.
+            OSError: it cannot be read.
+        """
+        self.path = Path(path)
+        self.counters = CaptureCounters()
+        self._data = self.path.read_bytes()
+        magic = self._data[:4]
+        if magic not in _PCAP_MAGIC and magic != _PCAPNG_MAGIC:
+            raise CaptureError(
+                f"{self.path}: neither pcap nor pcapng: it starts with {magic.hex(' ') or 'nothing'}; "
+                "convert it with 'editcap -F pcap'"
+            )
+
+    def __iter__(self) -> Iterator[Datagram]:
+        """All UDP payloads, in the order of the file; the counters start at zero."""
+        self.counters = CaptureCounters()
+        frames = self._pcapng() if self._data[:4] == _PCAPNG_MAGIC else self._pcap()
+        counters = self.counters
+        for stamp_ns, link, start, end in frames:
+            counters.records += 1
+            found = _udp(self._data, start, end, link)
+            if isinstance(found, str):
+                counters.skipped[found] += 1
+                continue
+            counters.datagrams += 1
+            port, start, end = found
+            yield Datagram(stamp_ns, port, self._data[start:end])
+
+    def _pcap(self) -> Iterator[tuple[int, int, int, int]]:
+        """(stamp, link type, start, end) of each frame."""
+        data = self._data
+        order, unit_ns = _PCAP_MAGIC[data[:4]]
+        if len(data) < 24:
+            self.counters.skipped["cut file header"] += 1
+            return
+        link = struct.unpack_from(order + "I", data, 20)[0] & 0xFFFF
+        record = struct.Struct(order + "IIII")
+        at, size = 24, len(data)
+        while at + 16 <= size:
+            seconds, fraction, captured, original = record.unpack_from(data, at)
+            at += 16
+            if at + captured > size:
+                self.counters.skipped["cut record"] += 1
+                return
+            if captured < original:
+                # A frame that the snapshot length cut: its payload is not whole.
+                self.counters.records += 1
+                self.counters.skipped["cut frame"] += 1
+            else:
+                yield seconds * 1_000_000_000 + fraction * unit_ns, link, at, at + captured
+            at += captured
+        if at < size:
+            self.counters.skipped["cut record"] += 1
+
+    def _pcapng(self) -> Iterator[tuple[int, int, int, int]]:
+        """(stamp, link type, start, end) of each frame of the enhanced packet blocks."""
+        data, size = self._data, len(self._data)
+        at, order = 0, "<"
+        interfaces: list[tuple[int, float]] = []
+        while at + 12 <= size:
+            if data[at : at + 4] == _PCAPNG_MAGIC:
+                order = "<" if data[at + 8 : at + 12] == b"\x4d\x3c\x2b\x1a" else ">"
+                interfaces = []
+            kind, length = struct.unpack_from(order + "II", data, at)
+            if length < 12 or length % 4 or at + length > size:
+                self.counters.skipped["cut record"] += 1
+                return
+            body, end = at + 8, at + length - 4
+            at += length
+            if kind == 1 and end - body >= 8:
+                link = struct.unpack_from(order + "H", data, body)[0]
+                interfaces.append((link, _tick_ns(data, body + 8, end, order)))
+            elif kind == 6 and end - body >= 20:
+                interface, high, low, captured, original = struct.unpack_from(order + "IIIII", data, body)
+                if interface >= len(interfaces) or body + 20 + captured > end:
+                    self.counters.skipped["broken packet block"] += 1
+                elif captured < original:
+                    self.counters.records += 1
+                    self.counters.skipped["cut frame"] += 1
+                else:
+                    link, tick_ns = interfaces[interface]
+                    ticks = high << 32 | low
+                    stamp_ns = ticks * int(tick_ns) if tick_ns >= 1.0 else round(ticks * tick_ns)
+                    yield stamp_ns, link, body + 20, body + 20 + captured
+            elif kind in (2, 3):
+                self.counters.skipped["packet block without a time"] += 1
+        if at < size:
+            self.counters.skipped["cut record"] += 1
+
+
+def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
+    """Nanoseconds of a timestamp's unit by the interface's options (if_tsresol, code 9)."""
+    while at + 4 <= end:
+        code, length = struct.unpack_from(order + "HH", data, at)
+        if code == 0:
+            break
+        if code == 9 and length >= 1 and at + 4 < end:
+            value = data[at + 4]
+            return 1e9 / 2 ** (value & 0x7F) if value & 0x80 else 10.0 ** (9 - value)
+        at += 4 + (length + 3) // 4 * 4
+    return 1000.0
+
+
+def _udp(data: bytes, start: int, end: int, link: int) -> tuple[int, int, int] | str:
+    """(destination port, start, end) of the UDP payload of a frame, or why there is none."""
+    if link == LINK_ETHERNET:
+        at = start + 12
+        while end - at >= 4 and data[at : at + 2] in (b"\x81\x00", b"\x88\xa8"):
+            at += 4
+        if data[at : at + 2] not in (b"\x08\x00", b"\x86\xdd"):
+            return "not IP"
+        at += 2
+    elif link == LINK_RAW:
+        at = start
+    elif link == LINK_NULL:
+        at = start + 4
+    elif link == LINK_LINUX_SLL:
+        at = start + 16
+    elif link == LINK_LINUX_SLL2:
+        at = start + 20
+    else:
+        return f"unknown link type {link}"
+    if at + 20 > end:
+        return "cut frame"
+    version = data[at] >> 4
+    if version == 4:
+        protocol, header = data[at + 9], 4 * (data[at] & 0x0F)
+        if (data[at + 6] & 0x3F) | data[at + 7]:
+            return "IP fragment"
+    elif version == 6:
+        protocol, header = data[at + 6], 40
+    else:
+        return "not IP"
+    if protocol != 17:
+        return "not UDP"
+    udp = at + header
+    if udp + 8 > end:
+        return "cut frame"
+    length = data[udp + 4] << 8 | data[udp + 5]
+    if length < 8 or udp + length > end:
+        return "cut datagram"
+    return data[udp + 2] << 8 | data[udp + 3], udp + 8, udp + length

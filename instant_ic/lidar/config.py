@@ -1,0 +1,57 @@
+"""Parameters of the VLP-16: decoding and the flat scan."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DecoderConfig:
+    """From packets to revolutions.
+
+    Attributes:
+        cut_angle_deg: a revolution ends where the sensor passes this azimuth (clockwise from ahead), degrees.
+        min_range: nearer returns are left out as too close, metres.
+        max_range: farther returns are left out, metres.
+    """
+
+    cut_angle_deg: float = 180.0
+    min_range: float = 0.4
+    max_range: float = 130.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0.0 <= self.cut_angle_deg < 360.0:
+            raise ValueError(f"cut_angle_deg must be in 0..360 (got {self.cut_angle_deg})")
+        if not 0.0 <= self.min_range < self.max_range <= 131.07:
+            raise ValueError(
+                f"min_range must be >= 0 and below max_range, which is at most 131.07 m "
+                f"(got {self.min_range}, {self.max_range})"
+            )
+
+
+@dataclass(frozen=True)
+class FlatScanConfig:
+    """From a revolution to one range a direction.
+
+    Attributes:
+        min_height: points lower than this above the ground (z of base_link) are no obstacles, metres.
+        max_height: points higher than this are passed under, metres.
+        beams: directions over 360 degrees.
+        range_min: what the scan says of its nearest range, metres.
+        range_max: farther points are left out of the scan, metres.
+    """
+
+    min_height: float = 0.10
+    max_height: float = 1.30
+    beams: int = 720
+    range_min: float = 0.4
+    range_max: float = 100.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not (math.isfinite(self.min_height) and self.min_height < self.max_height):
+            raise ValueError(f"min_height must be below max_height (got {self.min_height}, {self.max_height})")
+        if not 4 <= self.beams <= 7200:
+            raise ValueError(f"beams must be in 4..7200 (got {self.beams})")
+        if not 0.0 <= self.range_min < self.range_max:
+            raise ValueError(f"range_min must be below range_max (got {self.range_min}, {self.range_max})")

@@ -1,0 +1,182 @@
+"""From data packets to points, a whole revolution at a time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from instant_ic.lidar.packets import (
+    BLOCK_PERIOD_US,
+    BLOCKS,
+    DATA_PACKET_BYTES,
+    DISTANCE_UNIT_M,
+    FIRING_PERIOD_US,
+    FIRINGS,
+    LASER_ELEVATION_DEG,
+    LASER_PERIOD_US,
+    LASER_RING,
+    LASER_VERTICAL_OFFSET_M,
+    LASERS,
+    RETURN_DUAL,
+)
+
+POINT_DTYPE = np.dtype(
+    {
+        "names": ["x", "y", "z", "intensity", "ring", "time"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u2", "<f4"],
+        "offsets": [0, 4, 8, 12, 16, 18],
+        "itemsize": 22,
+    }
+)
+"""A point in the layout of ros-drivers/velodyne; ``time`` is seconds after the first firing."""
+
+_ELEVATION = np.radians(LASER_ELEVATION_DEG)
+_COS_ELEVATION = np.cos(_ELEVATION)
+_SIN_ELEVATION = np.sin(_ELEVATION)
+_AZIMUTH = np.radians(np.arange(36000) / 100.0)
+_COS_AZIMUTH = np.cos(_AZIMUTH)
+_SIN_AZIMUTH = np.sin(_AZIMUTH)
+_RAY_TIME_US = FIRING_PERIOD_US * np.arange(FIRINGS)[:, None] + LASER_PERIOD_US * np.arange(LASERS)
+"""Time of each ray of a block after the block's first, (2, 16)."""
+
+
+@dataclass(frozen=True)
+class DecodedPackets:
+    """Points of consecutive packets, and what is known of the directions that gave none.
+
+    Attributes:
+        points: returns within the range limits by time of firing, `POINT_DTYPE`, (N,).
+        firing_azimuth: azimuth of each firing sequence, rad, clockwise from ahead, (F,).
+        firing_time: its time after the first one, seconds, (F,).
+        firing_too_close: whether one of its lasers had a return nearer than min_range, (F,).
+        duration_s: from the first firing to the end of the last one.
+    """
+
+    points: NDArray[np.void]
+    firing_azimuth: NDArray[np.float32]
+    firing_time: NDArray[np.float32]
+    firing_too_close: NDArray[np.bool_]
+    duration_s: float
+
+
+def decode_packets(
+    packets: NDArray[np.uint8],
+    time_us: NDArray[np.float64],
+    first_block: int = 0,
+    end_block: int = BLOCKS,
+    min_range: float = 0.4,
+    max_range: float = 130.0,
+) -> DecodedPackets:
+    """Decode consecutive packets of one return mode.
+
+    Axes are those of ROS: x ahead (azimuth 0), y left, z up. The azimuth of each ray is interpolated by the
+    mean turn rate of its packet and rounded to the sensor's own unit, 0.01 degrees. In dual return mode a ray
+    gives its last return and then its strongest (or second strongest) one; an identical pair gives one point.
+
+    Args:
+        packets: payloads, (P, 1206); all of them with the return mode of the first.
+        time_us: time of each packet's first firing, any origin, (P,).
+        first_block: the first packet is read from this block on; even in dual return mode.
+        end_block: the last packet is read up to this block, which is left out; even in dual return mode.
+        min_range: nearer returns are left out, metres.
+        max_range: farther returns are left out, metres.
+    """
+    if packets.ndim != 2 or packets.shape[1] != DATA_PACKET_BYTES or len(packets) == 0:
+        raise ValueError(f"packets must be (P, {DATA_PACKET_BYTES}) with P > 0 (got {packets.shape})")
+    pair = 2 if packets[0, 1204] == RETURN_DUAL else 1
+    points = np.empty(len(packets) * BLOCKS * FIRINGS * LASERS, POINT_DTYPE)
+    firings = len(packets) * BLOCKS // pair * FIRINGS
+    azimuth = np.empty(firings, np.float32)
+    time = np.empty(firings, np.float32)
+    too_close = np.empty(firings, np.bool_)
+    n_points, n_firings, end_us = _decode(
+        packets,
+        time_us,
+        first_block,
+        end_block,
+        pair,
+        int(np.ceil(min_range / DISTANCE_UNIT_M - 1e-6)),
+        int(np.floor(max_range / DISTANCE_UNIT_M + 1e-6)),
+        points,
+        azimuth,
+        time,
+        too_close,
+    )
+    return DecodedPackets(
+        points[:n_points], azimuth[:n_firings], time[:n_firings], too_close[:n_firings], end_us * 1e-6
+    )
+
+
+@njit(nogil=True, cache=True, boundscheck=False)
+def _decode(  # type: ignore[no-untyped-def]
+    packets,
+    time_us,
+    first_block,
+    end_block,
+    pair,
+    min_units,
+    max_units,
+    points,
+    firing_azimuth,
+    firing_time,
+    firing_too_close,
+):
+    """Kernel of `decode_packets`; returns the number of points, of firings, and the end's time in us."""
+    n_points = 0
+    n_firings = 0
+    n_packets = packets.shape[0]
+    origin_us = time_us[0] + BLOCK_PERIOD_US * (first_block // pair)
+    end_us = 0.0
+    for p in range(n_packets):
+        packet = packets[p]
+        first_azimuth = packet[2] | np.int32(packet[3]) << 8
+        last_azimuth = packet[1102] | np.int32(packet[1103]) << 8
+        turned = (last_azimuth - first_azimuth) % 36000
+        # Single precision and the order of additions are those of the C++ drivers: ties round alike.
+        per_us = np.float32(turned) / np.float32(BLOCKS // pair - 1) / np.float32(BLOCK_PERIOD_US)
+        start = first_block if p == 0 else 0
+        stop = end_block if p == n_packets - 1 else BLOCKS
+        for block in range(start, stop, pair):
+            at = 100 * block
+            block_azimuth = np.float32(packet[at + 2] | np.int32(packet[at + 3]) << 8)
+            block_us = time_us[p] - origin_us + BLOCK_PERIOD_US * (block // pair)
+            for firing in range(FIRINGS):
+                too_close = False
+                for laser in range(LASERS):
+                    ray_us = _RAY_TIME_US[firing, laser]
+                    index = -1
+                    offset = at + 4 + 48 * firing + 3 * laser
+                    before = -1
+                    for _ in range(pair):
+                        units = packet[offset] | np.int32(packet[offset + 1]) << 8
+                        reflectivity = np.int32(packet[offset + 2])
+                        offset += 100
+                        if units < min_units:
+                            too_close |= units > 0
+                            continue
+                        both = units << 8 | reflectivity
+                        if units > max_units or both == before:
+                            continue
+                        before = both
+                        if index < 0:
+                            azimuth = block_azimuth + per_us * np.float32(ray_us)
+                            index = int(azimuth + np.float32(0.5) + np.float32(36000.0)) % 36000
+                        distance = units * DISTANCE_UNIT_M
+                        across = distance * _COS_ELEVATION[laser]
+                        point = points[n_points]
+                        point.x = np.float32(across * _COS_AZIMUTH[index])
+                        point.y = np.float32(-across * _SIN_AZIMUTH[index])
+                        point.z = np.float32(distance * _SIN_ELEVATION[laser] + LASER_VERTICAL_OFFSET_M[laser])
+                        point.intensity = np.float32(reflectivity)
+                        point.ring = LASER_RING[laser]
+                        point.time = np.float32((block_us + ray_us) * 1e-6)
+                        n_points += 1
+                firing_us = FIRING_PERIOD_US * firing
+                turn = (block_azimuth + per_us * np.float32(firing_us)) * np.float32(0.01)
+                firing_azimuth[n_firings] = np.radians(turn % np.float32(360.0))
+                firing_time[n_firings] = np.float32((block_us + firing_us) * 1e-6)
+                firing_too_close[n_firings] = too_close
+                n_firings += 1
+                end_us = block_us + firing_us + FIRING_PERIOD_US
+    return n_points, n_firings, end_us

@@ -1,0 +1,169 @@
+"""One range a direction, from the points within a band of heights, all brought to one instant."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from instant_ic.lidar.config import FlatScanConfig
+from instant_ic.lidar.motion import PlanarMotion
+from instant_ic.lidar.stream import Revolution
+
+_MOTION_SAMPLES = 65
+"""Nodes of the motion over a revolution; within 1.6 ms the motion is straight enough (1 um at 1 rad/s)."""
+
+
+@dataclass(frozen=True)
+class FlatScan:
+    """A planar scan in the sensor's frame.
+
+    Attributes:
+        ranges: metres by REP-117: +inf nothing met, -inf too close, nan not measured; (beams,). Beam i looks
+            to angle_min + i * angle_increment, counter-clockwise from ahead.
+        angle_min: direction of the first beam, rad; the centre of its sector.
+        angle_increment: rad.
+        stamp_ns: the instant that all ranges are brought to: the revolution's end.
+        compensated: the base's motion during the revolution was taken out.
+    """
+
+    ranges: NDArray[np.float32]
+    angle_min: float
+    angle_increment: float
+    stamp_ns: int
+    compensated: bool
+
+
+def flat_scan(
+    revolution: Revolution,
+    base_from_lidar: NDArray[np.float64],
+    config: FlatScanConfig,
+    motion: PlanarMotion | None = None,
+) -> FlatScan:
+    """Project a revolution to a planar scan.
+
+    Each point is moved by what the base moved from the point's firing to the revolution's end. The smallest
+    range of each beam counts.
+
+    Args:
+        revolution: decoded points.
+        base_from_lidar: mount of the sensor, base_link's origin on the ground, (4, 4).
+        config: band of heights and beams.
+        motion: the base's poses around the revolution; without them the base is taken to stand.
+
+    Raises:
+        MotionError: the poses do not reach to the revolution.
+    """
+    duration_s = max(1e-6, (revolution.end_ns - revolution.stamp_ns) * 1e-9)
+    shifts = np.zeros((_MOTION_SAMPLES, 3))
+    if motion is not None:
+        times_ns = revolution.stamp_ns + np.linspace(0.0, duration_s * 1e9, _MOTION_SAMPLES).astype(np.int64)
+        shifts = motion.end_from_time(revolution.end_ns, times_ns)
+    ranges = np.empty(config.beams, np.float32)
+    _project(
+        revolution.points,
+        revolution.firing_azimuth,
+        revolution.firing_time,
+        revolution.firing_too_close,
+        np.ascontiguousarray(base_from_lidar[:3, :3], np.float64),
+        np.ascontiguousarray(base_from_lidar[:3, 3], np.float64),
+        shifts,
+        duration_s,
+        config.min_height,
+        config.max_height,
+        config.range_min,
+        config.range_max,
+        ranges,
+    )
+    return FlatScan(
+        ranges=ranges,
+        angle_min=-np.pi,
+        angle_increment=2.0 * np.pi / config.beams,
+        stamp_ns=revolution.end_ns,
+        compensated=motion is not None,
+    )
+
+
+def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion: PlanarMotion) -> NDArray[np.float32]:
+    """Positions of all points as the sensor would see them from where it is at the revolution's end, (N, 3).
+
+    Raises:
+        MotionError: the poses do not reach to the revolution.
+    """
+    rotation, translation = base_from_lidar[:3, :3], base_from_lidar[:3, 3]
+    stamps_ns = revolution.stamp_ns + (revolution.points["time"].astype(np.float64) * 1e9).astype(np.int64)
+    shift = motion.end_from_time(revolution.end_ns, stamps_ns)
+    base = revolution.xyz.astype(np.float64) @ rotation.T + translation
+    c, s = np.cos(shift[:, 2]), np.sin(shift[:, 2])
+    moved = np.stack(
+        [c * base[:, 0] - s * base[:, 1] + shift[:, 0], s * base[:, 0] + c * base[:, 1] + shift[:, 1], base[:, 2]],
+        axis=-1,
+    )
+    return np.asarray((moved - translation) @ rotation, np.float32)
+
+
+@njit(nogil=True, cache=True)
+def _project(  # type: ignore[no-untyped-def]
+    points,
+    firing_azimuth,
+    firing_time,
+    firing_too_close,
+    rotation,
+    translation,
+    shifts,
+    duration_s,
+    min_height,
+    max_height,
+    range_min,
+    range_max,
+    ranges,
+):
+    """Kernel of `flat_scan`; ``shifts`` are the base's poses over the revolution, seen from its end."""
+    beams = ranges.shape[0]
+    per_beam = 2.0 * np.pi / beams
+    last = shifts.shape[0] - 1
+    per_sample = last / duration_s
+    ranges[:] = np.nan
+
+    # Directions that were looked into, and those with something closer than the sensor can measure.
+    for i in range(firing_azimuth.shape[0]):
+        at = min(max(firing_time[i] * per_sample, 0.0), float(last))
+        k = min(int(at), last - 1)
+        yaw = shifts[k, 2] + (at - k) * (shifts[k + 1, 2] - shifts[k, 2])
+        # The mount turns the sensor against the base; a turn of the base about z turns the sensor alike.
+        direction = yaw - firing_azimuth[i]
+        beam = int(np.floor((direction + np.pi) / per_beam + 0.5)) % beams
+        if firing_too_close[i]:
+            ranges[beam] = -np.inf
+        elif np.isnan(ranges[beam]):
+            ranges[beam] = np.inf
+
+    for i in range(points.shape[0]):
+        point = points[i]
+        x = rotation[0, 0] * point.x + rotation[0, 1] * point.y + rotation[0, 2] * point.z + translation[0]
+        y = rotation[1, 0] * point.x + rotation[1, 1] * point.y + rotation[1, 2] * point.z + translation[1]
+        z = rotation[2, 0] * point.x + rotation[2, 1] * point.y + rotation[2, 2] * point.z + translation[2]
+        if z < min_height or z > max_height:
+            continue
+        at = min(max(point.time * per_sample, 0.0), float(last))
+        k = min(int(at), last - 1)
+        alpha = at - k
+        yaw = shifts[k, 2] + alpha * (shifts[k + 1, 2] - shifts[k, 2])
+        c = np.cos(yaw)
+        s = np.sin(yaw)
+        moved_x = c * x - s * y + shifts[k, 0] + alpha * (shifts[k + 1, 0] - shifts[k, 0]) - translation[0]
+        moved_y = s * x + c * y + shifts[k, 1] + alpha * (shifts[k + 1, 1] - shifts[k, 1]) - translation[1]
+        moved_z = z - translation[2]
+        # Back to the sensor's axes (the transposed rotation).
+        scan_x = rotation[0, 0] * moved_x + rotation[1, 0] * moved_y + rotation[2, 0] * moved_z
+        scan_y = rotation[0, 1] * moved_x + rotation[1, 1] * moved_y + rotation[2, 1] * moved_z
+        distance = np.hypot(scan_x, scan_y)
+        if distance > range_max:
+            continue
+        beam = int(np.floor((np.arctan2(scan_y, scan_x) + np.pi) / per_beam + 0.5)) % beams
+        found = ranges[beam]
+        if distance < range_min:
+            ranges[beam] = -np.inf
+        elif not distance >= found:
+            # Also where the beam was not known to be looked into (nan compares false).
+            ranges[beam] = distance

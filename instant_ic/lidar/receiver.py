@@ -1,0 +1,166 @@
+"""Receives the sensor's UDP packets."""
+
+import selectors
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import NamedTuple, Self
+
+from instant_ic.lidar.packets import DATA_PACKET_BYTES
+
+_SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
+"""Linux's number; Python 3.11 does not name it."""
+_TIMESPEC = struct.Struct("@ll")
+
+
+class ReceiverError(OSError):
+    """A port that cannot be bound; the text says which and why."""
+
+
+@dataclass(frozen=True)
+class ReceiverConfig:
+    """Where packets are received.
+
+    Attributes:
+        host: local address; 0.0.0.0 also takes the broadcasts of a sensor in its factory state.
+        port: of data packets; 0 lets the system choose (then see `PacketReceiver.port`).
+        position_port: of position packets; -1 does without.
+        sensor: only packets from this address; empty takes all.
+    """
+
+    host: str = "0.0.0.0"
+    port: int = 2368
+    position_port: int = 8308
+    sensor: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"port must be in 0..65535 (got {self.port})")
+        if not -1 <= self.position_port <= 65535:
+            raise ValueError(f"position_port must be in -1..65535 (got {self.position_port})")
+
+
+class Received(NamedTuple):
+    """A datagram from the sensor."""
+
+    stamp_ns: int
+    """When the kernel took it in, since the epoch."""
+    payload: bytes
+    is_data: bool
+    """From the data port; else from the position port."""
+
+
+class PacketReceiver:
+    """Both of the sensor's ports.
+
+    Example:
+        >>> with PacketReceiver(ReceiverConfig()) as receiver:      # doctest: +SKIP
+        ...     for received in receiver.read(timeout_s=0.1): ...
+
+    Attributes:
+        foreign: datagrams dropped because another host sent them.
+    """
+
+    def __init__(self, config: ReceiverConfig) -> None:
+        self.config = config
+        self.foreign = 0
+        self._selector: selectors.BaseSelector | None = None
+        self._data: socket.socket | None = None
+        self._position: socket.socket | None = None
+
+    @property
+    def port(self) -> int:
+        """The data port that was bound."""
+        return int(self._data.getsockname()[1]) if self._data else self.config.port
+
+    @property
+    def position_port(self) -> int:
+        """The position port that was bound."""
+        return int(self._position.getsockname()[1]) if self._position else self.config.position_port
+
+    def connect(self) -> None:
+        """Bind the ports.
+
+        Raises:
+            ReceiverError: one is taken or not allowed.
+        """
+        self.close()
+        self._selector = selectors.DefaultSelector()
+        try:
+            self._data = self._bind(self.config.port)
+            if self.config.position_port >= 0:
+                self._position = self._bind(self.config.position_port)
+        except OSError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Release the ports."""
+        for bound in (self._data, self._position):
+            if bound is not None:
+                bound.close()
+        if self._selector is not None:
+            self._selector.close()
+        self._selector = self._data = self._position = None
+
+    def __enter__(self) -> Self:
+        """Bind."""
+        self.connect()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Release."""
+        self.close()
+
+    def read(self, timeout_s: float) -> Iterator[Received]:
+        """What has come, waiting at most ``timeout_s`` for the first datagram; nothing on a time-out.
+
+        Raises:
+            ReceiverError: not connected.
+        """
+        if self._selector is None:
+            raise ReceiverError("the receiver is not connected; call connect() first")
+        for key, _ in self._selector.select(timeout_s):
+            bound = key.fileobj
+            assert isinstance(bound, socket.socket)
+            while True:
+                try:
+                    payload, ancillary, _, sender = bound.recvmsg(DATA_PACKET_BYTES + 512, 64)
+                except BlockingIOError:
+                    break
+                if self.config.sensor and sender[0] != self.config.sensor:
+                    self.foreign += 1
+                    continue
+                yield Received(_stamp_ns(ancillary), payload, bound is self._data)
+
+    def _bind(self, port: int) -> socket.socket:
+        bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            bound.setblocking(False)
+            # Room for half a second of packets: the decoder's thread may have to wait for its turn.
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+            bound.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            bound.bind((self.config.host, port))
+        except OSError as error:
+            bound.close()
+            raise ReceiverError(
+                f"UDP {self.config.host}:{port} cannot be bound ({error.strerror}); "
+                "is another driver running? 'ss -ulpn' shows who holds the port"
+            ) from error
+        assert self._selector is not None
+        self._selector.register(bound, selectors.EVENT_READ)
+        return bound
+
+
+def _stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) >= _TIMESPEC.size:
+            seconds, nanoseconds = _TIMESPEC.unpack_from(data)
+            return int(seconds * 1_000_000_000 + nanoseconds)
+    return time.time_ns()

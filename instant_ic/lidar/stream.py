@@ -1,0 +1,225 @@
+"""Cuts the stream of data packets into revolutions, and counts what is missing."""
+
+import struct
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.lidar.clock import DeviceClock
+from instant_ic.lidar.config import DecoderConfig
+from instant_ic.lidar.decode import decode_packets
+from instant_ic.lidar.packets import (
+    BLOCK_PERIOD_US,
+    BLOCKS,
+    DATA_PACKET_BYTES,
+    HOUR_US,
+    PACKET_PERIOD_US,
+    RETURN_DUAL,
+    check_data_packet,
+)
+
+_TAIL = struct.Struct("<H96xIBB")
+_TAIL_AT = 1102
+"""From the last block's azimuth to the end: azimuth, 96 bytes of returns, time, return mode, product."""
+
+_MAX_GAP_US = 20_000
+"""A longer silence ends the revolution: at 1200 rpm the head may pass the cut unseen in half a turn, 25 ms."""
+_LATE_US = -100_000
+"""A packet this much older than the newest is a late one; older still, and the sensor's clock was reset."""
+_MAX_PACKETS = 400
+"""Above one revolution at 300 rpm in dual mode (302): without a cut until then the head does not turn."""
+
+
+@dataclass(frozen=True)
+class Revolution:
+    """One turn of the sensor.
+
+    Attributes:
+        points: `instant_ic.lidar.decode.POINT_DTYPE`, (N,); ``time`` counts seconds from ``stamp_ns``.
+        stamp_ns: host time of the first firing.
+        end_ns: host time of the end of the last firing.
+        firing_azimuth: azimuth of each firing sequence, rad, clockwise from ahead, (F,).
+        firing_time: its time after ``stamp_ns``, seconds, (F,).
+        firing_too_close: whether it had a return nearer than the decoder's min_range, (F,).
+        complete: it was cut at the cut angle on both ends and no packet is missing.
+        missing_packets: packets that never came, by the sensor's own clock.
+        dual: dual return mode.
+    """
+
+    points: NDArray[np.void]
+    stamp_ns: int
+    end_ns: int
+    firing_azimuth: NDArray[np.float32]
+    firing_time: NDArray[np.float32]
+    firing_too_close: NDArray[np.bool_]
+    complete: bool
+    missing_packets: int
+    dual: bool
+
+    @property
+    def xyz(self) -> NDArray[np.float32]:
+        """Positions in the sensor's frame, metres, (N, 3)."""
+        return np.stack([self.points["x"], self.points["y"], self.points["z"]], axis=-1)
+
+
+@dataclass
+class StreamCounters:
+    """What came, and what was wrong with it, since the start.
+
+    Attributes:
+        packets: data packets taken.
+        missing: packets that never came.
+        late: packets dropped because newer ones had come before.
+        bad: payloads dropped because they are no data packets; by reason in ``bad_reasons``.
+        clock_resets: jumps of the sensor's clock (it was switched on anew, or a capture starts again).
+        revolutions: revolutions given out.
+    """
+
+    packets: int = 0
+    missing: int = 0
+    late: int = 0
+    bad: int = 0
+    clock_resets: int = 0
+    revolutions: int = 0
+    bad_reasons: dict[str, int] = field(default_factory=dict)
+
+
+class PacketStream:
+    """Takes data packets one by one and gives each revolution as soon as it is whole."""
+
+    def __init__(self, config: DecoderConfig | None = None) -> None:
+        self.config = config or DecoderConfig()
+        self.clock = DeviceClock()
+        self.counters = StreamCounters()
+        self._cut = round(self.config.cut_angle_deg * 100.0)
+        self._payloads: list[bytes] = []
+        self._times_us: list[int] = []
+        self._first_block = 0
+        self._missing = 0
+        self._dual = False
+        self._cut_before = False
+        self._turned: int | None = None
+
+    def feed(self, payload: bytes, received_ns: int) -> Revolution | None:
+        """Take one payload.
+
+        Args:
+            payload: 1206 bytes; anything else is counted and dropped.
+            received_ns: host time of its arrival.
+
+        Returns:
+            The revolution that this packet ends, if it ends one.
+        """
+        reason = check_data_packet(payload)
+        azimuth = timestamp_us = mode = 0
+        if reason is None:
+            azimuth, timestamp_us, mode, _ = _TAIL.unpack_from(payload, _TAIL_AT)
+            if timestamp_us >= HOUR_US or azimuth >= 36000:
+                reason = "time or azimuth out of range"
+        if reason is not None:
+            self.counters.bad += 1
+            self.counters.bad_reasons[reason] = self.counters.bad_reasons.get(reason, 0) + 1
+            return None
+
+        dual = mode == RETURN_DUAL
+        period_us = PACKET_PERIOD_US / 2 if dual else PACKET_PERIOD_US
+        done = None
+        step_us = self.clock.step_us(timestamp_us)
+        if step_us is not None:
+            if _LATE_US < step_us <= 0:
+                self.counters.late += 1
+                return None
+            if step_us <= _LATE_US:
+                self.counters.clock_resets += 1
+                done = self._end_early()
+                self.clock.restart()
+            elif step_us > 1.5 * period_us:
+                missing = round(step_us / period_us) - 1
+                self.counters.missing += missing
+                self._missing += missing
+                if step_us > _MAX_GAP_US:
+                    done = self._end_early()
+        if dual != self._dual or len(self._payloads) >= _MAX_PACKETS:
+            # One revolution has one return mode; and it ends, even when the head stands still.
+            done = self._end_early() or done
+            self._dual = dual
+
+        self.counters.packets += 1
+        # A packet arrives after its last firing, but its time is that of its first.
+        device_us = self.clock.take(timestamp_us, received_ns - round(period_us * 1000.0))
+        self._payloads.append(payload)
+        self._times_us.append(device_us)
+        turned = (azimuth - self._cut) % 36000
+        before, self._turned = self._turned, turned
+        if before is not None and before - turned > 18000:
+            done = self._end_at_cut(before) or done
+        return done
+
+    def finish(self) -> Revolution | None:
+        """Give what there is of the last revolution, as at the end of a capture."""
+        return self._end_early()
+
+    def _end_at_cut(self, turned: int) -> Revolution | None:
+        """End the revolution inside the newest packet, where the azimuth passes the cut."""
+        packet = self._payloads[-1]
+        block = 0
+        while block < BLOCKS:
+            azimuth = packet[100 * block + 2] | packet[100 * block + 3] << 8
+            relative = (azimuth - self._cut) % 36000
+            if turned - relative > 18000:
+                break
+            turned = relative
+            block += 1
+        if self._dual:
+            block -= block % 2
+        end_block = block or BLOCKS
+        keep_packet = block < BLOCKS
+        payloads = self._payloads if block else self._payloads[:-1]
+        revolution = self._decode(payloads, end_block, cut_after=True)
+        self._payloads = self._payloads[-1:] if keep_packet else []
+        self._times_us = self._times_us[-1:] if keep_packet else []
+        self._first_block = block if keep_packet else 0
+        self._missing = 0
+        self._cut_before = True
+        return revolution
+
+    def _end_early(self) -> Revolution | None:
+        """End the revolution where it stands; the next one starts with the next packet."""
+        revolution = self._decode(self._payloads, BLOCKS, cut_after=False)
+        self._payloads = []
+        self._times_us = []
+        self._first_block = 0
+        self._missing = 0
+        self._cut_before = False
+        self._turned = None
+        return revolution
+
+    def _decode(self, payloads: list[bytes], end_block: int, cut_after: bool) -> Revolution | None:
+        if not payloads or (len(payloads) == 1 and self._first_block >= end_block):
+            return None
+        packets = np.frombuffer(b"".join(payloads), np.uint8).reshape(-1, DATA_PACKET_BYTES)
+        first_us = self._times_us[0]
+        times = np.array(self._times_us[: len(payloads)], np.int64) - first_us
+        decoded = decode_packets(
+            packets,
+            times.astype(np.float64),
+            self._first_block,
+            end_block,
+            self.config.min_range,
+            self.config.max_range,
+        )
+        block_us = BLOCK_PERIOD_US * (self._first_block // 2 if self._dual else self._first_block)
+        start_us = first_us + block_us
+        self.counters.revolutions += 1
+        return Revolution(
+            points=decoded.points,
+            stamp_ns=self.clock.host_ns(start_us),
+            end_ns=self.clock.host_ns(start_us + decoded.duration_s * 1e6),
+            firing_azimuth=decoded.firing_azimuth,
+            firing_time=decoded.firing_time,
+            firing_too_close=decoded.firing_too_close,
+            complete=self._cut_before and cut_after and self._missing == 0,
+            missing_packets=self._missing,
+            dual=self._dual,
+        )
