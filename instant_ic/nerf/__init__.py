@@ -1,0 +1,26 @@
+"""Virtual space: hash-grid radiance field from a panorama with depth (needs numpy; numba or torch to compute)."""
+
+from .config import (
+    FieldConfig,
+    GeometryConfig,
+    ReadinessConfig,
+    TrainConfig,
+    VirtualSpaceConfig,
+)
+from .prior import KeyframeError
+from .space import NotReadyError, State, Status, TrainStats, View, VirtualSpace
+
+__all__ = [
+    "FieldConfig",
+    "GeometryConfig",
+    "KeyframeError",
+    "NotReadyError",
+    "ReadinessConfig",
+    "State",
+    "Status",
+    "TrainConfig",
+    "TrainStats",
+    "View",
+    "VirtualSpace",
+    "VirtualSpaceConfig",
+]

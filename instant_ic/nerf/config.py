@@ -1,0 +1,131 @@
+"""Parameters of the virtual space; each class checks its own values."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+
+def _require(condition: bool, key: str, value: object, rule: str) -> None:
+    if not condition:
+        raise ValueError(f"{key} must be {rule} (got {value!r})")
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Multi-resolution hash grid and the small network behind it."""
+
+    levels: int = 8
+    features: int = 4
+    """Features of a table entry; the CPU kernels know 2 and 4."""
+    log2_table: int = 17
+    base_resolution: int = 16
+    """Cells of the coarsest level across the scene."""
+    hidden: int = 32
+    """Width of the hidden layer; a multiple of 4."""
+
+    def __post_init__(self) -> None:
+        _require(1 <= self.levels <= 16, "levels", self.levels, "1 to 16")
+        _require(self.features in (2, 4), "features", self.features, "2 or 4")
+        _require(10 <= self.log2_table <= 22, "log2_table", self.log2_table, "10 to 22")
+        _require(2 <= self.base_resolution <= 256, "base_resolution", self.base_resolution, "2 to 256")
+        hidden_ok = 4 <= self.hidden <= 64 and self.hidden % 4 == 0
+        _require(hidden_ok, "hidden", self.hidden, "a multiple of 4 from 4 to 64")
+        inputs = self.levels * self.features
+        _require(inputs % 4 == 0 and inputs <= 64, "levels * features", inputs, "a multiple of 4 up to 64")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """One training run over a keyframe."""
+
+    ray_columns: int = 128
+    """Strata in azimuth; a batch has ``ray_columns * ray_rows`` rays, one jittered in each."""
+    ray_rows: int = 64
+    iterations: int = 600
+    """Length of the learning-rate schedule; training idles after it."""
+    table_lr: float = 0.04
+    network_lr: float = 0.01
+    final_lr_share: float = 0.03
+    refresh_lr_share: float = 0.5
+    """Share of the learning rates when a keyframe refreshes a trained field."""
+    distance_weight: float = 0.1
+    """Weight of the signed-distance error against the colour error."""
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        for key in ("ray_columns", "ray_rows"):
+            value = getattr(self, key)
+            _require(8 <= value <= 1024 and value % 8 == 0, key, value, "a multiple of 8 from 8 to 1024")
+        _require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
+        for key in ("table_lr", "network_lr", "final_lr_share", "refresh_lr_share"):
+            _require(0 < getattr(self, key) <= 1, key, getattr(self, key), "in (0, 1]")
+        _require(self.distance_weight > 0, "distance_weight", self.distance_weight, "above 0")
+
+
+@dataclass(frozen=True)
+class GeometryConfig:
+    """How the keyframe's depth shapes the field and the occupancy grid."""
+
+    band_min: float = 0.03
+    """Half width of the band round the depth in which the signed distance is learnt, share of the depth."""
+    band_max: float = 0.15
+    band_sigmas: float = 2.0
+    """Half width of the band in standard deviations of the depth, between the two limits."""
+    torn_ratio: float = 0.10
+    """Neighbouring depths that differ by more than this share are an edge, unless they lie on one plane."""
+    min_depth_m: float = 0.2
+    max_depth_m: float = 30.0
+    """Depths beyond are set to it."""
+    min_known_share: float = 0.5
+    """A keyframe whose depth is known in less of the picture is refused."""
+    cell_m: float = 0.04
+    """Smallest cell of the occupancy grid, metres; larger where max_cells would be passed."""
+    max_cells: int = 6_000_000
+
+    def __post_init__(self) -> None:
+        _require(0 < self.band_min <= 0.5, "band_min", self.band_min, "in (0, 0.5]")
+        _require(self.band_min <= self.band_max <= 0.5, "band_max", self.band_max, "between band_min and 0.5")
+        _require(self.band_sigmas > 0, "band_sigmas", self.band_sigmas, "above 0")
+        _require(0 < self.torn_ratio < 1, "torn_ratio", self.torn_ratio, "in (0, 1)")
+        _require(0 < self.min_depth_m < self.max_depth_m, "min_depth_m", self.min_depth_m, "in (0, max_depth_m)")
+        _require(0 < self.min_known_share <= 1, "min_known_share", self.min_known_share, "in (0, 1]")
+        _require(0 < self.cell_m <= 1, "cell_m", self.cell_m, "in (0, 1]")
+        _require(10_000 <= self.max_cells <= 2**27, "max_cells", self.max_cells, "from 1e4 to 2**27")
+
+
+@dataclass(frozen=True)
+class ReadinessConfig:
+    """When the space is fit to show, and how far from the keyframe."""
+
+    psnr_db: float = 24.0
+    """PSNR of the training rays that is good enough."""
+    plateau_iterations: int = 100
+    plateau_db: float = 0.3
+    """Less gain than this over ``plateau_iterations`` also counts as ready."""
+    max_radius_m: float = 3.0
+    parallax_rad: float = 0.035
+    """Shift of a surface in the picture, from the depth's error, that is still fit to show."""
+
+    def __post_init__(self) -> None:
+        for key in ("psnr_db", "plateau_iterations", "plateau_db", "max_radius_m", "parallax_rad"):
+            _require(getattr(self, key) > 0, key, getattr(self, key), "above 0")
+
+
+@dataclass(frozen=True)
+class VirtualSpaceConfig:
+    """Everything about the virtual space but the bus."""
+
+    device: str = "auto"
+    """``auto`` (CUDA where torch finds it, else numba on the CPU), ``cpu``, ``cuda``, or ``torch-cpu`` (slow)."""
+    panorama_width: int = 2048
+    """Wider panoramas are area-averaged to this width."""
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
+    geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
+    readiness: ReadinessConfig = dataclasses.field(default_factory=ReadinessConfig)
+
+    def __post_init__(self) -> None:
+        devices = ("auto", "cpu", "cuda", "torch-cpu")
+        _require(self.device in devices, "device", self.device, "one of " + ", ".join(devices))
+        _require(64 <= self.panorama_width <= 8192, "panorama_width", self.panorama_width, "from 64 to 8192")

@@ -1,0 +1,116 @@
+"""Training and rendering on one CPU thread by the numba kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from . import kernels, march
+from .config import FieldConfig, TrainConfig
+from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size
+
+FIRST_STRIDE = 4
+DEPTH_TOLERANCE = 0.08
+"""Neighbours further apart than this share are traced, not interpolated."""
+
+
+class NumbaDevice:
+    """See ``field.Device``. Not thread-safe: one thread at a time."""
+
+    name = "cpu (numba)"
+
+    def __init__(self, field: FieldConfig, train: TrainConfig) -> None:
+        self._train = train
+        self._rays = train.ray_columns * train.ray_rows
+        self._points = np.zeros((2 * self._rays, 3), np.float32)
+        self._target = np.zeros((2 * self._rays, 4), np.float32)
+        on_surface = np.repeat(np.tile([True, False], self._rays // 64), 64)
+        self._colour_weight = np.where(on_surface, 1 / (3 * self._rays), 0).astype(np.float32)
+        self._distance_weight = np.full(2 * self._rays, train.distance_weight / (2 * self._rays), np.float32)
+        self.load(FieldParameters.random(field, train.seed))
+
+    def load(self, parameters: FieldParameters) -> None:
+        self._p = parameters
+        table = parameters.table
+        self._table_grad = np.zeros_like(table)
+        self._touched = np.zeros(table.shape[:2], np.uint8)
+        self._table_moments = (np.zeros_like(table), np.zeros_like(table))
+        self._network_grads = tuple(np.zeros_like(a) for a in parameters.network())
+        self._network_moments = tuple((np.zeros_like(a), np.zeros_like(a)) for a in parameters.network())
+        self._steps = 0
+
+    def set_scene(self, scene: Scene) -> None:
+        self._scene = scene
+        self._map_from_camera = scene.prior.map_from_camera.astype(np.float32)
+        self._camera_from_map = np.linalg.inv(scene.prior.map_from_camera).astype(np.float32)
+        for moments in (self._table_moments, *self._network_moments):
+            for moment in moments:
+                moment[...] = 0
+        self._steps = 0
+
+    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
+        prior, lattice, p = self._scene.prior, self._scene.lattice, self._p
+        march.sample_rays(
+            uniform, self._train.ray_columns, self._train.ray_rows, prior.rgb, prior.inverse_depth, prior.torn,
+            self._map_from_camera, np.float32(prior.band), self._points, self._target,
+        )  # fmt: skip
+        g1, gb1, g2, gb2 = self._network_grads
+        colour, distance = kernels.gradient(
+            p.table, *p.network(), lattice.cells_per_m, lattice.origin, self._points, self._target,
+            self._colour_weight, self._distance_weight, self._table_grad, self._touched, g1, gb1, g2, gb2,
+        )  # fmt: skip
+        self._steps += 1
+        betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
+        step_size = np.float32(adam_step_size(table_lr, self._steps))
+        kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_size, *betas)
+        step_size = np.float32(adam_step_size(network_lr, self._steps))
+        for value, grad, (m, v) in zip(p.network(), self._network_grads, self._network_moments, strict=True):
+            m += (1 - betas[0]) * (grad - m)
+            v += (1 - betas[1]) * (grad * grad - v)
+            value -= step_size * m / (np.sqrt(v) + betas[2])
+            grad[...] = 0
+        return float(colour), float(distance) / self._train.distance_weight
+
+    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+        height, width = rays.shape
+        axial_depth, confidence = self._trace(rays)
+        depth = axial_depth / rays.axial
+        met = np.flatnonzero(depth)
+        points = rays.origin + depth[met, None] * rays.directions[met]
+        out = np.empty((met.size, 4), np.float32)
+        p, lattice = self._p, self._scene.lattice
+        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, points, out)
+        colour = np.zeros((height * width, 3), np.float32)
+        colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
+        return colour, depth, confidence
+
+    def _trace(self, rays: Rays) -> tuple[Floats, Floats]:
+        """Depth along the view's axis and confidence: every 4th pixel first, then what cannot be interpolated."""
+        height, width = rays.shape
+        depth = np.zeros(height * width, np.float32)
+        confidence = np.zeros(height * width, np.float32)
+        index = np.arange(height * width, dtype=np.int32).reshape(height, width)
+        self._march(rays, index[::FIRST_STRIDE, ::FIRST_STRIDE].reshape(-1).copy(), depth, confidence)
+        listed = np.empty(height * width, np.int32)
+        stride = FIRST_STRIDE // 2
+        while stride >= 1:
+            count = march.interpolate_depth(
+                depth.reshape(height, width), confidence.reshape(height, width), stride, np.float32(DEPTH_TOLERANCE), listed
+            )
+            self._march(rays, listed[:count], depth, confidence)
+            stride //= 2
+        return depth, confidence
+
+    def _march(self, rays: Rays, pixels: np.ndarray, depth: Floats, confidence: Floats) -> None:
+        scene, p = self._scene, self._p
+        prior, grid = scene.prior, scene.occupancy
+        march.trace(
+            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin,
+            grid.distance, grid.origin, np.float32(grid.cell_m),
+            prior.inverse_depth, prior.torn, prior.known, self._camera_from_map, np.float32(prior.band),
+            rays.origin, rays.directions, pixels, depth, confidence,
+        )  # fmt: skip
+        depth[pixels] *= rays.axial[pixels]
+
+    def parameters(self) -> FieldParameters:
+        p = self._p
+        return FieldParameters(p.table.copy(), *(a.copy() for a in p.network()))

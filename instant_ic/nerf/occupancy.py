@@ -1,0 +1,95 @@
+"""Occupancy grid round the prior's surfaces: where rendering has to ask the field at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.projections import equirect_directions
+
+from .config import GeometryConfig
+from .prior import PanoramaPrior
+
+MAX_DISTANCE = 100
+_MAX_PARTS = 16
+
+
+@dataclass(frozen=True)
+class Occupancy:
+    """City-block distance in cells to the nearest occupied cell, 0 in it.
+
+    Attributes:
+        distance: (nx, ny, nz) uint8, at most ``MAX_DISTANCE``.
+        origin: corner of cell (0, 0, 0) in the map frame, metres, (3,) float32.
+        cell_m: edge of a cell.
+    """
+
+    distance: NDArray[np.uint8]
+    origin: NDArray[np.float32]
+    cell_m: float
+
+    @property
+    def occupied_share(self) -> float:
+        return float(np.count_nonzero(self.distance == 0)) / self.distance.size
+
+
+def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
+    """Points of the prior's surfaces in the map frame, dense enough to leave no gap of a cell, (N, 3).
+
+    Quads that are not torn are divided where their corners are further apart than a cell (planes that lean away), up to
+    16 × 16 parts. Along a quad the inverse depth is linear.
+    """
+    height, width = prior.inverse_depth.shape
+    directions = equirect_directions(width, height) @ prior.map_from_camera[:3, :3].T.astype(np.float32)
+    inverse = prior.inverse_depth
+    points = directions / inverse[..., None]
+    clouds = [points.reshape(-1, 3)]
+    down = np.linalg.norm(points[1:] - points[:-1], axis=2)
+    across = np.linalg.norm(np.roll(points, -1, 1) - points, axis=2)[:-1]
+    parts = np.ceil(np.maximum(down, across) / cell_m)
+    parts = 2 ** np.ceil(np.log2(np.clip(parts, 1, _MAX_PARTS))).astype(np.intp)
+    parts[prior.torn[:-1] > 0] = 1
+    for count in np.unique(parts):
+        if count == 1:
+            continue
+        v, u = np.nonzero(parts == count)
+        u1 = (u + 1) % width
+        step = np.arange(count, dtype=np.float32) / np.float32(count)
+        share_v, share_u = (axis.reshape(-1)[:, None] for axis in np.meshgrid(step, step, indexing="ij"))
+        weights = ((1 - share_v) * (1 - share_u), (1 - share_v) * share_u, share_v * (1 - share_u), share_v * share_u)
+        corners = ((v, u), (v, u1), (v + 1, u), (v + 1, u1))
+        direction = sum(w[..., None] * directions[c] for w, c in zip(weights, corners, strict=True))
+        nearness = sum(w * inverse[c] for w, c in zip(weights, corners, strict=True))
+        clouds.append((direction / np.asarray(nearness)[..., None]).reshape(-1, 3))
+    cloud = np.concatenate(clouds)
+    cloud += prior.map_from_camera[:3, 3].astype(np.float32)
+    return np.asarray(cloud, np.float32)
+
+
+def build_occupancy(prior: PanoramaPrior, config: GeometryConfig) -> Occupancy:
+    """Occupancy grid of a keyframe; one cell is added all round each surface."""
+    cloud = surface_points(prior, config.cell_m * 1.5)
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
+    cell = max(config.cell_m, (volume / config.max_cells) ** (1 / 3))
+    origin = low - np.float32(3 * cell)
+    shape = tuple(int(n) for n in np.ceil((high - origin) / cell).astype(int) + 3)
+    index = ((cloud - origin) * np.float32(1 / cell)).astype(np.intp)
+    distance = np.full(shape, MAX_DISTANCE, np.uint8)
+    distance.reshape(-1)[np.ravel_multi_index(tuple(index.T), shape)] = 0
+    _spread(distance)
+    # One cell of margin: surfaces between the samples, and the field's own small differences from the prior.
+    np.subtract(distance, 1, out=distance, where=distance > 0)
+    return Occupancy(distance, origin.astype(np.float32), float(cell))
+
+
+def _spread(distance: NDArray[np.uint8]) -> None:
+    """City-block distance transform in place: exact, as the metric separates by axes."""
+    for axis in range(3):
+        lines = np.moveaxis(distance, axis, 0)
+        for order in (1, -1):
+            ordered = lines[::order]
+            for previous, current in zip(ordered[:-1], ordered[1:], strict=True):
+                np.minimum(current, previous + np.uint8(1), out=current)

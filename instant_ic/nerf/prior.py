@@ -1,0 +1,226 @@
+"""A keyframe made ready for training: panorama, depth prior with its tears, pose, uncertainty (paper, IV.A-B)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import GeometryConfig
+
+
+class KeyframeError(ValueError):
+    """The keyframe cannot be trained from; the message says what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class PanoramaPrior:
+    """What training and rendering need of a keyframe.
+
+    Attributes:
+        rgb: panorama, (H, W, 3) uint8.
+        inverse_depth: 1/m along the ray, (h, w) float32, h = w/2, holes filled.
+        known: 1 where the depth was measured or estimated, (h, w) uint8.
+        torn: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
+        map_from_camera: pose, (4, 4).
+        relative_sigma: standard deviation of the depth, relative to it.
+        band: half width, relative to the depth, of the band in which the signed distance is learnt.
+    """
+
+    rgb: NDArray[np.uint8]
+    inverse_depth: NDArray[np.float32]
+    known: NDArray[np.uint8]
+    torn: NDArray[np.uint8]
+    map_from_camera: NDArray[np.float64]
+    relative_sigma: float
+    band: float
+
+    @property
+    def median_depth_m(self) -> float:
+        """Median over the viewing sphere's middle band (within 60° of the horizon)."""
+        rows = self.inverse_depth.shape[0]
+        return float(1.0 / np.median(self.inverse_depth[rows // 6 : rows - rows // 6]))
+
+
+def prepare(
+    rgb: NDArray[np.uint8],
+    depth_m: NDArray[np.floating],
+    map_from_camera: NDArray[np.floating],
+    relative_sigma: float,
+    config: GeometryConfig,
+    panorama_width: int,
+) -> PanoramaPrior:
+    """Checks a keyframe and makes its prior.
+
+    Args:
+        rgb: equirect panorama (H, W, 3) uint8, W = 2 H.
+        depth_m: radial depth (h, w) in metres, w = 2 h, 0 = unknown; need not have the panorama's size.
+        map_from_camera: camera pose in the map, (4, 4).
+        relative_sigma: one standard deviation of the depth, relative to it.
+        config: geometry parameters.
+        panorama_width: a wider panorama is area-averaged to this width.
+
+    Raises:
+        KeyframeError: wrong shape or type, values that are not finite, too little depth, a pose that is none.
+    """
+    _check_panorama(rgb)
+    _check_pose(map_from_camera)
+    depth = _checked_depth(depth_m, config)
+    if not np.isfinite(relative_sigma) or relative_sigma < 0:
+        raise KeyframeError(f"relative_sigma must be finite and not negative (got {relative_sigma})")
+    if rgb.shape[1] > panorama_width:
+        rgb = area_average(rgb, panorama_width // 2, panorama_width)
+    known = depth > 0
+    with np.errstate(divide="ignore"):
+        inverse = np.where(known, 1.0 / np.clip(depth, config.min_depth_m, config.max_depth_m), 0.0)
+    inverse = fill_holes(inverse.astype(np.float32), known)
+    band = float(np.clip(config.band_sigmas * relative_sigma, config.band_min, config.band_max))
+    return PanoramaPrior(
+        rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile anew
+        inverse_depth=np.ascontiguousarray(inverse),
+        known=known.astype(np.uint8),
+        torn=torn_quads(inverse, config.torn_ratio),
+        map_from_camera=np.array(map_from_camera, np.float64),
+        relative_sigma=float(relative_sigma),
+        band=band,
+    )
+
+
+def _check_panorama(rgb: NDArray[np.uint8]) -> None:
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        raise KeyframeError(f"panorama must be (H, W, 3) uint8 (got {rgb.shape} {rgb.dtype})")
+    height, width = rgb.shape[:2]
+    if width != 2 * height or width < 32:
+        raise KeyframeError(f"panorama must be twice as wide as high, 32 pixels or more (got {width} x {height})")
+    if int(rgb.max()) - int(rgb.min()) < 2:
+        raise KeyframeError("panorama has one colour only: covered lens or black picture")
+
+
+def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
+    pose = np.asarray(map_from_camera, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise KeyframeError(f"pose must be a finite 4x4 matrix (got shape {pose.shape})")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise KeyframeError("pose has no rotation matrix in it")
+
+
+def _checked_depth(depth_m: NDArray[np.floating], config: GeometryConfig) -> NDArray[np.float32]:
+    if depth_m.ndim != 2 or depth_m.shape[1] != 2 * depth_m.shape[0] or depth_m.shape[1] < 32:
+        raise KeyframeError(f"depth must be (H, 2 H), 32 columns or more (got {depth_m.shape})")
+    bad = int(np.count_nonzero(~np.isfinite(depth_m)))
+    if bad:
+        raise KeyframeError(f"depth holds {bad} values that are not finite; unknown is written 0")
+    if float(depth_m.min()) < 0:
+        raise KeyframeError(f"depth is negative (smallest {float(depth_m.min()):.3f} m)")
+    # Geometry does not gain from more than 0.35° a pixel, and tears and occupancy cost by the pixel.
+    step = max(1, depth_m.shape[1] // 1024)
+    depth = np.ascontiguousarray(depth_m[::step, ::step], np.float32)
+    if depth.shape[1] != 2 * depth.shape[0]:
+        depth = depth[: depth.shape[1] // 2, : 2 * depth.shape[0]]
+    share = float(np.count_nonzero(depth)) / depth.size
+    if share < config.min_known_share:
+        raise KeyframeError(f"depth is known in {share:.0%} of the picture, {config.min_known_share:.0%} are needed")
+    return depth
+
+
+def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """Each target pixel is the mean over its area of the source, (H, W, C) → (height, width, C)."""
+    result = image.astype(np.float32)
+    for axis, target in ((0, height), (1, width)):
+        source = result.shape[axis]
+        if source == target:
+            continue
+        if source % target == 0:
+            shape = (*result.shape[:axis], target, source // target, *result.shape[axis + 1 :])
+            result = result.reshape(shape).mean(axis=axis + 1, dtype=np.float32)
+            continue
+        # Integral along the axis, read at the (fractional) edges of the target's pixels.
+        lines = np.moveaxis(result, axis, 0)
+        integral = np.zeros((source + 1, *lines.shape[1:]), np.float64)
+        np.cumsum(lines, axis=0, dtype=np.float64, out=integral[1:])
+        edges = np.arange(target + 1) * (source / target)
+        low = np.minimum(edges.astype(np.intp), source - 1)
+        share = (edges - low).reshape(-1, *([1] * (lines.ndim - 1)))
+        at_edges = integral[low] * (1 - share) + integral[low + 1] * share
+        result = np.moveaxis(np.diff(at_edges, axis=0) * (target / source), 0, axis).astype(np.float32)
+    return np.clip(np.rint(result), 0, 255).astype(np.uint8)
+
+
+def fill_holes(
+    values: NDArray[np.float32], valid: NDArray[np.bool_], weight: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Fills what is not valid from its surroundings by a pyramid of weighted means (pull, then push).
+
+    Args:
+        values: (H, W) or (H, W, C).
+        valid: (H, W); where nothing is valid at all, zeros come back.
+        weight: (H, W) positive weights of the valid values, 1 where None.
+    """
+    if valid.all():
+        return values
+    channels = values if values.ndim == 3 else values[..., None]
+    w = valid.astype(np.float32) if weight is None else np.where(valid, weight, 0).astype(np.float32)
+    total = channels * w[..., None]
+    levels = [(total, w)]
+    while min(levels[-1][1].shape) > 1:
+        total, w = levels[-1]
+        levels.append((_halve(total), _halve(w)))
+    total, w = levels[-1]
+    coarse = total / np.maximum(w, 1e-12)[..., None]
+    for total, w in reversed(levels[:-1]):
+        finer = _double(coarse, w.shape)
+        known = w > 1e-12
+        finer[known] = total[known] / w[known][:, None]
+        coarse = finer
+    coarse[valid] = channels[valid]
+    return coarse if values.ndim == 3 else coarse[..., 0]
+
+
+def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    height, width = values.shape[:2]
+    if height % 2 or width % 2:
+        pad = ((0, height % 2), (0, width % 2), *([(0, 0)] * (values.ndim - 2)))
+        values = np.pad(values, pad)
+    return values[::2, ::2] + values[1::2, ::2] + values[::2, 1::2] + values[1::2, 1::2]
+
+
+def _double(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Bilinear enlargement (weights 3/4 and 1/4), so that fills have no blocks."""
+    for axis in (0, 1):
+        before = np.concatenate([values.take([0], axis), values.take(range(values.shape[axis] - 1), axis)], axis)
+        after = np.concatenate([values.take(range(1, values.shape[axis]), axis), values.take([-1], axis)], axis)
+        pair = np.stack([0.75 * values + 0.25 * before, 0.75 * values + 0.25 * after], axis + 1)
+        merged = (*values.shape[:axis], 2 * values.shape[axis], *values.shape[axis + 1 :])
+        values = pair.reshape(merged)
+    return np.ascontiguousarray(values[: shape[0], : shape[1]], np.float32)
+
+
+def torn_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
+    """1 for each quad (v, u)-(v + 1, u + 1) that crosses a depth edge; columns wrap, the last row has no quad below.
+
+    Two neighbours are an edge when their depths differ by more than ``ratio`` and neither side's slope of the inverse
+    depth leads to the other: inverse depth is linear along a plane, however much the plane leans away.
+    """
+    inverse = inverse_depth.astype(np.float32)
+    across = _torn_pairs(inverse, np.roll(inverse, -1, 1), np.roll(inverse, 1, 1), np.roll(inverse, -2, 1), ratio)
+    below = np.concatenate([inverse[1:], inverse[-1:]])
+    before = np.concatenate([inverse[:1], inverse[:-1]])
+    after = np.concatenate([inverse[2:], inverse[-1:], inverse[-1:]])[: inverse.shape[0]]
+    down = _torn_pairs(inverse, below, before, after, ratio)
+    torn = across | np.concatenate([across[1:], across[-1:]]) | down | np.roll(down, -1, 1)
+    return torn.astype(np.uint8)
+
+
+def _torn_pairs(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    before_a: NDArray[np.float32],
+    after_b: NDArray[np.float32],
+    ratio: float,
+) -> NDArray[np.bool_]:
+    jump = np.abs(a - b)
+    limit = 0.5 * jump
+    off = (np.abs(2 * a - before_a - b) > limit) & (np.abs(2 * b - after_b - a) > limit)
+    return (jump > ratio * np.minimum(a, b)) & off

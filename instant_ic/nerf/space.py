@@ -1,0 +1,274 @@
+"""The virtual space: one keyframe's panorama and depth, trained and drawn by turns (paper, IV.A-B)."""
+
+from __future__ import annotations
+
+import enum
+import math
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.projections import perspective_directions
+
+from .config import VirtualSpaceConfig
+from .field import Device, FieldParameters, Lattice, Rays, Scene, Schedule
+from .occupancy import build_occupancy
+from .prior import KeyframeError, PanoramaPrior, fill_holes, prepare
+
+MIN_VIEW, MAX_VIEW = 16, 4096
+
+
+class State(enum.IntEnum):
+    """Numbers as in VspaceStatus.msg."""
+
+    EMPTY = 0
+    TRAINING = 1
+    READY = 2
+    FAILED = 3
+
+
+@dataclass(frozen=True)
+class TrainStats:
+    """What one ``train`` call did: iterations of this call and its CPU-independent wall time; PSNR is a running mean
+    over training rays since the newest keyframe, dB, NaN before the first iteration.
+    """
+
+    iterations: int
+    psnr_db: float
+    distance_error: float
+    """Root mean square of the signed distance's error, share of the band."""
+    elapsed_ms: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the space can show now; fields as in VspaceStatus.msg."""
+
+    state: State
+    psnr_db: float
+    iterations: int
+    train_seconds: float
+    """Spent in training since the newest keyframe."""
+    ready_iterations: int
+    """Iterations from the keyframe until READY, 0 while not ready."""
+    ms_per_iteration: float
+    ready_radius_m: float
+    """How far from the keyframe a view is fit to show."""
+    converged: bool
+    device: str
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture of the space: ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) radial, 0 where unknown; ``confidence``
+    (H, W) in 0..1, 0 where no keyframe has seen the place (``rgb`` is continued from the surroundings there).
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+
+
+class NotReadyError(RuntimeError):
+    """Asked for training or a picture before the first keyframe."""
+
+
+class VirtualSpace:
+    """A hash-grid radiance field that is trained from the newest keyframe and drawn between training steps.
+
+    One thread at a time. The same calls with the same seed give the same bits on the CPU, as long as training is asked
+    for by iterations and not by time.
+
+    Example:
+        >>> space = VirtualSpace(VirtualSpaceConfig())                        # doctest: +SKIP
+        >>> space.set_keyframe(rgb, depth_m, map_from_camera, relative_sigma=0.05)
+        >>> space.train(iterations=200).psnr_db
+        >>> space.render(map_from_camera, 320, 180, fov_rad=1.57).rgb
+    """
+
+    def __init__(self, config: VirtualSpaceConfig | None = None) -> None:
+        self.config = config or VirtualSpaceConfig()
+        self._device = make_device(self.config)
+        self._scene: Scene | None = None
+        self._rng = np.random.default_rng(self.config.train.seed)
+        self._directions: dict[tuple[int, int, float], NDArray[np.float32]] = {}
+        self._reset_run(refresh=False)
+
+    def _reset_run(self, refresh: bool) -> None:
+        self._schedule = Schedule(self.config.train, refresh)
+        self._psnr_db = math.nan
+        self._colour_error = math.nan
+        self._history: deque[float] = deque(maxlen=self.config.readiness.plateau_iterations + 1)
+        self._ready_iterations = 0
+        self._train_seconds = 0.0
+
+    @property
+    def keyframe(self) -> PanoramaPrior | None:
+        """The keyframe that the space rests on."""
+        return None if self._scene is None else self._scene.prior
+
+    def set_keyframe(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float,
+    ) -> None:
+        """Replaces the keyframe (K = 1, the paper's way); the field goes on from its present weights where it can.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good; the old space stays as it was.
+        """
+        config = self.config
+        prior = prepare(rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width)
+        occupancy = build_occupancy(prior, config.geometry)
+        lattice = Lattice.for_prior(prior, config.field)
+        refresh = self._scene is not None and self._scene.lattice.suits(lattice)
+        if refresh:
+            assert self._scene is not None
+            lattice = self._scene.lattice
+        elif self._scene is not None:
+            self._device.load(FieldParameters.random(config.field, config.train.seed))
+        self._scene = Scene(prior, lattice, occupancy)
+        self._device.set_scene(self._scene)
+        self._reset_run(refresh)
+
+    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
+        """Trains until the time is spent, the iterations are done or the schedule has ended, at least one iteration.
+
+        Raises:
+            NotReadyError: no keyframe yet.
+        """
+        if self._scene is None:
+            raise NotReadyError("no keyframe yet: call set_keyframe first")
+        start = time.perf_counter()
+        done, distance_error = 0, math.nan
+        limit = self.config.train.iterations if iterations is None else iterations
+        shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
+        while not self._schedule.finished and done < limit:
+            uniform = self._rng.random(shape, np.float32)
+            colour, distance = self._device.step(uniform, *self._schedule.rates())
+            self._schedule.iteration += 1
+            done += 1
+            distance_error = math.sqrt(distance)
+            self._note(colour)
+            if (time.perf_counter() - start) * 1e3 >= budget_ms:
+                break
+        elapsed = time.perf_counter() - start
+        self._train_seconds += elapsed
+        return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._schedule.finished)
+
+    def _note(self, colour_error: float) -> None:
+        first = math.isnan(self._colour_error)
+        self._colour_error = colour_error if first else 0.9 * self._colour_error + 0.1 * colour_error
+        self._psnr_db = -10 * math.log10(max(self._colour_error, 1e-10))
+        self._history.append(self._psnr_db)
+        rule = self.config.readiness
+        full = len(self._history) == rule.plateau_iterations + 1
+        plateau = full and self._history[-1] - self._history[0] < rule.plateau_db
+        good = self._psnr_db >= rule.psnr_db and self._schedule.iteration >= 5
+        if not self._ready_iterations and (good or plateau or self._schedule.finished):
+            self._ready_iterations = self._schedule.iteration
+
+    @property
+    def status(self) -> Status:
+        """What the space can show now."""
+        iterations = self._schedule.iteration
+        if self._scene is None:
+            state = State.EMPTY
+        else:
+            state = State.READY if self._ready_iterations else State.TRAINING
+        return Status(
+            state=state,
+            psnr_db=self._psnr_db,
+            iterations=iterations,
+            train_seconds=self._train_seconds,
+            ready_iterations=self._ready_iterations,
+            ms_per_iteration=self._train_seconds * 1e3 / iterations if iterations else 0.0,
+            ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
+            converged=self._scene is not None and self._schedule.finished,
+            device=self._device.name,
+        )
+
+    def _ready_radius_m(self) -> float:
+        """A surface at depth D, wrong by σ·D, seen from b aside is displaced by about b·σ/D radians."""
+        assert self._scene is not None
+        rule, prior = self.config.readiness, self._scene.prior
+        sigma = max(prior.relative_sigma, 1e-3)
+        return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
+
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
+        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+
+        Raises:
+            NotReadyError: no keyframe yet.
+            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+        """
+        if self._scene is None:
+            raise NotReadyError("no keyframe yet: call set_keyframe first")
+        if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
+            raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
+        pose = np.asarray(map_from_camera, np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError("pose of the view must be a finite 4x4 matrix")
+        rays = self._view_rays(pose, width, height, fov_rad)
+        colour, depth, confidence = self._device.draw(rays)
+        image = colour.reshape(height, width, 3)
+        depth = depth.reshape(height, width)
+        if np.any(depth == 0):
+            # What nothing is known of is continued from around it, more from the far side than from the near:
+            # it opens up behind the nearer surface.
+            image = fill_holes(image, depth > 0, weight=depth * depth)
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        return View(rgb, depth, confidence.reshape(height, width))
+
+    def _view_rays(self, pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
+        key = (width, height, round(fov_rad, 6))
+        if key not in self._directions:
+            self._directions.clear()
+            self._directions[key] = perspective_directions(width, height, fov_rad).reshape(-1, 3)
+        directions = self._directions[key]
+        axial = 1 / np.linalg.norm(directions, axis=1)
+        turned = (directions * axial[:, None]) @ pose[:3, :3].T.astype(np.float32)
+        return Rays(pose[:3, 3].astype(np.float32), np.ascontiguousarray(turned), axial, (height, width))
+
+    def parameters(self) -> FieldParameters:
+        """A copy of the field's present parameters."""
+        return self._device.parameters()
+
+
+def make_device(config: VirtualSpaceConfig) -> Device:
+    """The device that ``config.device`` asks for.
+
+    Raises:
+        RuntimeError: CUDA was asked for and torch finds none.
+    """
+    if config.device in ("auto", "cuda"):
+        import torch
+
+        if torch.cuda.is_available():
+            from .torch_device import TorchDevice
+
+            return TorchDevice(config.field, config.train, "cuda")
+        if config.device == "cuda":
+            raise RuntimeError("device is cuda, but torch finds no CUDA device; use auto or cpu")
+    if config.device != "torch-cpu":
+        try:
+            from .numba_device import NumbaDevice
+        except ImportError:
+            if config.device == "cpu":
+                raise
+        else:
+            return NumbaDevice(config.field, config.train)
+    from .torch_device import TorchDevice
+
+    return TorchDevice(config.field, config.train, "cpu")
+
+
+__all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace", "make_device"]

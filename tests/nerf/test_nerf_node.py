@@ -1,0 +1,170 @@
+"""The node in lockstep: keyframe in, status and views out, bad keyframes refused."""
+
+import cv2
+import numpy as np
+import pytest
+
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.msg import (
+    Keyframe,
+    ViewRequest,
+    compressed_image_message,
+    header,
+    image_message,
+    pose_message,
+)
+from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpaceConfig, box_room
+from instant_ic.nodes.nerf import NerfConfig, NerfNode
+
+EMPTY, TRAINING, READY = 0, 1, 2
+S = 1_000_000_000
+SPACE = VirtualSpaceConfig(
+    device="cpu",
+    field=FieldConfig(log2_table=14),
+    train=TrainConfig(ray_columns=64, ray_rows=32, iterations=60),
+)
+CAMERA = pose_matrix(x=0.5, y=-0.2, yaw=0.4)
+
+
+def keyframe_message(number=1, fit=True, depth=None, panorama=None, sigma=0.03):
+    picture = box_room.panorama(CAMERA, 128)
+    if panorama is None:
+        panorama = cv2.imencode(".jpg", picture.rgb[..., ::-1])[1].tobytes()
+    return Keyframe(
+        header=header("map", 7 * S),
+        id=number,
+        pose=pose_message(CAMERA),
+        panorama=compressed_image_message(panorama, "camera", 7 * S),
+        depth=image_message(picture.depth_m if depth is None else depth, "32FC1", "camera", 7 * S),
+        scale=1.0,
+        quality=0.9,
+        relative_sigma=sigma,
+        fit=fit,
+        message="" if fit else "no LiDAR",
+    )
+
+
+def request_message(number, width=160, height=90, fov=1.57, pose=CAMERA):
+    return ViewRequest(
+        header=header("map", 0), id=number, pose=pose_message(pose), fov_rad=fov, width=width, height=height
+    )
+
+
+@pytest.fixture
+def bus():
+    with LockstepBus(start_ns=10 * S) as bus:
+        bus.node = bus.add(NerfNode, NerfConfig(space=SPACE))
+        yield bus
+
+
+def diagnosis(bus, name):
+    return bus.node._diagnoses[name]
+
+
+def test_empty_until_a_keyframe_comes(bus):
+    bus.advance(1.0)
+    status = bus.last("/vspace/status")
+    assert status.state == EMPTY
+    assert "keyframe" in status.message
+    bus.publish("/view/request", request_message(1))
+    assert bus.messages("/vspace/view") == []
+    assert diagnosis(bus, "view")[0] == 1
+
+
+def test_trains_draws_and_comes_to_rest(bus):
+    bus.publish("/keyframe", keyframe_message(number=4), latched=True)
+    assert bus.last("/vspace/status").state == TRAINING
+    bus.advance(0.55)  # status at 0.5 s, before the tick of that time: four ticks of five iterations
+    early = bus.last("/vspace/status")
+    assert early.keyframe_id == 4
+    assert early.iterations == 20
+    bus.advance(3.0)
+    status = bus.last("/vspace/status")
+    assert status.state == READY
+    assert status.iterations == 60
+    assert "idle" in status.message
+    assert 0 < status.ready_seconds <= 1.5
+    assert status.ready_radius_m > 0.5
+    assert status.keyframe_pose.position.x == pytest.approx(0.5)
+    assert status.keyframe_stamp.sec == 7
+
+    bus.publish("/view/request", request_message(11))
+    bus.publish("/view/request", request_message(12, pose=pose_matrix(x=1.0, y=-0.2, yaw=0.4)))
+    views = bus.messages("/vspace/view")
+    assert [v.request_id for v in views] == [11, 12]
+    assert (views[0].width, views[0].height, views[0].keyframe_id) == (160, 90, 4)
+    assert views[0].confidence > 0.9
+    picture = cv2.imdecode(views[0].image.data, cv2.IMREAD_COLOR)[..., ::-1]
+    truth = box_room.perspective(CAMERA, 160, 90, 1.57).rgb
+    psnr = 10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2))
+    assert psnr > 20  # a flat grey of the right mean scores about 15
+    assert len(bus.messages("/vspace/image/compressed")) == 2
+
+
+def test_the_same_input_gives_the_same_bytes():
+    def run():
+        with LockstepBus(start_ns=10 * S) as bus:
+            bus.add(NerfNode, NerfConfig(space=SPACE))
+            bus.publish("/keyframe", keyframe_message(), latched=True)
+            bus.advance(1.0)
+            bus.publish("/view/request", request_message(1))
+            return [r.payload for t in ("/vspace/view", "/vspace/status") for r in bus.records(t)]
+
+    assert run() == run()
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (keyframe_message(2, fit=False), "no LiDAR"),
+        (keyframe_message(2, depth=np.zeros((128, 256), np.float32)), "known in 0%"),
+        (keyframe_message(2, depth=np.full((128, 256), np.nan, np.float32)), "not finite"),
+        (keyframe_message(2, depth=np.ones((100, 256), np.float32)), "depth must be"),
+        (keyframe_message(2, panorama=b"\xff\xd8 this is no picture"), "cannot be decoded"),
+        (keyframe_message(2, panorama=b""), "0 bytes"),
+        (keyframe_message(2, sigma=float("nan")), "relative_sigma"),
+    ],
+    ids=["unfit", "empty-depth", "nan-depth", "depth-shape", "bad-jpeg", "no-jpeg", "nan-sigma"],
+)
+def test_a_bad_keyframe_is_refused_and_the_old_space_stays(bus, message, words):
+    bus.publish("/keyframe", keyframe_message(1), latched=True)
+    bus.advance(0.3)
+    bus.publish("/keyframe", message, latched=True)
+    level, text, _ = diagnosis(bus, "keyframe")
+    assert level == 2
+    assert words in text
+    bus.advance(0.6)
+    status = bus.last("/vspace/status")
+    assert status.keyframe_id == 1
+    assert status.iterations > 10
+    bus.publish("/view/request", request_message(5))
+    assert bus.last("/vspace/view").keyframe_id == 1
+
+
+def test_a_new_keyframe_replaces_the_old(bus):
+    bus.publish("/keyframe", keyframe_message(1), latched=True)
+    bus.advance(1.0)
+    before = bus.last("/vspace/status")
+    bus.publish("/keyframe", keyframe_message(2), latched=True)
+    assert bus.last("/vspace/status").keyframe_id == 2
+    assert bus.last("/vspace/status").iterations == 0
+    bus.advance(0.6)
+    # Five iterations or so into the refresh the field is where it was, not where a new one would be.
+    assert bus.last("/vspace/status").psnr_db > before.psnr_db - 1
+
+
+@pytest.mark.parametrize("request_", [request_message(3, 4000, 4000), request_message(3, fov=3.5), request_message(3, 4, 4)])
+def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
+    bus.publish("/keyframe", keyframe_message(1), latched=True)
+    bus.publish("/view/request", request_)
+    assert bus.messages("/vspace/view") == []
+    assert diagnosis(bus, "view")[0] == 1
+    bus.publish("/view/request", request_message(4))
+    assert bus.last("/vspace/view").request_id == 4
+
+
+@pytest.mark.parametrize("values", [{"train_slice_ms": 0}, {"jpeg_quality": 101}, {"lockstep_iterations": -1}])
+def test_parameters_are_checked(values):
+    with pytest.raises(ValueError, match=next(iter(values))):
+        NerfConfig(**values)
