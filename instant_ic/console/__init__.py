@@ -1,0 +1,30 @@
+"""The operator's console: a web page, its server, and a client for tests.
+
+The folder knows neither the bus nor the messages: :class:`ConsoleServer` takes a :class:`Backend` and
+plain values; :mod:`instant_ic.nodes.console` joins it to the topics.
+"""
+
+from instant_ic.console.client import ConsoleClient
+from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.protocol import Frame, FrameKind, ProtocolError, decode_frame, encode_frame
+from instant_ic.console.server import Backend, ConsoleError, ConsoleServer, ServerConfig
+from instant_ic.console.view import Look, ViewConfig, ViewScheduler
+
+__all__ = [
+    "Backend",
+    "ConsoleClient",
+    "ConsoleError",
+    "ConsoleServer",
+    "DriveConfig",
+    "DriveGate",
+    "Frame",
+    "FrameKind",
+    "Look",
+    "ProtocolError",
+    "ServerConfig",
+    "Verdict",
+    "ViewConfig",
+    "ViewScheduler",
+    "decode_frame",
+    "encode_frame",
+]

@@ -1,0 +1,209 @@
+"""A console client in Python: drives through the page's own WebSocket, for system tests and scripts."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import aiohttp
+
+from instant_ic.console.protocol import Frame, FrameKind, decode_frame, parse_text
+
+
+class ConsoleClient:
+    """One operator without a browser.
+
+    Example::
+
+        async with ConsoleClient("http://127.0.0.1:8080/") as console:
+            await console.acquire()
+            console.drive(0.3, 0.0)
+            await console.wait_for(lambda c: c.mode == "virtual", timeout_s=60)
+
+    ``state``, ``plan``, ``health``, ``session`` and ``hello`` hold the newest message of that type;
+    ``frames[FrameKind.PANORAMA]`` the newest frame.
+    """
+
+    def __init__(self, url: str = "http://127.0.0.1:8080/", *, acknowledge: bool = True) -> None:
+        self.url = url
+        self.acknowledge = acknowledge
+        self.messages: dict[str, dict[str, Any]] = {}
+        self.frames: dict[FrameKind, Frame] = {}
+        self.frame_counts: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
+        self.refused: list[str] = []
+        self.errors: list[str] = []
+        self.round_trip_s: float | None = None
+        self._offset_ms: float | None = None
+        self._sequence = 0
+        self._command = (0.0, 0.0)
+        self._http: aiohttp.ClientSession | None = None
+        self._socket: aiohttp.ClientWebSocketResponse | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+        self._news = asyncio.Condition()
+
+    async def __aenter__(self) -> Self:
+        await self.connect()
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self.close()
+
+    async def connect(self, timeout_s: float = 10.0) -> None:
+        """Connects and waits until the clock offset to the server is known."""
+        self._http = aiohttp.ClientSession()
+        parts = urlsplit(self.url)
+        try:
+            self._socket = await asyncio.wait_for(
+                self._http.ws_connect(
+                    f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}/ws",
+                    headers={"Origin": f"{parts.scheme}://{parts.netloc}"},
+                    max_msg_size=32 << 20,
+                ),
+                timeout_s,
+            )
+        except BaseException:
+            await self._http.close()
+            raise
+        self._tasks = [asyncio.create_task(self._read()), asyncio.create_task(self._beat())]
+        await self.wait_for(lambda c: c._offset_ms is not None and "hello" in c.messages, timeout_s)
+
+    async def close(self) -> None:
+        """Stops and disconnects."""
+        for task in self._tasks:
+            task.cancel()
+        for task in self._tasks:
+            with contextlib.suppress(asyncio.CancelledError, aiohttp.ClientError, ConnectionError):
+                await task
+        if self._socket is not None:
+            await self._socket.close()
+        if self._http is not None:
+            await self._http.close()
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """Newest ``state`` message; empty before the first."""
+        return self.messages.get("state", {})
+
+    @property
+    def session(self) -> dict[str, Any]:
+        """Newest ``session`` message; empty before the first."""
+        return self.messages.get("session", {})
+
+    @property
+    def mode(self) -> str | None:
+        """Mode of the newest state: real, virtual, stopped or none; None before the first."""
+        return self.state.get("mode")
+
+    @property
+    def closed(self) -> bool:
+        """Whether the socket is closed."""
+        return self._socket is None or self._socket.closed
+
+    async def acquire(self, *, take: bool = False, timeout_s: float = 5.0) -> None:
+        """Becomes the driver; TimeoutError when another client keeps the lease."""
+        await self.send({"type": "lease", "take": take})
+        await self.wait_for(lambda c: c.session.get("driver") == "you", timeout_s)
+
+    def drive(self, linear: float, angular: float) -> None:
+        """From now on sends this command (m/s, rad/s) at 20 Hz, until :meth:`stop`."""
+        self._command = (linear, angular)
+
+    async def stop(self) -> None:
+        """Sends a zero command at once, and none after it."""
+        self._command = (0.0, 0.0)
+        await self.send_drive(0.0, 0.0)
+
+    async def estop(self) -> None:
+        """Sets the emergency stop."""
+        await self.send({"type": "estop"})
+
+    async def release_estop(self) -> None:
+        """Releases the emergency stop (drivers only)."""
+        await self.send({"type": "estop_release"})
+
+    async def look(self, yaw: float, pitch: float = 0.0, hfov: float = 1.57, vfov: float = 1.02) -> None:
+        """Turns the look direction (rad, left and up positive, relative to the robot's heading)."""
+        await self.send({"type": "look", "yaw": yaw, "pitch": pitch, "hfov": hfov, "vfov": vfov})
+
+    async def send_drive(self, linear: float, angular: float, *, age_s: float = 0.0) -> None:
+        """Sends one drive command, stamped ``age_s`` ago."""
+        if self._offset_ms is None:
+            raise RuntimeError("console client: connect() first")
+        self._sequence += 1
+        stamp = time.monotonic() * 1000 + self._offset_ms - age_s * 1000
+        await self.send(
+            {"type": "drive", "seq": self._sequence, "time_ms": stamp, "linear": linear, "angular": angular}
+        )
+
+    async def send(self, message: dict[str, Any]) -> None:
+        """Sends any text message."""
+        if self._socket is None:
+            raise RuntimeError("console client: connect() first")
+        await self._socket.send_json(message)
+
+    async def wait_for(self, predicate: Callable[[ConsoleClient], object], timeout_s: float = 10.0) -> None:
+        """Waits until ``predicate(self)`` is true after some message.
+
+        Raises:
+            TimeoutError: with the newest state in its text.
+            ConnectionError: the server closed the connection.
+        """
+        try:
+            async with asyncio.timeout(timeout_s):
+                async with self._news:
+                    while not predicate(self):
+                        if self._socket is None or self._socket.closed:
+                            raise ConnectionError(f"console client: {self.url} closed the connection")
+                        await self._news.wait()
+        except TimeoutError:
+            raise TimeoutError(
+                f"console client: not true within {timeout_s:g} s; state {self.state}, session {self.session}"
+            ) from None
+
+    async def _read(self) -> None:
+        assert self._socket is not None
+        try:
+            async for message in self._socket:
+                if message.type is aiohttp.WSMsgType.BINARY:
+                    await self._on_frame(decode_frame(message.data))
+                elif message.type is aiohttp.WSMsgType.TEXT:
+                    self._on_text(parse_text(message.data))
+                async with self._news:
+                    self._news.notify_all()
+        finally:
+            async with self._news:
+                self._news.notify_all()
+
+    async def _on_frame(self, frame: Frame) -> None:
+        self.frames[frame.kind] = frame
+        self.frame_counts[frame.kind] += 1
+        if self.acknowledge:
+            await self.send({"type": "ack", "kind": int(frame.kind), "seq": frame.sequence})
+
+    def _on_text(self, message: dict[str, Any]) -> None:
+        kind = message["type"]
+        self.messages[kind] = message
+        if kind == "pong":
+            now_ms = time.monotonic() * 1000
+            round_trip_ms = now_ms - message["client_ms"]
+            self.round_trip_s = round_trip_ms / 1000
+            self._offset_ms = message["server_ms"] + round_trip_ms / 2 - now_ms
+        elif kind == "refused":
+            self.refused.append(message["reason"])
+        elif kind == "error":
+            self.errors.append(message["text"])
+
+    async def _beat(self) -> None:
+        assert self._socket is not None
+        beat = 0
+        while not self._socket.closed:
+            if beat % 5 == 0:
+                await self.send({"type": "ping", "client_ms": time.monotonic() * 1000})
+            if self._command != (0.0, 0.0) and self._offset_ms is not None:
+                await self.send_drive(*self._command)
+            beat += 1
+            await asyncio.sleep(0.05)

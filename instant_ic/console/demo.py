@@ -1,0 +1,292 @@
+"""The page with made-up data, for work on the page: ``python -m instant_ic.console.demo``.
+
+A robot in a room, driven from the page, with an obstacle ahead. What it does at the obstacle is a
+sketch of the method that lets the page be tried; the real thing is instant_ic.control.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.console import demo_world
+from instant_ic.console.gridimage import GridImage, grid_image
+from instant_ic.console.protocol import FrameKind
+from instant_ic.console.server import ConsoleServer, ServerConfig
+from instant_ic.console.view import Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
+from instant_ic.geometry.projections import equirect_directions, perspective_directions
+
+CAMERA_HEIGHT_M = 1.2
+STEP_S = 0.05
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Sizes and rates of the made-up pictures."""
+
+    panorama_width: int = 640
+    panorama_hz: float = 5.0
+    view: ViewConfig = field(default_factory=ViewConfig)
+
+
+class Demo:
+    """A backend with a robot of its own. ``start`` and ``stop`` run it beside a server."""
+
+    def __init__(self, server_config: ServerConfig, config: DemoConfig | None = None) -> None:
+        self.config = config or DemoConfig()
+        page = {"dissolve_ms": 250, "footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
+        self.server = ConsoleServer(self, server_config, page)
+        self.commands: list[tuple[float, float]] = []
+        self.look = Look()
+        self.estop = False
+        self.forced_mode: str | None = None
+        self.mode = "real"
+        self.reason = ""
+        self.robot: Pose = np.zeros(3)
+        self.vbot: Pose = np.zeros(3)
+        self.plan: dict[str, Any] = {"trajectory": [], "path": [], "subgoal": None}
+        self.costmap: GridImage | None = None
+        self._command = (0.0, 0.0)
+        self._commanded = -math.inf
+        self._transitions = 0
+        self._views = ViewScheduler(self.config.view)
+        self._slow_due = 0.0
+        self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
+        self._stop = threading.Event()
+        self._threads = [
+            threading.Thread(target=run, name=f"console-demo-{run.__name__}", daemon=True)
+            for run in (self._move, self._draw)
+        ]
+
+    def on_drive(self, linear: float, angular: float) -> None:
+        """See Backend."""
+        self.commands.append((linear, angular))
+        self._command = (linear, angular)
+        self._commanded = time.monotonic()
+
+    def on_estop(self, stop: bool) -> None:
+        """See Backend."""
+        self.estop = stop
+
+    def on_look(self, look: Look) -> None:
+        """See Backend."""
+        self.look = look
+
+    def start(self) -> None:
+        """Starts the server and the robot."""
+        self.server.start()
+        grid, origin = demo_world.occupancy()
+        for kind, cells in ((FrameKind.MAP, grid), (FrameKind.COSTMAP, demo_world.inflate(grid, 0.05))):
+            image = grid_image(cells, 0.05, origin)
+            assert image is not None
+            self.server.send_frame(kind, image.header, image.png)
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Ends both."""
+        self._stop.set()
+        for thread in self._threads:
+            thread.join(timeout=5.0)
+        self.server.stop()
+
+    def _move(self) -> None:
+        last = time.monotonic()
+        while not self._stop.wait(STEP_S):
+            now = time.monotonic()
+            self.step(min(now - last, 0.2))
+            last = now
+            self._tell()
+
+    def _draw(self) -> None:
+        due = 0.0
+        while not self._stop.wait(0.01):
+            now = time.monotonic()
+            if now >= due:
+                due = now + 1.0 / self.config.panorama_hz
+                self._send_panorama()
+            if self._views.due(now, virtual=self.mode == "virtual"):
+                self._send_view(self._views.asked(now))
+
+    def step(self, seconds: float) -> None:
+        """Moves both robots on."""
+        v, w = (0.0, 0.0) if self.estop else self._command
+        before = self.mode
+        if self.estop:
+            self.mode, self.reason = "stopped", "Emergency stop"
+        elif self.forced_mode is not None:
+            self.mode, self.reason = self.forced_mode, ""
+        elif self.mode == "stopped":
+            self.mode, self.reason = "real", ""
+        elif self.mode == "real" and v > 0 and _hits(_ahead(self.robot, v, w, 1.0)):
+            self.mode, self.reason = "virtual", "Obstacle ahead: the robot goes round it"
+        elif self.mode == "virtual" and self._met() and not _hits(_ahead(self.robot, v, w, 0.5)):
+            self.mode, self.reason = "real", "Robot and virtual robot met"
+        self._transitions += before != self.mode
+        if self.mode == "virtual":
+            if before != "virtual":
+                self.vbot = self.robot.copy()
+            self.vbot = _moved(self.vbot, v, w, seconds)
+            self._follow(seconds)
+        elif self.mode == "real":
+            self.robot = _moved(self.robot, v, w, seconds)
+            self.plan["path"], self.plan["subgoal"] = [], None
+        shown = self.vbot if self.mode == "virtual" else self.robot
+        self.plan["trajectory"] = _ahead(shown, v, w, 3.0 * abs(v)).round(3).tolist() if v else []
+
+    def _met(self) -> bool:
+        gap = np.hypot(*(self.vbot - self.robot)[:2])
+        return bool(gap < 0.12 and abs(wrap_angle(self.vbot[2] - self.robot[2])) < 0.1)
+
+    def _follow(self, seconds: float) -> None:
+        """Goes to the v-bot, round the obstacle's left side where the straight way is blocked."""
+        box = demo_world.OBSTACLE
+        goal = self.vbot[:2].copy()
+        if _hits(goal[None]):
+            goal = np.array([box.high[0] + 0.75, 0.0])
+        points = [self.robot[:2], goal]
+        side = box.high[1] + 0.55
+        if self.robot[0] < box.high[0] + 0.3 < goal[0] + 0.3 and abs(goal[1]) < side:
+            points[1:1] = [np.array([box.low[0] - 0.1, side]), np.array([box.high[0] + 0.35, side])]
+            points[1:-1] = [p for p in points[1:-1] if p[0] > self.robot[0] + 0.05]
+        self.plan["path"] = [p.round(3).tolist() for p in points]
+        self.plan["subgoal"] = [*goal.round(3).tolist(), float(self.vbot[2])]
+        reach = points[1] - self.robot[:2]
+        distance = float(np.hypot(*reach))
+        far = distance > 0.08
+        turn = wrap_angle((math.atan2(reach[1], reach[0]) if far else self.vbot[2]) - self.robot[2])
+        speed = min(0.4, 1.5 * distance) * max(0.0, math.cos(turn)) if far else 0.0
+        self.robot = _moved(self.robot, speed, float(np.clip(2.5 * turn, -1.2, 1.2)), seconds)
+
+    def _tell(self) -> None:
+        now = time.monotonic()
+        v, w = self._command
+        self.server.publish(
+            "state",
+            {
+                "at_ms": self.server.now_ms(),
+                "mode": self.mode,
+                "reason": self.reason,
+                "estop": self.estop,
+                "blocked": False,
+                "transitions": self._transitions,
+                "robot": self.robot.round(4).tolist(),
+                "vbot": self.vbot.round(4).tolist() if self.mode == "virtual" else None,
+                "command": [v, w],
+                "applied": [v, w],
+            },
+        )
+        self.server.show(FrameKind.VIEW if self.mode == "virtual" else FrameKind.PANORAMA)
+        if now >= self._slow_due:
+            self._slow_due = now + 0.5
+            self._tell_health()
+        self.server.publish("plan", self.plan)
+
+    def _tell_health(self) -> None:
+        vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
+        battery = {"voltage": 24.6, "percent": 81.0}
+        self.server.publish("health", {"vspace": vspace, "battery": battery, "faults": [], "rates": {}})
+
+    def _send_panorama(self) -> None:
+        captured_ms = self.server.now_ms()
+        camera = _camera(self.robot)
+        picture = demo_world.shade(_position(camera), _turned(self._directions, camera))
+        header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist()}
+        self.server.send_frame(FrameKind.PANORAMA, header, _jpeg(picture))
+
+    def _send_view(self, request_id: int) -> None:
+        captured_ms = self.server.now_ms()
+        look = self.look
+        shape = view_shape(look, self.config.view)
+        camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
+        directions = _turned(perspective_directions(shape.width, shape.height, shape.fov_rad), camera)
+        picture = demo_world.shade(_position(camera), directions)
+        header = {
+            "captured_ms": captured_ms,
+            "q": quaternion_from_matrix(camera).tolist(),
+            "p": camera[:3, 3].tolist(),
+            "fov": shape.fov_rad,
+            "confidence": 0.9,
+            "render_ms": 20.0,
+            "request_id": request_id,
+        }
+        self.server.send_frame(FrameKind.VIEW, header, _jpeg(picture))
+        self._views.answered(request_id)
+
+
+def _camera(pose: Pose) -> NDArray[np.float64]:
+    return pose_matrix(pose[0], pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, pose[2])
+
+
+def _position(camera: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = camera[:3, 3]
+    return float(x), float(y), float(z)
+
+
+def _turned(directions: NDArray[np.float32], camera: NDArray[np.float64]) -> NDArray[np.float32]:
+    rotation = matrix_from_quaternion(quaternion_from_matrix(camera))[:3, :3].astype(np.float32)
+    turned: NDArray[np.float32] = directions @ rotation.T
+    return turned
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    import cv2
+
+    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+    if not ok:
+        raise ValueError(f"JPEG encoder refused a picture of shape {picture.shape}")
+    return bytes(data.tobytes())
+
+
+def _moved(pose: Pose, v: float, w: float, seconds: float) -> Pose:
+    middle = pose[2] + w * seconds / 2
+    step = np.array([v * math.cos(middle), v * math.sin(middle), w]) * seconds
+    moved: Pose = pose + step
+    moved[2] = wrap_angle(moved[2])
+    return moved
+
+
+def _ahead(pose: Pose, v: float, w: float, metres: float) -> Pose:
+    """Where a command leads, (N, 2), up to ``metres`` of way."""
+    points = []
+    for _ in range(40):
+        points.append(pose[:2])
+        pose = _moved(pose, math.copysign(1.0, v) if v else 0.0, w / abs(v) if v else w, metres / 40)
+    return np.array(points)
+
+
+def _hits(points: Pose) -> bool:
+    box, margin = demo_world.OBSTACLE, 0.35
+    low, high = np.array(box.low[:2]) - margin, np.array(box.high[:2]) + margin
+    return bool(((points > low) & (points < high)).all(axis=1).any())
+
+
+def main() -> None:
+    """Serves the demo until Ctrl-C."""
+    parser = argparse.ArgumentParser(
+        prog="python -m instant_ic.console.demo", description=(__doc__ or "").partition("\n")[0]
+    )
+    parser.add_argument("--port", type=int, default=8080, help="port of the page (default 8080)")
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO)
+    demo = Demo(ServerConfig(port=arguments.port))
+    demo.start()
+    logging.getLogger("instant_ic.console.demo").info("open %s (Ctrl-C ends)", demo.server.url)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        demo.stop()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Occupancy grids and costmaps as small PNGs for the page."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+UNKNOWN = 255
+
+
+@dataclass(frozen=True)
+class GridImage:
+    """A grid as a grey PNG.
+
+    ``header``: resolution (m), width and height (cells), x and y (m): the lower left corner of the
+    picture in the grid's frame. Row 0 of the PNG is the highest y.
+    """
+
+    header: dict[str, float]
+    png: bytes
+    digest: int
+
+
+def grid_image(
+    grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float, float], *, crop: bool = True
+) -> GridImage | None:
+    """PNG of ``grid`` (H, W) int8, row 0 = lowest y, -1 unknown, 0..100.
+
+    Args:
+        grid: cells.
+        resolution: metres a cell.
+        origin_xy: lower left corner of the grid, m.
+        crop: cut to what is known, with a margin of 2 cells.
+
+    Returns:
+        None when nothing is known.
+    """
+    import cv2
+
+    known_rows = np.flatnonzero((grid >= 0).any(axis=1))
+    known_columns = np.flatnonzero((grid >= 0).any(axis=0))
+    if len(known_rows) == 0:
+        return None
+    row_0, row_1, column_0, column_1 = 0, grid.shape[0], 0, grid.shape[1]
+    if crop:
+        row_0, row_1 = max(known_rows[0] - 2, 0), min(known_rows[-1] + 3, row_1)
+        column_0, column_1 = max(known_columns[0] - 2, 0), min(known_columns[-1] + 3, column_1)
+    cells = grid[row_0:row_1, column_0:column_1]
+    grey = np.ascontiguousarray(np.where(cells < 0, UNKNOWN, cells).astype(np.uint8)[::-1])
+    ok, png = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise ValueError(f"PNG encoder refused a grid of {grey.shape[1]}x{grey.shape[0]} cells")
+    header = {
+        "resolution": float(resolution),
+        "width": int(grey.shape[1]),
+        "height": int(grey.shape[0]),
+        "x": float(origin_xy[0] + column_0 * resolution),
+        "y": float(origin_xy[1] + row_0 * resolution),
+    }
+    data = png.tobytes()
+    return GridImage(header, data, zlib.crc32(data, zlib.crc32(repr(header).encode())))

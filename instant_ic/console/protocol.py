@@ -1,0 +1,119 @@
+"""The console's WebSocket protocol: JSON text messages, and binary frames for pictures and maps.
+
+Binary frame, little endian::
+
+    offset 0   uint8   version (1)
+    offset 1   uint8   kind (FrameKind)
+    offset 2   uint16  0
+    offset 4   uint32  sequence number, grows by one a kind and client
+    offset 8   uint32  length of the header, bytes
+    offset 12          header: JSON, UTF-8
+    then               payload: JPEG or PNG
+
+docs/console.md lists the fields of each message and header.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+VERSION = 1
+PREFIX = struct.Struct("<BBHII")
+
+
+class ProtocolError(ValueError):
+    """A message that does not follow the protocol; says which field and what it held."""
+
+
+class FrameKind(IntEnum):
+    """What a binary frame holds."""
+
+    PANORAMA = 1  # equirect JPEG as the camera sent it
+    VIEW = 2  # perspective JPEG of the virtual space
+    MAP = 3  # 8-bit grey PNG: 0..100 occupied %, 255 unknown; row 0 is the highest y
+    COSTMAP = 4  # the same layout; 0..100 cost
+
+
+PICTURES = (FrameKind.PANORAMA, FrameKind.VIEW)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One binary frame."""
+
+    kind: FrameKind
+    sequence: int
+    header: dict[str, Any]
+    payload: bytes
+
+
+def encode_frame(frame: Frame) -> bytes:
+    """Bytes of ``frame`` for one binary WebSocket message."""
+    header = json.dumps(frame.header, separators=(",", ":"), allow_nan=False).encode()
+    return PREFIX.pack(VERSION, frame.kind, 0, frame.sequence, len(header)) + header + frame.payload
+
+
+def decode_frame(data: bytes) -> Frame:
+    """Frame from the bytes of one binary WebSocket message.
+
+    Raises:
+        ProtocolError: too short, unknown version or kind, or a header that is no JSON object.
+    """
+    if len(data) < PREFIX.size:
+        raise ProtocolError(f"binary frame of {len(data)} bytes: the prefix alone has {PREFIX.size}")
+    version, kind, _, sequence, header_length = PREFIX.unpack_from(data)
+    if version != VERSION:
+        raise ProtocolError(f"binary frame of version {version}: this side speaks {VERSION}")
+    end = PREFIX.size + header_length
+    if end > len(data):
+        raise ProtocolError(f"binary frame of {len(data)} bytes: its header should end at {end}")
+    try:
+        frame_kind = FrameKind(kind)
+        header = json.loads(data[PREFIX.size : end])
+    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
+        raise ProtocolError(f"binary frame: {error}") from None
+    if not isinstance(header, dict):
+        raise ProtocolError(f"binary frame: header is {type(header).__name__}, not an object")
+    return Frame(frame_kind, sequence, header, data[end:])
+
+
+def parse_text(text: str) -> dict[str, Any]:
+    """JSON object with a string ``type``; anything else raises ProtocolError."""
+    try:
+        message = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"text message is no JSON: {error}") from None
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise ProtocolError("text message must be an object with a string 'type'")
+    return message
+
+
+def number(message: dict[str, Any], key: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """Finite number ``message[key]`` within [low, high]; ProtocolError otherwise."""
+    value = message.get(key)
+    # json.loads takes NaN, Infinity and integers of any length, none of which may reach a motor.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(_as_float(value)):
+        raise ProtocolError(f"{message['type']}.{key} must be a finite number (got {value!r:.40})")
+    if not low <= value <= high:
+        raise ProtocolError(f"{message['type']}.{key} must be in [{low:g}, {high:g}] (got {value:g})")
+    return float(value)
+
+
+def whole(message: dict[str, Any], key: str) -> int:
+    """Integer ``message[key]`` in [0, 2**53]; ProtocolError otherwise."""
+    value = message.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**53:
+        raise ProtocolError(f"{message['type']}.{key} must be a whole number (got {value!r:.40})")
+    return value
+
+
+def _as_float(value: int | float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf

@@ -1,0 +1,459 @@
+"""HTTP and WebSocket server of the operator's page, in its own thread.
+
+It knows no bus: what the operator does goes to a :class:`Backend`, what the operator sees comes by
+:meth:`ConsoleServer.publish` and :meth:`ConsoleServer.send_frame`, which any thread may call.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import json
+import logging
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+from urllib.parse import urlsplit
+
+from aiohttp import WSCloseCode, WSMsgType, web
+
+from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.protocol import FrameKind, ProtocolError, number, parse_text, whole
+from instant_ic.console.session import PendingFrame, Session
+from instant_ic.console.view import MAX_FOV_RAD, Look
+
+STATIC = Path(__file__).parent / "static"
+MAX_CLIENT_MESSAGE = 4096
+MAX_BAD_MESSAGES = 20
+SILENT_CLIENT_S = 15.0
+START_TIMEOUT_S = 10.0
+SECURITY_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-cache",  # a new version of the page must not meet an old module
+}
+logger = logging.getLogger("instant_ic.console")
+
+
+class ConsoleError(RuntimeError):
+    """The server cannot start; says why and what to do."""
+
+
+class Backend(Protocol):
+    """What the operator's actions do. Called on the server's thread: return at once."""
+
+    def on_drive(self, linear: float, angular: float) -> None:
+        """Command to give on now, m/s and rad/s: 20 Hz while driving, zeros after a stop."""
+
+    def on_estop(self, stop: bool) -> None:
+        """Emergency stop set (any client) or released (the driver)."""
+
+    def on_look(self, look: Look) -> None:
+        """Look direction and field of view of the driver."""
+
+
+@dataclass(frozen=True)
+class ServerConfig:
+    """Where the page is served, and to whom."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080  # 0 = any free port
+    allowed_hosts: tuple[str, ...] = ()  # names by which browsers may reach the page besides localhost
+    max_clients: int = 16
+    background_picture_hz: float = 2.0  # pictures that are not shown (camera in the v-space)
+    drive: DriveConfig = field(default_factory=DriveConfig)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65535:
+            raise ValueError(f"port must be in [0, 65535] (got {self.port})")
+        if self.max_clients < 1:
+            raise ValueError(f"max_clients must be >= 1 (got {self.max_clients})")
+        if not self.background_picture_hz > 0:
+            raise ValueError(f"background_picture_hz must be > 0 (got {self.background_picture_hz})")
+
+
+class ConsoleServer:
+    """Serves the page and its WebSocket at ``/ws``.
+
+    Args:
+        backend: gets what the operator does.
+        config: address and limits.
+        page: values for the page (dissolve time, footprint, ...), sent in ``hello``.
+    """
+
+    def __init__(
+        self, backend: Backend, config: ServerConfig | None = None, page: dict[str, Any] | None = None
+    ) -> None:
+        self.backend = backend
+        self.config = config or ServerConfig()
+        self.page = page or {}
+        self.gate = DriveGate(self.config.drive)
+        self.port = 0
+        self._sessions: dict[int, Session] = {}
+        self._next_number = 1
+        self._texts: dict[str, str] = {}
+        self._frames: dict[FrameKind, PendingFrame] = {}
+        self._foreground = FrameKind.PANORAMA
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
+        self._gate_wake = asyncio.Event()
+        self._finish = asyncio.Event()
+        self._started: threading.Event = threading.Event()
+        self._start_error: Exception | None = None
+
+    # ---- any thread -------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Binds the port and serves; ConsoleError when that fails."""
+        self._thread = threading.Thread(target=self._run, name="console-server", daemon=True)
+        self._thread.start()
+        if not self._started.wait(START_TIMEOUT_S):
+            raise ConsoleError(f"console: server did not start within {START_TIMEOUT_S:g} s")
+        if self._start_error is not None:
+            raise ConsoleError(
+                f"console: cannot listen on {self.config.host}:{self.config.port}: {self._start_error}; "
+                "stop what uses the port or set server.port"
+            ) from self._start_error
+
+    def stop(self) -> None:
+        """Stops the robot's command, closes every client and ends the thread."""
+        if self._thread is None:
+            return
+        if self._loop is not None and self._thread.is_alive():
+            # The loop may end between the test and the call.
+            with contextlib.suppress(RuntimeError):
+                self._loop.call_soon_threadsafe(self._finish.set)
+        self._thread.join(timeout=5.0)
+        if self._thread.is_alive():
+            raise ConsoleError("console: server thread did not end within 5 s")
+        self._thread = None
+
+    @property
+    def url(self) -> str:
+        """Address of the page."""
+        host = "127.0.0.1" if self.config.host in ("0.0.0.0", "::") else self.config.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
+
+    @staticmethod
+    def now_ms() -> float:
+        """The server's clock for the page: monotonic milliseconds."""
+        return time.monotonic() * 1000.0
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        """Sends a text message of type ``kind`` to every client; only the newest of a kind waits."""
+        text = json.dumps({"type": kind, **message}, separators=(",", ":"), allow_nan=False)
+        self._call(self._publish, kind, text)
+
+    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
+        """Sends a picture or map to every client; only the newest of a kind waits."""
+        self._call(self._send_frame, kind, PendingFrame(header, payload))
+
+    def show(self, kind: FrameKind) -> None:
+        """Says which of PANORAMA and VIEW the page shows; the other is sent rarely."""
+        self._call(self._show, kind)
+
+    def _call(self, function: Callable[..., None], *args: Any) -> None:
+        if self._loop is None:
+            return
+        # After stop() there is nobody left to tell.
+        with contextlib.suppress(RuntimeError):
+            self._loop.call_soon_threadsafe(function, *args)
+
+    # ---- the server's thread ----------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._serve())
+        except OSError as error:
+            self._start_error = error
+        finally:
+            self._started.set()
+
+    async def _serve(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        app = web.Application(middlewares=[self._guard])
+        app.router.add_get("/", self._index)
+        app.router.add_get("/health", self._health)
+        app.router.add_get("/ws", self._websocket)
+        app.router.add_static("/static/", STATIC)
+        runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        await runner.setup()
+        try:
+            site = web.TCPSite(runner, self.config.host, self.config.port)
+            await site.start()
+            self.port = runner.addresses[0][1]
+            drive_task = asyncio.create_task(self._drive_forever())
+            self._started.set()
+            await self._finish.wait()
+            drive_task.cancel()
+            self.gate.stop(time.monotonic())
+            self._emit_due()
+            for session in list(self._sessions.values()):
+                await session.socket.close(code=WSCloseCode.GOING_AWAY, message=b"console ends")
+        finally:
+            await runner.cleanup()
+
+    @web.middleware
+    async def _guard(
+        self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+    ) -> web.StreamResponse:
+        if not host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts):
+            raise web.HTTPForbidden(text="unknown Host; name it in server.allowed_hosts\n")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(SECURITY_HEADERS)
+        return response
+
+    async def _index(self, request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(STATIC / "index.html")
+
+    async def _health(self, request: web.Request) -> web.StreamResponse:
+        return web.json_response(
+            {
+                "clients": len(self._sessions),
+                "driver": self.gate.driver,
+                "estop": self.gate.estop,
+                "watchdog_trips": self.gate.watchdog_trips,
+                "commands": {verdict.name.lower(): count for verdict, count in self.gate.counts.items()},
+            }
+        )
+
+    async def _websocket(self, request: web.Request) -> web.StreamResponse:
+        if not origin_allowed(request.headers.get("Origin"), request.headers.get("Host", "")):
+            logger.warning("refused a WebSocket from origin %r", request.headers.get("Origin"))
+            raise web.HTTPForbidden(text="Origin does not match Host\n")
+        if len(self._sessions) >= self.config.max_clients:
+            raise web.HTTPServiceUnavailable(text=f"{self.config.max_clients} clients already\n")
+        socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=1.0)
+        await socket.prepare(request)
+        session = Session(self._next_number, socket, time.monotonic())
+        self._next_number += 1
+        self._sessions[session.number] = session
+        self._greet(session)
+        sender = asyncio.create_task(session.send_forever())
+        try:
+            await self._read_forever(session)
+        finally:
+            sender.cancel()
+            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                await sender
+            self.gate.forget(session.number, time.monotonic())
+            del self._sessions[session.number]
+            self._emit_due()
+            self._tell_session()
+        return socket
+
+    def _greet(self, session: Session) -> None:
+        drive = self.config.drive
+        session.reply(
+            {
+                "type": "hello",
+                "client": session.number,
+                "server_ms": self.now_ms(),
+                "max_linear": drive.max_linear_mps,
+                "max_angular": drive.max_angular_rps,
+                "rate_hz": drive.rate_hz,
+                "page": self.page,
+            }
+        )
+        for key, text in self._texts.items():
+            session.put_text(key, text)
+        for kind, frame in self._frames.items():
+            session.put_frame(kind, frame)
+        session.set_foreground(self._foreground, 1.0 / self.config.background_picture_hz)
+        self._tell_session()
+
+    async def _read_forever(self, session: Session) -> None:
+        while True:
+            try:
+                message = await session.socket.receive(timeout=SILENT_CLIENT_S)
+            except TimeoutError:
+                await session.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"silent")
+                return
+            if message.type is not WSMsgType.TEXT:
+                if message.type is WSMsgType.BINARY:
+                    await session.socket.close(code=WSCloseCode.UNSUPPORTED_DATA)
+                return
+            now = time.monotonic()
+            session.last_heard = now
+            try:
+                self._handle(session, parse_text(message.data), now)
+            except ProtocolError as error:
+                session.bad_messages += 1
+                logger.warning("client %d: %s", session.number, error)
+                if session.bad_messages >= MAX_BAD_MESSAGES:
+                    await session.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"bad messages")
+                    return
+                session.reply({"type": "error", "text": str(error)})
+
+    def _handle(self, session: Session, message: dict[str, Any], now: float) -> None:
+        kind = message["type"]
+        handler = {
+            "ping": self._on_ping,
+            "drive": self._on_drive,
+            "lease": self._on_lease,
+            "yield": self._on_yield,
+            "estop": self._on_estop,
+            "estop_release": self._on_estop_release,
+            "look": self._on_look,
+            "ack": self._on_ack,
+        }.get(kind)
+        if handler is None:
+            raise ProtocolError(f"unknown message type {kind!r:.40}")
+        self.gate.touch(session.number, now)
+        handler(session, message, now)
+
+    def _on_ping(self, session: Session, message: dict[str, Any], now: float) -> None:
+        age_s = self.gate.last_age_s
+        session.reply(
+            {
+                "type": "pong",
+                "client_ms": number(message, "client_ms"),
+                "server_ms": self.now_ms(),
+                "command_age_ms": None if age_s is None else max(age_s, 0.0) * 1000.0,
+            }
+        )
+
+    def _on_drive(self, session: Session, message: dict[str, Any], now: float) -> None:
+        age_s = (self.now_ms() - number(message, "time_ms")) / 1000.0
+        linear, angular = number(message, "linear"), number(message, "angular")
+        verdict = self.gate.receive(session.number, whole(message, "seq"), age_s, linear, angular, time.monotonic())
+        # A zero needs no permission, and out-of-order ones are harmless: only refused motion is told.
+        if verdict is not Verdict.ACCEPTED and (linear, angular) != (0.0, 0.0):
+            session.reply({"type": "refused", "reason": verdict.name.lower(), "text": verdict.value})
+        self._emit_due()
+
+    def _on_lease(self, session: Session, message: dict[str, Any], now: float) -> None:
+        take = message.get("take", False)
+        if not isinstance(take, bool):
+            raise ProtocolError(f"lease.take must be true or false (got {take!r:.40})")
+        self.gate.request(session.number, now, take=take)
+        self._emit_due()
+        self._tell_session()
+
+    def _on_yield(self, session: Session, message: dict[str, Any], now: float) -> None:
+        self.gate.leave(session.number, now)
+        self._emit_due()
+        self._tell_session()
+
+    def _on_estop(self, session: Session, message: dict[str, Any], now: float) -> None:
+        self.gate.set_estop(now)
+        self.backend.on_estop(True)
+        self._emit_due()
+        self._tell_session()
+        logger.warning("emergency stop from client %d", session.number)
+
+    def _on_estop_release(self, session: Session, message: dict[str, Any], now: float) -> None:
+        if not self.gate.release_estop(session.number):
+            session.reply({"type": "refused", "reason": "not_driver", "text": "only the driver may release"})
+            return
+        self.backend.on_estop(False)
+        self._tell_session()
+        logger.warning("emergency stop released by client %d", session.number)
+
+    def _on_look(self, session: Session, message: dict[str, Any], now: float) -> None:
+        look = Look(
+            yaw=number(message, "yaw", -6.3, 6.3),
+            pitch=number(message, "pitch", -1.6, 1.6),
+            hfov=number(message, "hfov", 0.01, MAX_FOV_RAD),
+            vfov=number(message, "vfov", 0.01, MAX_FOV_RAD),
+        )
+        # The renderer has one camera: it looks where the driver looks, or the only one who watches.
+        if self.gate.driver in (session.number, None):
+            self.backend.on_look(look)
+
+    def _on_ack(self, session: Session, message: dict[str, Any], now: float) -> None:
+        try:
+            kind = FrameKind(whole(message, "kind"))
+        except ValueError as error:
+            raise ProtocolError(f"ack.kind: {error}") from None
+        session.acknowledge(kind, whole(message, "seq"))
+
+    async def _drive_forever(self) -> None:
+        while True:
+            driver, trips = self.gate.driver, self.gate.watchdog_trips
+            deadline = self.gate.next_deadline(time.monotonic())
+            self._gate_wake.clear()
+            with contextlib.suppress(TimeoutError):
+                delay = None if deadline is None else max(deadline - time.monotonic(), 0.001)
+                await asyncio.wait_for(self._gate_wake.wait(), delay)
+                continue  # woken: what is due may have changed
+            self._emit_due(wake=False)
+            if self.gate.watchdog_trips != trips:
+                logger.warning("no command for %.2f s: stopped", self.config.drive.watchdog_s)
+            if (self.gate.driver, self.gate.watchdog_trips) != (driver, trips):
+                self._tell_session()
+
+    def _emit_due(self, *, wake: bool = True) -> None:
+        command = self.gate.take_due(time.monotonic())
+        if command is not None:
+            self.backend.on_drive(*command)
+        if wake:
+            self._gate_wake.set()
+
+    def _tell_session(self) -> None:
+        for session in self._sessions.values():
+            driver = self.gate.driver
+            role = "none" if driver is None else "you" if driver == session.number else "other"
+            message = {
+                "type": "session",
+                "driver": role,
+                "clients": len(self._sessions),
+                "estop": self.gate.estop,
+                "watchdog_trips": self.gate.watchdog_trips,
+            }
+            session.put_text("session", json.dumps(message))
+
+    def _publish(self, kind: str, text: str) -> None:
+        self._texts[kind] = text
+        for session in self._sessions.values():
+            session.put_text(kind, text)
+
+    def _send_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
+        self._frames[kind] = frame
+        for session in self._sessions.values():
+            session.put_frame(kind, frame)
+
+    def _show(self, kind: FrameKind) -> None:
+        if kind is self._foreground:
+            return
+        self._foreground = kind
+        for session in self._sessions.values():
+            session.set_foreground(kind, 1.0 / self.config.background_picture_hz)
+
+
+def host_allowed(host: str, allowed: tuple[str, ...]) -> bool:
+    """Whether a Host header names this machine.
+
+    A page of a foreign site can point its own name at 127.0.0.1 (DNS rebinding), and then its Origin
+    equals its Host; but it cannot make a browser send an IP literal or "localhost".
+    """
+    try:
+        name = urlsplit(f"//{host}").hostname
+    except ValueError:
+        return False
+    if not name:
+        return False
+    if name == "localhost" or name in {entry.lower() for entry in allowed}:
+        return True
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def origin_allowed(origin: str | None, host: str) -> bool:
+    """Whether a WebSocket comes from the page itself; programs send no Origin and are let in."""
+    if origin is None:
+        return True
+    try:
+        parts = urlsplit(origin)
+    except ValueError:
+        return False
+    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower() != ""

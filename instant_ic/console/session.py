@@ -1,0 +1,108 @@
+"""One connected page: what waits to be sent to it, newest only, so that a slow one holds up nobody."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from aiohttp import web
+
+from instant_ic.console.protocol import Frame, FrameKind, encode_frame
+
+# Small things first: a picture must not delay the state, nor the map a picture.
+FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.MAP, FrameKind.COSTMAP)
+
+
+@dataclass(frozen=True)
+class PendingFrame:
+    """A frame before it has a sequence number."""
+
+    header: dict[str, Any]
+    payload: bytes
+
+
+class Session:
+    """Outbox of one client. Used on the server's loop only.
+
+    Replies go out in order; a text of a key and a frame of a kind replace an older one that still
+    waits; the next frame of a kind goes when the last was acknowledged.
+    """
+
+    def __init__(self, number: int, socket: web.WebSocketResponse, now: float) -> None:
+        self.number = number
+        self.socket = socket
+        self.last_heard = now
+        self.bad_messages = 0
+        self.frames_replaced = 0
+        self._replies: deque[str] = deque()
+        self._texts: dict[str, str] = {}
+        self._frames: dict[FrameKind, PendingFrame] = {}
+        self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
+        self._unacknowledged: dict[FrameKind, int] = {}
+        self._last_sent: dict[FrameKind, float] = {}
+        self._foreground = FrameKind.PANORAMA
+        self._background_period_s = 0.0
+        self._wake = asyncio.Event()
+
+    def reply(self, message: dict[str, Any]) -> None:
+        """Queues an answer that must not be lost; the reader's own pace bounds the queue."""
+        self._replies.append(json.dumps(message, separators=(",", ":"), allow_nan=False))
+        self._wake.set()
+
+    def put_text(self, key: str, text: str) -> None:
+        """Queues ``text``; replaces one of the same key that still waits."""
+        self._texts[key] = text
+        self._wake.set()
+
+    def put_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
+        """Queues a frame; replaces one of the same kind that still waits."""
+        self.frames_replaced += kind in self._frames
+        self._frames[kind] = frame
+        self._wake.set()
+
+    def set_foreground(self, kind: FrameKind, background_period_s: float) -> None:
+        """Pictures of the other kind go out once in ``background_period_s`` only."""
+        self._foreground = kind
+        self._background_period_s = background_period_s
+        self._wake.set()
+
+    def acknowledge(self, kind: FrameKind, sequence: int) -> None:
+        """The client has shown frame ``sequence``."""
+        if self._unacknowledged.get(kind) == sequence:
+            del self._unacknowledged[kind]
+            self._wake.set()
+
+    async def send_forever(self) -> None:
+        """Sends what waits until the socket closes."""
+        while not self.socket.closed:
+            await self._wake.wait()
+            self._wake.clear()
+            while (item := self._next(time.monotonic())) is not None:
+                if isinstance(item, str):
+                    await self.socket.send_str(item)
+                else:
+                    await self.socket.send_bytes(item)
+
+    def _next(self, now: float) -> str | bytes | None:
+        if self._replies:
+            return self._replies.popleft()
+        if self._texts:
+            return self._texts.pop(next(iter(self._texts)))
+        for kind in FRAME_ORDER:
+            if kind not in self._frames or kind in self._unacknowledged or self._held_back(kind, now):
+                continue
+            pending = self._frames.pop(kind)
+            self._sent_frames[kind] += 1
+            self._unacknowledged[kind] = self._sent_frames[kind]
+            self._last_sent[kind] = now
+            return encode_frame(Frame(kind, self._sent_frames[kind], pending.header, pending.payload))
+        return None
+
+    def _held_back(self, kind: FrameKind, now: float) -> bool:
+        if kind is self._foreground or kind not in (FrameKind.PANORAMA, FrameKind.VIEW):
+            return False
+        return now - self._last_sent.get(kind, float("-inf")) < self._background_period_s

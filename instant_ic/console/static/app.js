@@ -1,0 +1,274 @@
+// The operator's page: joins link, drive, look, pictures, map and overlay.
+
+import { attachStick, Drive, isDriveKey } from "./drive.js";
+import { FlatViewer } from "./flatviewer.js";
+import { drawCompass, drawGuide } from "./guide.js";
+import * as hud from "./hud.js";
+import { COSTMAP, Link, MAP } from "./link.js";
+import { Look } from "./look.js";
+import { radians, transpose } from "./math.js";
+import { MiniMap } from "./minimap.js";
+import { Pictures } from "./pictures.js";
+import { GlViewer } from "./viewer.js";
+
+const LOOK_MS = 100; // look direction sent at most this often
+const byId = (id) => document.getElementById(id);
+const options = new URLSearchParams(location.search);
+const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
+
+const picture = byId("picture"), guide = byId("guide"), compass = byId("compass-tape");
+const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
+const drive = new Drive(link);
+const look = new Look(picture);
+const viewer = makeViewer();
+const pictures = new Pictures(viewer, link);
+const minimap = new MiniMap(byId("map-canvas"));
+
+let page = { footprint: [0.6, 0.5], camera: [0, 0, 1.2], dissolve_ms: 250 };
+let state = null, session = { driver: "none", clients: 0, estop: false };
+let plan = { trajectory: [], path: [], subgoal: null };
+let everConnected = false;
+let sentLook = "", sentLookAt = 0;
+let mapChanged = true, lastFrame = performance.now(), lastHud = 0, lastGuide = "", lastMapKey = "";
+
+function makeViewer() {
+  if (options.get("viewer") !== "canvas") {
+    try {
+      return new GlViewer(picture);
+    } catch (error) {
+      console.info(`${error.message}: the picture is drawn without it`);
+    }
+  }
+  return new FlatViewer(picture);
+}
+
+// ---- what comes --------------------------------------------------------------------------------
+
+link.addEventListener("open", () => {
+  everConnected = true;
+  sentLook = "";
+  link.send({ type: "lease", take: false });
+  showBanner();
+});
+link.addEventListener("lost", () => {
+  session = { ...session, driver: "none" };
+  drive.setEnabled(false);
+  showBanner();
+});
+link.addEventListener("message", ({ detail: message }) => {
+  switch (message.type) {
+    case "hello":
+      page = { ...page, ...message.page };
+      pictures.dissolveMs = reducedMotion.matches ? 0 : page.dissolve_ms;
+      drive.limits = { linear: message.max_linear, angular: message.max_angular };
+      break;
+    case "state":
+      state = message;
+      mapChanged = true;
+      hud.showMode(state);
+      showBanner();
+      break;
+    case "plan":
+      plan = message;
+      mapChanged = true;
+      break;
+    case "health":
+      hud.showHealth(message);
+      break;
+    case "session":
+      session = message;
+      drive.setEnabled(session.driver === "you" && !session.estop);
+      hud.showSession(session);
+      showBanner();
+      break;
+    case "refused":
+      if (message.reason === "not_driver") hud.toast("Another operator drives. Take over to drive.");
+      break;
+    case "error":
+      console.error(`server: ${message.text}`);
+  }
+});
+link.addEventListener("frame", async ({ detail: frame }) => {
+  if (frame.kind !== MAP && frame.kind !== COSTMAP) return pictures.take(frame);
+  try {
+    const bitmap = await createImageBitmap(frame.payload, { colorSpaceConversion: "none" });
+    minimap.setLayer(frame.kind === MAP ? "map" : "costmap", bitmap, frame.header);
+    bitmap.close();
+    mapChanged = true;
+  } catch (error) {
+    console.warn(`map ${frame.sequence}: ${error}`);
+  } finally {
+    link.acknowledge(frame);
+  }
+});
+
+// ---- what the operator does ----------------------------------------------------------------------
+
+function stopNow() {
+  drive.stop();
+  link.send({ type: "estop" });
+  if (!link.connected) hud.toast("No link: the stop could not be sent");
+}
+
+function setScale(percent) {
+  const value = Math.min(Math.max(percent, 10), 100);
+  byId("scale").value = value;
+  byId("scale-text").textContent = `${value} %`;
+  drive.setScale(value / 100);
+}
+
+function enlargeMap() {
+  minimap.large = byId("map").classList.toggle("large");
+  byId("map-size").setAttribute("aria-label", minimap.large ? "Shrink the map" : "Enlarge the map");
+  mapChanged = true;
+}
+
+function fullScreen() {
+  if (document.fullscreenElement) document.exitFullscreen();
+  else document.documentElement.requestFullscreen().catch((error) => hud.toast(`No full screen: ${error.message}`));
+}
+
+const SHORTCUTS = {
+  KeyM: enlargeMap,
+  KeyF: fullScreen,
+  KeyH: () => (byId("help").open ? byId("help").close() : byId("help").showModal()),
+  Minus: () => setScale(+byId("scale").value - 10),
+  Equal: () => setScale(+byId("scale").value + 10),
+};
+SHORTCUTS.NumpadSubtract = SHORTCUTS.Minus;
+SHORTCUTS.NumpadAdd = SHORTCUTS.Equal;
+
+window.addEventListener("keydown", (event) => {
+  if (event.code === "Space") {
+    // Before any focused button gets it: the space bar always stops.
+    event.preventDefault();
+    event.stopPropagation();
+    if (!event.repeat) stopNow();
+    return;
+  }
+  if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
+  SHORTCUTS[event.code]?.();
+  // Whoever wants to drive while nobody does, may.
+  if (isDriveKey(event) && session.driver === "none") link.send({ type: "lease", take: false });
+  else if (isDriveKey(event) && session.driver === "other") hud.toast("Another operator drives. Take over to drive.");
+}, { capture: true });
+window.addEventListener("keyup", (event) => {
+  if (event.code === "Space") event.preventDefault();
+}, { capture: true });
+
+byId("estop").addEventListener("pointerdown", stopNow);
+byId("estop").addEventListener("click", stopNow);
+byId("take").addEventListener("click", () => link.send({ type: "lease", take: true }));
+byId("yield").addEventListener("click", () => link.send({ type: "yield" }));
+byId("compass").addEventListener("click", () => look.centre());
+byId("map-size").addEventListener("click", enlargeMap);
+byId("map-canvas").addEventListener("click", enlargeMap);
+byId("fullscreen").addEventListener("click", fullScreen);
+byId("help-open").addEventListener("click", SHORTCUTS.KeyH);
+byId("scale").addEventListener("input", (event) => setScale(+event.target.value));
+byId("scale").addEventListener("change", (event) => event.target.blur());
+hud.holdToConfirm(byId("release"), () => link.send({ type: "estop_release" }));
+attachStick(byId("stick"), drive);
+drive.addEventListener("stop", ({ detail: why }) => hud.toast(`Stopped: ${why}`));
+document.addEventListener("visibilitychange", () => { lastFrame = performance.now(); });
+
+// ---- what is shown -------------------------------------------------------------------------------
+
+function showBanner() {
+  hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), session.driver);
+}
+
+function fit(canvas) {
+  const ratio = Math.min(devicePixelRatio, 2);
+  const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width === width && canvas.height === height) return false;
+  canvas.width = width;
+  canvas.height = height;
+  return true;
+}
+
+function shownFov() {
+  const tanV = Math.tan(look.vfov / 2);
+  const tanH = (tanV * picture.clientWidth) / Math.max(picture.clientHeight, 1);
+  return [tanH, tanV];
+}
+
+function sendLook(tanHalf, now) {
+  if (!link.connected || now - sentLookAt < LOOK_MS) return;
+  const message = {
+    type: "look",
+    yaw: look.yaw,
+    pitch: look.pitch,
+    hfov: Math.min(2 * Math.atan(tanHalf[0]), radians(149)),
+    vfov: Math.min(2 * Math.atan(tanHalf[1]), radians(149)),
+  };
+  const key = [message.yaw, message.pitch, message.hfov, message.vfov].map((value) => value.toFixed(3)).join() + session.driver;
+  if (key === sentLook) return;
+  sentLook = key;
+  sentLookAt = now;
+  link.send(message);
+}
+
+function cameraPosition() {
+  const pose = state?.mode === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
+  if (!pose) return null;
+  const [x, y, yaw] = pose, [cx, cy, cz] = page.camera;
+  return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
+}
+
+const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
+
+function frame(now) {
+  requestAnimationFrame(frame);
+  const elapsed = Math.min(now - lastFrame, 200);
+  lastFrame = now;
+  look.step(elapsed / 1000);
+  const tanHalf = shownFov();
+  sendLook(tanHalf, now);
+  const scene = pictures.scene(state, look, tanHalf, elapsed);
+  const colour = COLOURS[state?.mode] ?? COLOURS.none;
+
+  const key = `${look.yaw.toFixed(4)},${look.pitch.toFixed(4)},${look.vfov.toFixed(4)}`;
+  const moved = fit(picture) | (key !== lastGuide) | pictures.changed;
+  if (moved && !viewer.lost) {
+    viewer.draw(scene);
+    pictures.changed = false;
+  }
+  if (fit(guide) | moved | mapChanged) {
+    const position = cameraPosition();
+    const camera = { lookFromMap: transpose(scene.mapFromLook), position };
+    drawGuide(guide, position && link.connected ? plan.trajectory : [], camera, tanHalf, page.footprint[1] / 2, colour);
+    fit(compass);
+    drawCompass(compass, look.yaw, colour);
+    lastGuide = key;
+  }
+  const mapKey = `${key},${picture.clientWidth}`;
+  if (fit(minimap.canvas) | mapChanged | (mapKey !== lastMapKey)) {
+    mapChanged = false;
+    lastMapKey = mapKey;
+    minimap.draw({
+      mode: state?.mode ?? "none",
+      robot: state?.robot ?? null,
+      vbot: state?.vbot ?? null,
+      plan,
+      footprint: page.footprint,
+      lookYaw: look.yaw,
+      hfov: 2 * Math.atan(tanHalf[0]),
+    });
+  }
+  hud.showCommand(drive);
+  for (const cap of document.querySelectorAll("#keys kbd")) cap.classList.toggle("held", drive.holds(cap.dataset.code));
+  if (now - lastHud > 250) {
+    lastHud = now;
+    hud.showLatency(link, pictures);
+    document.body.dataset.picture = pictures.shown ? (pictures.stale ? "stale" : "live") : "none";
+  }
+  // For tests and for whoever debugs: what the page shows.
+  document.body.dataset.blend = scene.blend.toFixed(2);
+  document.body.dataset.viewer = viewer.name;
+  document.body.dataset.map = minimap.hasMap ? "drawn" : "none";
+}
+
+setScale(70);
+hud.showMode(null);
+requestAnimationFrame(frame);

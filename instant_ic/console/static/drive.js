@@ -1,0 +1,156 @@
+// Hold to drive: keyboard and touch stick. Whatever may hide a release counts as one.
+
+import { clamp } from "./math.js";
+
+const SEND_MS = 50;
+const KEYS = {
+  KeyW: [1, 0], ArrowUp: [1, 0],
+  KeyS: [-1, 0], ArrowDown: [-1, 0],
+  KeyA: [0, 1], ArrowLeft: [0, 1],
+  KeyD: [0, -1], ArrowRight: [0, -1],
+};
+
+/** Whether a key event drives; keys of a focused slider belong to the slider. */
+export function isDriveKey(event) {
+  const slider = event.target instanceof HTMLInputElement && event.code.startsWith("Arrow");
+  return event.code in KEYS && !slider;
+}
+
+/** Event "stop" (detail: why) when something other than a released key or stick ended a drive. */
+export class Drive extends EventTarget {
+  constructor(link) {
+    super();
+    this.link = link;
+    this.scale = 0.7;
+    this.limits = { linear: 0, angular: 0 };
+    this.enabled = false;
+    this.command = [0, 0];
+    this._held = new Set();
+    this._stick = [0, 0];
+    this._timer = null;
+    window.addEventListener("keydown", (event) => this._keyDown(event));
+    window.addEventListener("keyup", (event) => this._keyUp(event));
+    window.addEventListener("blur", () => this.stop("the window lost the focus"));
+    window.addEventListener("pagehide", () => this.stop("the page was left"));
+    window.addEventListener("contextmenu", () => this.stop("a menu was opened"));
+    document.addEventListener("visibilitychange", () => {
+      if (document.hidden) this.stop("the page was hidden");
+    });
+    link.addEventListener("lost", () => this.stop("the link was lost"));
+  }
+
+  /** Forgets every held key and the stick, and sends zero at once. */
+  stop(why) {
+    const moving = this.command[0] !== 0 || this.command[1] !== 0;
+    this._held.clear();
+    this._stick = [0, 0];
+    this._update();
+    if (moving && why) this.dispatchEvent(new CustomEvent("stop", { detail: why }));
+  }
+
+  /** Whether a key of this direction (KeyW, KeyA, KeyS, KeyD) is held. */
+  holds(code) {
+    const [forward, left] = KEYS[code];
+    return [...this._held].some((held) => KEYS[held][0] === forward && KEYS[held][1] === left);
+  }
+
+  setEnabled(enabled) {
+    if (this.enabled && !enabled) this.stop();
+    this.enabled = enabled;
+  }
+
+  setScale(scale) {
+    this.scale = clamp(scale, 0.1, 1);
+    this._update();
+  }
+
+  /** Stick position: forward and left, each in [-1, 1]. */
+  setStick(forward, left) {
+    this._stick = this.enabled ? [forward, left] : [0, 0];
+    this._update();
+  }
+
+  _keyDown(event) {
+    if (!isDriveKey(event)) return;
+    // With a system key held the browser may swallow the key-up.
+    if (event.ctrlKey || event.metaKey || event.altKey) return this.stop("a system key was pressed");
+    event.preventDefault();
+    if (event.repeat || !this.enabled) return;
+    this._held.add(event.code);
+    this._update();
+  }
+
+  _keyUp(event) {
+    if (event.key === "Meta") return this.stop("a system key was pressed");
+    if (this._held.delete(event.code)) this._update();
+  }
+
+  _update() {
+    let [forward, left] = this._stick;
+    for (const code of this._held) {
+      forward += KEYS[code][0];
+      left += KEYS[code][1];
+    }
+    const linear = clamp(forward, -1, 1) * this.scale * this.limits.linear;
+    const angular = clamp(left, -1, 1) * this.scale * this.limits.angular;
+    const changed = linear !== this.command[0] || angular !== this.command[1];
+    this.command = [linear, angular];
+    if (!changed) return;
+    this._send();
+    const active = linear !== 0 || angular !== 0;
+    if (active && this._timer === null) this._timer = setInterval(() => this._send(), SEND_MS);
+    if (!active && this._timer !== null) {
+      clearInterval(this._timer);
+      this._timer = null;
+    }
+  }
+
+  _send() {
+    this.link.drive(this.command[0], this.command[1]);
+  }
+}
+
+/** On-screen stick: `element` holds a child with class "knob". */
+export function attachStick(element, drive) {
+  const knob = element.querySelector(".knob");
+  let pointer = null;
+
+  const release = (event) => {
+    if (event.pointerId !== pointer) return;
+    pointer = null;
+    knob.style.transform = "";
+    drive.setStick(0, 0);
+  };
+  const move = (event) => {
+    if (event.pointerId !== pointer) return;
+    const box = element.getBoundingClientRect();
+    const radius = box.width / 2 - 22;
+    let x = event.clientX - box.left - box.width / 2;
+    let y = event.clientY - box.top - box.height / 2;
+    const length = Math.hypot(x, y);
+    if (length > radius) {
+      x *= radius / length;
+      y *= radius / length;
+    }
+    knob.style.transform = `translate(${x}px, ${y}px)`;
+    drive.setStick(deadZone(-y / radius), deadZone(-x / radius));
+  };
+  element.addEventListener("pointerdown", (event) => {
+    if (pointer !== null) return;
+    pointer = event.pointerId;
+    element.setPointerCapture(pointer);
+    event.preventDefault();
+    move(event);
+  });
+  element.addEventListener("pointermove", move);
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) element.addEventListener(end, release);
+  drive.addEventListener("stop", () => {
+    pointer = null;
+    knob.style.transform = "";
+  });
+}
+
+function deadZone(value) {
+  const size = Math.abs(value);
+  return size < 0.12 ? 0 : (Math.sign(value) * (size - 0.12)) / 0.88;
+}

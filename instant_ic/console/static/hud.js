@@ -1,0 +1,149 @@
+// The overlay: mode, link, faults, gauges, banner. Text only, never HTML from the robot.
+
+import { degrees } from "./math.js";
+import { PANORAMA, VIEW } from "./link.js";
+
+const MODES = {
+  real: ["REAL", "You drive the robot"],
+  virtual: ["VIRTUAL", "The robot follows you round the obstacle"],
+  stopped: ["STOPPED", "The robot is held"],
+  none: ["WAITING", "No controller is running"],
+};
+const HOLD_MS = 800;
+const TOAST_MS = 2600;
+const byId = (id) => document.getElementById(id);
+
+function write(element, text) {
+  // Setting the same text again would make screen readers say it again.
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function showMode(state) {
+  const mode = state?.mode ?? "none";
+  const [name, usual] = MODES[mode] ?? MODES.none;
+  document.body.dataset.mode = mode;
+  write(byId("mode-name"), name);
+  write(byId("mode-reason"), state?.reason || usual);
+}
+
+export function showLatency(link, pictures) {
+  const put = (id, value, text, warn, bad) => {
+    const element = byId(id);
+    write(element, value === null ? "–" : text(value));
+    element.className = value === null ? "" : value > bad ? "bad" : value > warn ? "warn" : "";
+  };
+  const ms = (value) => (value < 9950 ? `${Math.round(value)} ms` : `${(value / 1000).toFixed(0)} s`);
+  put("link-ms", link.connected ? link.roundTripMs : null, ms, 80, 200);
+  put("picture-ms", link.connected ? pictures.ageMs() : null, ms, 400, 1000);
+  put("command-ms", link.connected ? link.commandAgeMs : null, ms, 80, 200);
+  const camera = pictures.rate(PANORAMA), view = pictures.rate(VIEW);
+  write(byId("rates"), camera || view ? `${camera.toFixed(0)} · ${view.toFixed(0)} /s` : "–");
+}
+
+export function showHealth(health) {
+  const { vspace, battery, faults = [] } = health;
+  byId("vspace-dot").dataset.state = vspace?.state ?? "empty";
+  write(byId("vspace-text"), vspaceText(vspace));
+  write(byId("vspace-more"), vspace?.psnr_db > 0 ? ` · ${vspace.psnr_db.toFixed(1)} dB` : "");
+  byId("battery-row").hidden = !battery;
+  if (battery) {
+    const share = battery.percent === null ? "" : ` · ${Math.round(battery.percent)} %`;
+    write(byId("battery"), `${battery.voltage.toFixed(1)} V${share}`);
+  }
+  const list = byId("faults");
+  const key = JSON.stringify(faults);
+  if (list.dataset.key === key) return;
+  list.dataset.key = key;
+  list.replaceChildren(...faults.map(({ level, name, text }) => {
+    const item = document.createElement("li");
+    item.className = level;
+    const bold = document.createElement("b");
+    bold.textContent = name;
+    item.append(bold, ` ${text}`);
+    return item;
+  }));
+}
+
+function vspaceText(vspace) {
+  if (!vspace) return "No virtual space yet";
+  switch (vspace.state) {
+    case "ready": return "Virtual space ready";
+    case "training": return `Virtual space learning, ${vspace.train_seconds.toFixed(0)} s`;
+    case "failed": return `Virtual space failed: ${vspace.message}`;
+    default: return vspace.message || "No virtual space yet";
+  }
+}
+
+export function showCommand(drive) {
+  const [linear, angular] = drive.command;
+  bar(byId("speed-bar"), linear / (drive.limits.linear || 1));
+  bar(byId("turn-bar"), -angular / (drive.limits.angular || 1));
+  write(byId("speed"), `${linear.toFixed(2)} m/s`);
+  write(byId("turn"), `${Math.round(degrees(Math.abs(angular)))} °/s${angular ? (angular > 0 ? " L" : " R") : ""}`);
+}
+
+function bar(element, share) {
+  element.style.left = `${50 + Math.min(share, 0) * 50}%`;
+  element.style.width = `${Math.abs(share) * 50}%`;
+}
+
+export function showSession(session) {
+  document.body.dataset.driver = session.driver;
+  const watchers = session.clients - 1;
+  const text = {
+    you: watchers > 0 ? `You drive · ${watchers} watching` : "You drive",
+    other: "Another operator drives",
+    none: "Nobody drives",
+  }[session.driver];
+  write(byId("lease-text"), text);
+  write(byId("take"), session.driver === "none" ? "Drive" : "Take over");
+  byId("take").hidden = session.driver === "you";
+  byId("yield").hidden = session.driver !== "you" || watchers === 0;
+}
+
+/** One banner at a time: a lost link first, then the emergency stop. */
+export function showBanner(connected, everConnected, estop, driver) {
+  document.body.dataset.link = connected ? "up" : everConnected ? "lost" : "connecting";
+  document.body.dataset.estop = estop ? "set" : "free";
+  const banner = byId("banner");
+  const lost = !connected && everConnected;
+  banner.hidden = !lost && !estop;
+  if (banner.hidden) return;
+  write(byId("banner-title"), lost ? "LINK LOST" : "EMERGENCY STOP");
+  write(byId("banner-text"), lost
+    ? "The robot was told to stop. Connecting again…"
+    : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
+  byId("release").hidden = lost || driver !== "you";
+}
+
+let toastTimer = null;
+export function toast(text) {
+  const element = byId("toast");
+  write(element, text);
+  element.classList.add("shown");
+  clearTimeout(toastTimer);
+  toastTimer = setTimeout(() => element.classList.remove("shown"), TOAST_MS);
+}
+
+/** Calls `done` when `button` was held by pointer or Enter for 0.8 s. */
+export function holdToConfirm(button, done) {
+  let timer = null;
+  const start = () => {
+    if (timer !== null) return;
+    button.classList.add("holding");
+    timer = setTimeout(() => {
+      cancel();
+      done();
+    }, HOLD_MS);
+  };
+  const cancel = () => {
+    clearTimeout(timer);
+    timer = null;
+    button.classList.remove("holding");
+  };
+  button.addEventListener("pointerdown", start);
+  for (const end of ["pointerup", "pointerleave", "pointercancel", "blur", "keyup"]) button.addEventListener(end, cancel);
+  button.addEventListener("keydown", (event) => {
+    if (event.code === "Enter") start();
+  });
+}

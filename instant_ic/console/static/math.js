@@ -1,0 +1,54 @@
+// Rotations as 3x3 row-major arrays, x forward, y left, z up; angles counter-clockwise, radians.
+
+export const identity = [1, 0, 0, 0, 1, 0, 0, 0, 1];
+
+export function rotationZ(angle) {
+  const c = Math.cos(angle), s = Math.sin(angle);
+  return [c, -s, 0, s, c, 0, 0, 0, 1];
+}
+
+/** Line of sight turned left by `yaw` and up by `pitch`. */
+export function lookRotation(yaw, pitch) {
+  const c = Math.cos(pitch), s = Math.sin(pitch);
+  return multiply(rotationZ(yaw), [c, 0, -s, 0, 1, 0, s, 0, c]);
+}
+
+export function multiply(a, b) {
+  const m = new Array(9);
+  for (let i = 0; i < 3; i++)
+    for (let j = 0; j < 3; j++)
+      m[3 * i + j] = a[3 * i] * b[j] + a[3 * i + 1] * b[3 + j] + a[3 * i + 2] * b[6 + j];
+  return m;
+}
+
+export function transpose(m) {
+  return [m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]];
+}
+
+export function rotate(m, v) {
+  return [
+    m[0] * v[0] + m[1] * v[1] + m[2] * v[2],
+    m[3] * v[0] + m[4] * v[1] + m[5] * v[2],
+    m[6] * v[0] + m[7] * v[1] + m[8] * v[2],
+  ];
+}
+
+/** Rotation matrix of a quaternion [x, y, z, w]. */
+export function fromQuaternion([x, y, z, w]) {
+  return [
+    1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
+    2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
+    2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y),
+  ];
+}
+
+export function wrapAngle(angle) {
+  return angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
+}
+
+export function clamp(value, low, high) {
+  return Math.min(Math.max(value, low), high);
+}
+
+export const degrees = (radians) => (radians * 180) / Math.PI;
+export const radians = (angle) => (angle * Math.PI) / 180;

@@ -1,0 +1,160 @@
+// The map in a corner: walls, costs, both robots, path, subgoal and predicted trajectory.
+
+const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", path: "#8fb8ff", goal: "#ffffff" };
+const RADIUS_M = 3.5; // half the width shown in the small map
+
+export class MiniMap {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d");
+    this.large = false;
+    this._layers = { floor: null, costs: null, walls: null };
+  }
+
+  /** `bitmap` holds grey cells (gridimage.py), `header` where they lie. */
+  setLayer(name, bitmap, header) {
+    const paints = name === "map" ? { floor: paintFloor, walls: paintWalls } : { costs: paintCosts };
+    for (const [layer, paint] of Object.entries(paints)) this._layers[layer] = { image: painted(bitmap, paint), header };
+  }
+
+  get hasMap() {
+    return this._layers.walls !== null;
+  }
+
+  /** `scene`: mode, robot, vbot ([x, y, yaw] or null), plan, footprint [length, width], lookYaw, hfov. */
+  draw(scene) {
+    const { context, canvas } = this;
+    const { width, height } = canvas;
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.clearRect(0, 0, width, height);
+    const shown = scene.mode === "virtual" ? scene.vbot ?? scene.robot : scene.robot ?? scene.vbot;
+    if (!shown) return this._say("No pose yet");
+    const scale = this._place(shown, width, height);
+    for (const layer of Object.values(this._layers)) if (layer) this._drawLayer(layer);
+    const pixel = 1 / scale;
+    this._cone(shown, scene, 1.7);
+    this._line(scene.plan.path, COLOURS.path, 2 * pixel, [6 * pixel, 5 * pixel]);
+    this._line(scene.plan.trajectory, scene.mode === "virtual" ? COLOURS.virtual : COLOURS.real, 3 * pixel, []);
+    if (scene.plan.subgoal) this._goal(scene.plan.subgoal, pixel);
+    if (scene.robot) this._robot(scene.robot, scene.footprint, COLOURS.real, pixel, true);
+    if (scene.vbot && scene.mode === "virtual") this._robot(scene.vbot, scene.footprint, COLOURS.virtual, pixel, false);
+  }
+
+  /** Sets metres as units: heading up when small, north up with the whole map when large. */
+  _place([x, y, yaw], width, height) {
+    const context = this.context;
+    if (this.large && this._layers.walls) {
+      const { header } = this._layers.walls;
+      const w = header.width * header.resolution, h = header.height * header.resolution;
+      const scale = Math.min(width / (w + 1), height / (h + 1));
+      context.translate(width / 2, height / 2);
+      context.scale(scale, -scale);
+      context.translate(-(header.x + w / 2), -(header.y + h / 2));
+      return scale;
+    }
+    const scale = Math.min(width, height) / (2 * RADIUS_M);
+    context.translate(width / 2, height * 0.6);
+    context.scale(scale, -scale);
+    context.rotate(Math.PI / 2 - yaw);
+    context.translate(-x, -y);
+    return scale;
+  }
+
+  _drawLayer({ image, header }) {
+    const context = this.context;
+    const h = header.height * header.resolution;
+    context.save();
+    context.imageSmoothingEnabled = false;
+    context.translate(header.x, header.y + h);
+    context.scale(header.resolution, -header.resolution);
+    context.drawImage(image, 0, 0);
+    context.restore();
+  }
+
+  _line(points, colour, width, dash) {
+    if (!points || points.length < 2) return;
+    const context = this.context;
+    context.save();
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.lineJoin = context.lineCap = "round";
+    context.setLineDash(dash);
+    context.beginPath();
+    points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
+    context.stroke();
+    context.restore();
+  }
+
+  _goal([x, y], pixel) {
+    const context = this.context;
+    context.strokeStyle = COLOURS.goal;
+    context.lineWidth = 2 * pixel;
+    context.beginPath();
+    context.arc(x, y, 6 * pixel, 0, 2 * Math.PI);
+    context.moveTo(x + 1.5 * pixel, y);
+    context.arc(x, y, 1.5 * pixel, 0, 2 * Math.PI);
+    context.stroke();
+  }
+
+  _cone([x, y, yaw], scene, length) {
+    const context = this.context;
+    const middle = yaw + scene.lookYaw;
+    const gradient = context.createRadialGradient(x, y, 0, x, y, length);
+    gradient.addColorStop(0, "rgba(255,255,255,0.28)");
+    gradient.addColorStop(1, "rgba(255,255,255,0)");
+    context.fillStyle = gradient;
+    context.beginPath();
+    context.moveTo(x, y);
+    context.arc(x, y, length, middle - scene.hfov / 2, middle + scene.hfov / 2);
+    context.fill();
+  }
+
+  _robot([x, y, yaw], [length, width], colour, pixel, solid) {
+    const context = this.context;
+    context.save();
+    context.translate(x, y);
+    context.rotate(yaw);
+    context.lineWidth = 2 * pixel;
+    context.strokeStyle = colour;
+    context.fillStyle = solid ? colour : "rgba(240,172,69,0.22)";
+    if (!solid) context.setLineDash([4 * pixel, 3 * pixel]);
+    context.beginPath();
+    context.roundRect(-length / 2, -width / 2, length, width, 0.08);
+    context.fill();
+    context.stroke();
+    context.setLineDash([]);
+    // The nose tells where it heads.
+    context.fillStyle = solid ? "#0b0e12" : colour;
+    context.beginPath();
+    context.moveTo(length * 0.36, 0);
+    context.lineTo(-length * 0.05, width * 0.27);
+    context.lineTo(-length * 0.05, -width * 0.27);
+    context.fill();
+    context.restore();
+  }
+
+  _say(text) {
+    const { context, canvas } = this;
+    context.fillStyle = "#a3adb8";
+    context.font = `${13 * devicePixelRatio}px system-ui, sans-serif`;
+    context.textAlign = "center";
+    context.fillText(text, canvas.width / 2, canvas.height / 2);
+  }
+}
+
+function painted(bitmap, paint) {
+  const image = document.createElement("canvas");
+  image.width = bitmap.width;
+  image.height = bitmap.height;
+  const context = image.getContext("2d", { willReadFrequently: true });
+  context.drawImage(bitmap, 0, 0);
+  const cells = context.getImageData(0, 0, image.width, image.height);
+  for (let i = 0; i < cells.data.length; i += 4) cells.data.set(paint(cells.data[i]), i);
+  context.putImageData(cells, 0, 0);
+  return image;
+}
+
+// Colours [r, g, b, alpha] of a cell: 0..100, 255 unknown.
+const paintFloor = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : [0, 0, 0, 0]);
+const paintWalls = (cell) => (cell >= 50 && cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
+const paintCosts = (cell) => (cell <= 100 ? [255, 110, 80, 0.6 * cell] : [0, 0, 0, 0]);

@@ -1,0 +1,383 @@
+"""Serves the operator's page: pictures, state and map to it; commands, emergency stop and look direction from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
+from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look, ServerConfig, ViewConfig, ViewScheduler
+from instant_ic.console.gridimage import grid_image
+from instant_ic.console.view import view_shape
+from instant_ic.geometry.poses import Matrix, pose2_from_matrix, quaternion_from_matrix, transform_points
+from instant_ic.geometry.transforms import TransformError
+from instant_ic.msg import (
+    BatteryState,
+    Bool,
+    CompressedImage,
+    ControlState,
+    DiagnosticArray,
+    NodeStatus,
+    OccupancyGrid,
+    Odometry,
+    Path,
+    PoseStamped,
+    RenderedView,
+    TwistStamped,
+    ViewRequest,
+    VspaceStatus,
+    grid_array,
+    header,
+    path_array,
+    pose_matrix,
+    pose_message,
+    stamp_ns,
+    twist_stamped,
+    twist_values,
+)
+
+MODES = {0: "real", 1: "virtual", 2: "stopped"}
+VSPACE_STATES = {0: "empty", 1: "training", 2: "ready", 3: "failed"}
+HEARTBEAT_TIMEOUT_S = 3.0
+MAX_FAULTS = 6
+
+
+@dataclass(frozen=True)
+class ConsoleConfig:
+    """Parameters; config/console.yaml says what each does."""
+
+    server: ServerConfig = field(default_factory=ServerConfig)
+    view: ViewConfig = field(default_factory=ViewConfig)
+    state_rate_hz: float = 20.0
+    map_rate_hz: float = 2.0
+    dissolve_ms: float = 250.0
+    footprint_length_m: float = 0.6
+    footprint_width_m: float = 0.5
+    camera_height_m: float = 1.2
+
+    def __post_init__(self) -> None:
+        for key in ("state_rate_hz", "map_rate_hz", "footprint_length_m", "footprint_width_m"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        if not 0 <= self.dissolve_ms <= 5000:
+            raise ValueError(f"dissolve_ms must be in [0, 5000] (got {self.dissolve_ms})")
+
+
+class ConsoleNode(Node[ConsoleConfig]):
+    """Joins the topics to a :class:`ConsoleServer`, whose backend it is."""
+
+    name = "console"
+
+    def setup(self) -> None:
+        config = self.config
+        self.command_out = self.publisher("/operator/cmd_vel", TwistStamped, qos=SENSOR)
+        self.estop_out = self.publisher("/operator/estop", Bool, qos=LATCHED)
+        self.request_out = self.publisher("/view/request", ViewRequest, qos=SENSOR)
+        self.control = self.latest("/ic/state", ControlState, max_age_s=1.0, qos=LATCHED)
+        self.vbot = self.latest("/vbot/odom", Odometry, max_age_s=0.5)
+        self.trajectory = self.latest("/ic/trajectory", Path, max_age_s=0.5)
+        self.path = self.latest("/nav/path", Path, max_age_s=5.0)
+        self.subgoal = self.latest("/ic/subgoal", PoseStamped, max_age_s=1.0)
+        self.vspace = self.latest("/vspace/status", VspaceStatus, max_age_s=5.0, qos=LATCHED)
+        self.battery = self.latest("/battery", BatteryState, max_age_s=5.0)
+        self.camera = self.latest("/camera/image/compressed", CompressedImage, max_age_s=2.0)
+        self.subscribe("/camera/image/compressed", CompressedImage, self.on_panorama, qos=SENSOR)
+        self.subscribe("/vspace/view", RenderedView, self.on_view, qos=SENSOR)
+        self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
+        self.subscribe("/costmap", OccupancyGrid, self.on_costmap, qos=SENSOR)
+        self.subscribe("/diagnostics", DiagnosticArray, self.on_diagnostics, qos=RELIABLE)
+        self.subscribe("/heartbeat", NodeStatus, self.on_heartbeat, qos=RELIABLE)
+        self.look = Look()
+        self.views = ViewScheduler(config.view)
+        self.mode = "none"
+        self._grids: dict[FrameKind, Any] = {}
+        self._grid_digests: dict[FrameKind, int] = {}
+        self._diagnoses_seen: dict[str, tuple[int, str, float]] = {}
+        self._heartbeats: dict[str, tuple[float, bool]] = {}
+        self.tf  # noqa: B018 - subscribes to /tf now, not at the first picture
+        page = {
+            "dissolve_ms": config.dissolve_ms,
+            "footprint": [config.footprint_length_m, config.footprint_width_m],
+            "camera": [0.0, 0.0, config.camera_height_m],
+        }
+        self.server = ConsoleServer(self, config.server, page)
+        if not self.lockstep:
+            try:
+                self.server.start()
+            except ConsoleError as error:
+                raise NodeError(str(error)) from error
+            self.log.info("open %s in a browser", self.server.url)
+        self.timer(1.0 / config.state_rate_hz, self.send_state)
+        self.timer(0.2, self.send_plan)
+        self.timer(1.0, self.send_health)
+        self.timer(1.0 / config.map_rate_hz, self.send_grids)
+
+    def teardown(self) -> None:
+        if hasattr(self, "server"):
+            self.server.stop()
+
+    # ---- from the operator, on the server's thread ----------------------------------------------
+
+    def on_drive(self, linear: float, angular: float) -> None:
+        """Gives a command on at once: a round by the node's thread would cost latency."""
+        self.command_out.publish(twist_stamped(linear, angular, self.clock.now_ns()))
+
+    def on_estop(self, stop: bool) -> None:
+        """Sets or releases the emergency stop."""
+        self.estop_out.publish(Bool(data=stop))
+
+    def on_look(self, look: Look) -> None:
+        """Takes the look direction for the next view."""
+        self.look = look
+
+    # ---- pictures -------------------------------------------------------------------------------
+
+    def on_panorama(self, message: CompressedImage) -> None:
+        """Passes a panorama on as it came, with the camera's pose when it was taken."""
+        stamp = stamp_ns(message)
+        map_from_camera = self.lookup("map", "camera", stamp)
+        self.server.send_frame(
+            FrameKind.PANORAMA,
+            {
+                "captured_ms": self.captured_ms(stamp),
+                "q": None if map_from_camera is None else quaternion_from_matrix(map_from_camera).tolist(),
+            },
+            bytes(message.data),
+        )
+
+    def on_view(self, message: RenderedView) -> None:
+        """Passes a rendered view on, and asks for the next."""
+        camera = pose_matrix(message.pose)
+        if not (0 < message.fov_rad < math.pi):
+            self.diagnose("view", ERROR, f"rendered view with a field of view of {message.fov_rad:.3g} rad: dropped")
+            return
+        self.views.answered(int(message.request_id))
+        self.server.send_frame(
+            FrameKind.VIEW,
+            {
+                "captured_ms": self.captured_ms(stamp_ns(message)),
+                "q": quaternion_from_matrix(camera).tolist(),
+                "p": camera[:3, 3].tolist(),
+                "fov": float(message.fov_rad),
+                "confidence": _finite(message.confidence),
+                "render_ms": _finite(message.render_ms),
+                "request_id": int(message.request_id),
+            },
+            bytes(message.image.data),
+        )
+        self.request_view()
+
+    def request_view(self) -> None:
+        """Asks the virtual space for the picture where the operator looks, if one is due."""
+        now = self.clock.now_ns()
+        virtual = self.mode == "virtual"
+        if not self.views.due(now / 1e9, virtual=virtual):
+            return
+        map_from_base = self.vbot_pose() if virtual else self.robot_pose()
+        if map_from_base is None:
+            return
+        look = self.look
+        # The look direction is relative to the robot's heading, so of the mount only the place counts.
+        map_from_camera = map_from_base @ self.camera_place() @ look.rotation()
+        shape = view_shape(look, self.config.view)
+        self.request_out.publish(
+            ViewRequest(
+                header=header("map", now),
+                id=self.views.asked(now / 1e9),
+                pose=pose_message(map_from_camera),
+                fov_rad=shape.fov_rad,
+                width=shape.width,
+                height=shape.height,
+            )
+        )
+
+    # ---- state ----------------------------------------------------------------------------------
+
+    def send_state(self) -> None:
+        """Tells the page mode, poses and commands; asks for views at the rate of the mode."""
+        control = self.control.message
+        self.mode = "none" if control is None else MODES.get(int(control.mode), "none")
+        self.server.show(FrameKind.VIEW if self.mode == "virtual" else FrameKind.PANORAMA)
+        state: dict[str, Any] = {
+            "at_ms": self.server.now_ms(),
+            "mode": self.mode,
+            "robot": _planar(self.robot_pose()),
+            "vbot": _planar(self.vbot_pose()) if self.mode == "virtual" else None,
+        }
+        if control is not None:
+            state |= {
+                "reason": control.reason,
+                "estop": bool(control.estop),
+                "blocked": bool(control.blocked),
+                "transitions": int(control.transitions),
+                "command": [_finite(value) for value in twist_values(control.operator_command)],
+                "applied": [_finite(value) for value in twist_values(control.applied_command)],
+                "pose_gap_m": _finite(control.pose_gap_m),
+                "yaw_gap_rad": _finite(control.yaw_gap_rad),
+                "time_to_obstacle_s": _finite(control.time_to_obstacle_s),
+            }
+        self.server.publish("state", state)
+        self.request_view()
+
+    def send_plan(self) -> None:
+        """Tells the page trajectory, path and subgoal, all in the map's frame."""
+        virtual = self.mode == "virtual"
+        subgoal = self.subgoal.message if virtual else None
+        self.server.publish(
+            "plan",
+            {
+                "trajectory": self.points(self.trajectory.message),
+                "path": self.points(self.path.message) if virtual else [],
+                "subgoal": None if subgoal is None else _planar(pose_matrix(subgoal)),
+            },
+        )
+
+    def send_health(self) -> None:
+        """Tells the page what is wrong, in the words of whoever found it."""
+        level, text = (OK, "picture comes") if self.camera.message is not None else (WARN, "no picture from the camera")
+        self.diagnose("camera", level, text, age_s=self.camera.age_s)
+        level, text = (OK, "state comes") if self.control.message is not None else (WARN, "no state from the arbiter")
+        self.diagnose("controller", level, text, age_s=self.control.age_s)
+        level, text = (OK, "pose known") if self.robot_pose() is not None else (WARN, "the robot's pose is unknown")
+        self.diagnose("pose", level, text)
+        self.server.publish(
+            "health",
+            {
+                "vspace": _vspace(self.vspace.message),
+                "battery": _battery(self.battery.message),
+                "faults": self.faults(),
+                "nodes": sorted(self._heartbeats),
+            },
+        )
+
+    def faults(self) -> list[dict[str, str]]:
+        """Present faults, the worst first: ``level`` (warn, error), ``name``, ``text``."""
+        now = self.clock.now_ns() / 1e9
+        found = [
+            (level, name.partition(":")[0], text)
+            for name, (level, text, seen) in self._diagnoses_seen.items()
+            if level >= WARN and now - seen < HEARTBEAT_TIMEOUT_S
+        ]
+        found += [
+            (ERROR, name, "does not answer")
+            for name, (seen, stopping) in self._heartbeats.items()
+            if not stopping and now - seen > HEARTBEAT_TIMEOUT_S
+        ]
+        found.sort(key=lambda fault: -fault[0])
+        return [
+            {"level": "error" if level >= ERROR else "warn", "name": name, "text": text}
+            for level, name, text in dict.fromkeys(found[:MAX_FAULTS])
+        ]
+
+    def on_diagnostics(self, message: DiagnosticArray) -> None:
+        """Keeps the newest diagnosis of each name."""
+        now = self.clock.now_ns() / 1e9
+        for status in message.status:
+            self._diagnoses_seen[status.name] = (int(status.level), status.message, now)
+
+    def on_heartbeat(self, message: NodeStatus) -> None:
+        """Notes that a node lives; one that says it stops is not missed."""
+        self._heartbeats[message.node] = (self.clock.now_ns() / 1e9, int(message.state) == NodeStatus.STOPPING)
+
+    # ---- map ------------------------------------------------------------------------------------
+
+    def on_map(self, message: OccupancyGrid) -> None:
+        """Keeps the newest map."""
+        self._grids[FrameKind.MAP] = message
+
+    def on_costmap(self, message: OccupancyGrid) -> None:
+        """Keeps the newest costmap."""
+        self._grids[FrameKind.COSTMAP] = message
+
+    def send_grids(self) -> None:
+        """Sends map and costmap where they have changed."""
+        while self._grids:
+            kind, message = self._grids.popitem()
+            image = grid_image(*grid_array(message))
+            if image is not None and self._grid_digests.get(kind) != image.digest:
+                self._grid_digests[kind] = image.digest
+                self.server.send_frame(kind, image.header, image.png)
+
+    # ---- poses ----------------------------------------------------------------------------------
+
+    def lookup(self, target: str, source: str, stamp: int | None = None) -> Matrix | None:
+        """``target_from_source`` at ``stamp``, else the newest; None when the tree has a gap."""
+        for when in (stamp, None):
+            try:
+                return self.tf.lookup(target, source, when)
+            except TransformError:
+                continue
+        return None
+
+    def robot_pose(self) -> Matrix | None:
+        """map_from_base of the r-bot; of the arbiter where the tree has a gap."""
+        pose = self.lookup("map", "base_link")
+        if pose is None and self.control.message is not None:
+            return pose_matrix(self.control.message.robot_pose)
+        return pose
+
+    def vbot_pose(self) -> Matrix | None:
+        """map_from_base of the v-bot; of the arbiter until the v-bot tells its own."""
+        if self.vbot.message is not None:
+            return pose_matrix(self.vbot.message)
+        return None if self.control.message is None else pose_matrix(self.control.message.vbot_pose)
+
+    def camera_place(self) -> Matrix:
+        """Translation from base to camera."""
+        place = np.eye(4)
+        base_from_camera = self.lookup("base_link", "camera")
+        place[:3, 3] = (0, 0, self.config.camera_height_m) if base_from_camera is None else base_from_camera[:3, 3]
+        return place
+
+    def points(self, path: Path | None) -> list[list[float]]:
+        """Points [x, y] of a path in the map's frame, centimetres exact; empty when there is none."""
+        if path is None or not path.poses:
+            return []
+        xyz = np.pad(path_array(path)[:, :2], ((0, 0), (0, 1)))
+        if path.header.frame_id not in ("", "map"):
+            map_from_frame = self.lookup("map", path.header.frame_id)
+            if map_from_frame is None:
+                return []
+            xyz = transform_points(map_from_frame, xyz)
+        points: list[list[float]] = xyz[np.isfinite(xyz).all(axis=1), :2].round(3).tolist()
+        return points
+
+    def captured_ms(self, stamp: int) -> float:
+        """A stamp on the server's clock for the page; a stamp from the future counts as now."""
+        age_ms = (self.clock.now_ns() - stamp) / 1e6
+        return self.server.now_ms() - max(age_ms, 0.0)
+
+
+def _planar(pose: Matrix | None) -> list[float] | None:
+    return None if pose is None else [round(float(value), 4) for value in pose2_from_matrix(pose)]
+
+
+def _finite(value: Any) -> float | None:
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _vspace(status: VspaceStatus | None) -> dict[str, Any] | None:
+    if status is None:
+        return None
+    return {
+        "state": VSPACE_STATES.get(int(status.state), "empty"),
+        "psnr_db": _finite(status.psnr_db) or 0.0,
+        "train_seconds": _finite(status.train_seconds) or 0.0,
+        "message": status.message,
+    }
+
+
+def _battery(battery: BatteryState | None) -> dict[str, Any] | None:
+    voltage = None if battery is None else _finite(battery.voltage)
+    if battery is None or voltage is None:
+        return None
+    share = _finite(battery.percentage)  # 0..1; NaN where unknown (sensor_msgs/BatteryState)
+    return {"voltage": voltage, "percent": None if share is None else 100.0 * share}
+
+
+if __name__ == "__main__":
+    main(ConsoleNode)
