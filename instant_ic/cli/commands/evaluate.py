@@ -1,0 +1,61 @@
+"""``ic evaluate``: runs the stack or a part of it on recordings and measures what comes out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds ``evaluate`` to the ``ic`` command."""
+    parser = subparsers.add_parser(
+        "evaluate", help="measure the stack on recordings", description=__doc__.replace("``", "")
+    )
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
+    recordings = kinds.add_parser(
+        "recordings",
+        help="a LiDAR capture and a panorama photo through every node",
+        description=(
+            "Sends a VLP-16 capture as UDP packets and a 360° photo by the Theta's web API through the whole stack. "
+            "Writes a bag, the trained view beside the photo's own crop, the depth and the map as PNG, "
+            "and summary.json into the output folder."
+        ),
+        epilog="example: ic evaluate recordings --pcap drive.pcap --panorama room.jpg -o runs/recordings",
+    )
+    recordings.add_argument("--pcap", type=Path, required=True, help="capture of VLP-16 data packets")
+    recordings.add_argument("--panorama", type=Path, required=True, help="equirect photo (JPEG, 2:1)")
+    recordings.add_argument("-o", "--out", type=Path, required=True, help="folder for what is written")
+    recordings.add_argument("--timeout", type=float, default=240.0, metavar="S", help="in all (default: %(default)g s)")
+    recordings.add_argument("--json", type=Path, metavar="OUT", help="also write the summary here")
+    recordings.set_defaults(func=evaluate_recordings)
+
+
+def evaluate_recordings(args: argparse.Namespace) -> int:
+    """Runs ``ic evaluate recordings``; returns the exit status."""
+    from rich.console import Console
+
+    from ...evaluation.recordings import evaluate_recordings as run
+    from ...evaluation.stack import StackError
+
+    console = Console(stderr=True)
+    try:
+        with console.status("starting") as status:
+
+            def tell(text: str) -> None:
+                status.update(text)
+                if not console.is_terminal:
+                    console.print(text)
+
+            summary = run(args.pcap, args.panorama, args.out, args.timeout, tell)
+    except (FileNotFoundError, FileExistsError, StackError) as error:
+        console.print(f"ic evaluate recordings: {error}", style="red", markup=False)
+        return 1
+    text = json.dumps(summary, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+    console.print(f"pictures and bag in {args.out}/: view.png, depth.png, map.png, bag/")
+    return 0

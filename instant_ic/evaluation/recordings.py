@@ -1,0 +1,159 @@
+"""Real recordings through the real nodes: a LiDAR capture to a map, a panorama photo to a virtual space.
+
+The simulated devices send the recordings over the devices' own protocols, so every driver and node runs as with the
+hardware. Photo and capture need not come from one place: then the depth's scale means nothing, but every step works.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bus import LATCHED, SENSOR
+from ..geometry.poses import inverse, pose_matrix, yaw_of
+from ..msg import grid_array, image_array, message_type, pose_message, stamp_ns, to_time
+from ..msg import pose_matrix as matrix_of_pose
+from .pictures import perspective_crop, psnr_db, save_depth, save_map, save_view_strip
+from .stack import Stack, StackError, free_ports
+
+_YAWS_DEG = (0, 90, 180, -90)
+_WIDTH, _HEIGHT, _FOV = 640, 360, math.radians(90)
+
+
+def evaluate_recordings(
+    pcap: Path,
+    panorama: Path,
+    out: Path,
+    timeout_s: float = 240.0,
+    tell: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Runs ``launch/sim.yaml`` on recordings and writes a bag, pictures and a summary into ``out``.
+
+    Writes ``bag/`` (rosbag2 MCAP), ``view.png`` (trained view beside the photo's own crop), ``depth.png``,
+    ``map.png``, ``launch.log`` and ``summary.json``, whose content is returned.
+
+    Raises:
+        FileNotFoundError: a recording is missing.
+        FileExistsError: ``out`` holds a bag already.
+        StackError: a step did not come about in time.
+    """
+    for path in (pcap, panorama):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist")
+    if (out / "bag").exists():
+        raise FileExistsError(f"{out}/bag exists already: choose another folder or take it away")
+    out.mkdir(parents=True, exist_ok=True)
+    # Sockets need a short path, which `out` may not be.
+    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
+    arguments = {
+        **free_ports(),
+        "pcap": pcap.resolve(),
+        "panorama": panorama.resolve(),
+        "record": (out / "bag").resolve(),
+        "headless": True,
+    }
+    try:
+        with Stack("sim.yaml", run_dir, arguments, out / "launch.log") as stack:
+            summary = _watch(stack, out, timeout_s, tell)
+            tell("stopping the stack")
+            status = stack.stop()
+        if status != 0:
+            raise StackError(f"the stack ended with status {status}; see {out}/launch.log")
+    finally:
+        shutil.rmtree(run_dir, ignore_errors=True)
+    (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    return summary
+
+
+def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None]) -> dict[str, Any]:
+    import cv2
+
+    started = time.monotonic()
+    scans = stack.collect("/scan", message_type("LaserScan"))
+    poses = stack.collect("/pose", message_type("PoseWithCovarianceStamped"))
+    maps = stack.collect("/map", message_type("OccupancyGrid"), LATCHED)
+    keyframes = stack.collect("/keyframe", message_type("Keyframe"), LATCHED)
+    statuses = stack.collect("/vspace/status", message_type("VspaceStatus"), LATCHED)
+    views = stack.collect("/vspace/view", message_type("RenderedView"))
+    requests = stack.observer.publisher("/view/request", message_type("ViewRequest"), SENSOR)
+    ready = message_type("VspaceStatus").READY
+
+    def wait(condition: Callable[[], Any], what: str) -> Any:
+        tell(f"waiting for {what}")
+        return stack.wait_for(condition, max(1.0, timeout_s - (time.monotonic() - started)), what)
+
+    wait(lambda: len(scans) >= 5, "laser scans of the capture")
+    wait(lambda: maps and poses, "a map")
+    keyframe = wait(lambda: keyframes and keyframes[-1], "a keyframe of the photo")
+    wait(lambda: statuses and statuses[-1].state == ready, "a virtual space that is fit to show")
+    time_to_ready_s = float(statuses[-1].ready_seconds)
+    # A little longer than fit to show: what an operator sees after the first moments.
+    settled = time.monotonic() + 10.0
+    wait(lambda: time.monotonic() > settled, "ten more seconds of training")
+    keyframe = keyframes[-1]
+
+    encoded = np.asarray(keyframe.panorama.data)
+    photo = cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+    map_from_camera = matrix_of_pose(keyframe.pose)
+    rows = []
+    scores = {}
+    for number, yaw_deg in enumerate(_YAWS_DEG, start=1):
+        map_from_view = map_from_camera @ pose_matrix(yaw=math.radians(yaw_deg))
+        request = _request(number, map_from_view)
+        next_try = 0.0
+
+        def view_of(number: int = number, request: Any = request) -> Any:
+            nonlocal next_try
+            if time.monotonic() > next_try:  # asked again: only the newest request is served
+                next_try = time.monotonic() + 2.0
+                requests.publish(request)
+            return next((v for v in views if v.request_id == number), None)
+
+        view = wait(view_of, f"the view at {yaw_deg}°")
+        data = np.asarray(view.image.data)
+        rendered = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        camera_from_view = (inverse(map_from_camera) @ map_from_view)[:3, :3]
+        crop = perspective_crop(photo, camera_from_view, rendered.shape[1], rendered.shape[0], _FOV)
+        scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
+        rows.append((f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)", rendered, crop))
+    save_view_strip(out / "view.png", rows)
+    depth = image_array(keyframe.depth)
+    save_depth(out / "depth.png", photo, depth, f"depth, scale {keyframe.scale:.3f}, quality {keyframe.quality:.2f}")
+    grid, resolution, origin = grid_array(maps[-1])
+    robot = matrix_of_pose(poses[-1])
+    save_map(out / "map.png", grid, resolution, origin, (robot[0, 3], robot[1, 3], yaw_of(robot)))
+    span_s = (stamp_ns(scans[-1]) - stamp_ns(scans[0])) / 1e9
+    return {
+        "scans": len(scans),
+        "scan_rate_hz": round((len(scans) - 1) / span_s, 2) if span_s > 0 else 0.0,
+        "map_cells_known": int((grid >= 0).sum()),
+        "map_cells_occupied": int((grid > 50).sum()),
+        "keyframe_to_ready_s": round(time_to_ready_s, 2),
+        "training_psnr_db": round(float(statuses[-1].psnr_db), 2),
+        "view_psnr_db": scores,
+        "depth_scale": round(float(keyframe.scale), 4),
+        "depth_quality": round(float(keyframe.quality), 3),
+        "depth_fit": bool(keyframe.fit),
+        "depth_message": str(keyframe.message),
+        "device": str(statuses[-1].device),
+    }
+
+
+def _request(number: int, map_from_view: Any) -> Any:
+    request, head = message_type("ViewRequest"), message_type("Header")
+    return request(
+        header=head(stamp=to_time(time.time_ns()), frame_id="map"),
+        id=number,
+        pose=pose_message(map_from_view),
+        fov_rad=_FOV,
+        width=_WIDTH,
+        height=_HEIGHT,
+    )

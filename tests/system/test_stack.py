@@ -1,0 +1,141 @@
+"""The whole stack, once, as an operator uses it: real processes, real sockets, the page's own WebSocket."""
+
+import asyncio
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from instant_ic.bus import registry
+from instant_ic.evaluation.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
+from instant_ic.evaluation.stack import Stack, free_ports, processes_of
+from instant_ic.msg import ControlState
+from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.worlds import corridor_world
+
+pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]
+ROOT = Path(__file__).resolve().parents[2]
+OBSTACLE = (4.0, -0.25, 4.5, 0.25)
+"""Where the corridor's white box stands: x_min, y_min, x_max, y_max."""
+
+
+@dataclass
+class Outcome:
+    record: DriveRecord
+    bag: Path
+    topics: dict[str, str]
+    nodes: set[str]
+    exit_status: int
+    seconds_to_end: float
+    left_processes: list[str]
+    left_sockets: list[Path]
+    log: str
+
+
+@pytest.fixture(scope="module")
+def outcome(tmp_path_factory):
+    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
+    bag = tmp_path_factory.mktemp("drive") / "bag"
+    ports = free_ports()
+    try:
+        with Stack("sim.yaml", run_dir, {**ports, "record": bag, "headless": True}) as stack:
+            recorder = DriveRecorder(stack)
+            url = f"http://127.0.0.1:{ports['console_port']}/"
+            asyncio.run(drive_through_obstacle(stack, recorder, url, beyond_x_m=5.6))
+            topics = {t.topic: t.type_name for t in registry.list_topics(run_dir)}
+            nodes = {n.name for n in registry.list_nodes(run_dir)}
+            started = time.monotonic()
+            status = stack.stop()
+            seconds = time.monotonic() - started
+            left = [" ".join(p.cmdline()) for p in processes_of(run_dir)]
+            log = stack.log_path.read_text(errors="replace")
+        sockets = list(run_dir.glob("topics/*/*.sock"))
+        yield Outcome(recorder.record, bag, topics, nodes, status, seconds, left, sockets, log)
+    finally:
+        shutil.rmtree(run_dir, ignore_errors=True)
+
+
+def test_control_passes_to_the_virtual_robot_and_back_once(outcome):
+    assert outcome.record.modes[-3:] == [ControlState.REAL, ControlState.VIRTUAL, ControlState.REAL]
+    # Before the space is ready there may be a time without control; after it, one passage each way and no flicker.
+    assert Counter(outcome.record.modes)[ControlState.VIRTUAL] == 1
+
+
+def test_obstacle_stands_where_these_tests_think():
+    x0, y0, x1, y1 = OBSTACLE
+    centre_z = 0.4
+    origins = np.array(
+        [[x0 - 1, 0, centre_z], [x1 + 1, 0, centre_z], [4.25, y0 - 0.5, centre_z], [4.25, y1 + 0.5, centre_z]]
+    )
+    directions = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    ranges, _ = EquirectRenderer(corridor_world()).cast(origins, directions)
+    assert ranges == pytest.approx([1, 1, 0.5, 0.5], abs=1e-3)
+
+
+def test_real_robot_never_touches_the_obstacle_that_the_virtual_one_drives_through(outcome):
+    box = OBSTACLE
+    assert not outcome.record.contact
+    assert min(footprint_clearance(pose, box) for pose in outcome.record.truth[::3]) > 0.02
+    assert min(footprint_clearance(pose, box) for pose in outcome.record.vbot) == 0.0
+    # Round the obstacle, not back: the r-bot ends beyond it.
+    assert outcome.record.truth[-1][0] > box[2]
+
+
+def test_every_process_ends_cleanly(outcome):
+    assert outcome.exit_status == 0
+    assert outcome.left_processes == []
+    assert outcome.left_sockets == []
+    assert outcome.seconds_to_end < 15  # 5 s on a free machine; this one may be busy
+    assert "Traceback" not in outcome.log
+
+
+def test_topics_are_those_of_the_architecture(outcome):
+    table = {}
+    text = (ROOT / "docs/architecture.md").read_text()
+    for names, types in re.findall(r"^\| ((?:`/[\w/]+`(?:, )?)+) \| ([^|]+) \|", text, re.M):
+        topics = re.findall(r"`(/[\w/]+)`", names)
+        kinds = re.findall(r"\w+/\w+", types)
+        table.update(zip(topics, kinds if len(kinds) == len(topics) else kinds * len(topics), strict=True))
+    undocumented = {t: n for t, n in outcome.topics.items() if table.get(t) != n.replace("/msg/", "/")}
+    assert undocumented == {}
+
+
+def test_bag_opens_with_rosbags_and_holds_the_run(outcome):
+    with AnyReader([outcome.bag]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+        for connection, _, raw in reader.messages(connections=[c for c in reader.connections if c.topic == "/scan"]):
+            scan = reader.deserialize(raw, connection.msgtype)
+            assert len(scan.ranges) == 720
+            break
+    for topic in ("/camera/image/compressed", "/lidar/points", "/scan", "/wheel/odom", "/tf", "/keyframe", "/ic/state"):
+        assert counts.get(topic, 0) >= 1, topic
+    assert counts["/scan"] >= 100
+
+
+@pytest.mark.timeout(900)
+def test_lockstep_replay_is_the_same_twice(outcome, tmp_path):
+    for name in ("a", "b"):
+        subprocess.run(
+            [
+                *(sys.executable, "-m", "instant_ic.cli.main", "replay", str(outcome.bag)),
+                *("--nodes", "grid_slam,depth_estimator,depth_scaler", "-o", str(tmp_path / name)),
+            ],
+            check=True,
+            timeout=400,
+            stdin=subprocess.DEVNULL,
+        )
+    command = [sys.executable, "-m", "instant_ic.cli.main", "bag", "diff", str(tmp_path / "a"), str(tmp_path / "b")]
+    assert subprocess.run(command, timeout=120).returncode == 0
+    with AnyReader([tmp_path / "a"]) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    for topic in ("/map", "/pose", "/depth/raw", "/depth/scaled", "/keyframe"):
+        assert counts.get(topic, 0) >= 1, topic
