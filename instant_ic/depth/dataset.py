@@ -1,0 +1,95 @@
+"""Panoramas with depth on disk: written once by a renderer, read by the training through memory maps."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+INFO = "dataset.json"
+
+
+class DatasetError(ValueError):
+    """A data folder is missing, incomplete or of another shape than asked for."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One panorama: ``rgb`` (H, W, 3) uint8, ``depth_m`` (H, W) radial metres, 0 = unknown; ``world`` its seed."""
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.floating]
+    world: int
+
+
+class PanoramaDataset:
+    """A folder with ``rgb.npy``, ``depth.npy`` (float16), ``world.npy`` and ``dataset.json``."""
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        try:
+            self.info: dict[str, Any] = json.loads((self.folder / INFO).read_text(encoding="utf-8"))
+            self.rgb = np.load(self.folder / "rgb.npy", mmap_mode="r")
+            self.depth = np.load(self.folder / "depth.npy", mmap_mode="r")
+            self.world = np.load(self.folder / "world.npy")
+        except (OSError, ValueError) as error:
+            raise DatasetError(f"{self.folder}: not a panorama data folder ({error})") from error
+        count = int(self.info["count"])
+        self.rgb, self.depth, self.world = self.rgb[:count], self.depth[:count], self.world[:count]
+
+    def __len__(self) -> int:
+        return len(self.world)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        return int(self.rgb.shape[1]), int(self.rgb.shape[2])
+
+    def __getitem__(self, index: int) -> Sample:
+        return Sample(np.asarray(self.rgb[index]), np.asarray(self.depth[index], np.float32), int(self.world[index]))
+
+    def split(self, held_out_share: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indices for training and for evaluation; whole worlds are held out, the last ones.
+
+        Raises:
+            ValueError: the share leaves no world on one side.
+        """
+        worlds = np.unique(self.world)
+        count = max(1, round(len(worlds) * held_out_share))
+        if not 0 < held_out_share < 1 or count >= len(worlds):
+            raise ValueError(f"held_out_share {held_out_share} of {len(worlds)} worlds leaves nothing to train on")
+        held_out = np.isin(self.world, worlds[-count:])
+        return np.flatnonzero(~held_out), np.flatnonzero(held_out)
+
+
+def write_dataset(
+    folder: str | Path, samples: Iterable[Sample], count: int, size: tuple[int, int], info: dict[str, Any]
+) -> Iterator[int]:
+    """Writes up to ``count`` samples of ``size`` (height, width); gives the number written after each.
+
+    What is written so far can be opened at any time; a folder that was cut short just holds fewer samples.
+
+    Raises:
+        DatasetError: a sample has another shape.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    height, width = size
+    rgb = np.lib.format.open_memmap(folder / "rgb.npy", "w+", np.uint8, (count, height, width, 3))
+    depth = np.lib.format.open_memmap(folder / "depth.npy", "w+", np.float16, (count, height, width))
+    world = np.lib.format.open_memmap(folder / "world.npy", "w+", np.int64, (count,))
+    for index, sample in enumerate(samples):
+        if index == count:
+            break
+        if sample.rgb.shape != (height, width, 3) or sample.depth_m.shape != (height, width):
+            raise DatasetError(f"sample {index}: rgb {sample.rgb.shape}, depth {sample.depth_m.shape}, wanted {size}")
+        rgb[index], depth[index], world[index] = sample.rgb, sample.depth_m, sample.world
+        temporary = folder / (INFO + ".part")
+        temporary.write_text(json.dumps({**info, "count": index + 1}, indent=2) + "\n", encoding="utf-8")
+        temporary.replace(folder / INFO)
+        yield index + 1

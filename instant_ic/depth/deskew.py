@@ -1,0 +1,45 @@
+"""LiDAR points of a revolution, brought into the camera's frame at one moment (motion compensation)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.poses import transform_points
+
+
+def points_at(
+    points: NDArray[np.floating],
+    time_s: NDArray[np.floating],
+    start_ns: int,
+    camera_from_lidar: Callable[[int], NDArray[np.float64]],
+    slices: int = 12,
+) -> NDArray[np.float64]:
+    """Moves every point from where the LiDAR was when it measured it.
+
+    Args:
+        points: (N, 3) in the LiDAR's frame, each at its own time; points that are not finite are left out.
+        time_s: (N,) seconds after ``start_ns``.
+        start_ns: stamp of the cloud.
+        camera_from_lidar: pose of the LiDAR at a time (ns) in the camera's frame at the picture's time.
+        slices: poses a revolution; points between two share the nearer one. At 10 Hz and 1 rad/s twelve leave
+            an error under 0.25 degrees.
+
+    Returns:
+        (M, 3) float64 points in the camera's frame, in the order given.
+    """
+    usable = np.isfinite(points).all(axis=1) & np.isfinite(time_s)
+    points, time_s = points[usable].astype(np.float64), time_s[usable].astype(np.float64)
+    if len(points) == 0:
+        return points
+    first, last = float(time_s.min()), float(time_s.max())
+    width = max((last - first) / slices, 1e-9)
+    index = np.minimum(((time_s - first) / width).astype(np.intp), slices - 1)
+    moved = np.empty_like(points)
+    for number in np.unique(index):
+        chosen = index == number
+        middle_ns = start_ns + round((first + (number + 0.5) * width) * 1e9)
+        moved[chosen] = transform_points(camera_from_lidar(middle_ns), points[chosen])
+    return moved

@@ -1,0 +1,76 @@
+"""When a new keyframe is due: the robot has moved, and what to do while the depth cannot be scaled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """When keyframes are taken.
+
+    Attributes:
+        distance_m: motion of the camera since the last keyframe that makes a new one due.
+        angle_deg: likewise for its rotation.
+        unfit_after_s: a keyframe that is due but whose depth cannot be scaled is put off for so long, in the hope of
+            a better one; then it goes out marked as not fit. A fit one replaces it as soon as there is one.
+    """
+
+    distance_m: float = 0.6
+    angle_deg: float = 45.0
+    unfit_after_s: float = 5.0
+
+    def __post_init__(self) -> None:
+        for key in ("distance_m", "angle_deg"):
+            if getattr(self, key) <= 0:
+                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
+        if self.unfit_after_s < 0:
+            raise ValueError(f"unfit_after_s must be 0 or more (got {self.unfit_after_s})")
+
+
+class KeyframeSelector:
+    """Decides for each scaled depth picture in turn whether it becomes a keyframe."""
+
+    def __init__(self, config: KeyframeConfig | None = None) -> None:
+        self.config = config or KeyframeConfig()
+        self.count = 0
+        self._pose: NDArray[np.float64] | None = None
+        self._fit = False
+        self._due_since_ns: int | None = None
+
+    def take(self, map_from_camera: NDArray[np.float64], fit: bool, stamp_ns: int) -> bool:
+        """Whether the picture at this pose becomes a keyframe; if so it is the last one from now on.
+
+        Args:
+            map_from_camera: (4, 4) pose of the picture.
+            fit: whether its depth could be scaled.
+            stamp_ns: its time; waiting is measured by it.
+        """
+        if not self._due(map_from_camera, fit):
+            self._due_since_ns = None
+            return False
+        if not fit:
+            if self._due_since_ns is None:
+                self._due_since_ns = stamp_ns
+            if stamp_ns - self._due_since_ns < self.config.unfit_after_s * 1e9:
+                return False
+        self._pose, self._fit, self._due_since_ns = np.array(map_from_camera), fit, None
+        self.count += 1
+        return True
+
+    def restart(self) -> None:
+        """Forgets the last keyframe: the next fit picture becomes one. The count goes on."""
+        self._pose, self._fit, self._due_since_ns = None, False, None
+
+    def _due(self, map_from_camera: NDArray[np.float64], fit: bool) -> bool:
+        if self._pose is None or (fit and not self._fit):
+            return True
+        moved = float(np.linalg.norm(map_from_camera[:3, 3] - self._pose[:3, 3]))
+        if moved >= self.config.distance_m:
+            return True
+        cosine = (np.trace(self._pose[:3, :3].T @ map_from_camera[:3, :3]) - 1) / 2
+        return math.degrees(math.acos(float(np.clip(cosine, -1, 1)))) >= self.config.angle_deg

@@ -1,0 +1,44 @@
+"""Training losses (torch): each pixel by its solid angle, pixels without truth left out."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+MIN_DEPTH_M = 0.1
+
+
+def berhu(error: Tensor, threshold: float) -> Tensor:
+    """Reverse Huber: |e| up to ``threshold``, (e² + c²) / 2c above; continuous with its slope."""
+    magnitude = error.abs()
+    return torch.where(magnitude <= threshold, magnitude, (error**2 + threshold**2) / (2 * threshold))
+
+
+def weighted_mean(values: Tensor, valid: Tensor, row_weights: Tensor) -> Tensor:
+    """Mean of (B, H, W) values over valid pixels, each weighted by its row, (H,); 0 where nothing is valid."""
+    weights = valid.to(values.dtype) * row_weights[:, None]
+    return (values * weights).sum() / weights.sum().clamp_min(1e-9)
+
+
+def depth_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor, metres_share: float = 0.1) -> Tensor:
+    """|log d - log t| plus a small share of berHu in metres, (B, H, W) in metres, truth 0 = unknown.
+
+    The logarithm counts relative errors, which is what a scaled depth is judged by; it is cut at ``MIN_DEPTH_M``,
+    and the term in metres keeps a gradient there.
+    """
+    valid = truth > 0
+    safe = torch.where(valid, truth, torch.ones_like(truth))
+    log_error = (predicted.clamp_min(MIN_DEPTH_M).log() - safe.clamp_min(MIN_DEPTH_M).log()).abs()
+    return weighted_mean(log_error + metres_share * berhu(predicted - safe, 1.0), valid, row_weights)
+
+
+def edge_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
+    """|∇ log d - ∇ log t| between neighbours in both directions (the panorama's seam included).
+
+    Keeps walls flat and depth steps sharp, which a loss on single pixels does not ask for.
+    """
+    valid = truth > 0
+    log_ratio = predicted.clamp_min(MIN_DEPTH_M).log() - torch.where(valid, truth, 1.0).clamp_min(MIN_DEPTH_M).log()
+    across = weighted_mean((log_ratio - log_ratio.roll(1, -1)).abs(), valid & valid.roll(1, -1), row_weights)
+    down = weighted_mean((log_ratio[:, 1:] - log_ratio[:, :-1]).abs(), valid[:, 1:] & valid[:, :-1], row_weights[1:])
+    return across + down

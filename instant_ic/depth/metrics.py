@@ -1,0 +1,93 @@
+"""The usual measures of a depth map, over valid pixels only (numpy)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class DepthMetrics:
+    """Errors of one depth map or the mean over several.
+
+    Attributes:
+        mre: mean of |d - t| / t.
+        mae: mean of |d - t|, metres.
+        rmse: root of the mean of (d - t)², metres.
+        delta1: share of pixels with max(d/t, t/d) < 1.25; ``delta2`` with 1.25², ``delta3`` with 1.25³.
+        pixels: number of valid pixels.
+    """
+
+    mre: float
+    mae: float
+    rmse: float
+    delta1: float
+    delta2: float
+    delta3: float
+    pixels: int
+
+    def as_dict(self) -> dict[str, float]:
+        """Rounded plain values for records and printing."""
+        return {key: round(value, 5) for key, value in asdict(self).items()}
+
+
+def depth_metrics(predicted: Floats, truth: Floats, valid: NDArray[np.bool_] | None = None) -> DepthMetrics:
+    """Compares two depth maps of the same shape, metres.
+
+    A pixel counts where the truth is finite and positive, and ``valid`` where given. A prediction that is not
+    positive or not finite counts as 0 m: a full relative error and no hit in any delta.
+
+    Raises:
+        ValueError: the shapes differ or no pixel is valid.
+    """
+    if predicted.shape != truth.shape:
+        raise ValueError(f"shapes differ: predicted {predicted.shape}, truth {truth.shape}")
+    usable = np.isfinite(truth) & (truth > 0)
+    if valid is not None:
+        usable &= valid
+    count = int(usable.sum())
+    if count == 0:
+        raise ValueError("no valid pixel in the truth")
+    t = truth[usable].astype(np.float64)
+    d = predicted[usable].astype(np.float64)
+    d = np.where(np.isfinite(d) & (d > 0), d, 0.0)
+    error = np.abs(d - t)
+    ratio = np.maximum(d / t, t / np.maximum(d, 1e-9))
+    return DepthMetrics(
+        mre=float((error / t).mean()),
+        mae=float(error.mean()),
+        rmse=float(np.sqrt((error**2).mean())),
+        delta1=float((ratio < 1.25).mean()),
+        delta2=float((ratio < 1.25**2).mean()),
+        delta3=float((ratio < 1.25**3).mean()),
+        pixels=count,
+    )
+
+
+def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
+    """Mean over maps (every map counts the same); ``pixels`` is the sum.
+
+    Raises:
+        ValueError: nothing to average.
+    """
+    if not each:
+        raise ValueError("no metrics to average")
+    columns = {key: np.array([getattr(one, key) for one in each]) for key in asdict(each[0])}
+    means = {key: float(values.mean()) for key, values in columns.items() if key != "pixels"}
+    return DepthMetrics(**means, pixels=int(columns["pixels"].sum()))
+
+
+def solid_angle_weights(height: int) -> NDArray[np.float32]:
+    """Weight of each row of an equirect picture, (height,), mean 1.
+
+    The solid angle of a pixel is proportional to the sine difference of its edges' elevations. Without it the poles,
+    which fill many pixels and little space, rule a mean over pixels.
+    """
+    edges = np.pi / 2 - np.arange(height + 1) * (np.pi / height)
+    weights = np.sin(edges[:-1]) - np.sin(edges[1:])
+    return (weights / weights.mean()).astype(np.float32)

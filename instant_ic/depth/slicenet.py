@@ -1,0 +1,354 @@
+"""SliceNet: depth of an equirect panorama from a sequence of vertical slices.
+
+Pintore et al., "SliceNet: deep dense depth estimation from a single indoor panorama using a slice-based
+representation", CVPR 2021. A panorama of a levelled camera has gravity along its columns, so the features of a
+column are folded into one vector, an LSTM runs over the columns, and a decoder unfolds each column again.
+
+The full-size ResNet-50 model has the published parameter names and shapes, so published checkpoints load
+(:func:`load_checkpoint`). Smaller relatives are described by :class:`SliceNetConfig`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+BACKBONES: dict[str, tuple[bool, tuple[int, int, int, int]]] = {
+    # name: (bottleneck blocks?, blocks a stage)
+    "resnet18": (False, (2, 2, 2, 2)),
+    "resnet34": (False, (3, 4, 6, 3)),
+    "resnet50": (True, (3, 4, 6, 3)),
+}
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class CheckpointError(ValueError):
+    """A checkpoint file does not hold a SliceNet model that can be loaded."""
+
+
+@dataclass(frozen=True)
+class SliceNetConfig:
+    """Shape of the network.
+
+    Attributes:
+        backbone: ``resnet18``, ``resnet34`` or ``resnet50``.
+        height: rows of the input; a power of two, 64 or more. The width is twice that.
+        width_multiplier: share of the usual ResNet channels; 1.0 in the published model.
+        lstm_hidden: LSTM features a direction; 512 in the published model.
+        column_stride: the LSTM runs on every n-th column (1, 2, 4) and the last decoder stages double the width
+            too; 1 in the published model.
+        decoder_floor: the fewest channels inside the decoder; 4 in the published model.
+    """
+
+    backbone: str = "resnet50"
+    height: int = 512
+    width_multiplier: float = 1.0
+    lstm_hidden: int = 512
+    column_stride: int = 1
+    decoder_floor: int = 4
+
+    def __post_init__(self) -> None:
+        if self.backbone not in BACKBONES:
+            raise ValueError(f"backbone must be one of {', '.join(BACKBONES)} (got {self.backbone!r})")
+        if self.height < 64 or self.height & (self.height - 1):
+            raise ValueError(f"height must be a power of two, 64 or more (got {self.height})")
+        if not 0.1 <= self.width_multiplier <= 4.0:
+            raise ValueError(f"width_multiplier must be 0.1 to 4 (got {self.width_multiplier})")
+        if self.lstm_hidden < 8:
+            raise ValueError(f"lstm_hidden must be 8 or more (got {self.lstm_hidden})")
+        if self.column_stride not in (1, 2, 4):
+            raise ValueError(f"column_stride must be 1, 2 or 4 (got {self.column_stride})")
+        if self.decoder_floor < 1:
+            raise ValueError(f"decoder_floor must be 1 or more (got {self.decoder_floor})")
+
+    @property
+    def width(self) -> int:
+        """Columns of the input: twice its rows."""
+        return 2 * self.height
+
+    @property
+    def base_channels(self) -> int:
+        """Channels after the stem, a multiple of 8 so that each contraction to an eighth comes out even."""
+        return max(8, round(64 * self.width_multiplier / 8) * 8)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for checkpoints and training records."""
+        return asdict(self)
+
+
+# The model that the project trains and ships.
+SMALL = SliceNetConfig(
+    backbone="resnet18",
+    height=256,
+    width_multiplier=0.5,
+    lstm_hidden=160,
+    column_stride=2,
+    decoder_floor=24,
+)
+
+
+class CircularPad(nn.Module):
+    """Pads the width with the columns of the other edge: the panorama has no left and right border."""
+
+    def __init__(self, columns: int) -> None:
+        super().__init__()
+        self.columns = columns
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) -> (B, C, H, W + 2 columns)."""
+        # Slices and a concatenation, because they export to plain ONNX operators.
+        return torch.cat((x[..., -self.columns :], x, x[..., : self.columns]), dim=-1)
+
+
+def wrapped_conv(
+    inputs: int, outputs: int, kernel: int, stride: int | tuple[int, int] = 1, bias: bool = True
+) -> nn.Sequential:
+    """Convolution that is circular in width and zero-padded in height."""
+    pad = kernel // 2
+    conv = nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=(pad, 0), bias=bias)
+    return nn.Sequential(CircularPad(pad), conv)
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions (ResNet-18 and -34)."""
+
+    expansion = 1
+
+    def __init__(self, inputs: int, planes: int, stride: int, downsample: nn.Module | None) -> None:
+        super().__init__()
+        self.conv1 = wrapped_conv(inputs, planes, 3, stride, bias=False)
+        self.bn1 = nn.BatchNorm2d(planes)
+        self.conv2 = wrapped_conv(planes, planes, 3, bias=False)
+        self.bn2 = nn.BatchNorm2d(planes)
+        self.downsample = downsample
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = functional.relu(self.bn1(self.conv1(x)))
+        y = self.bn2(self.conv2(y))
+        return functional.relu(y + (x if self.downsample is None else self.downsample(x)))
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3 (which strides), 1x1 (ResNet-50)."""
+
+    expansion = 4
+
+    def __init__(self, inputs: int, planes: int, stride: int, downsample: nn.Module | None) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, planes, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(planes)
+        self.conv2 = wrapped_conv(planes, planes, 3, stride, bias=False)
+        self.bn2 = nn.BatchNorm2d(planes)
+        self.conv3 = nn.Conv2d(planes, planes * self.expansion, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(planes * self.expansion)
+        self.downsample = downsample
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = functional.relu(self.bn1(self.conv1(x)))
+        y = functional.relu(self.bn2(self.conv2(y)))
+        y = self.bn3(self.conv3(y))
+        return functional.relu(y + (x if self.downsample is None else self.downsample(x)))
+
+
+class Encoder(nn.Module):
+    """ResNet without its pooled head; circular in width except for the max-pool."""
+
+    def __init__(self, config: SliceNetConfig) -> None:
+        super().__init__()
+        bottleneck, blocks = BACKBONES[config.backbone]
+        block = Bottleneck if bottleneck else BasicBlock
+        base = config.base_channels
+        self.conv1 = wrapped_conv(3, base, 7, 2, bias=False)
+        self.bn1 = nn.BatchNorm2d(base)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        self.channels: list[int] = []
+        inputs = base
+        for level, count in enumerate(blocks):
+            planes = base * 2**level
+            outputs = planes * block.expansion
+            layers: list[nn.Module] = []
+            for index in range(count):
+                stride = 2 if level > 0 and index == 0 else 1
+                downsample = None
+                if stride != 1 or inputs != outputs:
+                    downsample = nn.Sequential(
+                        nn.Conv2d(inputs, outputs, 1, stride=stride, bias=False), nn.BatchNorm2d(outputs)
+                    )
+                layers.append(block(inputs, planes, stride, downsample))
+                inputs = outputs
+            self.add_module(f"layer{level + 1}", nn.Sequential(*layers))
+            self.channels.append(outputs)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """(B, 3, H, W) -> four levels at 1/4, 1/8, 1/16, 1/32."""
+        x = self.maxpool(functional.relu(self.bn1(self.conv1(x))))
+        levels = []
+        for level in range(4):
+            x = self.get_submodule(f"layer{level + 1}")(x)
+            levels.append(x)
+        return levels
+
+
+class ConvStage(nn.Module):
+    """Circular 3x3 convolution, batch norm, PReLU with a slope a channel; doubles the size first where told."""
+
+    def __init__(
+        self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1), upscale: tuple[int, int] = (1, 1)
+    ) -> None:
+        super().__init__()
+        self.upscale = upscale
+        self.layers = nn.Sequential(
+            wrapped_conv(inputs, outputs, 3, stride), nn.BatchNorm2d(outputs), nn.PReLU(outputs)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.upscale != (1, 1):
+            scale = (float(self.upscale[0]), float(self.upscale[1]))
+            x = functional.interpolate(x, scale_factor=scale, mode="nearest")
+        return self.layers(x)
+
+
+class Contraction(nn.Module):
+    """Folds the height of one encoder level: three strided stages, height and channels to an eighth."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        sizes = (channels, channels // 2, channels // 4, channels // 8)
+        self.layer = nn.Sequential(*(ConvStage(a, b, (2, 1)) for a, b in pairwise(sizes)))
+
+    def forward(self, x: Tensor, columns: int) -> Tensor:
+        """(B, C, H, W) -> (B, C/8 * H/8, columns)."""
+        x = self.layer(x)
+        height, width = x.shape[-2:]
+        if columns != width:
+            # One column of the other edge on each side makes the interpolation circular.
+            factor = columns // width
+            x = torch.cat((x[..., -1:], x, x[..., :1]), dim=-1)
+            size = (height, columns + 2 * factor)
+            x = functional.interpolate(x, size=size, mode="bilinear", align_corners=False)
+            x = x[..., factor:-factor]
+        return x.flatten(1, 2)
+
+
+class SlicingModule(nn.Module):
+    """The four contracted levels side by side: one feature vector a column."""
+
+    def __init__(self, channels: list[int]) -> None:
+        super().__init__()
+        self.slc_lst = nn.ModuleList(Contraction(count) for count in channels)
+
+    def forward(self, levels: list[Tensor], columns: int) -> Tensor:
+        """Levels -> (B, features, columns)."""
+        parts = [part(x, columns) for part, x in zip(self.slc_lst, levels, strict=True)]
+        return torch.cat(parts, dim=1)
+
+
+class _FeatureExtractor(nn.Module):
+    """Only there for the published parameter names (``feature_extractor.encoder``)."""
+
+    def __init__(self, config: SliceNetConfig) -> None:
+        super().__init__()
+        self.encoder = Encoder(config)
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        return self.encoder(x)
+
+
+class SliceNet(nn.Module):
+    """(B, 3, H, 2H) RGB, 0..1 -> (B, H, 2H) depth in metres (radial), unclamped.
+
+    Example:
+        >>> model = SliceNet(SliceNetConfig(backbone="resnet18", height=64, lstm_hidden=16)).eval()
+        >>> model(torch.zeros(1, 3, 64, 128)).shape
+        torch.Size([1, 64, 128])
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, config: SliceNetConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or SliceNetConfig()
+        self.feature_extractor = _FeatureExtractor(config)
+        channels = self.feature_extractor.encoder.channels
+        self.slicing_module = SlicingModule(channels)
+        features = sum(
+            (count // 8) * _contracted_height(config.height // 4 // 2**level) for level, count in enumerate(channels)
+        )
+        self.bi_rnn = nn.LSTM(features, config.lstm_hidden, num_layers=2, bidirectional=True)
+        self.decoder = nn.ModuleList(_decoder_stages(config))
+        # Not persistent: the published state has no such keys.
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        levels = self.feature_extractor((x - self.mean) / self.std)
+        columns = self.slicing_module(levels, self.config.width // self.config.column_stride)
+        sequence, _ = self.bi_rnn(columns.permute(2, 0, 1))  # (columns, B, 2 hidden)
+        y = sequence.permute(1, 2, 0).unsqueeze(2)  # (B, 2 hidden, 1, columns)
+        for stage in self.decoder:
+            y = stage(y)
+        return y.squeeze(1)
+
+
+def _contracted_height(height: int) -> int:
+    """Rows after three stages of stride 2 with a padded 3x3 kernel."""
+    for _ in range(3):
+        height = (height + 1) // 2
+    return height
+
+
+def _decoder_stages(config: SliceNetConfig) -> list[ConvStage]:
+    count = config.height.bit_length() - 1
+    widening = config.column_stride.bit_length() - 1
+    stages = []
+    inputs = 2 * config.lstm_hidden
+    for index in range(count):
+        last = index == count - 1
+        outputs = 1 if last else max(config.decoder_floor, inputs // 2)
+        upscale = (2, 2) if index >= count - widening else (2, 1)
+        stages.append(ConvStage(inputs, outputs, upscale=upscale))
+        inputs = outputs
+    return stages
+
+
+def load_checkpoint(path: str | Path) -> SliceNet:
+    """Loads a checkpoint of ours (``config``, ``state_dict``) or a published one (``kwargs``, ``state_dict``).
+
+    Only tensors and plain values are unpickled. Published weights from before 2021-08-13 were replaced by their
+    authors; the file's own date cannot prove its age, so check where it came from.
+
+    Raises:
+        CheckpointError: the file is no such checkpoint, or its tensors do not fit the network it names.
+    """
+    path = Path(path)
+    try:
+        payload = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise CheckpointError(f"{path}: no such file") from None
+    except Exception as error:  # torch.load raises anything from KeyError to UnpicklingError
+        raise CheckpointError(f"{path}: not a torch checkpoint of tensors and plain values ({error})") from error
+    if not isinstance(payload, dict) or "state_dict" not in payload:
+        raise CheckpointError(f"{path}: no 'state_dict' in the file")
+    if "config" in payload:
+        config = SliceNetConfig(**payload["config"])
+    elif "kwargs" in payload:
+        options = payload["kwargs"]
+        config = SliceNetConfig(
+            backbone=options.get("backbone", "resnet50"), height=512 if options.get("full_size", True) else 256
+        )
+    else:
+        raise CheckpointError(f"{path}: neither 'config' nor 'kwargs' in the file; cannot tell the network's shape")
+    model = SliceNet(config)
+    try:
+        model.load_state_dict(payload["state_dict"], strict=True)
+    except RuntimeError as error:
+        raise CheckpointError(f"{path}: does not fit {config}: {error}") from error
+    return model.eval()
