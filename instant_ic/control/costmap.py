@@ -1,0 +1,349 @@
+"""Costmap in the map frame: static map, live scan with ray clearing, inflation.
+
+Costs, layers and parameters carry nav2's names (costmap_2d): 0 free, 1..252 inflated, 253 inscribed,
+254 lethal, 255 unknown. Arrays are (H, W), row 0 at the lowest y, as in ``nav_msgs/OccupancyGrid``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from .footprint import Footprint
+
+FREE = 0
+INSCRIBED = 253
+LETHAL = 254
+UNKNOWN = 255
+
+
+@dataclass(frozen=True)
+class CostmapConfig:
+    """Parameters of the rolling window."""
+
+    width_m: float = 12.0
+    resolution: float = 0.05
+    inflation_radius: float = 0.70
+    cost_scaling_factor: float = 3.0
+    obstacle_max_range: float = 8.0
+    raytrace_max_range: float = 8.5
+    inf_is_valid: bool = True
+    occupied_threshold: int = 65
+    footprint_clearing_enabled: bool = True
+
+    def __post_init__(self) -> None:
+        for key in ("width_m", "resolution", "cost_scaling_factor", "obstacle_max_range", "raytrace_max_range"):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"costmap.{key} must be > 0 (got {value})")
+        if self.width_m < 10 * self.resolution:
+            raise ValueError(f"costmap.width_m must be at least ten cells (got {self.width_m})")
+        if not self.inflation_radius >= 0:
+            raise ValueError(f"costmap.inflation_radius must be >= 0 (got {self.inflation_radius})")
+        if not 1 <= self.occupied_threshold <= 100:
+            raise ValueError(f"costmap.occupied_threshold must be 1..100 (got {self.occupied_threshold})")
+
+
+@dataclass(frozen=True)
+class Costmap:
+    """Costs with their place in the map frame."""
+
+    costs: NDArray[np.uint8]
+    """(H, W), row 0 at the lowest y."""
+    resolution: float
+    origin: NDArray[np.float64]
+    """(2,) metres: the outer corner of cell (0, 0)."""
+
+    def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Row and column of points (..., 2); not checked against the window."""
+        index = np.floor((np.asarray(points, dtype=np.float64) - self.origin) / self.resolution).astype(np.int64)
+        return index[..., 1], index[..., 0]
+
+    def centres(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Centres (..., 2) of cells in metres."""
+        return self.origin + (np.stack([columns, rows], axis=-1) + 0.5) * self.resolution
+
+    def cost_at(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Cost (...) at points (..., 2); UNKNOWN outside the window."""
+        rows, columns = self.cells(points)
+        height, width = self.costs.shape
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        found = self.costs[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+        return np.where(inside, found, UNKNOWN).astype(np.uint8)
+
+    def lethal_overlap(self, poses: NDArray[np.float64], body: NDArray[np.float64]) -> NDArray[np.int64]:
+        """How many of the ``body`` points (M, 2) lie in a lethal cell, for each pose (N, 3)."""
+        poses = np.ascontiguousarray(poses, dtype=np.float64).reshape(-1, 3)
+        body = np.ascontiguousarray(body, dtype=np.float64)
+        ox, oy = float(self.origin[0]), float(self.origin[1])
+        overlap: NDArray[np.int64] = _lethal_overlap(self.costs, ox, oy, self.resolution, poses, body)
+        return overlap
+
+    def occupancy(self) -> NDArray[np.int8]:
+        """The costs in the -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
+        return _TO_OCCUPANCY[self.costs]
+
+    @staticmethod
+    def from_occupancy(occupancy: NDArray[np.int8], resolution: float, origin: NDArray[np.float64]) -> Costmap:
+        """Inverse of ``occupancy``; inflated costs come back within 1.3 of what they were."""
+        costs = _FROM_OCCUPANCY[np.asarray(occupancy, dtype=np.int8).view(np.uint8)]
+        return Costmap(costs, float(resolution), np.asarray(origin, dtype=np.float64)[:2])
+
+
+def _occupancy_tables() -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
+    to = np.zeros(256, dtype=np.int8)
+    to[1:INSCRIBED] = 1 + (97 * (np.arange(1, INSCRIBED) - 1)) // 251
+    to[INSCRIBED], to[LETHAL], to[UNKNOWN] = 99, 100, -1
+    back = np.full(256, UNKNOWN, dtype=np.uint8)
+    back[0] = FREE
+    for value in range(1, 99):  # the middle one of the costs that fall on each published value
+        costs = np.flatnonzero(to == value)
+        back[value] = costs[costs.size // 2]
+    back[99], back[100] = INSCRIBED, LETHAL
+    return to, back
+
+
+_TO_OCCUPANCY, _FROM_OCCUPANCY = _occupancy_tables()
+
+
+@dataclass(frozen=True)
+class StaticMap:
+    """An occupancy grid: -1 unknown, 0..100 probability of being occupied."""
+
+    occupancy: NDArray[np.int8]
+    resolution: float
+    origin: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.occupancy.ndim != 2 or self.occupancy.size == 0:
+            raise ValueError(f"map must be a grid with cells (got shape {self.occupancy.shape})")
+        if not self.resolution > 0:
+            raise ValueError(f"map resolution must be > 0 (got {self.resolution})")
+
+
+@dataclass(frozen=True)
+class ScanRays:
+    """One scan in the map frame, ready for marking and clearing."""
+
+    origin: NDArray[np.float64]
+    """(2,) where the sensor was."""
+    ends: NDArray[np.float64]
+    """(N, 2) where each beam ended."""
+    hits: NDArray[np.bool_]
+    """(N,) whether it ended on something near enough to be marked."""
+
+
+def scan_points(
+    ranges: NDArray[np.floating], angle_min: float, angle_increment: float, range_min: float, range_max: float
+) -> NDArray[np.float64]:
+    """Hits (N, 2) in the sensor's plane, metres; what is no measurement (REP-117) is left out."""
+    r = np.asarray(ranges, dtype=np.float64)
+    valid = np.isfinite(r) & (r >= range_min) & (r <= range_max)
+    angle = angle_min + angle_increment * np.flatnonzero(valid)
+    return np.stack([r[valid] * np.cos(angle), r[valid] * np.sin(angle)], axis=-1)
+
+
+def scan_rays(
+    ranges: NDArray[np.floating],
+    angle_min: float,
+    angle_increment: float,
+    range_min: float,
+    range_max: float,
+    map_from_lidar: NDArray[np.float64],
+    config: CostmapConfig,
+) -> ScanRays:
+    """Beams of a scan in the map frame.
+
+    +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` where ``inf_is_valid``; NaN, -inf and
+    what is closer than ``range_min`` neither mark nor clear.
+
+    Args:
+        ranges: (N,) metres.
+        angle_min: of the first beam, radians.
+        angle_increment: radians.
+        range_min: metres.
+        range_max: metres.
+        map_from_lidar: (4, 4) at the stamp of the scan.
+        config: ranges for marking and clearing.
+    """
+    r = np.asarray(ranges, dtype=np.float64)
+    angle = angle_min + angle_increment * np.arange(r.size)
+    measured = np.isfinite(r) & (r >= range_min) & (r <= range_max)
+    nothing = np.isposinf(r) if config.inf_is_valid else np.zeros(r.size, dtype=bool)
+    keep = measured | nothing
+    reach = np.where(measured, np.where(np.isfinite(r), r, 0.0), config.raytrace_max_range)
+    hits = measured & (reach <= config.obstacle_max_range)
+    reach = np.minimum(reach, config.raytrace_max_range)[keep]
+    ends_lidar = np.stack([reach * np.cos(angle[keep]), reach * np.sin(angle[keep])], axis=-1)
+    ends = ends_lidar @ map_from_lidar[:2, :2].T + map_from_lidar[:2, 3]
+    return ScanRays(map_from_lidar[:2, 3].copy(), ends, hits[keep])
+
+
+class RollingCostmap:
+    """A window that moves with the robot and remembers what the scans saw in it."""
+
+    def __init__(self, config: CostmapConfig, footprint: Footprint) -> None:
+        self.config = config
+        self.footprint = footprint
+        self.size = round(config.width_m / config.resolution)
+        self._observed = np.full((self.size, self.size), UNKNOWN, dtype=np.uint8)
+        self._corner: tuple[int, int] | None = None  # window's first column and row in the endless grid
+        self._body = footprint.points(0.5 * config.resolution)
+
+    def reset(self) -> None:
+        """Forgets what the scans saw, as after a jump of the map."""
+        self._observed.fill(UNKNOWN)
+
+    def update(self, robot_pose: NDArray[np.float64], static: StaticMap | None, scan: ScanRays | None) -> Costmap:
+        """Moves the window over the robot (x, y, yaw), takes in a scan, and gives the costs."""
+        resolution = self.config.resolution
+        self._move_to(float(robot_pose[0]), float(robot_pose[1]))
+        assert self._corner is not None
+        origin = np.array(self._corner, dtype=np.float64) * resolution
+        if scan is not None and len(scan.ends):
+            start = (scan.origin - origin) / resolution
+            ends = np.ascontiguousarray((scan.ends - origin) / resolution)
+            _clear_and_mark(self._observed, float(start[0]), float(start[1]), ends, scan.hits)
+        if self.config.footprint_clearing_enabled:
+            self._clear_footprint(robot_pose, origin)
+        master = self._master(static, origin)
+        return Costmap(self._inflate(master), resolution, origin)
+
+    def _move_to(self, x: float, y: float) -> None:
+        half = self.size // 2
+        corner = (
+            math.floor(x / self.config.resolution) - half,
+            math.floor(y / self.config.resolution) - half,
+        )
+        if corner == self._corner:
+            return
+        if self._corner is not None:
+            dx, dy = corner[0] - self._corner[0], corner[1] - self._corner[1]
+            moved = np.full_like(self._observed, UNKNOWN)
+            n = self.size
+            if abs(dx) < n and abs(dy) < n:
+                moved[max(0, -dy) : n - max(0, dy), max(0, -dx) : n - max(0, dx)] = self._observed[
+                    max(0, dy) : n - max(0, -dy), max(0, dx) : n - max(0, -dx)
+                ]
+            self._observed = moved
+        self._corner = corner
+
+    def _clear_footprint(self, pose: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        points = self._body @ np.array([[c, s], [-s, c]]) + np.asarray(pose)[:2]
+        index = np.floor((points - origin) / self.config.resolution).astype(np.int64)
+        index = index[((index >= 0) & (index < self.size)).all(axis=1)]
+        self._observed[index[:, 1], index[:, 0]] = FREE
+
+    def _master(self, static: StaticMap | None, origin: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """Layers joined as nav2's ``combination_method`` max does: what either holds occupied is occupied."""
+        if static is None:
+            return self._observed.copy()
+        centres = (np.arange(self.size) + 0.5) * self.config.resolution
+        columns = np.floor((origin[0] + centres - static.origin[0]) / static.resolution).astype(np.int64)
+        rows = np.floor((origin[1] + centres - static.origin[1]) / static.resolution).astype(np.int64)
+        height, width = static.occupancy.shape
+        in_columns, in_rows = (columns >= 0) & (columns < width), (rows >= 0) & (rows < height)
+        occupancy = np.full((self.size, self.size), -1, dtype=np.int8)
+        occupancy[np.ix_(in_rows, in_columns)] = static.occupancy[np.ix_(rows[in_rows], columns[in_columns])]
+        master = np.where(occupancy < 0, self._observed, FREE).astype(np.uint8)
+        master[(occupancy >= self.config.occupied_threshold) | (self._observed == LETHAL)] = LETHAL
+        return master
+
+    def _inflate(self, master: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """nav2's inflation: 252·exp(-cost_scaling_factor·(d - inscribed_radius)); inscribed within it."""
+        import cv2
+
+        lethal = master == LETHAL
+        if not lethal.any():
+            return master
+        distance = cv2.distanceTransform((~lethal).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(
+            np.float64
+        )
+        distance *= self.config.resolution
+        inscribed = self.footprint.inscribed_radius_m
+        # A hair of slack: a cell five whole cells away is at exactly the inscribed radius.
+        within = ~lethal & (distance <= inscribed + 1e-6)
+        near = ~lethal & ~within & (master != UNKNOWN) & (distance <= self.config.inflation_radius)
+        master[near] = (252.0 * np.exp(-self.config.cost_scaling_factor * (distance[near] - inscribed))).astype(
+            np.uint8
+        )
+        master[within] = INSCRIBED
+        return master
+
+
+def inflated_cost(distance_m: float, config: CostmapConfig, footprint: Footprint) -> int:
+    """Cost of a place ``distance_m`` from the nearest obstacle."""
+    if distance_m <= 0:
+        return LETHAL
+    if distance_m <= footprint.inscribed_radius_m + 1e-6:
+        return INSCRIBED
+    if distance_m > config.inflation_radius:
+        return FREE
+    return int(252.0 * math.exp(-config.cost_scaling_factor * (distance_m - footprint.inscribed_radius_m)))
+
+
+@njit(cache=True)
+def _clear_and_mark(
+    observed: NDArray[np.uint8],
+    start_x: float,
+    start_y: float,
+    ends: NDArray[np.float64],
+    hits: NDArray[np.bool_],
+) -> None:
+    """Clears along every beam up to its last cell, then marks the hits: a hit outlives a grazing beam.
+
+    Coordinates are in cells of ``observed``. Walks the cells a beam touches (Amanatides & Woo 1987).
+    """
+    height, width = observed.shape
+    for i in range(ends.shape[0]):
+        dx, dy = ends[i, 0] - start_x, ends[i, 1] - start_y
+        column, row = math.floor(start_x), math.floor(start_y)
+        last_column, last_row = math.floor(ends[i, 0]), math.floor(ends[i, 1])
+        step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
+        per_x = abs(1.0 / dx) if dx != 0.0 else np.inf
+        per_y = abs(1.0 / dy) if dy != 0.0 else np.inf
+        next_x = ((column + 1 - start_x) if dx > 0 else (start_x - column)) * per_x if dx != 0.0 else np.inf
+        next_y = ((row + 1 - start_y) if dy > 0 else (start_y - row)) * per_y if dy != 0.0 else np.inf
+        for _ in range(abs(last_column - column) + abs(last_row - row)):
+            if column < 0 or row < 0 or column >= width or row >= height:
+                break
+            observed[row, column] = 0
+            if next_x < next_y:
+                next_x += per_x
+                column += step_x
+            else:
+                next_y += per_y
+                row += step_y
+        if not hits[i] and 0 <= last_column < width and 0 <= last_row < height:
+            observed[last_row, last_column] = 0
+    for i in range(ends.shape[0]):
+        if hits[i]:
+            column, row = math.floor(ends[i, 0]), math.floor(ends[i, 1])
+            if 0 <= column < width and 0 <= row < height:
+                observed[row, column] = 254
+
+
+@njit(cache=True)
+def _lethal_overlap(
+    costs: NDArray[np.uint8],
+    origin_x: float,
+    origin_y: float,
+    resolution: float,
+    poses: NDArray[np.float64],
+    body: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    height, width = costs.shape
+    overlap = np.zeros(poses.shape[0], dtype=np.int64)
+    for i in range(poses.shape[0]):
+        c, s = math.cos(poses[i, 2]), math.sin(poses[i, 2])
+        for j in range(body.shape[0]):
+            column = math.floor((poses[i, 0] + c * body[j, 0] - s * body[j, 1] - origin_x) / resolution)
+            row = math.floor((poses[i, 1] + s * body[j, 0] + c * body[j, 1] - origin_y) / resolution)
+            if 0 <= row < height and 0 <= column < width and costs[row, column] == 254:
+                overlap[i] += 1
+    return overlap

@@ -1,0 +1,33 @@
+"""Prints the arbiter's table as a Mermaid state diagram and as Markdown tables, for docs/control.md."""
+
+from __future__ import annotations
+
+from .arbiter import ACTIONS, GUARDS, SOURCES, TRANSITIONS, TimeoutConfig
+
+
+def state_diagram() -> str:
+    """The state machine as a Mermaid diagram."""
+    lines = ["stateDiagram-v2", "    [*] --> STOPPED"]
+    lines += [f"    {row.source.name} --> {row.target.name}: {row.guard} / {row.action}" for row in TRANSITIONS]
+    return "\n".join(lines)
+
+
+def guard_table() -> str:
+    """What each guard and action of the diagram means, as a Markdown table."""
+    rows = ["| Guard or action | Meaning |", "|---|---|"]
+    rows += [f"| `{name}` | {meaning} |" for name, meaning in {**GUARDS, **ACTIONS}.items()]
+    return "\n".join(rows)
+
+
+def source_table(timeouts: TimeoutConfig | None = None) -> str:
+    """What must be fresh in which state, as a Markdown table."""
+    timeouts = timeouts or TimeoutConfig()
+    rows = [
+        "| Source | Needed in | Command zero after | STOPPED after |",
+        "|---|---|---|---|",
+    ]
+    for source in SOURCES:
+        modes = ", ".join(mode.name for mode in source.modes)
+        timeout = getattr(timeouts, source.key)
+        rows.append(f"| {source.name} | {modes} | {timeout:g} s | {max(timeout, timeouts.stop_after_s):g} s |")
+    return "\n".join(rows)

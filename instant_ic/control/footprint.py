@@ -1,0 +1,44 @@
+"""The robot's outline: a rectangle round the origin of ``base_link``."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Rectangle in metres, length along x, width along y."""
+
+    length_m: float = 0.60
+    width_m: float = 0.50
+
+    def __post_init__(self) -> None:
+        for key, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"footprint.{key} must be > 0 (got {value})")
+
+    @property
+    def inscribed_radius_m(self) -> float:
+        """Closer than this to an obstacle, the centre is in collision at any heading."""
+        return 0.5 * min(self.length_m, self.width_m)
+
+    @property
+    def circumscribed_radius_m(self) -> float:
+        """Farther than this from every obstacle, the robot is free at any heading."""
+        return 0.5 * math.hypot(self.length_m, self.width_m)
+
+    def corners(self, padding_m: float = 0.0) -> NDArray[np.float64]:
+        """Corners (4, 2) in ``base_link``, counter-clockwise from front left."""
+        a, b = 0.5 * self.length_m + padding_m, 0.5 * self.width_m + padding_m
+        return np.array([[a, b], [-a, b], [-a, -b], [a, -b]])
+
+    def points(self, spacing_m: float, padding_m: float = 0.0) -> NDArray[np.float64]:
+        """Points (N, 2) over the whole rectangle, edges included, no farther apart than ``spacing_m``."""
+        a, b = 0.5 * self.length_m + padding_m, 0.5 * self.width_m + padding_m
+        xs = np.linspace(-a, a, max(2, math.ceil(2 * a / spacing_m) + 1))
+        ys = np.linspace(-b, b, max(2, math.ceil(2 * b / spacing_m) + 1))
+        return np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)

@@ -1,0 +1,61 @@
+"""Motion of a skid-steer robot: limits and the exact arc of a constant twist."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.poses import wrap_angle
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Speed and acceleration limits of the base (config/base.yaml holds the base's own copy)."""
+
+    max_linear_m_s: float = 0.5
+    max_angular_rad_s: float = 1.0
+    max_linear_accel_m_s2: float = 0.8
+    max_angular_accel_rad_s2: float = 2.0
+
+    def __post_init__(self) -> None:
+        for key, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"limits.{key} must be > 0 (got {value})")
+
+
+def clip_twist(linear: float, angular: float, limits: MotionLimits) -> tuple[float, float]:
+    """Twist within the speed limits, the curvature kept where the linear speed is cut.
+
+    A command that is not finite gives zero: it is no command.
+    """
+    if not (math.isfinite(linear) and math.isfinite(angular)):
+        return 0.0, 0.0
+    excess = max(abs(linear) / limits.max_linear_m_s, abs(angular) / limits.max_angular_rad_s, 1.0)
+    return linear / excess, angular / excess
+
+
+def _towards(value: float, target: float, step: float) -> float:
+    return value + min(max(target - value, -step), step)
+
+
+def accelerate(
+    velocity: tuple[float, float], command: tuple[float, float], limits: MotionLimits, dt_s: float
+) -> tuple[float, float]:
+    """Velocity (m/s, rad/s) after ``dt_s`` of going towards ``command`` at the acceleration limits."""
+    return (
+        _towards(velocity[0], command[0], limits.max_linear_accel_m_s2 * dt_s),
+        _towards(velocity[1], command[1], limits.max_angular_accel_rad_s2 * dt_s),
+    )
+
+
+def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) -> NDArray[np.float64]:
+    """Pose (x, y, yaw) after ``dt_s`` of a constant twist: the exact arc, not a straight step."""
+    x, y, yaw = float(pose[0]), float(pose[1]), float(pose[2])
+    turn = angular * dt_s
+    # sin(t/2)/(t/2) is the chord over the arc; numpy's sinc carries the limit at zero.
+    chord = linear * dt_s * float(np.sinc(turn / (2.0 * math.pi)))
+    heading = yaw + 0.5 * turn
+    return np.array([x + chord * math.cos(heading), y + chord * math.sin(heading), wrap_angle(yaw + turn)])

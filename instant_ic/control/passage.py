@@ -1,0 +1,76 @@
+"""Whether going on virtually makes sense: is there something behind the obstacle, and a way round for the r-bot?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .costmap import UNKNOWN, Costmap
+from .planner import GridPlanner
+from .prediction import Prediction
+from .subgoal import extend_ahead
+from .walls import WallMap
+
+
+@dataclass(frozen=True)
+class PassageConfig:
+    """How far behind the obstacle free space must be, and how long the way round may be."""
+
+    max_pass_m: float = 3.0
+    max_detour_m: float = 4.0
+    max_cost: int = 150
+    wall_clearance_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        for key, value in vars(self).items():
+            if not value >= 0:
+                raise ValueError(f"passage.{key} must be >= 0 (got {value})")
+
+
+@dataclass(frozen=True)
+class Passage:
+    """``open`` when the r-bot can get behind the obstacle; else why not, in plain words."""
+
+    open: bool
+    reason: str
+
+
+def find_passage(
+    costmap: Costmap,
+    prediction: Prediction,
+    forward: bool,
+    walls: WallMap | None,
+    planner: GridPlanner,
+    config: PassageConfig,
+) -> Passage:
+    """Looks straight on from where the predicted trajectory meets an obstacle, then plans a way there.
+
+    The first place behind that is free, or not seen yet, must come before any wall and be reachable by a path at
+    most ``max_detour_m`` longer than the straight line.
+    """
+    if prediction.hit_index is None:
+        return Passage(True, "")
+    hit = prediction.poses[prediction.hit_index]
+    heading = hit if forward else hit + np.array([0.0, 0.0, math.pi])
+    ahead = extend_ahead(heading, config.max_pass_m, costmap.resolution)
+    costs = costmap.cost_at(ahead[:, :2])
+    free = (costs <= config.max_cost) | (costs == UNKNOWN)
+    # What is free before the obstacle has begun is not behind it.
+    inside = np.flatnonzero(~free)
+    free[: inside[0] if inside.size else 0] = False
+    exit_index = int(np.flatnonzero(free)[0]) if free.any() else len(ahead)
+    if walls is not None:
+        at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < config.wall_clearance_m)
+        if at_wall.size:
+            return Passage(False, "a wall is ahead")
+    if exit_index == len(ahead):
+        return Passage(False, f"no free space within {config.max_pass_m:.1f} m behind the obstacle")
+    goal = ahead[exit_index]
+    start = prediction.poses[0]
+    plan = planner.plan(costmap, start, goal)
+    straight = float(np.linalg.norm(goal[:2] - start[:2]))
+    if plan.whole_length_m > straight + config.max_detour_m:
+        return Passage(False, "there is no way round the obstacle")
+    return Passage(True, "")

@@ -1,0 +1,120 @@
+"""Where the command now given leads, and whether the footprint meets an obstacle on the way."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .costmap import Costmap
+from .footprint import Footprint
+from .kinematics import MotionLimits, accelerate, clip_twist, move
+
+
+@dataclass(frozen=True)
+class PredictionConfig:
+    """How far to look ahead."""
+
+    latency_s: float = 0.2
+    margin_m: float = 0.6
+    yaw_margin_rad: float = 0.4
+    max_horizon_s: float = 8.0
+    step_s: float = 0.05
+    padding_m: float = 0.03
+
+    def __post_init__(self) -> None:
+        for key in ("latency_s", "margin_m", "yaw_margin_rad", "padding_m"):
+            if not getattr(self, key) >= 0:
+                raise ValueError(f"prediction.{key} must be >= 0 (got {getattr(self, key)})")
+        for key in ("max_horizon_s", "step_s"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"prediction.{key} must be > 0 (got {getattr(self, key)})")
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A predicted trajectory and what it meets."""
+
+    times_s: NDArray[np.float64]
+    """(N,) from now, first 0."""
+    poses: NDArray[np.float64]
+    """(N, 3) x, y, yaw in the map frame."""
+    hit_index: int | None
+    """First pose whose footprint lies on an obstacle that it is not on already; None when the way is free."""
+    distance_m: float
+    """How far the robot's farthest corner travels until then; inf when free."""
+
+    @property
+    def time_to_obstacle_s(self) -> float:
+        """Seconds until the footprint meets the obstacle; inf when the way is free."""
+        return math.inf if self.hit_index is None else float(self.times_s[self.hit_index])
+
+
+def stopping_distance(speed_m_s: float, limits: MotionLimits, latency_s: float) -> float:
+    """Metres from the command to stop until the robot stands."""
+    return speed_m_s * latency_s + speed_m_s**2 / (2.0 * limits.max_linear_accel_m_s2)
+
+
+class Predictor:
+    """Rolls a command out with the base's latency and acceleration limits.
+
+    The horizon is a length, not a time: the stopping distance at the speed commanded (or driven, if that is more)
+    plus a margin. It is measured at the footprint's farthest corner, so turning on the spot is looked at too.
+    """
+
+    def __init__(self, config: PredictionConfig, limits: MotionLimits, footprint: Footprint) -> None:
+        self.config = config
+        self.limits = limits
+        self.reach_m = footprint.circumscribed_radius_m
+        self.body = footprint.points(0.045, config.padding_m)
+
+    def horizon(self, linear: float, angular: float) -> float:
+        """Metres that the farthest corner is followed, for a speed of (m/s, rad/s)."""
+        speed = abs(linear) + self.reach_m * abs(angular)
+        if speed == 0.0:
+            return 0.0
+        share = abs(linear) / speed
+        margin = share * self.config.margin_m + (1.0 - share) * self.reach_m * self.config.yaw_margin_rad
+        return stopping_distance(speed, self.limits, self.config.latency_s) + margin
+
+    def predict(
+        self,
+        pose: NDArray[np.float64],
+        velocity: tuple[float, float],
+        command: tuple[float, float],
+        costmap: Costmap | None,
+        extra_m: float = 0.0,
+    ) -> Prediction:
+        """Trajectory from ``pose`` (x, y, yaw) at ``velocity`` under ``command`` (m/s, rad/s).
+
+        ``extra_m`` is added to the horizon. Without a costmap nothing is met.
+        """
+        step = self.config.step_s
+        command = clip_twist(*command, self.limits)
+        faster = command if _speed(command, self.reach_m) >= _speed(velocity, self.reach_m) else velocity
+        length = self.horizon(*faster)
+        length += extra_m if length > 0 else 0.0
+        poses, travelled = [np.asarray(pose, dtype=np.float64)], [0.0]
+        v = velocity
+        for k in range(math.ceil(self.config.max_horizon_s / step)):
+            if k * step >= self.config.latency_s:
+                v = accelerate(v, command, self.limits, step)
+            if travelled[-1] >= length or (v == command == (0.0, 0.0)):
+                break
+            poses.append(move(poses[-1], v[0], v[1], step))
+            travelled.append(travelled[-1] + _speed(v, self.reach_m) * step)
+        path = np.array(poses)
+        times = step * np.arange(len(path))
+        hit = None
+        if costmap is not None:
+            overlap = costmap.lethal_overlap(path, self.body)
+            # Standing on an obstacle already (a map that jumped) must not hold the robot there for good.
+            worse = np.flatnonzero(overlap > overlap[0])
+            hit = int(worse[0]) if worse.size else None
+        return Prediction(times, path, hit, math.inf if hit is None else travelled[hit])
+
+
+def _speed(velocity: tuple[float, float], reach_m: float) -> float:
+    return abs(velocity[0]) + reach_m * abs(velocity[1])

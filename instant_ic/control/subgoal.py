@@ -1,0 +1,116 @@
+"""Where the r-bot is sent while the operator drives the v-bot (paper, III.A)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .costmap import LETHAL, UNKNOWN, Costmap
+from .prediction import Prediction
+from .walls import WallMap
+
+
+@dataclass(frozen=True)
+class SubgoalConfig:
+    """What counts as a free place, and how far ahead one is looked for."""
+
+    max_cost: int = 150
+    extend_m: float = 3.0
+    search_radius_m: float = 1.5
+    anticipate: bool = True
+    wall_clearance_m: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_cost < LETHAL - 1:
+            raise ValueError(f"subgoal.max_cost must be 0..252 (got {self.max_cost})")
+        for key in ("extend_m", "search_radius_m", "wall_clearance_m"):
+            if not getattr(self, key) >= 0:
+                raise ValueError(f"subgoal.{key} must be >= 0 (got {getattr(self, key)})")
+
+
+@dataclass(frozen=True)
+class Subgoal:
+    """Pose (x, y, yaw) for the r-bot, and which of the rules gave it."""
+
+    pose: NDArray[np.float64]
+    rule: str
+    """``vbot``, ``trajectory``, ``ahead`` or ``around``."""
+
+
+def extend_ahead(pose: NDArray[np.float64], length_m: float, step_m: float) -> NDArray[np.float64]:
+    """Poses (N, 3) straight ahead of ``pose``, ``step_m`` apart, without ``pose`` itself."""
+    distance = step_m * np.arange(1, math.floor(length_m / step_m) + 1)
+    direction = np.array([math.cos(pose[2]), math.sin(pose[2])])
+    ahead = np.asarray(pose)[:2] + distance[:, None] * direction
+    return np.concatenate([ahead, np.full((len(ahead), 1), pose[2])], axis=1)
+
+
+def _free(costs: NDArray[np.uint8], config: SubgoalConfig) -> NDArray[np.bool_]:
+    # The place behind an obstacle has not been seen yet: unknown may be a goal. The planner does not drive into
+    # it; it goes on as the robot sees more.
+    return (costs <= config.max_cost) | (costs == UNKNOWN)
+
+
+def choose_subgoal(
+    costmap: Costmap,
+    vbot_pose: NDArray[np.float64],
+    prediction: Prediction,
+    forward: bool,
+    walls: WallMap | None,
+    config: SubgoalConfig,
+) -> Subgoal | None:
+    """Subgoal for the v-bot's pose (3,) and its predicted trajectory.
+
+    The v-bot's pose if free; else the farthest free point of the trajectory; else the first free point straight on
+    from its end, short of any wall; else the nearest free cell round the v-bot; else None. With ``anticipate`` a
+    free v-bot that is about to pass an obstacle sends the r-bot behind it already, so that it need not first follow
+    up to the obstacle and turn there.
+    """
+    vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
+    if _free(costmap.cost_at(vbot_pose[:2]), config):
+        if config.anticipate and prediction.hit_index is not None:
+            behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, config)
+            if behind is not None:
+                return Subgoal(behind, "ahead")
+        return Subgoal(vbot_pose, "vbot")
+    trajectory = prediction.poses
+    free = np.flatnonzero(_free(costmap.cost_at(trajectory[:, :2]), config))
+    if free.size:
+        return Subgoal(trajectory[free[-1]], "trajectory")
+    beyond = _straight_on(costmap, trajectory[-1], forward, walls, config)
+    if beyond is not None:
+        return Subgoal(beyond, "ahead")
+    rows, columns = np.nonzero(costmap.costs <= config.max_cost)
+    if rows.size == 0:
+        return None
+    centres = costmap.centres(rows, columns)
+    distance = np.linalg.norm(centres - vbot_pose[:2], axis=1)
+    nearest = int(np.argmin(distance))
+    if distance[nearest] > config.search_radius_m:
+        return None
+    return Subgoal(np.array([*centres[nearest], vbot_pose[2]]), "around")
+
+
+def _straight_on(
+    costmap: Costmap,
+    pose: NDArray[np.float64],
+    forward: bool,
+    walls: WallMap | None,
+    config: SubgoalConfig,
+) -> NDArray[np.float64] | None:
+    """First free pose (3,) behind the obstacle that ``pose`` runs into; None when a wall comes first."""
+    heading = pose if forward else pose + np.array([0.0, 0.0, math.pi])
+    ahead = extend_ahead(heading, config.extend_m, costmap.resolution)
+    free = _free(costmap.cost_at(ahead[:, :2]), config)
+    taken = np.flatnonzero(~free)
+    free[: taken[0] if taken.size else 0] = False
+    index = np.flatnonzero(free)
+    if index.size == 0:
+        return None
+    first = int(index[0])
+    if walls is not None and (walls.distance(ahead[: first + 1, :2]) < config.wall_clearance_m).any():
+        return None
+    return np.array([*ahead[first, :2], pose[2]])

@@ -1,0 +1,45 @@
+"""Walls of the static map: long straight runs of occupied cells. What is shorter is an obstacle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .costmap import StaticMap
+
+
+class WallMap:
+    """Distance to the nearest wall of a map.
+
+    Two things are told apart by length alone: a straight run of at least ``min_length_m`` is a wall, which the
+    v-bot does not pass; a box, a chair or a person is not, even where it touches a wall. Curved walls count as
+    obstacles.
+    """
+
+    def __init__(self, static: StaticMap, min_length_m: float = 1.5, occupied_threshold: int = 65) -> None:
+        import cv2
+
+        self.static = static
+        occupied = (static.occupancy >= occupied_threshold).astype(np.uint8)
+        length = max(2, math.ceil(min_length_m / static.resolution))
+        lines = cv2.HoughLinesP(occupied * 255, 1.0, math.pi / 180.0, length // 2, minLineLength=length, maxLineGap=3)
+        drawn = np.zeros_like(occupied)
+        for x0, y0, x1, y1 in np.zeros((0, 4), np.int32) if lines is None else np.reshape(lines, (-1, 4)):
+            cv2.line(drawn, (int(x0), int(y0)), (int(x1), int(y1)), 1, thickness=3)
+        self.mask: NDArray[np.bool_] = (drawn & occupied).astype(bool)
+        if self.mask.any():
+            distance = cv2.distanceTransform((~self.mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            self._distance = distance.astype(np.float64) * static.resolution
+        else:
+            self._distance = np.full(self.mask.shape, np.inf)
+
+    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Metres (...) from points (..., 2) to the nearest wall; inf outside the map."""
+        index = np.floor((np.asarray(points) - self.static.origin) / self.static.resolution).astype(np.int64)
+        height, width = self._distance.shape
+        columns, rows = index[..., 0], index[..., 1]
+        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+        found = self._distance[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+        return np.where(inside, found, np.inf)

@@ -1,0 +1,25 @@
+"""Compiles the kernels before the robot moves: the first call of each costs up to seconds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .costmap import CostmapConfig, RollingCostmap, scan_rays
+from .footprint import Footprint
+from .kinematics import MotionLimits
+from .planner import GridPlanner, PlannerConfig
+from .prediction import PredictionConfig, Predictor
+from .safety import CollisionMonitor, CollisionMonitorConfig
+
+
+def warm_up() -> None:
+    """Runs each numba kernel of this folder once on a small room."""
+    config, footprint = CostmapConfig(width_m=4.0), Footprint()
+    ranges = np.full(90, 1.5, dtype=np.float64)
+    rays = scan_rays(ranges, -math.pi, 2 * math.pi / 90, 0.1, 10.0, np.eye(4), config)
+    costmap = RollingCostmap(config, footprint).update(np.zeros(3), None, rays)
+    Predictor(PredictionConfig(), MotionLimits(), footprint).predict(np.zeros(3), (0.0, 0.0), (0.4, 0.0), costmap)
+    GridPlanner(PlannerConfig()).plan(costmap, np.zeros(3), np.array([0.5, 0.5, 0.0]))
+    CollisionMonitor(CollisionMonitorConfig(), footprint).limit((0.4, 0.0), np.array([[0.5, 0.0], [0.5, 0.1]]))

@@ -1,0 +1,105 @@
+"""The robot that the operator drives in the virtual space; in real mode it stands where the r-bot is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.control.arbiter import Mode
+from instant_ic.control.costmap import StaticMap
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.vbot import VbotConfig, VirtualRobot
+from instant_ic.control.walls import WallMap
+from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
+from instant_ic.msg import (
+    ControlState,
+    OccupancyGrid,
+    Odometry,
+    TwistStamped,
+    grid_array,
+    odometry_message,
+    pose_matrix,
+    stamp_ns,
+    twist_values,
+)
+
+
+@dataclass(frozen=True)
+class VirtualRobotConfig:
+    """Parameters of the node ``virtual_robot``."""
+
+    rate_hz: float = 20.0
+    command_timeout_s: float = 0.3
+    state_timeout_s: float = 0.5
+    wall_min_length_m: float = 1.5
+    walls_block: bool = True
+    limits: MotionLimits = field(default_factory=MotionLimits)
+    vbot: VbotConfig = field(default_factory=VbotConfig)
+
+    def __post_init__(self) -> None:
+        for key in ("rate_hz", "command_timeout_s", "state_timeout_s", "wall_min_length_m"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+
+
+class VirtualRobotNode(Node[VirtualRobotConfig]):
+    """Topics in and out of ``VirtualRobot``."""
+
+    name = "virtual_robot"
+
+    def setup(self) -> None:
+        self.robot = VirtualRobot(self.config.vbot, self.config.limits)
+        self.walls: WallMap | None = None
+        self.transitions: int | None = None
+        self.stepped_ns = self.clock.now_ns()
+        self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
+        self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
+        self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
+        if self.config.walls_block:
+            self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
+        self.timer(1.0 / self.config.rate_hz, self.tick)
+
+    def on_map(self, message: OccupancyGrid) -> None:
+        grid, resolution, origin = grid_array(message)
+        if grid.size:
+            self.walls = WallMap(StaticMap(grid, resolution, np.array(origin)), self.config.wall_min_length_m)
+
+    def tick(self) -> None:
+        now_ns = self.clock.now_ns()
+        # A late timer must not become a leap of the picture.
+        dt_s = min((now_ns - self.stepped_ns) / 1e9, 0.2)
+        self.stepped_ns = now_ns
+        state = self.state.message
+        if state is None:
+            self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
+            self.robot.place(self.robot.pose, (0.0, 0.0))
+            if self.transitions is None:
+                return  # nowhere yet
+        elif state.mode != Mode.VIRTUAL:
+            self.transitions = state.transitions
+            self.robot.place(pose2_from_matrix(pose_matrix(state.robot_pose)), twist_values(state.applied_command))
+            self.diagnose("state", OK, "with the r-bot")
+        else:
+            if state.transitions != self.transitions:
+                self.transitions = state.transitions
+                # It goes on at the speed that the operator is driving at.
+                self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_start)), self.robot.velocity)
+            self.robot.step(self.operator(now_ns), pose2_from_matrix(pose_matrix(state.robot_pose)), dt_s, self.walls)
+            slowed = self.robot.slowed_by
+            self.diagnose("state", OK, f"driven, slowed by {slowed}" if slowed else "driven")
+        self.odom.publish(
+            odometry_message(matrix_from_pose2(self.robot.pose), *self.robot.velocity, "map", "vbot_base_link", now_ns)
+        )
+
+    def operator(self, now_ns: int) -> tuple[float, float]:
+        """The operator's command; zero when it is old, by arrival or by its stamp."""
+        message = self.command.message
+        if message is None or now_ns - stamp_ns(message) > self.config.command_timeout_s * 1e9:
+            return 0.0, 0.0
+        return twist_values(message)
+
+
+if __name__ == "__main__":
+    main(VirtualRobotNode)

@@ -1,0 +1,231 @@
+"""A flat world for the tests of the control part: analytic scans, exact contact, a base with latency.
+
+Nothing here uses the code under test, but for the closed loop that drives it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
+from instant_ic.control.costmap import CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.follower import FollowerConfig, PathFollower
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.navigator import Navigator
+from instant_ic.control.planner import GridPlanner, PlannerConfig
+from instant_ic.control.vbot import VbotConfig, VirtualRobot
+from instant_ic.control.walls import WallMap
+
+LENGTH_M, WIDTH_M = 0.60, 0.50
+BEAMS = 720
+LIDAR_MIN_M, LIDAR_MAX_M = 0.30, 20.0
+
+
+def rectangle(x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
+    """Four segments (4, 2, 2)."""
+    p = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+    return np.stack([p, np.roll(p, -1, axis=0)], axis=1)
+
+
+@dataclass
+class World:
+    """Segments (N, 2, 2) in metres."""
+
+    segments: np.ndarray
+
+    def cast(self, x: float, y: float, yaw: float) -> np.ndarray:
+        """Ranges (BEAMS,), the first beam at -pi from the heading; +inf where nothing is met."""
+        angle = yaw - math.pi + 2 * math.pi * np.arange(BEAMS) / BEAMS
+        d = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
+        a, e = self.segments[:, 0][None], (self.segments[:, 1] - self.segments[:, 0])[None]
+        to_a = a - np.array([x, y])
+        cross = d[..., 0] * e[..., 1] - d[..., 1] * e[..., 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (to_a[..., 0] * e[..., 1] - to_a[..., 1] * e[..., 0]) / cross
+            u = (to_a[..., 0] * d[..., 1] - to_a[..., 1] * d[..., 0]) / cross
+            t = np.where((np.abs(cross) > 1e-12) & (t > 0) & (u >= 0) & (u <= 1), t, np.inf)
+        r = t.min(axis=1)
+        return np.where(r < LIDAR_MIN_M, -np.inf, np.where(r > LIDAR_MAX_M, np.inf, r))
+
+    def contact(self, pose: np.ndarray) -> bool:
+        """Whether the true footprint touches a segment (sampled each centimetre)."""
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        for a, b in self.segments:
+            n = max(2, math.ceil(float(np.linalg.norm(b - a)) / 0.01))
+            p = a + (b - a) * np.linspace(0, 1, n)[:, None] - pose[:2]
+            local = np.stack([c * p[:, 0] + s * p[:, 1], -s * p[:, 0] + c * p[:, 1]], axis=-1)
+            if ((np.abs(local[:, 0]) < LENGTH_M / 2) & (np.abs(local[:, 1]) < WIDTH_M / 2)).any():
+                return True
+        return False
+
+
+def corridor(length: float = 16.0, width: float = 2.4, start: float = -2.0) -> np.ndarray:
+    return rectangle(start, -width / 2, start + length, width / 2)
+
+
+def draw_map(segments: np.ndarray, inside: tuple[float, float, float, float], resolution: float = 0.05) -> StaticMap:
+    """Occupancy grid with the given segments drawn, free inside the rectangle, unknown outside."""
+    x0, y0, x1, y1 = inside
+    origin = np.array([x0 - 1.0, y0 - 1.0])
+    shape = (round((y1 - y0 + 2.0) / resolution), round((x1 - x0 + 2.0) / resolution))
+    grid = np.full(shape, -1, dtype=np.int8)
+    centre_x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
+    centre_y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
+    grid[np.ix_((centre_y > y0) & (centre_y < y1), (centre_x > x0) & (centre_x < x1))] = 0
+    for a, b in segments:
+        n = math.ceil(float(np.linalg.norm(b - a)) / (resolution / 4)) + 1
+        index = np.floor((a + (b - a) * np.linspace(0, 1, n)[:, None] - origin) / resolution).astype(int)
+        grid[index[:, 1], index[:, 0]] = 100
+    return StaticMap(grid, resolution, origin)
+
+
+def matrix(pose: np.ndarray) -> np.ndarray:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    m = np.eye(4)
+    m[:2, :2], m[:2, 3] = [[c, -s], [s, c]], pose[:2]
+    return m
+
+
+def _clip(value: float, bound: float) -> float:
+    return max(-bound, min(bound, value))
+
+
+@dataclass
+class Base:
+    """Tracked base: command latency, speed and acceleration limits, small Euler steps."""
+
+    pose: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    v: float = 0.0
+    w: float = 0.0
+    latency_steps: int = 2
+    queue: deque = field(default_factory=deque)
+
+    def step(self, command: tuple[float, float], dt: float) -> None:
+        self.queue.append(command)
+        now = self.queue.popleft() if len(self.queue) > self.latency_steps else (0.0, 0.0)
+        for _ in range(10):
+            h = dt / 10
+            self.v += _clip(_clip(now[0], 0.5) - self.v, 0.8 * h)
+            self.w += _clip(_clip(now[1], 1.0) - self.w, 2.0 * h)
+            x, y, yaw = self.pose
+            self.pose = np.array([x + self.v * math.cos(yaw) * h, y + self.v * math.sin(yaw) * h, yaw + self.w * h])
+        self.pose[2] = math.atan2(math.sin(self.pose[2]), math.cos(self.pose[2]))
+
+
+@dataclass
+class Frame:
+    """One step of the closed loop."""
+
+    t: float
+    decision: Decision
+    robot: np.ndarray
+    vbot: np.ndarray
+    command: tuple[float, float]
+    speed: float
+    state: str
+
+
+class Loop:
+    """The whole control part against the world at 20 Hz: scan at 10 Hz, costmap at 5 Hz, SLAM is the truth."""
+
+    dt = 0.05
+
+    def __init__(
+        self,
+        world: World,
+        static: StaticMap | None,
+        config: ArbiterConfig | None = None,
+        start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self.world, self.static = world, static
+        self.walls = WallMap(static) if static is not None else None
+        self.costmaps = RollingCostmap(CostmapConfig(), Footprint())
+        self.costmap_config = CostmapConfig()
+        self.arbiter = Arbiter(config)
+        limits = MotionLimits()
+        self.navigator = Navigator(GridPlanner(PlannerConfig()), PathFollower(FollowerConfig(), limits))
+        self.vbot = VirtualRobot(VbotConfig(), limits)
+        self.base = Base(np.array(start))
+        self.vspace = Vspace(ready=True, position=np.zeros(2), ready_radius_m=100.0)
+        self.k = 0
+        self.frames: list[Frame] = []
+        self.ages = dict.fromkeys(["scan", "odometry", "pose", "camera", "vbot", "nav", "command", "vspace"], 0.0)
+        self.estop = False
+        self.decision: Decision | None = None
+        self.nav: tuple[float, float] = (0.0, 0.0)
+        self.nav_state = ""
+        self.costmap = None
+
+    def step(self, operator: tuple[float, float]) -> Frame:
+        now_ns = round(self.k * self.dt * 1e9)
+        robot = self.base.pose.copy()
+        if self.k % 2 == 0:
+            self.ranges, self.scan_pose = self.world.cast(*robot), robot
+        scan = (self.ranges, -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M)
+        if self.k % 4 == 0:
+            rays = scan_rays(*scan, matrix(self.scan_pose), self.costmap_config)
+            self.costmap = self.costmaps.update(robot, self.static, rays)
+        points = np.column_stack([scan_points(*scan), np.zeros((np.isfinite(self.ranges)).sum())])
+        base_from_scan = np.linalg.inv(matrix(robot)) @ matrix(self.scan_pose)
+        in_base = points @ base_from_scan[:3, :3].T + base_from_scan[:3, 3]
+        last = self.decision
+        virtual = last is not None and last.mode == Mode.VIRTUAL
+        if virtual:
+            if last.changed:
+                self.vbot.place(last.vbot_start, last.command)
+            fresh = operator if self.ages["command"] <= 0.3 else (0.0, 0.0)
+            self.vbot.step(fresh, robot, self.dt, self.walls)
+        else:
+            self.vbot.place(robot, (self.base.v, self.base.w))
+            self.navigator.reset()
+        inputs = ArbiterInputs(
+            robot_pose=robot,
+            robot_velocity=(self.base.v, self.base.w),
+            operator_command=operator,
+            estop=self.estop,
+            scan_points=in_base[:, :2],
+            costmap=self.costmap,
+            walls=self.walls,
+            vspace=self.vspace,
+            vbot_pose=self.vbot.pose,
+            vbot_velocity=self.vbot.velocity,
+            nav_command=self.nav,
+            ages=dict(self.ages),
+        )
+        self.decision = self.arbiter.step(inputs, now_ns)
+        self.nav = (0.0, 0.0)
+        if self.decision.mode == Mode.VIRTUAL and self.decision.subgoal is not None:
+            subgoal = self.decision.subgoal
+            velocity = self.vbot.velocity if subgoal.rule == "vbot" else (0.0, 0.0)
+            step = self.navigator.step(robot, self.base.v, subgoal.pose, self.costmap, now_ns, velocity)
+            self.nav, self.nav_state = step.command, step.state
+        self.base.step(self.decision.command, self.dt)
+        frame = Frame(
+            self.k * self.dt,
+            self.decision,
+            robot,
+            self.vbot.pose.copy(),
+            self.decision.command,
+            self.base.v,
+            self.nav_state,
+        )
+        self.frames.append(frame)
+        self.k += 1
+        return frame
+
+    def start(self) -> None:
+        """Hands off until the arbiter lets the operator drive."""
+        for _ in range(40):
+            if self.step((0.0, 0.0)).decision.mode == Mode.REAL:
+                return
+        raise AssertionError(f"never left STOPPED: {self.decision.reason}")
+
+    def modes(self) -> list[str]:
+        """Modes in order, without repeats."""
+        names = [frame.decision.mode.name for frame in self.frames]
+        return [name for i, name in enumerate(names) if i == 0 or names[i - 1] != name]

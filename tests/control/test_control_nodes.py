@@ -1,0 +1,239 @@
+"""The three nodes over the lockstep bus: wiring, time-outs, and the whole flow once."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
+
+from instant_ic.bus import params
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.msg import (
+    Bool,
+    CompressedImage,
+    ControlState,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    TFMessage,
+    VspaceStatus,
+    compressed_image_message,
+    grid_message,
+    header,
+    odometry_message,
+    pose_matrix,
+    pose_message,
+    scan_message,
+    to_time,
+    transform_message,
+    twist_stamped,
+    twist_values,
+)
+from instant_ic.nodes.arbiter import ArbiterNode, ArbiterNodeConfig
+from instant_ic.nodes.navigator import NavigatorConfig, NavigatorNode
+from instant_ic.nodes.virtual_robot import VirtualRobotConfig, VirtualRobotNode
+
+CONFIG = Path(__file__).resolve().parents[2] / "config" / "control.yaml"
+STEP_NS = 50_000_000
+
+
+@pytest.mark.parametrize(
+    ("name", "config_class"),
+    [("arbiter", ArbiterNodeConfig), ("virtual_robot", VirtualRobotConfig), ("navigator", NavigatorConfig)],
+)
+def test_the_shipped_file_holds_every_parameter_at_its_default(name: str, config_class: type) -> None:
+    values = params.load_file(CONFIG, name)
+    assert params.build(config_class, values) == config_class()
+
+    def keys(part: dict, prefix: str = "") -> set[str]:
+        found: set[str] = set()
+        for key, value in part.items():
+            found |= keys(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key}
+        return found
+
+    assert set(values) == keys(dataclasses.asdict(config_class()))
+
+
+class Stack:
+    """The three nodes on a lockstep bus, and a world that answers them at 20 Hz."""
+
+    def __init__(self, obstacles: np.ndarray) -> None:
+        walls = corridor()
+        self.world = World(np.concatenate([walls, obstacles]))
+        static = draw_map(walls, (-2, -1.2, 14, 1.2))
+        self.bus = LockstepBus(start_ns=1_000_000_000_000)
+        self.base = Base()
+        for node in (VirtualRobotNode, NavigatorNode, ArbiterNode):
+            self.bus.add(node)
+        self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
+        mount = transform_message(np.eye(4), "base_link", "velodyne", self.now)
+        self.bus.publish("/tf_static", TFMessage([mount]), latched=True)
+        self.silent: set[str] = set()
+        self.k = 0
+        self.contact = False
+
+    @property
+    def now(self) -> int:
+        return self.bus.clock.now_ns()
+
+    def send(self, topic: str, message: object) -> None:
+        if topic not in self.silent:
+            self.bus.publish(topic, message)
+
+    def step(self, command: tuple[float, float] | None) -> ControlState:
+        now, map_from_base = self.now, matrix(self.base.pose)
+        if "/tf" not in self.silent:
+            self.bus.publish(
+                "/tf",
+                TFMessage(
+                    [
+                        transform_message(np.eye(4), "map", "odom", now),
+                        transform_message(map_from_base, "odom", "base_link", now),
+                    ]
+                ),
+            )
+        self.send("/wheel/odom", odometry_message(map_from_base, self.base.v, self.base.w, "odom", "base_link", now))
+        if self.k % 2 == 0:
+            ranges = self.world.cast(*self.base.pose)
+            scan = scan_message(ranges, -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M, "velodyne", now)
+            self.send("/scan", scan)
+            covariance = PoseWithCovariance(pose=pose_message(map_from_base), covariance=np.zeros(36))
+            self.send("/pose", PoseWithCovarianceStamped(header=header("map", now), pose=covariance))
+            self.send("/camera/image/compressed", compressed_image_message(b"not a JPEG", "camera", now))
+        if self.k % 10 == 0:
+            self.send("/vspace/status", self.status(now))
+        if command is not None:
+            self.send("/operator/cmd_vel", twist_stamped(*command, now))
+        self.bus.advance_to(now + STEP_NS)
+        self.k += 1
+        self.base.step(twist_values(self.bus.last("/cmd_vel")), 0.05)
+        self.contact |= self.world.contact(self.base.pose)
+        return self.bus.last("/ic/state")
+
+    def status(self, now: int) -> VspaceStatus:
+        fields = {field.name: 0 for field in dataclasses.fields(VspaceStatus)}
+        fields |= {name: 0.0 for name in ("ready_radius_m", "psnr_db", "train_seconds", "ready_seconds")}
+        fields |= {name: 0.0 for name in ("ms_per_iteration", "render_ms", "render_fps")}
+        fields.pop("__msgtype__", None)
+        return VspaceStatus(
+            **fields
+            | {
+                "header": header("map", now),
+                "state": VspaceStatus.READY,
+                "keyframe_pose": pose_message(np.eye(4)),
+                "keyframe_stamp": to_time(now),
+                "ready_radius_m": 100.0,
+                "device": "cpu",
+                "message": "",
+            }
+        )
+
+    def drive(self, seconds: float, command: tuple[float, float] | None) -> list[ControlState]:
+        return [self.step(command) for _ in range(round(seconds * 20))]
+
+
+def modes(states: list[ControlState]) -> list[int]:
+    listed = [state.mode for state in states]
+    return [mode for i, mode in enumerate(listed) if i == 0 or listed[i - 1] != mode]
+
+
+def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    states = stack.drive(1.5, None) + stack.drive(17.0, (0.4, 0.0))
+    assert modes(states) == [ControlState.STOPPED, ControlState.REAL, ControlState.VIRTUAL, ControlState.REAL]
+    assert not stack.contact
+    assert states[-1].transitions == 3
+    # The v-bot went straight through the box, the r-bot round it.
+    virtual = [s for s in states if s.mode == ControlState.VIRTUAL]
+    vbot = np.array([pose2_from_matrix(pose_matrix(s.vbot_pose)) for s in virtual])
+    robot = np.array([pose2_from_matrix(pose_matrix(s.robot_pose)) for s in virtual])
+    assert np.abs(vbot[:, 1]).max() < 0.01
+    assert ((vbot[:, 0] > 2.5) & (vbot[:, 0] < 3.0)).sum() > 10
+    assert np.abs(robot[:, 1]).max() > 0.5
+    # No leap of what the operator sees: 0.5 m/s for 50 ms is 2.5 cm.
+    assert np.linalg.norm(np.diff(vbot[:, :2], axis=0), axis=1).max() < 0.03
+    for topic in ("/ic/subgoal", "/ic/trajectory", "/costmap", "/nav/cmd_vel", "/nav/path"):
+        assert stack.bus.messages(topic), topic
+
+
+@pytest.mark.parametrize(
+    ("topic", "words", "limit_s"),
+    [
+        ("/scan", "LiDAR scan", 0.45),
+        ("/wheel/odom", "wheel odometry", 0.35),
+        ("/operator/cmd_vel", "you drive the robot", 0.35),
+        ("/camera/image/compressed", "camera picture", 0.7),
+        ("/pose", "SLAM pose", 1.1),
+    ],
+)
+def test_each_loss_sends_zero_within_its_time(topic: str, words: str, limit_s: float) -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    assert twist_values(stack.drive(1.0, (0.4, 0.0))[-1].applied_command)[0] == pytest.approx(0.4)
+    stack.silent.add(topic)
+    states = stack.drive(limit_s, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+    assert words in states[-1].reason
+    assert states[-1].mode == ControlState.REAL  # a short gap changes no view
+    states = stack.drive(2.0, (0.4, 0.0))
+    expected = ControlState.REAL if topic == "/operator/cmd_vel" else ControlState.STOPPED
+    assert states[-1].mode == expected
+
+
+def test_the_robot_goes_on_after_a_long_loss_only_when_the_controls_were_let_go() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    stack.drive(0.5, (0.4, 0.0))
+    stack.silent.add("/scan")
+    assert stack.drive(2.5, (0.4, 0.0))[-1].mode == ControlState.STOPPED
+    stack.silent.clear()
+    state = stack.drive(2.0, (0.4, 0.0))[-1]
+    assert state.mode == ControlState.STOPPED
+    assert "let go" in state.reason
+    assert stack.drive(0.2, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+def test_emergency_stop_acts_at_once_and_holds() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    stack.drive(1.0, (0.4, 0.0))
+    stack.bus.publish("/operator/estop", Bool(data=True), latched=True)
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)  # before any timer
+    states = stack.drive(3.0, (0.4, 0.0))
+    assert {s.mode for s in states} == {ControlState.STOPPED}
+    assert states[-1].estop
+    stack.bus.publish("/operator/estop", Bool(data=False), latched=True)
+    assert stack.drive(1.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED  # the key is still down
+    assert stack.drive(0.5, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+def test_the_robot_stands_when_the_navigator_or_the_vbot_dies() -> None:
+    for dead in (NavigatorNode, VirtualRobotNode):
+        stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+        stack.drive(1.5, None)
+        assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+        victim = next(node for node in stack.bus.nodes if isinstance(node, dead))
+        victim.close()
+        stack.bus.nodes.remove(victim)
+        stack.drive(0.35, (0.4, 0.0))
+        assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+        assert stack.drive(2.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED
+
+
+def test_pictures_are_not_decoded() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    assert stack.drive(1.5, None)[-1].mode == ControlState.REAL  # with a payload that is no JPEG
+    assert isinstance(stack.bus.last("/camera/image/compressed"), CompressedImage)
+
+
+def test_the_arbiter_leaves_a_zero_behind() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    stack.drive(1.0, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/cmd_vel"))[0] > 0
+    stack.bus.close()
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
