@@ -1,0 +1,200 @@
+"""Lockstep replay: a bag through real nodes in one process, with the same result every time, bit for bit."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from instant_ic import paths
+from instant_ic.bag.files import BagError, BagMessage, BagReader, BagWriter
+from instant_ic.bag.player import NEVER_PLAYED
+from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.bus.main import load_config
+from instant_ic.bus.node import Node
+from instant_ic.msg import deserialize, message_type, serialize
+
+BROADCASTS: Mapping[str, tuple[str, ...]] = {
+    "grid_slam": ("odom",),
+    "crawler_base": ("base_link",),
+    "theta_camera": ("camera",),
+    "vlp16_driver": ("velodyne",),
+}
+"""Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed. What else a
+replayed node broadcasts is left out from its first broadcast on."""
+
+TRANSFORM_TOPICS = ("/tf", "/tf_static")
+
+
+class ReplayError(RuntimeError):
+    """A replay that cannot begin; the message says why."""
+
+
+@dataclass(frozen=True)
+class ReplayNode:
+    """A node to replay.
+
+    Attributes:
+        name: module in ``instant_ic.nodes``.
+        node_class: its class.
+        config: its parameters.
+    """
+
+    name: str
+    node_class: type[Node[Any]]
+    config: Any
+
+
+@dataclass
+class ReplayResult:
+    """What a replay did.
+
+    Attributes:
+        fed: messages of the bag that went in, by topic.
+        left_out: messages of the bag that did not, because a replayed node makes them.
+        made: messages that came out, by topic.
+    """
+
+    fed: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
+    made: Counter[str] = field(default_factory=Counter)
+
+
+def find_node_class(name: str) -> type[Node[Any]]:
+    """The node's class in ``instant_ic.nodes.NAME``.
+
+    Raises:
+        ReplayError: no such module, or no node in it.
+    """
+    module_name = f"instant_ic.nodes.{name}"
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name != module_name:
+            raise
+        raise ReplayError(f"there is no node {name!r}") from None
+    for value in vars(module).values():
+        if inspect.isclass(value) and issubclass(value, Node) and value.__module__ == module_name:
+            return value
+    raise ReplayError(f"{module_name} defines no node")
+
+
+def shipped_parameter_files(name: str) -> list[Path]:
+    """Files of ``config/`` with a section for a node, in the order of their names, except the simulator's."""
+    try:
+        folder = paths.share_dir("config")
+    except FileNotFoundError:
+        return []
+    found = []
+    for file in sorted(folder.glob("*.yaml")):
+        if file.name == "sim.yaml":
+            continue
+        try:
+            content = yaml.safe_load(file.read_text())
+        except (OSError, yaml.YAMLError):
+            continue  # a broken file that this node may not even use: whoever names it gets the message
+        if isinstance(content, dict) and name in content:
+            found.append(file)
+    return found
+
+
+def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequence[str]) -> ReplayNode:
+    """A node with its parameters.
+
+    Args:
+        name: module in ``instant_ic.nodes``.
+        params_files: parameter files; None takes what ``config/`` has for the node.
+        overrides: ``node.key:=value`` words; those of other nodes are skipped.
+
+    Raises:
+        ReplayError: no such node.
+        ParameterError: wrong parameters.
+    """
+    node_class = find_node_class(name)
+    files = shipped_parameter_files(name) if params_files is None else list(params_files)
+    own = [word.removeprefix(f"{name}.") for word in overrides if word.startswith(f"{name}.")]
+    config, _ = load_config(node_class, name, files, own)
+    return ReplayNode(name, node_class, config)
+
+
+def replay(
+    bag: Path,
+    nodes: Sequence[ReplayNode],
+    output: Path,
+    drop_transforms: Iterable[str] = (),
+    on_progress: Callable[[float], None] | None = None,
+) -> ReplayResult:
+    """Feeds a bag to nodes message by message and records what they publish.
+
+    The clock is the bag's: it stands still while a node works, so nothing depends on how fast the machine is. Topics
+    that a replayed node publishes are not fed, and of the transforms those with a child frame that one broadcasts.
+
+    Args:
+        bag: what to feed.
+        nodes: what to feed it to.
+        output: folder of the new bag, which must not exist.
+        drop_transforms: further child frames to leave out.
+        on_progress: called with the share of the bag that has gone in, 0 to 1.
+
+    Raises:
+        BagError: a bag cannot be read or written.
+    """
+    result = ReplayResult()
+    with BagReader(bag) as reader:
+        if not reader.count:
+            raise BagError(f"bag {bag} is empty")
+        with BagWriter(output) as writer:
+            made_frames = {child for node in nodes for child in BROADCASTS.get(node.name, ())}
+            made_frames.update(drop_transforms)
+
+            def record(entry: Record) -> None:
+                result.made[entry.topic] += 1
+                if entry.topic in TRANSFORM_TOPICS:
+                    transforms = deserialize(entry.payload, entry.type_name).transforms
+                    made_frames.update(t.child_frame_id for t in transforms)
+                writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
+
+            with LockstepBus(start_ns=reader.start_ns, keep=False, on_record=record) as bus:
+                running = [bus.add(node.node_class, node.config, node.name) for node in nodes]
+                span_ns = max(1, reader.end_ns - reader.start_ns)
+                for message in reader.messages():
+                    made_topics = {p.topic for node in running for p in node.publishers}
+                    payload = _what_to_feed(message, made_topics, made_frames)
+                    if payload is None:
+                        result.left_out[message.topic] += 1
+                        bus.advance_to(message.stamp_ns)
+                    else:
+                        result.fed[message.topic] += 1
+                        bus.publish_bytes(
+                            message.topic, message.type_name, payload, message.stamp_ns, message.qos.latched
+                        )
+                    if on_progress is not None:
+                        on_progress((message.stamp_ns - reader.start_ns) / span_ns)
+                for node in running:
+                    for publisher in node.publishers:
+                        writer.add_topic(publisher.topic, publisher.raw.type_name, publisher.raw.qos)
+    return result
+
+
+def _what_to_feed(message: BagMessage, made_topics: set[str], made_frames: set[str]) -> bytes | None:
+    """The message's bytes; None when a replayed node makes it itself."""
+    if message.topic in TRANSFORM_TOPICS:
+        return _without(message, made_frames)
+    if message.topic in made_topics or message.topic in NEVER_PLAYED:
+        return None
+    return message.payload
+
+
+def _without(message: BagMessage, frames: set[str]) -> bytes | None:
+    """Transforms less those with a child in ``frames``; None when none is left."""
+    transforms = deserialize(message.payload, message.type_name).transforms
+    kept = [transform for transform in transforms if transform.child_frame_id not in frames]
+    if len(kept) == len(transforms):
+        return message.payload
+    return bytes(serialize(message_type(message.type_name)(transforms=kept))) if kept else None

@@ -1,0 +1,69 @@
+"""The ``ic`` command: one module a verb in ``instant_ic.cli.commands``, each with ``add_parser(subparsers)``.
+
+A verb's module imports what it needs inside its functions, so that ``ic --help`` stays quick. Exit status: 0 done,
+1 failed, 2 wrong usage.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import pkgutil
+import sys
+from collections.abc import Sequence
+
+from instant_ic.cli import commands
+from instant_ic.cli.errors import UserError
+
+_DESCRIPTION = "Instant IC: teleoperation that passes between a real robot and an instantly built virtual one."
+_EPILOG = """examples:
+  ic launch sim                         everything against simulated devices
+  ic launch robot --show-args           what can be set
+  ic topic hz /scan                     rate of a topic
+  ic bag record -o drive                record everything into the folder drive
+  ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again
+  ic doctor                             check this machine
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command line with every verb."""
+    parser = argparse.ArgumentParser(
+        prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for info in sorted(pkgutil.iter_modules(commands.__path__), key=lambda info: info.name):
+        module = importlib.import_module(f"{commands.__name__}.{info.name}")
+        if hasattr(module, "add_parser"):
+            module.add_parser(subparsers)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit status."""
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    function = getattr(args, "func", None)
+    if function is None:
+        parser.error("a command is missing")
+    try:
+        return int(function(args) or 0)
+    except UserError as error:
+        print(f"ic: {error}", file=sys.stderr)
+        return error.status
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # ic topic echo ... | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        # Our own error classes carry words for the user; anything else is a bug and keeps its trace.
+        if not type(error).__module__.startswith("instant_ic."):
+            raise
+        print(f"ic: {error}", file=sys.stderr)
+        return 2 if type(error).__name__ in ("LaunchFileError", "ParameterError") else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,260 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader
+
+from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag.compare import compare, digest
+from instant_ic.bag.recorder import Recorder, TopicChoice
+from instant_ic.bag.recover import recover
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR
+from instant_ic.bus.qos import QoS
+from instant_ic.bus.registry import PublisherInfo, TopicInfo
+from instant_ic.msg import (
+    Bool,
+    Keyframe,
+    compressed_image_message,
+    header,
+    image_message,
+    message_type,
+    pose_message,
+    scan_message,
+    serialize,
+    typestore,
+)
+
+SCAN, BOOL, KEYFRAME = "sensor_msgs/msg/LaserScan", "std_msgs/msg/Bool", "instant_ic_msgs/msg/Keyframe"
+VELODYNE = "velodyne_msgs/msg/VelodyneScan"
+
+
+def scan(value: float, stamp_ns: int = 5) -> bytes:
+    ranges = np.full(8, value, np.float32)
+    return bytes(serialize(scan_message(ranges, -1.0, 0.25, 0.1, 30.0, "velodyne", stamp_ns)))
+
+
+def keyframe() -> bytes:
+    depth = image_message(np.arange(8, dtype=np.float32).reshape(2, 4), "32FC1", "camera", 7)
+    message = Keyframe(
+        header=header("map", 7),
+        id=3,
+        pose=pose_message(np.eye(4)),
+        panorama=compressed_image_message(b"\xff\xd8jpeg", "camera", 7),
+        depth=depth,
+        scale=1.5,
+        quality=0.9,
+        relative_sigma=0.1,
+        fit=True,
+        message="good",
+    )
+    return bytes(serialize(message))
+
+
+def make_bag(path: Path, count: int = 20, value: float = 1.0) -> Path:
+    with BagWriter(path) as writer:
+        writer.write("/operator/estop", BOOL, bytes(serialize(Bool(data=True))), 1_000_000_000, LATCHED)
+        for index in range(count):
+            writer.write("/scan", SCAN, scan(value + index), 1_000_000_000 + index * 100_000_000, SENSOR)
+        writer.write("/keyframe", KEYFRAME, keyframe(), 1_500_000_000, LATCHED)
+    return path
+
+
+def test_rosbags_reads_it_back_with_types_and_qos(tmp_path: Path) -> None:
+    bag = make_bag(tmp_path / "bag")
+    # AnyReader takes the types from the definitions in the bag, not from our store.
+    with AnyReader([bag]) as reader:
+        got = {}
+        for connection, stamp_ns, payload in reader.messages():
+            got.setdefault(connection.topic, []).append(
+                (stamp_ns, reader.deserialize(payload, connection.msgtype), payload)
+            )
+    assert {topic: len(messages) for topic, messages in got.items()} == {
+        "/operator/estop": 1,
+        "/scan": 20,
+        "/keyframe": 1,
+    }
+    stamp_ns, message, payload = got["/keyframe"][0]
+    assert stamp_ns == 1_500_000_000 and payload == keyframe()
+    assert (message.id, message.fit, message.message) == (3, True, "good")
+    assert message.depth.data.view(np.float32).tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert [m.ranges[0] for _, m, _ in got["/scan"]] == [1.0 + i for i in range(20)]
+    with Reader(bag) as plain:
+        profiles = {c.topic: c.ext.offered_qos_profiles[0] for c in plain.connections}  # type: ignore[union-attr]
+    assert (profiles["/scan"].reliability.name, profiles["/scan"].durability.name) == ("BEST_EFFORT", "VOLATILE")
+    assert (profiles["/keyframe"].reliability.name, profiles["/keyframe"].durability.name) == (
+        "RELIABLE",
+        "TRANSIENT_LOCAL",
+    )
+
+
+def test_type_hash_is_that_of_ros(tmp_path: Path) -> None:
+    bag = make_bag(tmp_path / "bag")
+    with Reader(bag) as reader:
+        digests = {c.msgtype: c.digest for c in reader.connections}
+    assert digests[KEYFRAME] == typestore().hash_rihs01(KEYFRAME)
+    # Published hash of std_msgs/msg/Bool in ROS 2 Jazzy.
+    assert digests[BOOL] == "RIHS01_feb91e995ff9ebd09c0cb3d2aed18b11077585839fb5db80193b62d74528f6c9"
+
+
+def test_own_reader(tmp_path: Path) -> None:
+    with BagReader(make_bag(tmp_path / "bag")) as reader:
+        assert (reader.count, reader.start_ns, reader.end_ns) == (22, 1_000_000_000, 2_900_000_000)
+        assert [(t.topic, t.count, t.qos.name) for t in reader.topics] == [
+            ("/keyframe", 1, "latched"),
+            ("/operator/estop", 1, "latched"),
+            ("/scan", 20, "sensor"),
+        ]
+        stamps = [m.stamp_ns for m in reader.messages({"/scan"}, 1_200_000_000, 1_500_000_000)]
+        assert stamps == [1_200_000_000, 1_300_000_000, 1_400_000_000]
+
+
+def test_bare_mcap_file_opens_too(tmp_path: Path) -> None:
+    bag = make_bag(tmp_path / "bag")
+    with BagReader(bag / "bag.mcap") as reader:
+        assert reader.count == 22
+
+
+def test_big_messages_over_many_chunks_keep_their_order(tmp_path: Path) -> None:
+    payloads = [bytes([i]) * 700_000 for i in range(9)]
+    with BagWriter(tmp_path / "bag") as writer:
+        for index, payload in reversed(list(enumerate(payloads))):
+            writer.write("/scan", SCAN, payload, 10 + index, RELIABLE)
+            writer.flush()
+    with BagReader(tmp_path / "bag") as reader:
+        assert [m.payload for m in reader.messages()] == payloads
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (lambda p: BagReader(p / "nothing"), "does not exist"),
+        (lambda p: BagReader(p), "no metadata.yaml"),
+        (lambda p: BagWriter(p), "exists already"),
+        (lambda p: BagWriter(p / "new").write("/a", "no_msgs/msg/No", b"", 1), "no message type 'no_msgs/msg/No'"),
+        (lambda p: recover(p, p / "new"), "there is no .mcap file"),
+    ],
+)
+def test_what_cannot_be_done_is_told(tmp_path: Path, action: object, message: str) -> None:
+    with pytest.raises(BagError, match=message):
+        action(tmp_path)  # type: ignore[operator]
+
+
+def test_flushed_messages_of_a_killed_recorder_are_recovered(tmp_path: Path) -> None:
+    writer = BagWriter(tmp_path / "bag")
+    for index in range(10):
+        writer.write("/scan", SCAN, scan(index), 100 + index, SENSOR)
+    writer.flush()
+    writer.write("/scan", SCAN, scan(99), 200, SENSOR)  # never flushed: lost with its process
+    # What a kill leaves: no index, no metadata.yaml.
+    with pytest.raises(BagError, match="ic bag recover"):
+        BagReader(tmp_path / "bag")
+    recovered = recover(tmp_path / "bag", tmp_path / "saved")
+    assert recovered.count == 10
+    with BagReader(tmp_path / "saved") as reader:
+        assert [m.payload for m in reader.messages()] == [scan(i) for i in range(10)]
+        assert [t.qos for t in reader.topics] == [SENSOR]
+        assert reader.custom["recovered_from"] == "bag"
+    writer.close()
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.7, 0.95])
+def test_cut_file_gives_what_lies_before_the_cut(tmp_path: Path, share: float) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        for index in range(30):
+            writer.write("/scan", SCAN, bytes([index]) * 200_000, 100 + index, SENSOR)
+    file = tmp_path / "bag" / "bag.mcap"
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(BagError, match="ic bag recover"):
+        with BagReader(tmp_path / "bag") as reader:
+            list(reader.messages())
+    # Chunks hold 6 messages of 0.2 MB (the first size over 1 MiB); whole chunks before the cut survive.
+    chunk = 6
+    whole = int(len(data) * share / (chunk * 200_060)) * chunk
+    if whole == 0:
+        with pytest.raises(BagError, match="no message could be recovered"):
+            recover(tmp_path / "bag", tmp_path / "saved")
+        return
+    recovered = recover(tmp_path / "bag", tmp_path / "saved")
+    assert recovered.count == whole and recovered.stopped_by
+    with BagReader(tmp_path / "saved") as reader:
+        assert [m.payload[0] for m in reader.messages()] == list(range(whole))
+
+
+def test_a_whole_bag_is_recovered_whole(tmp_path: Path) -> None:
+    bag = make_bag(tmp_path / "bag")
+    assert recover(bag, tmp_path / "copy").stopped_by == ""
+    assert all(topic.same for topic in compare(bag, tmp_path / "copy"))
+
+
+def test_compare_names_the_first_field(tmp_path: Path) -> None:
+    a, b = make_bag(tmp_path / "a"), make_bag(tmp_path / "b", value=1.5)
+    c = make_bag(tmp_path / "c", count=19)
+    assert all(topic.same for topic in compare(a, a)) and digest(a) == digest(make_bag(tmp_path / "a2"))
+    found = {topic.topic: topic.first for topic in compare(a, b)}
+    assert found["/keyframe"] == ""
+    assert found["/scan"].startswith("message 1: ranges[0] is")
+    assert found["/scan"].endswith("(8 of 8 entries differ)")
+    assert digest(a) != digest(b)
+    assert {t.topic: t.first for t in compare(a, c)}["/scan"] == "20 and 19 messages"
+    assert [t.topic for t in compare(a, b, ignore=("/scan",))] == ["/keyframe", "/operator/estop"]
+
+
+class Counter:
+    lost = 0
+
+
+def topic_info(topic: str, type_name: str, *presets: QoS) -> TopicInfo:
+    publishers = [
+        PublisherInfo(f"n{i}", 1, qos.name, Path("s"), type_name, "00", 0) for i, qos in enumerate(presets)
+    ]
+    return TopicInfo(topic, type_name, publishers)
+
+
+def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -> None:
+    counters: dict[str, Counter] = {}
+
+    def subscribe(topic: str, callback: object) -> Counter:
+        return counters.setdefault(topic, Counter())
+
+    recorder = Recorder(tmp_path / "bag", TopicChoice(exclude=("/heart*",)), subscribe)
+    recorder.discover([topic_info("/estop", BOOL, SENSOR, LATCHED), topic_info("/heartbeat", BOOL, RELIABLE)])
+    recorder.discover([topic_info("/estop", BOOL, LATCHED), topic_info("/scan", SCAN, SENSOR)])
+    assert list(counters) == ["/estop", "/scan"]
+    recorder.take("/estop", BOOL, b"old", 5)  # minutes before the recording
+    recorder.take("/scan", SCAN, b"first", 1000)
+    recorder.take("/scan", SCAN, b"second", 1100)
+    recorder.take("/scan", SCAN, b"no clock yet", 0)
+    counters["/scan"].lost = 4
+    recorder.close()
+    with BagReader(tmp_path / "bag") as reader:
+        assert [(m.topic, m.stamp_ns, m.payload) for m in reader.messages()] == [
+            ("/estop", 1000, b"old"),
+            ("/scan", 1000, b"first"),
+            ("/scan", 1100, b"second"),
+        ]
+        assert {t.topic: t.qos.name for t in reader.topics} == {"/estop": "latched", "/scan": "sensor"}
+        assert json.loads(reader.custom["instant_ic.lost"]) == {"/scan": 4}
+        assert reader.custom["instant_ic.before_clock"] == "1"
+
+
+def test_recorder_on_simulated_time_gives_foreign_stamps_its_own(tmp_path: Path) -> None:
+    now_ns = [0]
+    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, callback: Counter(), lambda: now_ns[0])
+    recorder.discover([topic_info("/scan", SCAN, SENSOR)])
+    recorder.take("/scan", SCAN, b"early", 0)
+    now_ns[0] = 50_000_000_000
+    recorder.take("/scan", SCAN, b"follows the clock", 49_900_000_000)
+    recorder.take("/scan", SCAN, b"wall time", 1_700_000_000_000_000_000)
+    recorder.close()
+    with BagReader(tmp_path / "bag") as reader:
+        assert [(m.stamp_ns, m.payload) for m in reader.messages()] == [
+            (49_900_000_000, b"follows the clock"),
+            (50_000_000_000, b"wall time"),
+        ]
+
+
+def test_velodyne_type_is_in_the_store() -> None:
+    assert message_type(VELODYNE).__msgtype__ == VELODYNE
