@@ -1,0 +1,69 @@
+"""A recording's UDP payloads, sent again at their own pace."""
+
+import socket
+from pathlib import Path
+
+from instant_ic.lidar.capture import CaptureReader
+from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES
+
+
+class CaptureReplay:
+    """Sends the data and position packets of a VLP-16 capture, payloads untouched, in the recorded rhythm.
+
+    Args:
+        path: pcap or pcapng.
+        host: where to send.
+        data_port, position_port: UDP ports there; the recorded ones do not matter.
+        loop: start again after the end; the pause between is one packet's.
+
+    Attributes:
+        sent: datagrams sent.
+        duration_s: length of the recording.
+
+    Raises:
+        CaptureError: it is no capture.
+        ValueError: it holds no VLP-16 packets.
+    """
+
+    def __init__(self, path: str | Path, host: str, data_port: int, position_port: int, loop: bool = True) -> None:
+        ports = {DATA_PACKET_BYTES: data_port, POSITION_PACKET_BYTES: position_port}
+        datagrams = [d for d in CaptureReader(path) if len(d.payload) in ports]
+        if not datagrams:
+            raise ValueError(f"pcap {path} holds no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
+        first = min(d.stamp_ns for d in datagrams)
+        self._items = sorted(
+            ((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams
+        )
+        count = len(self._items)
+        self.duration_s = self._items[-1][0]
+        self._period_s = self.duration_s * (count + 1) / count if count > 1 else 0.1
+        self._loop = loop
+        self._next = 0
+        self._began_s = 0.0
+        self.sent = 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+
+    @property
+    def finished(self) -> bool:
+        """Whether everything was sent (never with ``loop``)."""
+        return self._next >= len(self._items)
+
+    def pump(self, time_s: float) -> None:
+        """Sends what is due at ``time_s`` (seconds since the start)."""
+        while not self.finished and self._items[self._next][0] + self._began_s <= time_s:
+            _, address, payload = self._items[self._next]
+            try:
+                self._socket.sendto(payload, address)
+            except ConnectionRefusedError:
+                # Told of an earlier datagram that nobody read; a sensor would not know.
+                pass
+            self.sent += 1
+            self._next += 1
+            if self.finished and self._loop:
+                self._next = 0
+                self._began_s = max(self._began_s + self._period_s, time_s - self._period_s)
+
+    def close(self) -> None:
+        """Closes the socket."""
+        self._socket.close()

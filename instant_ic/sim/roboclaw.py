@@ -1,0 +1,65 @@
+"""RoboClaw controller on a pseudo-terminal: the driver opens it as it would a serial port."""
+
+import contextlib
+import logging
+import os
+import select
+import threading
+import tty
+from pathlib import Path
+
+from instant_ic.base.emulator import RoboclawEmulator
+
+log = logging.getLogger(__name__)
+
+
+class RoboClawServer:
+    """Serves an emulated controller on a pseudo-terminal.
+
+    Args:
+        emulator: the controller; whoever simulates the robot moves its time.
+        lock: held whenever the emulator is touched.
+        link: symbolic link to make to the terminal, None for none; replaced if it is there.
+    """
+
+    def __init__(self, emulator: RoboclawEmulator, lock: threading.Lock, link: Path | None = None) -> None:
+        self._emulator = emulator
+        self._lock = lock
+        # The slave end stays open here, so that the master never sees the line drop when a driver closes it.
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.device = os.ttyname(self._slave)
+        self.link = link
+        if link is not None:
+            link.parent.mkdir(parents=True, exist_ok=True)
+            with contextlib.suppress(FileNotFoundError):
+                link.unlink()
+            link.symlink_to(self.device)
+        self._wake_read, self._wake_write = os.pipe()
+        self._thread = threading.Thread(target=self._run, name="roboclaw", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the thread, takes the link away and closes the terminal."""
+        os.write(self._wake_write, b"x")
+        self._thread.join(2.0)
+        if self.link is not None and self.link.is_symlink() and os.readlink(self.link) == self.device:
+            self.link.unlink()
+        for descriptor in (self._master, self._slave, self._wake_read, self._wake_write):
+            os.close(descriptor)
+
+    def _run(self) -> None:
+        while True:
+            ready, _, _ = select.select([self._master, self._wake_read], [], [])
+            if self._wake_read in ready:
+                return
+            data = os.read(self._master, 4096)
+            with self._lock:
+                reply = self._emulator.feed(data)
+            while reply:
+                # A driver that asks and never reads must not stop the simulator for good.
+                _, writable, _ = select.select([], [self._master], [], 0.5)
+                if not writable:
+                    log.warning("%s: %d bytes of a reply were not read and are dropped", self.device, len(reply))
+                    break
+                reply = reply[os.write(self._master, reply) :]

@@ -1,0 +1,156 @@
+"""Dynamics of the tracked robot: motors, tracks that slip, encoders, contact with the world."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic.base.config import SkidSteerConfig
+from instant_ic.base.kinematics import SkidSteer
+from instant_ic.sim.contact import OccupancyMask
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """What the simulated robot is like.
+
+    Attributes:
+        length, width: footprint, metres, centred on base_link.
+        contact_low, contact_high: things between these heights are run into, metres.
+        track_acceleration: most that a track's speed can change, m/s².
+        motor_lag_s: time constant with which a track follows its set point.
+        slip: standard deviation of the share of a track's motion that is lost, 0 = none.
+        turn_slip: standard deviation of the effective track width, as a share of it, 0 = none.
+        slip_time_s: over which time the slip changes.
+        encoder_noise_pulses: standard deviation of the encoder count while a track moves.
+        steering: geometry, the same as the driver's when its odometry shall be without bias.
+    """
+
+    length: float = 0.60
+    width: float = 0.50
+    contact_low: float = 0.03
+    contact_high: float = 0.9
+    track_acceleration: float = 2.0
+    motor_lag_s: float = 0.06
+    slip: float = 0.02
+    turn_slip: float = 0.05
+    slip_time_s: float = 1.0
+    encoder_noise_pulses: float = 2.0
+    steering: SkidSteerConfig = SkidSteerConfig()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for key in ("length", "width", "track_acceleration", "motor_lag_s", "slip_time_s"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        for key in ("slip", "turn_slip"):
+            if not 0 <= getattr(self, key) < 0.5:
+                raise ValueError(f"{key} must be in 0..0.5 (got {getattr(self, key)})")
+        if self.encoder_noise_pulses < 0:
+            raise ValueError(f"encoder_noise_pulses must be >= 0 (got {self.encoder_noise_pulses})")
+        if not 0 <= self.contact_low < self.contact_high:
+            raise ValueError(f"contact_low must be below contact_high (got {self.contact_low}, {self.contact_high})")
+
+
+class TrackedRobot:
+    """The robot on the floor plan.
+
+    Attributes:
+        pose: (3,) x, y, yaw (unwrapped) in the world's frame.
+        twist: (3,) v_x, v_y, yaw rate in the robot's own frame, as it really moves.
+        tracks: (2,) speeds of the left and right track over the sprockets, m/s: what encoders measure.
+        contact: whether the robot pushes against something now.
+        contacts: how often a contact began.
+    """
+
+    def __init__(
+        self, config: RobotConfig, mask: OccupancyMask, pose: tuple[float, float, float], seed: int = 0
+    ) -> None:
+        self.config = config
+        self.kinematics = SkidSteer(config.steering)
+        self.pose: FloatArray = np.asarray(pose, float)
+        self.twist: FloatArray = np.zeros(3)
+        self.tracks: FloatArray = np.zeros(2)
+        self.contact = False
+        self.contacts = 0
+        self._mask = mask
+        self._rng = np.random.default_rng([31, seed])
+        self._slip: FloatArray = np.zeros(3)
+        self._travelled: FloatArray = np.zeros(2)
+        self._jitter: FloatArray = np.zeros(2)
+        self._outline = _outline(config.length, config.width, mask.cell_m)
+        if self.touches(self.pose):
+            raise ValueError(f"the robot would start inside something at x={pose[0]:.2f}, y={pose[1]:.2f}")
+
+    @property
+    def encoder_pulses(self) -> FloatArray:
+        """(2,) counts of the motors M1 and M2 since the start (not rounded)."""
+        return self.kinematics.motors_from_tracks(self._travelled) + self._jitter
+
+    @property
+    def motor_speed_pps(self) -> FloatArray:
+        """(2,) speeds of the motors M1 and M2, pulses/s."""
+        return self.kinematics.motors_from_tracks(self.tracks)
+
+    def touches(self, pose: npt.ArrayLike) -> bool:
+        """Whether the footprint's outline at a pose (x, y, yaw) meets something."""
+        x, y, yaw = np.asarray(pose, float)
+        c, s = math.cos(yaw), math.sin(yaw)
+        points = self._outline @ np.asarray([[c, s], [-s, c]]) + (x, y)
+        return bool(self._mask.at(points).any())
+
+    def step(self, setpoint_pps: npt.ArrayLike, dt_s: float) -> None:
+        """Moves the robot by ``dt_s`` (at most about 20 ms) with the motors' set points (2,) in pulses/s."""
+        config = self.config
+        wanted = self.kinematics.tracks_from_motors(setpoint_pps)
+        follow = (wanted - self.tracks) * (1 - math.exp(-dt_s / config.motor_lag_s))
+        most = config.track_acceleration * dt_s
+        before = self.tracks.copy()
+        self.tracks += np.clip(follow, -most, most)
+        # The lag never quite ends; a motor at rest is at rest.
+        self.tracks[(np.abs(self.tracks) < 1e-4) & (wanted == 0)] = 0.0
+        mean = 0.5 * (before + self.tracks)
+        self._travelled += mean * dt_s
+        moving = np.abs(mean) > 1e-4
+        if config.encoder_noise_pulses > 0:
+            noise = self._rng.normal(0, config.encoder_noise_pulses, 2)
+            self._jitter = np.where(moving, noise, self._jitter)
+
+        keep = math.exp(-dt_s / config.slip_time_s)
+        spread = np.asarray([config.slip, config.slip, config.turn_slip]) * math.sqrt(1 - keep * keep)
+        self._slip = keep * self._slip + spread * self._rng.standard_normal(3)
+        twist = self.kinematics.twist_from_tracks(mean * (1 - self._slip[:2]))
+        twist[1:] /= 1 + self._slip[2]
+        self._move(twist, dt_s)
+
+    def _move(self, twist: FloatArray, dt_s: float) -> None:
+        yaw = self.pose[2] + 0.5 * twist[2] * dt_s
+        c, s = math.cos(yaw), math.sin(yaw)
+        target = self.pose + dt_s * np.asarray([c * twist[0] - s * twist[1], s * twist[0] + c * twist[1], twist[2]])
+        if bool(np.any(twist != 0)) and self.touches(target):
+            if not self.contact:
+                self.contacts += 1
+            self.contact = True
+            self.twist = np.zeros(3)
+            return
+        self.pose, self.twist = target, twist
+        if bool(np.any(np.abs(twist) > 1e-6)):
+            self.contact = False
+
+
+def _outline(length: float, width: float, step: float) -> FloatArray:
+    """(N, 2) points on the border of a rectangle, at most ``step`` apart."""
+    along = np.linspace(-0.5, 0.5, int(length / step) + 2) * length
+    across = np.linspace(-0.5, 0.5, int(width / step) + 2) * width
+    half = np.full_like
+    return np.concatenate(
+        [
+            np.column_stack([along, half(along, width / 2)]),
+            np.column_stack([along, half(along, -width / 2)]),
+            np.column_stack([half(across, length / 2), across]),
+            np.column_stack([half(across, -length / 2), across]),
+        ]
+    )

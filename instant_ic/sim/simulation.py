@@ -1,0 +1,158 @@
+"""The whole robot in a world: dynamics, pose history, and what its devices would say; no threads, no sockets."""
+
+import math
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic.base.emulator import RoboclawEmulator
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.sim.render import EquirectRenderer, Frame
+from instant_ic.sim.robot import RobotConfig, TrackedRobot
+from instant_ic.sim.theta import ThetaConfig
+from instant_ic.sim.vlp16 import Vlp16, Vlp16Config
+from instant_ic.sim.world import World
+from instant_ic.sim.worlds import make_world
+
+#: Longest step of the dynamics.
+STEP_S = 0.02
+#: How long poses are remembered.
+HISTORY_S = 3.0
+
+
+@dataclass(frozen=True)
+class BaseConfig:
+    """The simulated motor controller.
+
+    Attributes:
+        enabled: whether there is one.
+        link: name under RUN_DIR/dev of the link to its pseudo-terminal.
+        address: packet serial address.
+        battery_v: voltage of the full battery at rest.
+    """
+
+    enabled: bool = True
+    link: str = "roboclaw"
+    address: int = 0x80
+    battery_v: float = 25.2
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not self.link or "/" in self.link:
+            raise ValueError(f"link must be a plain file name (got {self.link!r})")
+        if self.battery_v <= 0:
+            raise ValueError(f"battery_v must be > 0 (got {self.battery_v})")
+
+
+@dataclass(frozen=True)
+class SimulationConfig:
+    """What is simulated.
+
+    Attributes:
+        world: corridor, corridor:SEED, corridor-free, random:SEED, or a mesh file (see ``make_world``).
+        start: x, y, yaw of the robot in the world, radians; empty: the world's own place.
+        seed: of all noise.
+        robot, camera, lidar, base: its parts.
+    """
+
+    world: str = "corridor"
+    start: tuple[float, ...] = ()
+    seed: int = 0
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    camera: ThetaConfig = field(default_factory=ThetaConfig)
+    lidar: Vlp16Config = field(default_factory=Vlp16Config)
+    base: BaseConfig = field(default_factory=BaseConfig)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if len(self.start) not in (0, 3):
+            raise ValueError(f"start must be empty or x, y, yaw (got {list(self.start)})")
+
+
+class Simulation:
+    """Robot and world, moved by ``step``; as fast as the machine allows.
+
+    Example:
+        >>> simulation = Simulation(SimulationConfig(world="corridor"))       # doctest: +SKIP
+        >>> simulation.drive(0.3, 0.0); simulation.step(1.0)                  # doctest: +SKIP
+        >>> simulation.panorama(1024, 512).rgb.shape                          # doctest: +SKIP
+        (512, 1024, 3)
+
+    Attributes:
+        time_s: simulated time since the start.
+        lock: held while the controller is touched; whoever serves it to a serial line holds it too.
+    """
+
+    def __init__(self, config: SimulationConfig, start_ns: int = 0, world: World | None = None) -> None:
+        self.config = config
+        self.start_ns = start_ns
+        self.world = world or make_world(config.world)
+        start = config.start or self.world.spawn
+        mask = self.world.occupied(config.robot.contact_low, config.robot.contact_high, 0.01)
+        self.robot = TrackedRobot(config.robot, mask, (start[0], start[1], start[2]), config.seed)
+        self.controller = RoboclawEmulator(config.base.address, ideal_motors=False)
+        self.controller.battery_v = config.base.battery_v
+        self.lock = threading.Lock()
+        self.renderer = EquirectRenderer(self.world)
+        self.time_s = 0.0
+        size = int(HISTORY_S / STEP_S) + 2
+        self._history = np.column_stack([np.full(size, -1e9), np.tile(self.robot.pose, (size, 1))])
+        self._remember()
+        self.scanner = Vlp16(config.lidar, self.world, self.poses_at, self.epoch_ns, config.seed)
+
+    def epoch_ns(self, time_s: float) -> int:
+        """Epoch time of a simulated time; ``start_ns`` may be moved when the simulation had to stand still."""
+        return self.start_ns + round(time_s * 1e9)
+
+    def step(self, dt_s: float) -> None:
+        """Moves robot and controller on."""
+        if dt_s < 0:
+            raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
+        count = max(1, math.ceil(dt_s / STEP_S - 1e-9)) if dt_s > 0 else 0
+        for _ in range(count):
+            part = dt_s / count
+            with self.lock:
+                self.controller.advance(part)
+                self.robot.step(self.controller.setpoint_pps, part)
+                self.controller.encoder[:] = self.robot.encoder_pulses
+                self.controller.speed_pps[:] = self.robot.motor_speed_pps
+                load = float(np.abs(self.robot.tracks).mean())
+                used = self.time_s / 3600.0 * 0.4
+                self.controller.battery_v = max(20.0, self.config.base.battery_v - used - 0.6 * load)
+            self.time_s += part
+            self._remember()
+
+    def drive(self, v: float, w: float) -> None:
+        """Sets the motors as a driver would, for simulations without a serial line: m/s and rad/s."""
+        kinematics = self.robot.kinematics
+        pulses = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
+        with self.lock:
+            self.controller.target_speed_pps[:] = pulses
+            self.controller.acceleration_pps2 = 0.0
+
+    def poses_at(self, times_s: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """x, y, yaw (N, 3) of base_link in the world at simulated times (N,), interpolated; the ends are held."""
+        times = np.asarray(times_s, float)
+        history = self._history
+        return np.stack([np.interp(times, history[:, 0], history[:, k]) for k in (1, 2, 3)], axis=-1)
+
+    def world_from_base(self, time_s: float | None = None) -> npt.NDArray[np.float64]:
+        """Pose (4, 4) of base_link now or at a simulated time."""
+        x, y, yaw = self.robot.pose if time_s is None else self.poses_at([time_s])[0]
+        return pose_matrix(x, y, 0.0, 0.0, 0.0, yaw)
+
+    def panorama(self, width: int, height: int) -> Frame:
+        """What the camera sees now."""
+        mount = self.config.camera
+        base_from_camera = pose_matrix(*mount.mount_xyz, 0.0, 0.0, math.radians(mount.mount_yaw_deg))
+        return self.renderer.render(self.world_from_base() @ base_from_camera, width, height)
+
+    def scan_packets(self, count: int | None = None) -> list[bytes]:
+        """The scanner's next data packets: ``count``, or all that are complete by now."""
+        return self.scanner.make(self.scanner.due(self.time_s) if count is None else count)
+
+    def _remember(self) -> None:
+        # A new array instead of a shift in place: another thread may be reading the old one.
+        self._history = np.vstack([self._history[1:], [self.time_s, *self.robot.pose]])

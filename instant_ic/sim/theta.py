@@ -1,0 +1,460 @@
+"""Ricoh Theta Z1's Web API (OSC 2): state, options and the live preview, over HTTP."""
+
+import hashlib
+import json
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+log = logging.getLogger(__name__)
+
+#: Formats of the live preview (facts: Z1, firmware 2.21.1): width, height, frames a second.
+PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
+BOUNDARY = "---osclivepreview---"
+#: After options were set the preview is not ready for this long.
+SETTLE_S = 0.8
+
+
+@dataclass(frozen=True)
+class ThetaConfig:
+    """The simulated camera.
+
+    Attributes:
+        enabled: whether there is one.
+        host, port: where its Web API listens; port 0 takes a free one.
+        width, height: preview format until a driver sets another.
+        rate: most frames a second that are made, whatever the format promises.
+        latency_s: from the moment a picture shows to its delivery.
+        quality: of the JPEG, 1-100.
+        noise: standard deviation of a pixel's value, of 255.
+        user, password: HTTP digest (client mode); an empty user means none.
+        mount_xyz: place on the robot, metres from base_link.
+        mount_yaw_deg: turn on the robot.
+    """
+
+    enabled: bool = True
+    host: str = "127.0.0.1"
+    port: int = 8089
+    width: int = 1024
+    height: int = 512
+    rate: float = 5.0
+    latency_s: float = 0.15
+    quality: int = 92
+    noise: float = 0.0
+    user: str = ""
+    password: str = ""
+    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 1.20)
+    mount_yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if (self.width, self.height) not in {f[:2] for f in PREVIEW_FORMATS}:
+            formats = ", ".join(sorted({f"{w}x{h}" for w, h, _ in PREVIEW_FORMATS}))
+            raise ValueError(f"width and height must be one of {formats} (got {self.width}x{self.height})")
+        if not 0 < self.rate <= 30:
+            raise ValueError(f"rate must be in 0..30 (got {self.rate})")
+        if not 0 <= self.latency_s < 2:
+            raise ValueError(f"latency_s must be in 0..2 (got {self.latency_s})")
+        if not 1 <= self.quality <= 100:
+            raise ValueError(f"quality must be in 1..100 (got {self.quality})")
+        if self.noise < 0:
+            raise ValueError(f"noise must be >= 0 (got {self.noise})")
+        if not 0 <= self.port < 65536:
+            raise ValueError(f"port must be in 0..65535 (got {self.port})")
+
+
+#: Gives a panorama (H, W, 3) sRGB for a width and height: what the camera sees now.
+PictureSource = Callable[[int, int], npt.NDArray[np.uint8]]
+
+
+def panorama_file(path: str | Path) -> PictureSource:
+    """Source that always shows one panorama file, area-averaged to the format asked for.
+
+    Raises:
+        ValueError: it cannot be read as a picture.
+    """
+    import cv2
+
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"panorama {path} cannot be read as a picture")
+    rgb = np.ascontiguousarray(image[..., ::-1])
+    sized: dict[tuple[int, int], npt.NDArray[np.uint8]] = {}
+
+    def source(width: int, height: int) -> npt.NDArray[np.uint8]:
+        if (width, height) not in sized:
+            sized[width, height] = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+        return sized[width, height]
+
+    return source
+
+
+class _ApiError(Exception):
+    def __init__(self, status: int, code: str, message: str) -> None:
+        super().__init__(message)
+        self.status, self.code = status, code
+
+
+class ThetaServer:
+    """Camera with its Web API. Pictures are made only while somebody watches the preview.
+
+    Args:
+        config: parameters.
+        source: what the camera sees; called from the camera's own thread.
+        seed: of the noise.
+
+    Attributes:
+        port: where it listens.
+        rate_hz: frames a second made lately; 0 while nobody watches.
+        frames: pictures made.
+    """
+
+    def __init__(self, config: ThetaConfig, source: PictureSource, seed: int = 0) -> None:
+        self.config = config
+        self.source = source
+        self.rate_hz = 0.0
+        self.frames = 0
+        self.fault = ""
+        self._format = next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height))
+        self._options: dict[str, Any] = {"captureMode": "image", "sleepDelay": 180, "offDelay": 600}
+        self._options_set_s = -1e9
+        self._began_s = time.monotonic()
+        self._nonce = secrets.token_hex(16)
+        self._rng = np.random.default_rng([41, seed])
+        self._frame: bytes | None = None
+        self._number = 0
+        self._viewers = 0
+        self._changed = threading.Condition()
+        self._stopping = False
+        server = self
+
+        class Handler(_Handler):
+            camera = server
+
+        self._http = ThreadingHTTPServer((config.host, config.port), Handler)
+        self._http.daemon_threads = True
+        self.port = int(self._http.server_address[1])
+        self._threads = [
+            threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.2}, name="theta-http"),
+            threading.Thread(target=self._make_frames, name="theta-camera"),
+        ]
+        for thread in self._threads:
+            thread.daemon = True
+            thread.start()
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody watches the preview."""
+        return self._viewers > 0
+
+    def close(self) -> None:
+        """Ends the streams and the server."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify_all()
+        self._http.shutdown()
+        self._http.server_close()
+        for thread in self._threads:
+            thread.join(3.0)
+
+    # --- pictures -----------------------------------------------------------------------------------
+
+    def _make_frames(self) -> None:
+        import cv2
+
+        due = time.monotonic()
+        while True:
+            with self._changed:
+                while self._viewers == 0 and not self._stopping:
+                    self.rate_hz = 0.0
+                    self._changed.wait(1.0)
+                    due = time.monotonic()
+                if self._stopping:
+                    return
+                width, height, promised = self._format
+            began = time.monotonic()
+            rgb = self.source(width, height)
+            if self.config.noise > 0:
+                grain = self._rng.normal(0, self.config.noise, rgb.shape[:2]).astype(np.float32)
+                rgb = np.clip(np.rint(rgb + grain[..., None]), 0, 255).astype(np.uint8)
+            ok, encoded = cv2.imencode(
+                ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, self.config.quality]
+            )
+            if not ok:
+                raise RuntimeError(f"OpenCV could not encode a picture of {width}x{height}")
+            self._sleep(began + self.config.latency_s)
+            with self._changed:
+                self._frame = encoded.tobytes()
+                self._number += 1
+                self.frames += 1
+                self._changed.notify_all()
+            period = 1.0 / min(self.config.rate, promised)
+            # A camera whose picture takes too long shows fewer, never old ones.
+            due = max(due + period, time.monotonic())
+            self._sleep(due)
+            took = time.monotonic() - began
+            self.rate_hz = 1 / took if self.rate_hz == 0 else 0.8 * self.rate_hz + 0.2 / took
+
+    def _sleep(self, until: float) -> None:
+        with self._changed:
+            while not self._stopping and (left := until - time.monotonic()) > 0:
+                self._changed.wait(left)
+
+    def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
+        """Number and JPEG of the newest picture after number ``after``; None when none came in time or at the end."""
+        deadline = time.monotonic() + timeout_s
+        with self._changed:
+            while (self._number <= after or self._frame is None) and not self._stopping:
+                left = deadline - time.monotonic()
+                if left <= 0:
+                    return None
+                self._changed.wait(left)
+            if self._stopping or self._frame is None:
+                return None
+            return self._number, self._frame
+
+    # --- Web API ------------------------------------------------------------------------------------
+
+    def authorised(self, header: str | None, method: str, path: str) -> bool:
+        """Whether an Authorization header is the right answer to this camera's digest challenge (RFC 7616, MD5)."""
+        if not self.config.user:
+            return True
+        if not header or not header.lower().startswith("digest "):
+            return False
+        fields: dict[str, str] = {}
+        for part in header[7:].split(","):
+            key, _, value = part.strip().partition("=")
+            fields[key] = value.strip('"')
+
+        def md5(text: str) -> str:
+            return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
+
+        secret = md5(f"{self.config.user}:{fields.get('realm', '')}:{self.config.password}")
+        request = md5(f"{method}:{fields.get('uri', path)}")
+        if fields.get("qop"):
+            middle = f"{fields.get('nc')}:{fields.get('cnonce')}:{fields['qop']}"
+            expected = md5(f"{secret}:{fields.get('nonce')}:{middle}:{request}")
+        else:
+            expected = md5(f"{secret}:{fields.get('nonce')}:{request}")
+        right_nonce = fields.get("nonce") == self._nonce and fields.get("username") == self.config.user
+        return right_nonce and fields.get("uri") == path and secrets.compare_digest(expected, fields.get("response", ""))
+
+    @property
+    def challenge(self) -> str:
+        """Value of WWW-Authenticate."""
+        return f'Digest realm="RICOH THETA Z1", qop="auth", nonce="{self._nonce}", algorithm=MD5'
+
+    def info(self) -> dict[str, Any]:
+        """Reply to GET /osc/info."""
+        return {
+            "manufacturer": "RICOH",
+            "model": "RICOH THETA Z1",
+            "serialNumber": "YN10000000",
+            "firmwareVersion": "2.21.1",
+            "supportUrl": "https://theta360.com/en/support/",
+            "gps": False,
+            "gyro": True,
+            "endpoints": {"httpPort": 80, "httpUpdatesPort": 80},
+            "apiLevel": [2],
+            "api": [
+                "/osc/info", "/osc/state", "/osc/checkForUpdates", "/osc/commands/execute", "/osc/commands/status",
+            ],
+            "uptime": int(time.monotonic() - self._began_s),
+        }  # fmt: skip
+
+    def state(self) -> dict[str, Any]:
+        """Reply to POST /osc/state."""
+        return {
+            "fingerprint": f"FIG_{self._viewers:04d}",
+            "state": {
+                "batteryLevel": 0.8,
+                "storageUri": f"http://{self.config.host}:{self.port}/files/thetasd/",
+                "_apiVersion": 2,
+                "_batteryState": "disconnect",
+                "_batteryTemp": 31,
+                "_boardTemp": 44,
+                "_cameraError": [],
+                "_captureStatus": "idle",
+                "_captureMode": self._options["captureMode"],
+            },
+        }
+
+    def execute(self, request: Any) -> dict[str, Any]:
+        """Reply to a command other than the live preview.
+
+        Raises:
+            _ApiError: it is refused.
+        """
+        name = request.get("name") if isinstance(request, dict) else None
+        parameters = request.get("parameters", {}) if isinstance(request, dict) else {}
+        if name is None:
+            raise _ApiError(400, "missingParameter", "name is missing")
+        if not isinstance(parameters, dict):
+            raise _ApiError(400, "invalidParameterValue", "parameters must be an object")
+        if name == "camera.setOptions":
+            self._set_options(parameters.get("options"))
+            return {"name": name, "state": "done"}
+        if name == "camera.getOptions":
+            wanted = parameters.get("optionNames")
+            if not isinstance(wanted, list):
+                raise _ApiError(400, "missingParameter", "optionNames is missing")
+            return {"name": name, "state": "done", "results": {"options": self._get_options(wanted)}}
+        raise _ApiError(400, "unknownCommand", f"command {name} is not known")
+
+    def _get_options(self, names: list[Any]) -> dict[str, Any]:
+        width, height, rate = self._format
+        known = {
+            **self._options,
+            "previewFormat": {"width": width, "height": height, "framerate": rate},
+            "previewFormatSupport": [{"width": w, "height": h, "framerate": r} for w, h, r in PREVIEW_FORMATS],
+        }
+        for name in names:
+            if name not in known:
+                raise _ApiError(400, "invalidParameterValue", f"option {name} is not known")
+        return {name: known[name] for name in names}
+
+    def _set_options(self, options: Any) -> None:
+        if not isinstance(options, dict) or not options:
+            raise _ApiError(400, "missingParameter", "options is missing")
+        chosen = self._format
+        for name, value in options.items():
+            if name == "previewFormat":
+                value = value if isinstance(value, dict) else {}
+                asked = (value.get("width"), value.get("height"), value.get("framerate", 8))
+                if asked not in PREVIEW_FORMATS:
+                    raise _ApiError(400, "invalidParameterValue", f"previewFormat {value} is not supported")
+                chosen = next(f for f in PREVIEW_FORMATS if f == asked)
+            elif name not in self._options:
+                raise _ApiError(400, "invalidParameterName", f"option {name} is not known")
+        with self._changed:
+            self._format = chosen
+            self._options.update({k: v for k, v in options.items() if k != "previewFormat"})
+            self._options_set_s = time.monotonic()
+
+    def open_preview(self) -> int:
+        """Takes one more viewer; returns the number of the newest picture, which is not theirs.
+
+        Raises:
+            _ApiError: the camera is not ready after a change of options.
+        """
+        if time.monotonic() - self._options_set_s < SETTLE_S:
+            raise _ApiError(503, "serviceUnavailable", "the camera is changing its settings")
+        with self._changed:
+            self._viewers += 1
+            self._changed.notify_all()
+            return self._number
+
+    def close_preview(self) -> None:
+        """A viewer left."""
+        with self._changed:
+            self._viewers -= 1
+
+    @property
+    def stopping(self) -> bool:
+        """Whether the server is closing."""
+        return self._stopping
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection to the camera."""
+
+    camera: ThetaServer
+    protocol_version = "HTTP/1.1"
+    # A client that stops reading is let go after this long.
+    timeout = 30.0
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Requests go to the debug log."""
+        log.debug("theta: " + format, *args)
+
+    def do_GET(self) -> None:
+        """GET /osc/info."""
+        if not self._authorised():
+            return
+        if self.path == "/osc/info":
+            self._reply(200, self.camera.info())
+        else:
+            self._refuse(_ApiError(404, "invalidParameterValue", f"{self.path} does not exist"))
+
+    def do_POST(self) -> None:
+        """The other end points."""
+        length = int(self.headers.get("Content-Length") or 0)
+        body = self.rfile.read(length) if 0 <= length < 1_000_000 else b""
+        if not self._authorised():
+            return
+        try:
+            request = json.loads(body) if body.strip() else {}
+        except ValueError:
+            self._refuse(_ApiError(400, "invalidParameterValue", "the body is not JSON"))
+            return
+        try:
+            if self.path == "/osc/state":
+                self._reply(200, self.camera.state())
+            elif self.path == "/osc/checkForUpdates":
+                self._reply(200, {"stateFingerprint": self.camera.state()["fingerprint"], "throttleTimeout": 1})
+            elif self.path == "/osc/commands/execute":
+                if isinstance(request, dict) and request.get("name") == "camera.getLivePreview":
+                    self._preview()
+                else:
+                    self._reply(200, self.camera.execute(request))
+            elif self.path == "/osc/commands/status":
+                raise _ApiError(400, "invalidParameterValue", "no command with this id is running")
+            else:
+                raise _ApiError(404, "invalidParameterValue", f"{self.path} does not exist")
+        except _ApiError as error:
+            self._refuse(error, request.get("name", "") if isinstance(request, dict) else "")
+
+    def _authorised(self) -> bool:
+        if self.camera.authorised(self.headers.get("Authorization"), self.command, self.path):
+            return True
+        self.send_response(401)
+        self.send_header("WWW-Authenticate", self.camera.challenge)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+        return False
+
+    def _refuse(self, error: _ApiError, name: str = "") -> None:
+        self._reply(
+            error.status,
+            {"name": name, "state": "error", "error": {"code": error.code, "message": str(error)}},
+        )
+
+    def _reply(self, status: int, value: Any) -> None:
+        body = json.dumps(value).encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "application/json;charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def _preview(self) -> None:
+        number = self.camera.open_preview()
+        self.close_connection = True
+        try:
+            self.send_response(200)
+            self.send_header("Content-Type", f'multipart/x-mixed-replace; boundary="{BOUNDARY}"')
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            while not self.camera.stopping:
+                frame = self.camera.next_frame(number, 5.0)
+                if frame is None:
+                    continue
+                number, jpeg = frame
+                # The camera writes its boundary as it is, without the two dashes that RFC 2046 puts before it.
+                head = f"{BOUNDARY}\r\nContent-type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
+                part = head + jpeg + b"\r\n"
+                self.wfile.write(f"{len(part):x}\r\n".encode() + part + b"\r\n")
+            self.wfile.write(b"0\r\n\r\n")
+        except (BrokenPipeError, ConnectionResetError, TimeoutError):
+            log.debug("theta: a viewer left the preview")
+        finally:
+            self.camera.close_preview()

@@ -1,0 +1,213 @@
+"""VLP-16: rays with firing times and motion distortion, as UDP packets; or a recording's packets at its own pace."""
+
+import math
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic.lidar import packets as wire
+from instant_ic.sim.world import World
+
+FloatArray = npt.NDArray[np.float64]
+#: Gives x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
+PoseAt = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class Vlp16Config:
+    """The simulated scanner.
+
+    Attributes:
+        enabled: whether there is one.
+        host: where packets are sent.
+        data_port, position_port: UDP ports there.
+        rpm: revolutions a minute, 300-1200.
+        range_noise: standard deviation of a range, metres.
+        min_range, max_range: what gives no return, metres.
+        burst: packets sent together (1.33 ms each); more costs less.
+        mount_xyz: place on the robot, metres from base_link.
+        mount_yaw_deg: turn on the robot.
+    """
+
+    enabled: bool = True
+    host: str = "127.0.0.1"
+    data_port: int = 2368
+    position_port: int = 8308
+    rpm: float = 600.0
+    range_noise: float = 0.01
+    min_range: float = 0.4
+    max_range: float = 100.0
+    burst: int = 8
+    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 0.60)
+    mount_yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 300 <= self.rpm <= 1200:
+            raise ValueError(f"rpm must be in 300..1200 (got {self.rpm})")
+        if self.range_noise < 0:
+            raise ValueError(f"range_noise must be >= 0 (got {self.range_noise})")
+        if not 0 <= self.min_range < self.max_range <= 131.0:
+            raise ValueError(f"min_range must be below max_range <= 131 (got {self.min_range}, {self.max_range})")
+        if self.burst < 1:
+            raise ValueError(f"burst must be at least 1 (got {self.burst})")
+        for key in ("data_port", "position_port"):
+            if not 0 < getattr(self, key) < 65536:
+                raise ValueError(f"{key} must be in 1..65535 (got {getattr(self, key)})")
+
+
+class Vlp16:
+    """The scanner's optics and clock: packets for stretches of simulated time.
+
+    Args:
+        config: parameters.
+        world: what is seen.
+        pose_at: pose of base_link at given times.
+        epoch_ns: epoch time of a simulated time, from which packets take their microseconds past the hour.
+        seed: of the noise.
+    """
+
+    def __init__(
+        self, config: Vlp16Config, world: World, pose_at: PoseAt, epoch_ns: Callable[[float], int], seed: int = 0
+    ) -> None:
+        self.config = config
+        self._world = world
+        self._pose_at = pose_at
+        self._epoch_ns = epoch_ns
+        self._rng = np.random.default_rng([37, seed])
+        self.packets = 0
+        omega = np.radians(wire.LASER_ELEVATION_DEG)
+        self._cos, self._sin = np.cos(omega), np.sin(omega)
+        self._reflectance = (
+            100.0 * np.clip((world.textures.mean[world.texture] * world.tint).mean(axis=1), 0, 1)
+        ).astype(np.float32)
+        block = np.arange(wire.BLOCKS)[:, None, None] * wire.BLOCK_PERIOD_US
+        firing = np.arange(wire.FIRINGS)[None, :, None] * wire.FIRING_PERIOD_US
+        laser = np.arange(wire.LASERS)[None, None, :] * wire.LASER_PERIOD_US
+        self._firing_s = (block + firing + laser) * 1e-6
+
+    @property
+    def next_packet_end_s(self) -> float:
+        """When the last laser of the next packet fires."""
+        return (self.packets + 1) * wire.PACKET_PERIOD_US * 1e-6
+
+    def skip_to(self, time_s: float) -> int:
+        """Leaves out the packets that begin before a time; returns their number."""
+        target = math.ceil(time_s / (wire.PACKET_PERIOD_US * 1e-6))
+        skipped = max(0, target - self.packets)
+        self.packets += skipped
+        return skipped
+
+    def due(self, time_s: float) -> int:
+        """Number of packets that are complete at a time and were not made yet."""
+        return max(0, math.floor(time_s / (wire.PACKET_PERIOD_US * 1e-6)) - self.packets)
+
+    def make(self, count: int) -> list[bytes]:
+        """The next ``count`` data packets; poses up to the end of the last must be known."""
+        if count < 1:
+            return []
+        config = self.config
+        first_s = (self.packets + np.arange(count)) * (wire.PACKET_PERIOD_US * 1e-6)
+        self.packets += count
+        times = first_s[:, None, None, None] + self._firing_s
+        degrees_per_s = config.rpm * 6.0
+        # Azimuth is clockwise seen from above, 0 ahead (the sensor's x in ROS axes).
+        alpha = np.radians((times * degrees_per_s) % 360.0)
+        pose = self._pose_at(times.ravel()).reshape(*times.shape, 3)
+        heading = pose[..., 2] + math.radians(config.mount_yaw_deg) - alpha
+        directions = np.empty((*times.shape, 3), np.float32)
+        directions[..., 0] = self._cos * np.cos(heading)
+        directions[..., 1] = self._cos * np.sin(heading)
+        directions[..., 2] = self._sin
+        mx, my, mz = config.mount_xyz
+        c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        origins = np.empty_like(directions)
+        origins[..., 0] = pose[..., 0] + c * mx - s * my
+        origins[..., 1] = pose[..., 1] + s * mx + c * my
+        origins[..., 2] = mz + wire.LASER_VERTICAL_OFFSET_M
+        flat = directions.reshape(-1, 3)
+        range_m, face = self._world.caster.cast(origins.reshape(-1, 3), flat)
+        seen = (range_m >= config.min_range) & (range_m <= config.max_range)
+        measured = np.where(seen, range_m, 0.0)
+        if config.range_noise > 0:
+            measured += np.where(seen, self._rng.normal(0, config.range_noise, len(measured)), 0.0)
+        surface = self._world.face_surface[np.maximum(face, 0)]
+        incidence = np.abs(np.einsum("ij,ij->i", self._world.normal[surface], flat))
+        reflectivity = np.where(seen, self._reflectance[surface] * (0.35 + 0.65 * incidence), 0.0)
+
+        out = np.zeros(count, wire.PACKET_DTYPE)
+        blocks = out["blocks"]
+        blocks["flag"] = wire.BLOCK_FLAG
+        azimuth = np.rint(np.degrees(alpha[:, :, 0, 0]) * 100.0).astype(np.int64) % 36000
+        blocks["azimuth"] = azimuth
+        units = np.clip(np.rint(measured / wire.DISTANCE_UNIT_M), 0, 0xFFFF).astype(np.uint16)
+        blocks["returns"]["distance"] = units.reshape(times.shape)
+        blocks["returns"]["reflectivity"] = np.rint(reflectivity).astype(np.uint8).reshape(times.shape)
+        out["timestamp_us"] = [self._epoch_ns(second) // 1000 % wire.HOUR_US for second in first_s]
+        out["return_mode"] = wire.RETURN_STRONGEST
+        out["product"] = wire.PRODUCT_VLP16
+        data = out.tobytes()
+        size = wire.DATA_PACKET_BYTES
+        return [data[i * size : (i + 1) * size] for i in range(count)]
+
+    def position_packet(self, time_s: float) -> bytes:
+        """Position packet of a sensor whose clock is locked to GPS time."""
+        now_ns = self._epoch_ns(time_s)
+        moment = datetime.fromtimestamp(now_ns // 1_000_000_000, UTC)
+        body = f"GPRMC,{moment:%H%M%S},A,0000.0000,N,00000.0000,E,000.0,000.0,{moment:%d%m%y},000.0,E"
+        checksum = 0
+        for character in body.encode("ascii"):
+            checksum ^= character
+        return wire.encode_position_packet((now_ns // 1000) % wire.HOUR_US, 2, f"${body}*{checksum:02X}")
+
+
+class Vlp16Server:
+    """Sends the scanner's packets by UDP as simulated time goes on.
+
+    Attributes:
+        sent: data packets sent.
+        skipped: data packets left out because the machine was too slow.
+    """
+
+    POSITION_PERIOD_S = 0.1
+    #: Lag at which packets are left out instead of made up for.
+    MOST_LAG_S = 0.5
+
+    def __init__(self, scanner: Vlp16) -> None:
+        self._scanner = scanner
+        self._config = scanner.config
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+        self._next_position_s = 0.0
+        self.sent = 0
+        self.skipped = 0
+        self.refused = 0
+
+    def pump(self, time_s: float) -> None:
+        """Sends what is complete at simulated time ``time_s``, in bursts."""
+        due = self._scanner.due(time_s)
+        if due * wire.PACKET_PERIOD_US * 1e-6 > self.MOST_LAG_S:
+            self.skipped += self._scanner.skip_to(time_s - 0.1)
+            due = self._scanner.due(time_s)
+        if due >= self._config.burst:
+            for packet in self._scanner.make(due):
+                self._send(packet, self._config.data_port)
+                self.sent += 1
+        if time_s >= self._next_position_s:
+            self._send(self._scanner.position_packet(time_s), self._config.position_port)
+            self._next_position_s = time_s + self.POSITION_PERIOD_S
+
+    def close(self) -> None:
+        """Closes the socket."""
+        self._socket.close()
+
+    def _send(self, payload: bytes, port: int) -> None:
+        try:
+            self._socket.sendto(payload, (self._config.host, port))
+        except ConnectionRefusedError:
+            # Nobody listens yet: the kernel tells of an earlier packet. The sensor would not know either.
+            self.refused += 1
