@@ -134,7 +134,7 @@ def render() -> str:
         "# Nodes, topics, parameters",
         "",
         "Made by `scripts/make_reference.py` from the code and `config/*.yaml`; a test holds it to them. Every node",
-        "also takes `use_sim_time` and gives `/heartbeat`, `/diagnostics` and `/rosout`. Our own message types stand in",
+        "also takes `use_sim_time` and gives `/heartbeat`, `/diagnostics`, `/rosout`. Our own message types stand in",
         "`instant_ic/msg/definitions/`; the others are ROS 2's.",
         "",
     ]
