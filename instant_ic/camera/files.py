@@ -1,0 +1,116 @@
+"""Equirectangular pictures from a file or a folder, at a rate."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from instant_ic.camera.config import FilesConfig
+from instant_ic.camera.jpeg import JpegError, check_whole, jpeg_size
+from instant_ic.camera.source import Camera, CameraError, Frame
+
+JPEG_SUFFIXES = (".jpg", ".jpeg")
+SUFFIXES = (*JPEG_SUFFIXES, ".png", ".bmp", ".tif", ".tiff", ".webp")
+
+
+class FileCamera(Camera):
+    """Pictures in the order of their names; JPEG files go out byte for byte."""
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: FilesConfig | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Nothing is read yet.
+
+        Args:
+            path: picture, or folder of pictures.
+            config: rate and order.
+            now_ns: clock of the stamps and of the rate.
+            sleep: how the next picture's time is waited for.
+        """
+        self.path = Path(path)
+        self.config = config or FilesConfig()
+        super().__init__(self.config.latency_s, now_ns)
+        self._sleep = sleep
+        self._paths: list[Path] = []
+        self._loaded: dict[Path, tuple[bytes, int, int]] = {}
+        self._index = 0
+        self._due_ns: int | None = None
+
+    def connect(self) -> str:
+        """Find the pictures and read the first.
+
+        Raises:
+            CameraError: there is none, or it cannot be read.
+        """
+        self.close()
+        if self.path.is_dir():
+            self._paths = sorted(p for p in self.path.iterdir() if p.suffix.lower() in SUFFIXES)
+        elif self.path.is_file():
+            self._paths = [self.path]
+        if not self._paths:
+            raise CameraError(f"{self.path}: no picture ({', '.join(SUFFIXES)}) there")
+        _, width, height = self._load(self._paths[0])
+        return f"{len(self._paths)} pictures from {self.path}, {width}x{height} at {self.config.rate_hz} Hz"
+
+    def read(self) -> Frame:
+        """The next picture, when it is due.
+
+        Raises:
+            CameraError: not connected, or the file cannot be read.
+        """
+        period_ns = round(1e9 / self.config.rate_hz)
+        now_ns = self._now_ns()
+        if self._due_ns is None:
+            self._due_ns = now_ns
+        if now_ns < self._due_ns:
+            self._sleep((self._due_ns - now_ns) * 1e-9)
+        # A picture that comes late does not make the following ones come faster.
+        self._due_ns = max(self._due_ns, now_ns - period_ns) + period_ns
+        return self.next_frame()
+
+    def next_frame(self) -> Frame:
+        """The next picture now, stamped with now.
+
+        Raises:
+            CameraError: not connected, or the file cannot be read.
+        """
+        if not self._paths:
+            raise CameraError(f"{self.path}: not connected; call connect() first")
+        jpeg, width, height = self._load(self._paths[self._index])
+        if self._index + 1 < len(self._paths):
+            self._index += 1
+        elif self.config.loop:
+            self._index = 0
+        return Frame(jpeg, self._stamp_ns(), width, height)
+
+    def close(self) -> None:
+        """Forget the pictures."""
+        self._paths = []
+        self._loaded.clear()
+        self._index = 0
+        self._due_ns = None
+
+    def _load(self, path: Path) -> tuple[bytes, int, int]:
+        if path not in self._loaded:
+            try:
+                data = path.read_bytes()
+                if path.suffix.lower() in JPEG_SUFFIXES:
+                    check_whole(data)
+                else:
+                    data = self._encode(path)
+                self._loaded[path] = (data, *jpeg_size(data))
+            except (OSError, JpegError) as error:
+                self.bad_frames += 1
+                raise CameraError(f"{path}: {error}") from error
+        return self._loaded[path]
+
+    def _encode(self, path: Path) -> bytes:
+        import cv2
+
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise JpegError("OpenCV cannot read it as a picture")
+        return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])[1].tobytes())

@@ -1,0 +1,53 @@
+"""The little that has to be known of a JPEG without decoding it (ITU-T T.81, annex B)."""
+
+SOI = b"\xff\xd8"
+EOI = b"\xff\xd9"
+
+_START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
+
+
+class JpegError(ValueError):
+    """Bytes that are no whole JPEG; the text says what is wrong."""
+
+
+def check_whole(data: bytes | bytearray) -> None:
+    """See that the data starts and ends as a JPEG does.
+
+    Raises:
+        JpegError: it does not.
+    """
+    if data[:2] != SOI:
+        raise JpegError(f"starts with {bytes(data[:2]).hex() or 'nothing'} instead of ffd8 (SOI)")
+    if data[-2:] != EOI:
+        raise JpegError(f"ends with {bytes(data[-2:]).hex()} instead of ffd9 (EOI): it was cut")
+
+
+def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
+    """(width, height) by the frame header.
+
+    Raises:
+        JpegError: there is no frame header before the picture's data.
+    """
+    if data[:2] != SOI:
+        raise JpegError(f"starts with {bytes(data[:2]).hex() or 'nothing'} instead of ffd8 (SOI)")
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            raise JpegError(f"no marker at byte {at}")
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker in _WITHOUT_LENGTH:
+            at += 2
+            continue
+        length = data[at + 2] << 8 | data[at + 3]
+        if marker in _START_OF_FRAME:
+            if at + 9 > len(data):
+                break
+            return data[at + 7] << 8 | data[at + 8], data[at + 5] << 8 | data[at + 6]
+        if marker == 0xDA or length < 2:
+            break
+        at += 2 + length
+    raise JpegError("has no frame header")

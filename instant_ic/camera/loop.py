@@ -1,0 +1,89 @@
+"""Keeps a camera running on a thread of its own: connect, read, and connect again with growing waits."""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from instant_ic.camera.source import Camera, CameraError, Frame
+
+
+@dataclass(frozen=True)
+class ReconnectConfig:
+    """Waits between attempts to connect.
+
+    Attributes:
+        min_s: the first wait.
+        max_s: the longest; waits double up to it.
+    """
+
+    min_s: float = 0.5
+    max_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0.0 < self.min_s <= self.max_s:
+            raise ValueError(f"min_s must be > 0 and at most max_s (got {self.min_s}, {self.max_s})")
+
+
+class CameraLoop(threading.Thread):
+    """Reads a camera until `end`.
+
+    Attributes:
+        frames: pictures read.
+        connections: how often the camera was connected.
+        failures: attempts and connections that ended with an error.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        on_frame: Callable[[Frame], None],
+        on_event: Callable[[bool, str], None],
+        reconnect: ReconnectConfig | None = None,
+    ) -> None:
+        """Not started yet.
+
+        Args:
+            camera: used by this thread only.
+            on_frame: called on this thread with each picture.
+            on_event: called on this thread when the connection comes (True) or goes (False), with words.
+            reconnect: waits between attempts.
+        """
+        super().__init__(name="camera", daemon=True)
+        self.frames = 0
+        self.connections = 0
+        self.failures = 0
+        self._camera = camera
+        self._on_frame = on_frame
+        self._on_event = on_event
+        self._reconnect = reconnect or ReconnectConfig()
+        self._end = threading.Event()
+
+    def run(self) -> None:
+        """Connect and read until `end`."""
+        wait_s = self._reconnect.min_s
+        try:
+            while not self._end.is_set():
+                try:
+                    self._on_event(True, self._camera.connect())
+                    self.connections += 1
+                    while not self._end.is_set():
+                        frame = self._camera.read()
+                        # Only a picture shows that the connection is worth something.
+                        wait_s = self._reconnect.min_s
+                        self.frames += 1
+                        self._on_frame(frame)
+                except CameraError as error:
+                    self.failures += 1
+                    self._on_event(False, f"{error}; trying again in {wait_s:.1f} s")
+                    self._end.wait(wait_s)
+                    wait_s = min(2.0 * wait_s, self._reconnect.max_s)
+        finally:
+            self._camera.close()
+
+    def end(self, timeout_s: float = 3.0) -> bool:
+        """Stop reading; False when the thread does not end in time."""
+        self._end.set()
+        if self.is_alive():
+            self.join(timeout_s)
+        return not self.is_alive()

@@ -1,0 +1,100 @@
+"""The multipart stream of ``camera.getLivePreview``, which ordinary multipart parsers do not read.
+
+Its parts begin with the literal ``---osclivepreview---`` where RFC 2046 asks for two more dashes; other firmware
+and other cameras have the RFC's form. So the boundary is only looked for after a part that was cut, and parts are
+read by their Content-Length.
+"""
+
+import re
+
+from instant_ic.camera.jpeg import JpegError, check_whole
+
+_HEADER_END = b"\r\n\r\n"
+_LENGTH = re.compile(rb"content-length[ \t]*:[ \t]*(\d+)", re.IGNORECASE)
+_MAX_HEADER = 4096
+
+
+class PreviewParser:
+    """Takes the stream in pieces of any size and gives whole JPEGs.
+
+    Attributes:
+        bad_frames: parts dropped: cut, no JPEG, or without a usable length.
+        last_fault: why the last one was dropped, in words.
+    """
+
+    def __init__(self, boundary: str = "osclivepreview", max_frame_bytes: int = 16 << 20) -> None:
+        """Start before the first part.
+
+        Args:
+            boundary: as the Content-Type gives it; dashes and quotes round it do not matter.
+            max_frame_bytes: a longer part is not believed.
+        """
+        self.bad_frames = 0
+        self.last_fault = ""
+        self._boundary = boundary.strip("\"' \t-").encode("ascii", "replace")
+        self._max_frame_bytes = max_frame_bytes
+        self._buffer = bytearray()
+        self._length: int | None = None
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Take the next piece; returns the JPEGs that it completes, oldest first."""
+        self._buffer += data
+        frames: list[bytes] = []
+        while True:
+            if self._length is None and not self._read_header():
+                return frames
+            assert self._length is not None
+            if self._resync_in_body():
+                continue
+            if len(self._buffer) < self._length:
+                return frames
+            body = bytes(self._buffer[: self._length])
+            try:
+                check_whole(body)
+            except JpegError as error:
+                self._drop(str(error))
+                del self._buffer[: self._length]
+            else:
+                frames.append(body)
+                del self._buffer[: self._length]
+            self._length = None
+
+    def _read_header(self) -> bool:
+        """Take a part's header out of the buffer; False when it is not whole yet."""
+        end = self._buffer.find(_HEADER_END)
+        if end < 0:
+            if len(self._buffer) > _MAX_HEADER:
+                self._drop(f"no part header within {_MAX_HEADER} bytes")
+                at = self._buffer.rfind(self._boundary)
+                del self._buffer[: at if at > 0 else len(self._buffer) - len(_HEADER_END)]
+            return False
+        header = bytes(self._buffer[:end])
+        del self._buffer[: end + len(_HEADER_END)]
+        lengths = _LENGTH.findall(header)
+        # After rubbish, the last one belongs to the part that begins here.
+        length = int(lengths[-1]) if lengths else 0
+        if not 4 <= length <= self._max_frame_bytes:
+            self._drop(f"Content-Length {length}" if lengths else "no Content-Length")
+            self._skip_to_boundary()
+            return bool(self._buffer) and self._read_header()
+        self._length = length
+        return True
+
+    def _resync_in_body(self) -> bool:
+        """Where a part was cut, the next one begins inside its announced length: go there."""
+        assert self._length is not None
+        at = self._buffer.find(self._boundary, 0, self._length)
+        if at < 0:
+            return False
+        self._drop(f"cut after {at} of {self._length} bytes")
+        del self._buffer[:at]
+        self._length = None
+        return True
+
+    def _skip_to_boundary(self) -> None:
+        at = self._buffer.find(self._boundary)
+        del self._buffer[: at if at >= 0 else len(self._buffer)]
+
+    def _drop(self, reason: str) -> None:
+        self.bad_frames += 1
+        self.last_fault = reason

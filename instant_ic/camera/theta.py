@@ -1,0 +1,360 @@
+"""Ricoh Theta Z1 over its Web API (Open Spherical Camera API, level 2, with Ricoh's options)."""
+
+import re
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import requests
+import urllib3
+from requests.auth import AuthBase, HTTPDigestAuth
+
+from instant_ic.camera.config import ThetaConfig
+from instant_ic.camera.jpeg import JpegError, jpeg_size
+from instant_ic.camera.preview import PreviewParser
+from instant_ic.camera.source import Camera, CameraError, Frame
+
+NEVER = 65535
+"""Value of sleepDelay and offDelay with which the camera does not sleep or switch itself off."""
+
+_JSON = {"Content-Type": "application/json;charset=utf-8"}
+_CHUNK = 64 << 10
+
+
+class ThetaError(CameraError):
+    """The camera refused a command.
+
+    Attributes:
+        code: of the API, such as ``disabledCommand``; ``http`` and the status where it gave none.
+    """
+
+    def __init__(self, text: str, code: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+@dataclass(frozen=True)
+class ThetaState:
+    """What the camera tells of itself.
+
+    Attributes:
+        battery: charge, 0-1; None where the camera does not tell.
+        battery_temperature_c: degrees Celsius, or None.
+        board_temperature_c: degrees Celsius, or None.
+        errors: its error codes, such as HIGH_TEMPERATURE.
+    """
+
+    battery: float | None
+    battery_temperature_c: float | None
+    board_temperature_c: float | None
+    errors: tuple[str, ...]
+
+
+class ThetaClient:
+    """Commands to the camera over one persistent connection; may be used from several threads.
+
+    Example:
+        >>> client = ThetaClient("http://192.168.1.1", ThetaConfig())       # doctest: +SKIP
+        >>> client.info()["model"], client.state().battery                  # doctest: +SKIP
+        ('RICOH THETA Z1', 0.83)
+    """
+
+    def __init__(
+        self,
+        url: str,
+        config: ThetaConfig,
+        user: str = "",
+        password: str = "",
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Nothing is sent yet.
+
+        Args:
+            url: such as http://192.168.1.1 (the camera's own network) or its address in yours.
+            config: time-outs and retries.
+            user: for digest authentication, which the camera asks for in client mode; its serial number.
+            password: the digits of the serial number unless changed.
+            sleep: how waits are waited.
+        """
+        self.url = url.rstrip("/")
+        self.config = config
+        self.busy_replies = 0
+        """Replies with which the camera said that it was busy (503)."""
+        self._user = user
+        self._password = password
+        self._sleep = sleep
+        self._lock = threading.Lock()
+        self._session = self._new_session()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._session.close()
+
+    def info(self) -> dict[str, Any]:
+        """``GET /osc/info``: model, serial number, firmware.
+
+        Raises:
+            CameraError: no answer.
+        """
+        return self._call("GET", "/osc/info", None)
+
+    def state(self) -> ThetaState:
+        """``POST /osc/state``.
+
+        Raises:
+            CameraError: no answer.
+        """
+        state = self._call("POST", "/osc/state", {}).get("state", {})
+        errors = state.get("_cameraError") or []
+        return ThetaState(
+            battery=_number(state, "batteryLevel"),
+            battery_temperature_c=_number(state, "_batteryTemp"),
+            board_temperature_c=_number(state, "_boardTemp"),
+            errors=tuple(str(error) for error in ([errors] if isinstance(errors, str) else errors)),
+        )
+
+    def execute(self, name: str, parameters: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Run a command and return its results; one that takes long is waited for.
+
+        Raises:
+            ThetaError: the camera refused it.
+            CameraError: no answer.
+        """
+        reply = self._call("POST", "/osc/commands/execute", {"name": name, "parameters": dict(parameters or {})})
+        deadline = time.monotonic() + self.config.connect_timeout_s
+        while reply.get("state") == "inProgress":
+            if time.monotonic() > deadline:
+                raise CameraError(f"{self.url}: {name} has not ended in {self.config.connect_timeout_s} s")
+            self._sleep(0.1)
+            reply = self._call("POST", "/osc/commands/status", {"id": reply.get("id", "")})
+        results = reply.get("results", {})
+        return results if isinstance(results, dict) else {}
+
+    def set_options(self, options: Mapping[str, Any]) -> None:
+        """``camera.setOptions``.
+
+        Raises:
+            ThetaError: the camera does not know an option or its value.
+            CameraError: no answer.
+        """
+        self.execute("camera.setOptions", {"options": dict(options)})
+
+    def open_preview(self) -> tuple[requests.Session, requests.Response]:
+        """Start ``camera.getLivePreview`` on a connection of its own; both have to be closed by the caller.
+
+        Raises:
+            ThetaError: the camera refused it.
+            CameraError: no answer.
+        """
+        session = self._new_session()
+        try:
+            response = self._request(
+                session,
+                "POST",
+                "/osc/commands/execute",
+                {"name": "camera.getLivePreview"},
+                timeout=(self.config.connect_timeout_s, self.config.read_timeout_s),
+                stream=True,
+            )
+            kind = response.headers.get("Content-Type", "")
+            if not kind.lower().startswith("multipart/"):
+                raise CameraError(f"{self.url}: the preview is {kind or 'of no type'} instead of multipart")
+        except CameraError:
+            session.close()
+            raise
+        return session, response
+
+    def _call(self, method: str, path: str, body: Mapping[str, Any] | None) -> dict[str, Any]:
+        with self._lock:
+            response = self._request(self._session, method, path, body, self.config.connect_timeout_s)
+        reply = _json(response)
+        if reply is None:
+            raise CameraError(f"{self.url}{path}: the reply is no JSON object ({response.text[:80]!r})")
+        if reply.get("state") == "error":
+            raise _refusal(self.url + path, body, response.status_code, reply)
+        return reply
+
+    def _request(
+        self,
+        session: requests.Session,
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None,
+        timeout: float | tuple[float, float],
+        stream: bool = False,
+    ) -> requests.Response:
+        """One request, repeated with growing waits while the camera is busy."""
+        wait_s = self.config.busy_wait_s
+        for attempt in range(self.config.busy_retries + 1):
+            try:
+                response = session.request(
+                    method, self.url + path, json=body, headers=_JSON, timeout=timeout, stream=stream
+                )
+            except requests.RequestException as error:
+                raise CameraError(
+                    f"{self.url}{path}: no answer ({_cause(error)}); is the camera on, in the same network, "
+                    "and is its wireless mode the one you expect?"
+                ) from error
+            if response.status_code != 503:
+                break
+            self.busy_replies += 1
+            if attempt < self.config.busy_retries:
+                response.close()
+                self._sleep(wait_s)
+                wait_s *= 2.0
+        if response.status_code == 200:
+            return response
+        refusal = _refusal(self.url + path, body, response.status_code, _json(response) or {})
+        response.close()
+        raise refusal
+
+    def _new_session(self) -> requests.Session:
+        session = requests.Session()
+        # Proxies and .netrc of the environment are not for a camera on the local network.
+        session.trust_env = False
+        if self._user:
+            auth: AuthBase = HTTPDigestAuth(self._user, self._password)
+            session.auth = auth
+        return session
+
+
+class ThetaCamera(Camera):
+    """Live preview of a Theta Z1."""
+
+    def __init__(
+        self,
+        url: str,
+        config: ThetaConfig | None = None,
+        user: str = "",
+        password: str = "",
+        now_ns: Callable[[], int] = time.time_ns,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """As `ThetaClient`, whose arguments these are."""
+        self.config = config or ThetaConfig()
+        super().__init__(self.config.latency_s, now_ns)
+        self.client = ThetaClient(url, self.config, user, password, sleep)
+        self._sleep = sleep
+        self._session: requests.Session | None = None
+        self._response: requests.Response | None = None
+        self._parser = PreviewParser()
+        self._pending: list[Frame] = []
+
+    def connect(self) -> str:
+        """Set the camera up and start its preview.
+
+        Returns:
+            Model, firmware and preview format.
+
+        Raises:
+            CameraError: no answer, or it refused.
+        """
+        self._end_preview()
+        config = self.config
+        info = self.client.info()
+        self.client.set_options(
+            {
+                "sleepDelay": NEVER,
+                "offDelay": NEVER,
+                "previewFormat": {"width": config.width, "height": config.height, "framerate": config.rate_hz},
+            }
+        )
+        # Started sooner, the preview comes in the format of before, or stops at once.
+        self._sleep(config.settle_s)
+        self._session, self._response = self.client.open_preview()
+        found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
+        self._parser = PreviewParser(found.group(1) if found else "osclivepreview")
+        return (
+            f"{info.get('model', 'camera')} (firmware {info.get('firmwareVersion', 'unknown')}) at "
+            f"{self.client.url}, preview {config.width}x{config.height} at {config.rate_hz} Hz"
+        )
+
+    def read(self) -> Frame:
+        """The newest whole picture of what has come.
+
+        Raises:
+            CameraError: nothing within the read time-out, or the camera ended the preview (button, shooting,
+                change of mode).
+        """
+        response = self._response
+        if response is None:
+            raise CameraError(f"{self.client.url}: not connected; call connect() first")
+        deadline = time.monotonic() + self.config.read_timeout_s
+        while True:
+            if time.monotonic() > deadline:
+                raise self._ended(f"no whole picture for {self.config.read_timeout_s} s ({self._parser.last_fault})")
+            try:
+                # read1: what is there now, instead of waiting until the buffer is full.
+                data = response.raw.read1(_CHUNK)
+            except (urllib3.exceptions.HTTPError, OSError) as error:
+                raise self._ended(_cause(error)) from error
+            if not data:
+                raise self._ended("the camera ended it (button, shooting or change of mode?)")
+            bad_before = self._parser.bad_frames
+            frames = self._parser.feed(data)
+            self.bad_frames += self._parser.bad_frames - bad_before
+            stamp_ns = self._stamp_ns()
+            for jpeg in reversed(frames):
+                try:
+                    width, height = jpeg_size(jpeg)
+                except JpegError:
+                    self.bad_frames += 1
+                    continue
+                return Frame(jpeg, stamp_ns, width, height)
+
+    def close(self) -> None:
+        """End the preview and close both connections."""
+        self._end_preview()
+        self.client.close()
+
+    def _end_preview(self) -> None:
+        response, self._response = self._response, None
+        session, self._session = self._session, None
+        if response is not None:
+            response.close()
+        if session is not None:
+            session.close()
+
+    def _ended(self, reason: str) -> CameraError:
+        self._end_preview()
+        return CameraError(f"{self.client.url}: preview ended: {reason}")
+
+
+def _number(state: Mapping[str, Any], key: str) -> float | None:
+    value = state.get(key)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _json(response: requests.Response) -> dict[str, Any] | None:
+    try:
+        reply = response.json()
+    except (requests.RequestException, ValueError):
+        return None
+    return reply if isinstance(reply, dict) else None
+
+
+def _refusal(where: str, body: Mapping[str, Any] | None, status: int, reply: Mapping[str, Any]) -> ThetaError:
+    error = reply.get("error")
+    error = error if isinstance(error, dict) else {}
+    code = str(error.get("code", f"http {status}"))
+    text = str(error.get("message", ""))
+    command = f" {body['name']}" if body and "name" in body else ""
+    hint = ""
+    if status == 401:
+        hint = "; set INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD (serial number, and its digits)"
+    elif status == 503:
+        hint = "; it stayed busy: switch the camera off and on again"
+    return ThetaError(f"{where}:{command} refused: {code} {text}".rstrip() + hint, code)
+
+
+def _cause(error: BaseException) -> str:
+    """The innermost exception, which says what happened; the outer ones repeat addresses."""
+    seen = {id(error)}
+    while True:
+        inner = error.__cause__ or error.__context__ or getattr(error, "reason", None)
+        if not isinstance(inner, BaseException) or id(inner) in seen:
+            return f"{type(error).__name__}: {error}"
+        seen.add(id(inner))
+        error = inner
