@@ -15,10 +15,11 @@ import yaml
 from instant_ic import paths
 from instant_ic.bag.files import BagError, BagMessage, BagReader, BagWriter
 from instant_ic.bag.player import NEVER_PLAYED
+from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.bus.main import load_config
 from instant_ic.bus.node import Node
-from instant_ic.msg import deserialize, message_type, serialize
+from instant_ic.msg import deserialize
 
 BROADCASTS: Mapping[str, tuple[str, ...]] = {
     "grid_slam": ("odom",),
@@ -28,8 +29,6 @@ BROADCASTS: Mapping[str, tuple[str, ...]] = {
 }
 """Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed. What else a
 replayed node broadcasts is left out from its first broadcast on."""
-
-TRANSFORM_TOPICS = ("/tf", "/tf_static")
 
 
 class ReplayError(RuntimeError):
@@ -185,16 +184,7 @@ def replay(
 def _what_to_feed(message: BagMessage, made_topics: set[str], made_frames: set[str]) -> bytes | None:
     """The message's bytes; None when a replayed node makes it itself."""
     if message.topic in TRANSFORM_TOPICS:
-        return _without(message, made_frames)
+        return without_children(message, made_frames)
     if message.topic in made_topics or message.topic in NEVER_PLAYED:
         return None
     return message.payload
-
-
-def _without(message: BagMessage, frames: set[str]) -> bytes | None:
-    """Transforms less those with a child in ``frames``; None when none is left."""
-    transforms = deserialize(message.payload, message.type_name).transforms
-    kept = [transform for transform in transforms if transform.child_frame_id not in frames]
-    if len(kept) == len(transforms):
-        return message.payload
-    return bytes(serialize(message_type(message.type_name)(transforms=kept))) if kept else None

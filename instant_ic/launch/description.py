@@ -437,12 +437,12 @@ class _Reader:
         text = value.text() if value is not None else None
         return self._replace(text, value, context) if value is not None and text is not None else None
 
-    def _replace(self, text: str, value: Value, context: Context) -> str:
+    def _replace(self, text: str, value: Value, context: Context) -> str | None:
         try:
             return substitute(text, context)
         except SubstitutionError as error:
             value.problem(str(error))
-            return ""
+            return None
 
     @staticmethod
     def _plain_text(value: Value | None) -> str | None:

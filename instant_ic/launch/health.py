@@ -132,10 +132,11 @@ class HealthMonitor:
 
 
 def find_console(infos: Iterable[registry.NodeInfo], names: Iterable[str]) -> str | None:
-    """Address of a console out of the registry, by its parameters ``host`` and ``port``."""
+    """Address of a console out of the registry, by its parameters ``server.host`` and ``server.port``."""
     wanted = set(names)
     for info in infos:
-        if info.name in wanted and "port" in info.params:
-            host = str(info.params.get("host") or "127.0.0.1")
-            return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{info.params['port']}"
+        server = info.params.get("server", {})
+        if info.name in wanted and server.get("port"):
+            host = str(server.get("host") or "127.0.0.1")
+            return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{server['port']}"
     return None

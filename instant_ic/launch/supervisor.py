@@ -160,9 +160,12 @@ class Supervisor:
         spec, status = process.spec, process.exit_status or 0
         what = f"{spec.name} ended ({describe_exit(status)})"
         hint = f", see {process.log_path}" if status else ""
-        if spec.respawn and status == USAGE_STATUS:
-            self._output.event(f"{what}: its parameters are wrong, so it is not started again{hint}", bad=True)
-        elif spec.respawn:
+        if status == USAGE_STATUS:
+            self._status = 1
+            self._output.event(f"{what}: its parameters are wrong, so the stack ends{hint}", bad=True)
+            self._stop = True
+            return
+        if spec.respawn:
             delay_s = process.limit.next_delay_s(time.monotonic())
             if delay_s is not None:
                 process.state, process.start_again_s = State.WAITING, time.monotonic() + delay_s

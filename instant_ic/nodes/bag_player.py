@@ -10,6 +10,7 @@ from pathlib import Path
 from instant_ic.bag import BagError, BagMessage
 from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bag.recorder import TopicChoice
+from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.zmq_transport import ZmqTransport
@@ -28,6 +29,7 @@ class BagPlayerConfig:
         loop: begin again at the end.
         topics: names or patterns to play; empty plays everything.
         exclude: names or patterns to leave out.
+        drop_transforms: transforms with these child frames are left out of ``/tf``: somebody broadcasts them anew.
         publish_clock: whether to send ``/clock``.
         wait_for: nodes that must run, and be connected to what they read, before it begins.
         wait_timeout_s: how long to wait for them before it gives up, s.
@@ -41,6 +43,7 @@ class BagPlayerConfig:
     loop: bool = False
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
+    drop_transforms: tuple[str, ...] = ()
     publish_clock: bool = True
     wait_for: tuple[str, ...] = ()
     wait_timeout_s: float = 60.0
@@ -97,11 +100,15 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self.stop()
 
     def _send(self, message: BagMessage) -> None:
+        payload: bytes | None = message.payload
+        if self.config.drop_transforms and message.topic in TRANSFORM_TOPICS:
+            payload = without_children(message, self.config.drop_transforms)
         if isinstance(self.clock, ManualClock):
             self.clock.set(message.stamp_ns)
         if self._clock_out is not None:
             self._clock_out.publish(message_type("Clock")(clock=to_time(message.stamp_ns)))
-        self._out[message.topic].publish_bytes(message.payload)
+        if payload is not None:
+            self._out[message.topic].publish_bytes(payload)
 
     def _wait_for_readers(self) -> None:
         """Until each node of ``wait_for`` is in the registry and connected to every topic of the bag that it reads."""

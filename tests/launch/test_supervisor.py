@@ -94,11 +94,11 @@ def test_respawn_with_growing_wait_until_given_up(run_dir: Path) -> None:
     assert "given up" in output.events[3]
 
 
-def test_wrong_parameters_are_not_tried_again(run_dir: Path) -> None:
+def test_wrong_parameters_end_the_stack_at_once(run_dir: Path) -> None:
     output = Lines()
-    node = program("misfit", "raise SystemExit(2)", respawn=True, required=True)
+    node = program("misfit", "raise SystemExit(2)", respawn=True)
     assert supervise(run_dir, [node], output, RespawnLimit(0.01)) == 1
-    assert "its parameters are wrong" in output.events[0]
+    assert "its parameters are wrong, so the stack ends" in output.events[0]
 
 
 def test_respawn_limit_doubles_and_forgets() -> None:

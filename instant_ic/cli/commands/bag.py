@@ -35,17 +35,17 @@ def add_parser(subparsers: Any) -> None:
     recording.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
     recording.add_argument("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
     recording.add_argument(
-        "-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out; repeatable"
+        "-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out"
     )
     recording.add_argument("--duration", type=float, default=0.0, metavar="S", help="end after this time")
     recording.add_argument("--use-sim-time", action="store_true", help="file messages by /clock, as while a bag plays")
 
     playing = verb(
-        "play", "plays a bag, with /clock before each message", play, "ic bag play drive --rate 2 --start 10"
+        "play", "plays a bag with /clock", play, "ic bag play drive --rate 2 --start 10"
     )
     playing.add_argument("bag", metavar="BAG")
     playing.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
-    playing.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out; repeatable")
+    playing.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
     playing.add_argument("-r", "--rate", type=float, default=1.0, help="2 plays twice as fast (default: %(default)s)")
     playing.add_argument("--start", type=float, default=0.0, metavar="S", help="skip the beginning")
     playing.add_argument("--duration", type=float, default=0.0, metavar="S", help="play only so much of the bag")
@@ -53,19 +53,18 @@ def add_parser(subparsers: Any) -> None:
     playing.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="other name; repeatable")
     playing.add_argument("--no-clock", action="store_true", help="send no /clock")
     playing.add_argument(
-        "--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads; repeatable"
+        "--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads"
     )
 
-    verb("info", "topics, types, counts and losses of a bag", info, "ic bag info drive").add_argument(
-        "bag", metavar="BAG"
-    )
+    looking = verb("info", "topics, types, counts and losses of a bag", info, "ic bag info drive")
+    looking.add_argument("bag", metavar="BAG")
 
     comparing = verb(
         "diff", "compares two bags; exit status 1 when they differ", diff, "ic bag diff first second --ignore /rosout"
     )
     comparing.add_argument("a", metavar="A")
     comparing.add_argument("b", metavar="B")
-    comparing.add_argument("--ignore", action="append", default=[], metavar="TOPIC", help="leave out; repeatable")
+    comparing.add_argument("--ignore", action="append", default=[], metavar="TOPIC", help="leave out")
 
     rescuing = verb(
         "recover", "makes a readable bag of one that was cut short", recover, "ic bag recover broken -o saved"

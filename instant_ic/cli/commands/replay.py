@@ -24,7 +24,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("bag", metavar="BAG")
     parser.add_argument(
-        "--nodes", required=True, metavar="A,B,...", help="nodes, in the order in which they take turns"
+        "--nodes", required=True, metavar="A,B,...", help="nodes, in the order of their turns"
     )
     parser.add_argument("-o", "--output", required=True, metavar="DIR", help="new bag")
     parser.add_argument(
@@ -43,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
         action="append",
         default=[],
         metavar="FRAME",
-        help="leave out transforms with this child; repeatable",
+        help="leave out transforms with this child",
     )
     parser.set_defaults(func=run)
 

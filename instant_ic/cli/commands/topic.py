@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
     listing.add_argument("-v", "--verbose", action="store_true", help="with type, QoS and publishers")
     verb("info", "type, publishers and subscribers of a topic", info, "ic topic info /scan")
     echo_parser = verb(
-        "echo", "prints messages as they come", echo, "ic topic echo /pose -n 1 --field pose.pose.position"
+        "echo", "prints messages as they come", echo, "ic topic echo /pose -n 1 --field pose.pose"
     )
     echo_parser.add_argument("-n", type=_positive_int, default=0, metavar="COUNT", help="end after so many messages")
     echo_parser.add_argument("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
@@ -46,7 +46,7 @@ def add_parser(subparsers: Any) -> None:
     ):
         added = verb(name, words, function, f"ic topic {name} /scan")
         added.add_argument(
-            "--duration", type=_positive, default=float("inf"), metavar="S", help="default: until Ctrl-C"
+            "--duration", type=_positive, default=float("inf"), metavar="S", help="default: no end"
         )
 
 
@@ -147,9 +147,10 @@ def rate(args: argparse.Namespace) -> int:
 
 
 def _rate_line(stamps: list[float], lost: int) -> str:
+    from itertools import pairwise
     from statistics import fmean, pstdev
 
-    gaps = [later - earlier for earlier, later in zip(stamps, stamps[1:], strict=False)]
+    gaps = [later - earlier for earlier, later in pairwise(stamps)]
     if not gaps:
         return "no new message"
     mean = fmean(gaps)

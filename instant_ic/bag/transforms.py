@@ -1,0 +1,23 @@
+"""Takes transforms out of ``/tf`` messages that somebody else broadcasts now."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from instant_ic.bag.files import BagMessage
+from instant_ic.msg import deserialize, message_type, serialize
+
+TRANSFORM_TOPICS = ("/tf", "/tf_static")
+
+
+def without_children(message: BagMessage, frames: Collection[str]) -> bytes | None:
+    """The bytes of a message on a transform topic less the transforms with a child frame in ``frames``.
+
+    Returns:
+        The very same bytes where nothing is taken out; None where nothing is left.
+    """
+    transforms = deserialize(message.payload, message.type_name).transforms
+    kept = [transform for transform in transforms if transform.child_frame_id not in frames]
+    if len(kept) == len(transforms):
+        return message.payload
+    return bytes(serialize(message_type(message.type_name)(transforms=kept))) if kept else None
