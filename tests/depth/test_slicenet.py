@@ -103,7 +103,7 @@ def test_published_layout_loads_strictly(tmp_path: Path, published: SliceNet) ->
     assert all(loaded[key].flatten()[0] == index for index, key in enumerate(state))
     del state["bi_rnn.weight_ih_l0"]
     torch.save({"kwargs": {"backbone": "resnet50", "full_size": True}, "state_dict": state}, path)
-    with pytest.raises(CheckpointError, match="bi_rnn.weight_ih_l0"):
+    with pytest.raises(CheckpointError, match=r"bi_rnn\.weight_ih_l0"):
         load_checkpoint(path)
 
 

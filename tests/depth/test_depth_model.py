@@ -1,0 +1,237 @@
+"""Export, manifest and ONNX inference of a tiny network; the shipped model."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from instant_ic.depth.colour import depth_picture
+from instant_ic.depth.export import export_model, export_onnx
+from instant_ic.depth.manifest import (
+    ManifestError,
+    ModelManifest,
+    load_manifest,
+    manifest_path,
+    save_manifest,
+)
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.depth.slicenet import SliceNet, SliceNetConfig
+from instant_ic.geometry.projections import equirect_directions
+from instant_ic.paths import shipped_file
+
+TINY = SliceNetConfig(
+    backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=16, column_stride=2, decoder_floor=8
+)
+
+
+def random_network(seed: int = 0) -> SliceNet:
+    """Random weights with norms that have seen pictures, so that the output varies over a few metres."""
+    torch.manual_seed(seed)
+    model = SliceNet(TINY)
+    for module in model.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.momentum = None  # plain mean over the batches that follow
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, 0.0, 0.2)
+    torch.nn.init.constant_(model.decoder[-1].layers[1].bias, 3.0)
+    with torch.no_grad():
+        for _ in range(2):
+            model(torch.rand(2, 3, 64, 128))
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SliceNet]:
+    folder = tmp_path_factory.mktemp("model")
+    model = random_network()
+    export_model(model, folder / "tiny.onnx", "tiny", "Apache-2.0", 16.0, record={"steps": 3}, half_weights=False)
+    return folder / "tiny.onnx", model
+
+
+def panorama(height: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, 2 * height, 3), np.uint8)
+
+
+def test_onnx_computes_what_torch_does(exported: tuple[Path, SliceNet]) -> None:
+    path, network = exported
+    picture = panorama(64)
+    with torch.inference_mode():
+        expected = network(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255)[0].numpy()
+    got = DepthModel.load(path, threads=1).estimate(picture)
+    assert got.shape == (64, 128) and got.dtype == np.float32
+    assert np.ptp(expected) > 0.5  # the comparison means something
+    np.testing.assert_allclose(got, expected.clip(0.1, 16.0), atol=1e-5 * np.abs(expected).max(), rtol=1e-5)
+
+
+def test_same_picture_same_bits(exported: tuple[Path, SliceNet]) -> None:
+    picture = panorama(64)
+    first = DepthModel.load(exported[0], threads=2)
+    second = DepthModel.load(exported[0], threads=2)
+    results = [m.estimate(picture).tobytes() for m in (first, first, second)]
+    assert results[0] == results[1] == results[2]
+
+
+def test_training_record_stands_beside_the_model(exported: tuple[Path, SliceNet]) -> None:
+    record = json.loads(exported[0].with_suffix(".json").read_text())
+    assert record["steps"] == 3
+    assert record["export"]["difference"] < 1e-5
+
+
+def test_half_weights_halve_the_file(tmp_path: Path) -> None:
+    model = random_network()
+    export_onnx(model, tmp_path / "full.onnx")
+    result = export_onnx(model, tmp_path / "half.onnx", half_weights=True)
+    assert (tmp_path / "half.onnx").stat().st_size < 0.65 * (tmp_path / "full.onnx").stat().st_size
+    assert 0 < result["half_difference"] < 1e-2
+
+
+def test_large_pictures_are_averaged(exported: tuple[Path, SliceNet]) -> None:
+    small = panorama(64)
+    large = small.repeat(4, axis=0).repeat(4, axis=1)
+    model = DepthModel.load(exported[0])
+    np.testing.assert_array_equal(model.prepare(large), model.prepare(small))
+    checkered = np.zeros((128, 256, 3), np.uint8)
+    checkered[::2, ::2] = checkered[1::2, 1::2] = 200  # every 2 x 2 block averages to 100
+    np.testing.assert_allclose(model.prepare(checkered), 100 / 255, rtol=1e-6)
+
+
+def load_with(exported: tuple[Path, SliceNet], tmp_path: Path, **changes: object) -> DepthModel:
+    manifest = replace(load_manifest(manifest_path(exported[0])), **changes)
+    (tmp_path / "tiny.onnx").write_bytes(exported[0].read_bytes())
+    save_manifest(manifest, tmp_path / "tiny.yaml")
+    return DepthModel.load(tmp_path / "tiny.onnx")
+
+
+def test_normalisation_and_channel_order(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
+    model = load_with(exported, tmp_path, channels="bgr", mean=(0.5, 0.0, 0.0), std=(1.0, 2.0, 4.0))
+    picture = np.zeros((64, 128, 3), np.uint8)
+    picture[..., 2] = 255  # blue, the first channel of bgr
+    prepared = model.prepare(picture)[0, :, 0, 0]
+    np.testing.assert_allclose(prepared, [0.5, 0.0, 0.0])
+    picture[..., 0] = 255
+    np.testing.assert_allclose(model.prepare(picture)[0, :, 0, 0], [0.5, 0.0, 0.25])
+
+
+def test_scale_range_and_planar(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
+    plain = load_with(exported, tmp_path, output_kind="relative").estimate(panorama(64))
+    scaled = load_with(exported, tmp_path, output_kind="relative", output_scale=2.0).estimate(panorama(64))
+    np.testing.assert_allclose(scaled, 2 * plain, rtol=1e-6)
+    planar = load_with(exported, tmp_path, output_kind="relative", geometry="planar").estimate(panorama(64))
+    # Planar depth is along the axis of the cube face: forward the same, towards a cube's corner 1/sqrt(3) of radial.
+    factor = 1 / np.abs(equirect_directions(128, 64)).max(axis=-1)
+    assert factor.max() == pytest.approx(np.sqrt(3), rel=0.03)
+    np.testing.assert_allclose(planar, plain * factor, rtol=1e-5)
+    cut = load_with(exported, tmp_path, min_range_m=0.2, max_range_m=0.3).estimate(panorama(64))
+    assert cut.min() >= np.float32(0.2) and cut.max() <= np.float32(0.3)
+
+
+def test_picture_of_another_type_is_refused(exported: tuple[Path, SliceNet]) -> None:
+    with pytest.raises(ValueError, match="uint8"):
+        DepthModel.load(exported[0]).estimate(np.zeros((64, 128, 3), np.float32))
+
+
+def write_manifest(folder: Path, **changes: object) -> Path:
+    values = {"model": "m.onnx", "name": "m", "licence": "x", "input_height": 64, "input_width": 128, **changes}
+    path = folder / "m.yaml"
+    path.write_text(yaml.safe_dump({k: v for k, v in values.items() if v is not None}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"colour": "rgb"}, "unknown key colour"),
+        ({"input_height": None}, "missing key input_height"),
+        ({"input_height": "64"}, "input_height must be a whole number"),
+        ({"input_width": 100}, "input_width must be twice input_height"),
+        ({"channels": "gbr"}, "channels must be rgb or bgr"),
+        ({"output_kind": "metres"}, "output_kind must be one of"),
+        ({"geometry": "flat"}, "geometry must be radial or planar"),
+        ({"mean": [0.0, 1.0]}, "mean must be three numbers"),
+        ({"std": [1.0, 0.0, 1.0]}, "std must be above 0"),
+        ({"max_range_m": -1}, "max_range_m must be a number above 0"),
+        ({"max_range_m": 0.05}, "max_range_m must be above min_range_m"),
+        ({"name": 7}, "name must be text"),
+    ],
+)
+def test_bad_manifest_says_what_is_wrong(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    path = write_manifest(tmp_path, **changes)
+    with pytest.raises(ManifestError, match=message) as caught:
+        load_manifest(path)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_and_unreadable_manifests(tmp_path: Path) -> None:
+    with pytest.raises(ManifestError, match="no manifest"):
+        DepthModel.load(tmp_path / "absent.onnx")
+    (tmp_path / "m.yaml").write_text("a: [")
+    with pytest.raises(ManifestError, match="not YAML"):
+        load_manifest(tmp_path / "m.yaml")
+    (tmp_path / "m.yaml").write_text("- a")
+    with pytest.raises(ManifestError, match="keys and values"):
+        load_manifest(tmp_path / "m.yaml")
+
+
+def test_manifest_round_trip(tmp_path: Path) -> None:
+    manifest = ModelManifest("a.onnx", "a", "MIT", 64, 128, mean=(0.1, 0.2, 0.3), output_kind="disparity")
+    save_manifest(manifest, tmp_path / "a.yaml")
+    assert load_manifest(tmp_path / "a.yaml") == manifest
+
+
+def test_model_that_does_not_fit_its_manifest(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
+    with pytest.raises(ManifestError, match="the manifest says"):
+        load_with(exported, tmp_path, input_height=128, input_width=256)
+    with pytest.raises(ManifestError, match="no output 'valid' for the mask"):
+        load_with(exported, tmp_path, mask_output="valid")
+    with pytest.raises(ManifestError, match="no output besides the mask"):
+        load_with(exported, tmp_path, mask_output="depth")
+    with pytest.raises(ManifestError, match="SHA-256"):
+        load_with(exported, tmp_path, sha256="0" * 64)
+    path = write_manifest(tmp_path)
+    with pytest.raises(ManifestError, match="does not exist"):
+        DepthModel.load(path)
+    (tmp_path / "m.onnx").write_bytes(b"not a model")
+    with pytest.raises(ManifestError, match="onnxruntime cannot load"):
+        DepthModel.load(path)
+
+
+def test_depth_picture_marks_unknown_black() -> None:
+    depth = np.array([[1.0, 2.0, 4.0, 0.0]], np.float32)
+    coloured = depth_picture(depth, near=1.0, far=4.0)
+    assert coloured[0, 3].tolist() == [0, 0, 0]
+    expected = cv2.applyColorMap(np.array([[255, 127, 0]], np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    np.testing.assert_array_equal(coloured[0, :3], expected[0])
+    assert not depth_picture(np.zeros((2, 2))).any()
+
+
+def test_shipped_model_is_what_its_manifest_and_record_say() -> None:
+    path = shipped_file("models", DEFAULT_MODEL)
+    manifest = load_manifest(manifest_path(path))
+    assert path.stat().st_size < 20e6
+    assert manifest.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    record = json.loads(path.with_suffix(".json").read_text())
+    assert record["network"]["height"] == manifest.input_height
+    assert record["export"]["difference"] < 1e-5
+
+
+def test_shipped_model_knows_a_generated_room() -> None:
+    """Quality on a world that it was not trained on; a constant guess has a relative error of about 0.5."""
+    from instant_ic.depth.metrics import depth_metrics
+    from instant_ic.geometry.poses import pose_matrix
+    from instant_ic.sim.render import EquirectRenderer
+    from instant_ic.sim.worlds import random_world
+
+    path = shipped_file("models", DEFAULT_MODEL)
+    manifest = load_manifest(manifest_path(path))
+    world = random_world(5)
+    x, y, yaw = world.spawn
+    frame = EquirectRenderer(world).render(pose_matrix(x, y, 1.2, yaw=yaw), manifest.input_width, manifest.input_height)
+    got = depth_metrics(DepthModel.load(path, threads=1).estimate(frame.rgb), frame.depth_m)
+    assert got.mre < 0.2
+    assert got.delta1 > 0.7
