@@ -50,6 +50,8 @@ class Demo:
         self.look = Look()
         self.estop = False
         self.forced_mode: str | None = None
+        self.faults: list[dict[str, str]] = []
+        self.pictures = True
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
@@ -97,7 +99,8 @@ class Demo:
         """Ends both."""
         self._stop.set()
         for thread in self._threads:
-            thread.join(timeout=5.0)
+            if thread.is_alive():
+                thread.join(timeout=5.0)
         self.server.stop()
 
     def _move(self) -> None:
@@ -112,7 +115,7 @@ class Demo:
         due = 0.0
         while not self._stop.wait(0.01):
             now = time.monotonic()
-            if now >= due:
+            if now >= due and self.pictures:
                 due = now + 1.0 / self.config.panorama_hz
                 self._send_panorama()
             if self._views.due(now, virtual=self.mode == "virtual"):
@@ -195,7 +198,7 @@ class Demo:
     def _tell_health(self) -> None:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
         battery = {"voltage": 24.6, "percent": 81.0}
-        self.server.publish("health", {"vspace": vspace, "battery": battery, "faults": [], "rates": {}})
+        self.server.publish("health", {"vspace": vspace, "battery": battery, "faults": self.faults})
 
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()

@@ -42,6 +42,7 @@ from instant_ic.msg import (
 MODES = {0: "real", 1: "virtual", 2: "stopped"}
 VSPACE_STATES = {0: "empty", 1: "training", 2: "ready", 3: "failed"}
 HEARTBEAT_TIMEOUT_S = 3.0
+PICTURE_TIMEOUT_S = 2.0
 MAX_FAULTS = 6
 
 
@@ -83,7 +84,6 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.subgoal = self.latest("/ic/subgoal", PoseStamped, max_age_s=1.0)
         self.vspace = self.latest("/vspace/status", VspaceStatus, max_age_s=5.0, qos=LATCHED)
         self.battery = self.latest("/battery", BatteryState, max_age_s=5.0)
-        self.camera = self.latest("/camera/image/compressed", CompressedImage, max_age_s=2.0)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", RenderedView, self.on_view, qos=SENSOR)
         self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
@@ -93,6 +93,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.look = Look()
         self.views = ViewScheduler(config.view)
         self.mode = "none"
+        self._picture_ns: int | None = None
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
         self._diagnoses_seen: dict[str, tuple[int, str, float]] = {}
@@ -137,6 +138,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_panorama(self, message: CompressedImage) -> None:
         """Passes a panorama on as it came, with the camera's pose when it was taken."""
+        self._picture_ns = self.clock.now_ns()
         stamp = stamp_ns(message)
         map_from_camera = self.lookup("map", "camera", stamp)
         self.server.send_frame(
@@ -237,12 +239,10 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def send_health(self) -> None:
         """Tells the page what is wrong, in the words of whoever found it."""
-        level, text = (OK, "picture comes") if self.camera.message is not None else (WARN, "no picture from the camera")
-        self.diagnose("camera", level, text, age_s=self.camera.age_s)
-        level, text = (OK, "state comes") if self.control.message is not None else (WARN, "no state from the arbiter")
-        self.diagnose("controller", level, text, age_s=self.control.age_s)
-        level, text = (OK, "pose known") if self.robot_pose() is not None else (WARN, "the robot's pose is unknown")
-        self.diagnose("pose", level, text)
+        age_s = math.inf if self._picture_ns is None else (self.clock.now_ns() - self._picture_ns) / 1e9
+        self.check("camera", age_s <= PICTURE_TIMEOUT_S, "no picture from the camera", age_s=age_s)
+        self.check("controller", self.control.message is not None, "no state from the arbiter")
+        self.check("pose", self.robot_pose() is not None, "the robot's pose is unknown")
         self.server.publish(
             "health",
             {
@@ -252,6 +252,10 @@ class ConsoleNode(Node[ConsoleConfig]):
                 "nodes": sorted(self._heartbeats),
             },
         )
+
+    def check(self, name: str, fine: bool, fault: str, **values: Any) -> None:
+        """Sets a diagnosis: OK, or a warning in the words of ``fault``."""
+        self.diagnose(name, OK if fine else WARN, "" if fine else fault, **values)
 
     def faults(self) -> list[dict[str, str]]:
         """Present faults, the worst first: ``level`` (warn, error), ``name``, ``text``."""

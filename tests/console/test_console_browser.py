@@ -1,0 +1,338 @@
+"""The page in Debian's Chromium, against the server with a made-up robot."""
+
+import io
+import os
+import shutil
+import time
+
+import numpy as np
+import pytest
+
+from instant_ic.console.demo import Demo, DemoConfig
+from instant_ic.console.drive import DriveConfig
+from instant_ic.console.server import ServerConfig
+from instant_ic.console.view import ViewConfig
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WAIT_MS = 60_000
+SIZE = {"width": 960, "height": 600}
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(
+        CHROMIUM is None and os.environ.get("CI") != "true", reason="chromium is missing: apt install chromium"
+    ),
+]
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    assert CHROMIUM, "chromium is missing: apt install chromium"
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+def make_demo(port=0):
+    # No watchdog in the server's way: what stops the robot here must be the page.
+    drive = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
+    view = ViewConfig(width=160, height=96, virtual_rate_hz=5)
+    demo = Demo(ServerConfig(port=port, drive=drive), DemoConfig(panorama_width=192, panorama_hz=4, view=view))
+    demo.start()
+    return demo
+
+
+@pytest.fixture
+def demo():
+    demo = make_demo()
+    yield demo
+    demo.stop()
+
+
+@pytest.fixture
+def open_page(browser, demo):
+    contexts = []
+
+    def open_one(query="", driver="you", **options):
+        context = browser.new_context(**({"viewport": SIZE} | options))
+        context.set_default_timeout(WAIT_MS)
+        contexts.append(context)
+        page = context.new_page()
+        page.faults = []
+        page.on("pageerror", lambda error: page.faults.append(str(error)))
+        page.on("console", lambda m: page.faults.append(m.text) if m.type == "error" else None)
+        page.goto(demo.server.url + query)
+        expect_body(page, "driver", driver)
+        return page
+
+    yield open_one
+    faults = [fault for context in contexts for page in context.pages for fault in page.faults]
+    for context in contexts:
+        context.close()
+    assert not faults
+
+
+def expect_body(page, name, value):
+    from playwright.sync_api import expect
+
+    expect(page.locator("body")).to_have_attribute(f"data-{name}", value, timeout=WAIT_MS)
+
+
+def wait_until(predicate, page, what):
+    """Waits for something on the robot's side while the page lives on."""
+    deadline = time.monotonic() + WAIT_MS / 1000
+    while not predicate():
+        assert time.monotonic() < deadline, what
+        page.wait_for_timeout(20)
+
+
+def moving(demo):
+    return bool(demo.commands) and demo.commands[-1] != (0.0, 0.0)
+
+
+def start_driving(page, demo, key="w"):
+    page.keyboard.down(key)
+    wait_until(lambda: moving(demo), page, "the key drives")
+
+
+def wait_stopped(page, demo):
+    """Waits for the stop, and sees that nothing moves again while the page sends what it still would."""
+    wait_until(lambda: not moving(demo), page, f"stopped; last commands {demo.commands[-3:]}")
+    count = len([c for c in demo.commands if c != (0.0, 0.0)])
+    page.wait_for_timeout(200)  # four times the page's sending period
+    assert len([c for c in demo.commands if c != (0.0, 0.0)]) == count
+
+
+def picture_of(page):
+    """Pixels of the picture alone, (H, W, 3) float."""
+    from PIL import Image
+
+    page.add_style_tag(content="body > :not(#picture) { visibility: hidden !important }")
+    shot = page.screenshot(type="png")
+    page.evaluate("document.head.lastElementChild.remove()")
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
+
+
+@pytest.mark.parametrize(("query", "viewer"), [("", "webgl"), ("?viewer=canvas", "canvas")])
+def test_page_draws_picture_and_map_without_errors(open_page, demo, query, viewer):
+    page = open_page(query)
+    expect_body(page, "viewer", viewer)
+    expect_body(page, "picture", "live")
+    expect_body(page, "map", "drawn")
+    expect_body(page, "mode", "real")
+    map_pixels = page.evaluate(
+        """() => { const c = document.getElementById('map-canvas');
+        const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+        return new Set(Array.from({length: d.length / 4}, (_, i) => d.slice(4 * i, 4 * i + 3).join())).size; }"""
+    )
+    assert map_pixels > 20  # floor, costs, walls, robot
+    # The content policy forbids a style tag, so the picture is cut out where nothing lies over it.
+    from PIL import Image
+
+    shot = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"), float)
+    middle = shot[180:420, 300:660]
+    assert middle.std() > 10
+    # The room: white obstacle in the middle of the lower half, brown floor at both sides of it.
+    obstacle, floor = shot[330:350, 470:490].mean(axis=(0, 1)), shot[390:410, 320:340].mean(axis=(0, 1))
+    assert np.ptp(obstacle) < 25
+    assert floor[0] > floor[2] + 10
+
+
+def test_key_drives_while_held_and_stops_on_key_up(open_page, demo):
+    page = open_page()
+    start_driving(page, demo)
+    assert demo.commands[-1] == pytest.approx((0.28, 0.0))  # 70 % of 0.4 m/s
+    page.keyboard.down("a")
+    wait_until(lambda: demo.commands[-1][1] > 0, page, "turns left")
+    page.keyboard.up("a")
+    wait_until(lambda: demo.commands[-1] == pytest.approx((0.28, 0.0)), page, "straight on")
+    page.keyboard.up("w")
+    wait_stopped(page, demo)
+    page.keyboard.press("Minus")
+    start_driving(page, demo, "ArrowDown")
+    assert demo.commands[-1][0] == pytest.approx(-0.24)  # 60 %
+    page.keyboard.up("ArrowDown")
+    wait_stopped(page, demo)
+
+
+@pytest.mark.parametrize(
+    "event",
+    [
+        "window.dispatchEvent(new Event('blur'))",
+        "Object.defineProperty(document, 'hidden', {get: () => true});"
+        "document.dispatchEvent(new Event('visibilitychange'))",
+        "window.dispatchEvent(new PageTransitionEvent('pagehide'))",
+        "window.dispatchEvent(new KeyboardEvent('keydown', {code: 'KeyW', metaKey: true}))",
+    ],
+    ids=["blur", "hidden", "pagehide", "system key"],
+)
+def test_key_held_while_the_window_loses_focus_stops_the_robot(open_page, demo, event):
+    page = open_page()
+    start_driving(page, demo)
+    page.evaluate(event)
+    wait_stopped(page, demo)  # although the key is still down
+
+
+def test_closed_page_stops_the_robot(open_page, demo):
+    page, other = open_page(), open_page(driver="other")
+    start_driving(page, demo)
+    page.close()
+    wait_stopped(other, demo)
+
+
+def test_lost_link_is_told_and_does_not_drive_on_when_it_comes_back(open_page, demo):
+    page = open_page()
+    start_driving(page, demo)
+    port = demo.server.port
+    demo.stop()
+    assert demo.commands[-1] == (0.0, 0.0)
+    expect_body(page, "link", "lost")
+    assert page.locator("#banner-title").inner_text() == "LINK LOST"
+    again = make_demo(port)
+    try:
+        expect_body(page, "link", "up")
+        expect_body(page, "driver", "you")
+        page.wait_for_timeout(200)
+        assert not moving(again)  # the key is still down, but must be pressed anew
+        page.keyboard.up("w")
+        start_driving(page, again)
+        page.keyboard.up("w")
+        wait_stopped(page, again)
+    finally:
+        again.stop()
+    page.faults.clear()  # the browser reports the refused connections
+
+
+def test_emergency_stop_by_space_and_release_by_holding(open_page, demo):
+    page = open_page()
+    start_driving(page, demo)
+    page.keyboard.press("Space")
+    wait_stopped(page, demo)
+    assert demo.estop
+    expect_body(page, "estop", "set")
+    expect_body(page, "mode", "stopped")
+    page.keyboard.up("w")
+    page.keyboard.down("w")
+    page.wait_for_timeout(200)
+    assert not moving(demo)
+    page.keyboard.up("w")
+    page.locator("#release").click()  # a tap is not enough
+    page.wait_for_timeout(200)
+    assert demo.estop
+    box = page.locator("#release").bounding_box()
+    page.mouse.move(box["x"] + 20, box["y"] + 10)
+    page.mouse.down()
+    expect_body(page, "estop", "free")
+    page.mouse.up()
+    assert not demo.estop
+
+
+def test_watcher_stops_by_the_button_and_takes_over(open_page, demo):
+    page, other = open_page(), open_page(driver="other")
+    start_driving(page, demo)
+    other.keyboard.down("s")
+    other.wait_for_timeout(100)
+    assert demo.commands[-1][0] > 0  # a watcher's keys do nothing
+    other.keyboard.up("s")
+    other.locator("#take").click()
+    expect_body(other, "driver", "you")
+    expect_body(page, "driver", "other")
+    wait_stopped(page, demo)
+    page.locator("#estop").click()
+    expect_body(other, "estop", "set")
+    assert demo.estop
+    assert page.locator("#release").is_hidden()
+    assert other.locator("#release").is_visible()
+
+
+def test_passage_to_the_rendered_view_and_back(open_page, demo):
+    page = open_page(bypass_csp=True)
+    expect_body(page, "picture", "live")
+    demo.forced_mode = "real"
+    real = picture_of(page)
+    demo.forced_mode = "virtual"
+    expect_body(page, "mode", "virtual")
+    expect_body(page, "blend", "1.00")
+    page.wait_for_timeout(700)
+    virtual = picture_of(page)
+    # Same place, same direction, other picture: alike as a whole, not the same.
+    assert 0.5 < np.abs(virtual - real).mean() < 25
+    assert np.corrcoef(real[::4, ::4].ravel(), virtual[::4, ::4].ravel())[0, 1] > 0.85
+    demo.forced_mode = "real"
+    expect_body(page, "mode", "real")
+    expect_body(page, "blend", "0.00")
+
+
+def test_looking_round_by_drag_turns_the_picture_at_once_and_tells_the_robot(open_page, demo):
+    page = open_page(bypass_csp=True)
+    expect_body(page, "picture", "live")
+    before = picture_of(page)
+    page.mouse.move(480, 300)
+    page.mouse.down()
+    page.mouse.move(680, 300, steps=4)
+    page.mouse.up()
+    wait_until(lambda: demo.look.yaw > 0.1, page, "the look direction arrives")
+    # The picture follows the pointer: 200 of 600 pixels of a 60° high picture are 20°, to the left.
+    assert demo.look.yaw == pytest.approx(np.radians(20), abs=0.01)
+    turned = picture_of(page)
+    assert np.abs(turned - before).mean() > 3
+    # What was in the middle has moved to the right with the pointer.
+    strip = before[200:260, 380:580].mean(axis=2)
+    scores = {
+        shift: np.corrcoef(strip.ravel(), turned[200:260, 380 + shift : 580 + shift].mean(axis=2).ravel())[0, 1]
+        for shift in range(-240, 241, 20)
+    }
+    assert 120 <= max(scores, key=scores.get) <= 240
+    page.keyboard.press("c")
+    wait_until(lambda: abs(demo.look.yaw) < 0.01, page, "straight ahead again")
+
+
+def touch(page, kind, x, y):
+    page.evaluate(
+        """([kind, x, y]) => {
+        const stick = document.getElementById('stick');
+        stick.setPointerCapture = () => {};
+        stick.dispatchEvent(new PointerEvent(kind, {pointerId: 7, clientX: x, clientY: y, bubbles: true})); }""",
+        [kind, x, y],
+    )
+
+
+@pytest.mark.parametrize("end", ["pointerup", "pointercancel"])
+def test_phone_fits_and_its_stick_drives_until_it_is_let_go(open_page, demo, end):
+    page = open_page(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+    for name in ("#mode", "#link", "#map", "#panel", "#stick", "#estop"):
+        box = page.locator(name).bounding_box()
+        assert box["x"] >= 0 and box["y"] >= 0, name
+        assert box["x"] + box["width"] <= 390 and box["y"] + box["height"] <= 844, name
+    box = page.locator("#stick").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    touch(page, "pointerdown", x, y)
+    touch(page, "pointermove", x, y - 60)
+    wait_until(lambda: moving(demo), page, "the stick drives")
+    assert demo.commands[-1] == pytest.approx((0.28, 0.0), abs=0.03)
+    touch(page, end, x, y - 60)
+    wait_stopped(page, demo)
+
+
+def test_faults_and_silence_are_told(open_page, demo):
+    page = open_page()
+    expect_body(page, "picture", "live")
+    text = "<img src=x onerror=alert(1)> no packets"
+    demo.faults = [{"level": "error", "name": "vlp16_driver", "text": text}]
+    page.locator("#faults li").wait_for()
+    assert page.locator("#faults li").inner_text() == f"vlp16_driver {text}"  # as text, not as HTML
+    demo.pictures = False
+    expect_body(page, "picture", "stale")

@@ -1,0 +1,162 @@
+"""Lease, watchdog and emergency stop, by a clock that the test sets."""
+
+import pytest
+
+from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+
+CONFIG = DriveConfig(max_linear_mps=0.4, max_angular_rps=0.8, rate_hz=20, watchdog_s=0.25, stop_repeat_s=0.3)
+
+
+def driving_gate(now=0.0):
+    gate = DriveGate(CONFIG)
+    assert gate.request(1, now)
+    assert gate.receive(1, 1, 0.0, 0.3, 0.1, now) is Verdict.ACCEPTED
+    assert gate.take_due(now) == (0.3, 0.1)
+    return gate
+
+
+def run(gate, start, end, step=0.01):
+    """Commands given on in [start, end): list of (time, command)."""
+    given = []
+    for i in range(round((end - start) / step)):
+        command = gate.take_due(start + i * step)
+        if command is not None:
+            given.append((round(start + i * step, 3), command))
+    return given
+
+
+def test_commands_are_given_on_at_the_rate_and_a_change_at_once():
+    gate = driving_gate()
+    assert gate.take_due(0.02) is None
+    gate.receive(1, 2, 0.0, 0.3, -0.2, 0.03)
+    assert gate.take_due(0.03) == (0.3, -0.2)
+    assert gate.take_due(0.06) is None
+    assert gate.take_due(0.08) == (0.3, -0.2)  # 1/20 s after the last
+
+
+def test_lost_link_stops_the_robot_by_the_watchdog():
+    """Robot runs its last command after the link is lost: zero 0.25 s after the last command."""
+    given = run(driving_gate(), 0.01, 1.0)
+    first_zero = next(time for time, command in given if command == (0.0, 0.0))
+    assert first_zero == 0.25
+    assert [t for t, c in given if c == (0.3, 0.1)] == [0.05, 0.1, 0.15, 0.2]
+    # Zeros for 0.3 s, then silence.
+    assert [t for t, c in given if c == (0.0, 0.0)][:6] == [0.25, 0.3, 0.35, 0.4, 0.45, 0.5]
+    assert given[-1][0] <= 0.55
+
+
+def test_watchdog_counts_and_lets_a_fresh_command_through():
+    gate = driving_gate()
+    run(gate, 0.0, 0.5)
+    assert gate.watchdog_trips == 1
+    assert gate.receive(1, 2, 0.0, 0.2, 0.0, 0.6) is Verdict.ACCEPTED
+    assert gate.take_due(0.6) == (0.2, 0.0)
+
+
+def test_dead_man_release_sends_a_zero_at_once():
+    gate = driving_gate()
+    gate.receive(1, 2, 0.0, 0.0, 0.0, 0.01)
+    assert gate.take_due(0.01) == (0.0, 0.0)
+
+
+def test_one_zero_goes_out_even_without_repetition():
+    gate = DriveGate(DriveConfig(stop_repeat_s=0.0))
+    gate.request(1, 0.0)
+    gate.receive(1, 1, 0.0, 0.3, 0.0, 0.0)
+    gate.take_due(0.0)
+    gate.receive(1, 2, 0.0, 0.0, 0.0, 0.01)
+    assert gate.take_due(0.02) == (0.0, 0.0)
+    assert run(gate, 0.03, 0.5) == []
+
+
+def test_idle_zeros_of_a_watcher_do_not_fight_the_drivers_commands():
+    gate = driving_gate()
+    assert gate.receive(2, 1, 0.0, 0.0, 0.0, 0.01) is Verdict.NOT_DRIVER
+    assert gate.command == (0.3, 0.1)
+    assert gate.receive(2, 2, 0.0, 0.4, 0.0, 0.02) is Verdict.NOT_DRIVER
+    assert gate.counts[Verdict.NOT_DRIVER] == 2
+
+
+def test_an_idle_driver_gives_nothing_on():
+    gate = DriveGate(CONFIG)
+    gate.request(1, 0.0)
+    gate.receive(1, 1, 0.0, 0.0, 0.0, 0.0)
+    assert run(gate, 0.0, 0.5) == []
+    assert gate.next_deadline(0.1) == pytest.approx(2.0)  # of the lease alone
+
+
+def test_take_over_stops_the_robot_and_the_old_driver_no_longer_counts():
+    gate = driving_gate()
+    assert not gate.request(2, 0.01)
+    assert gate.driver == 1
+    assert gate.request(2, 0.02, take=True)
+    assert gate.take_due(0.02) == (0.0, 0.0)
+    assert gate.receive(1, 2, 0.0, 0.3, 0.0, 0.03) is Verdict.NOT_DRIVER
+
+
+def test_closed_socket_stops_the_robot_and_frees_the_lease():
+    gate = driving_gate()
+    gate.forget(1, 0.01)
+    assert gate.take_due(0.01) == (0.0, 0.0)
+    assert gate.driver is None
+    assert gate.request(2, 0.02)
+
+
+def test_silent_driver_loses_the_lease_and_a_living_one_keeps_it():
+    gate = driving_gate()
+    gate.touch(1, 1.5)
+    run(gate, 1.6, 3.4, step=0.01)
+    assert gate.driver == 1
+    run(gate, 3.5, 3.6, step=0.01)
+    assert gate.driver is None
+
+
+def test_old_future_and_out_of_order_commands_are_dropped():
+    gate = driving_gate()
+    assert gate.receive(1, 2, 0.31, 0.4, 0.0, 0.01) is Verdict.OLD
+    assert gate.receive(1, 2, -0.31, 0.4, 0.0, 0.01) is Verdict.OLD
+    assert gate.receive(1, 1, 0.0, 0.4, 0.0, 0.01) is Verdict.OUT_OF_ORDER
+    assert gate.command == (0.3, 0.1)
+    assert gate.receive(1, 2, 0.29, 0.4, 0.0, 0.01) is Verdict.ACCEPTED
+
+
+def test_commands_are_clamped():
+    gate = driving_gate()
+    gate.receive(1, 2, 0.0, 9.0, -9.0, 0.01)
+    assert gate.command == (0.4, -0.8)
+
+
+def test_emergency_stop_is_latched_and_only_the_driver_releases_it():
+    gate = driving_gate()
+    gate.set_estop(0.01)
+    assert gate.take_due(0.01) == (0.0, 0.0)
+    assert gate.receive(1, 2, 0.0, 0.3, 0.0, 0.02) is Verdict.STOPPED
+    gate.request(2, 0.03, take=True)
+    assert not gate.release_estop(1)
+    assert gate.estop
+    assert gate.release_estop(2)
+    assert gate.receive(2, 1, 0.0, 0.3, 0.0, 0.04) is Verdict.ACCEPTED
+
+
+def test_deadlines():
+    gate = driving_gate(now=10.0)
+    assert gate.next_deadline(10.0) == pytest.approx(10.05)  # the next of 20 Hz
+    gate.take_due(10.2)
+    assert gate.next_deadline(10.2) == pytest.approx(10.25)  # both
+    assert gate.next_deadline(10.3) == pytest.approx(10.3)  # overdue: now
+    assert DriveGate(CONFIG).next_deadline(0.0) is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("max_linear_mps", 0.0),
+        ("watchdog_s", float("nan")),
+        ("stop_repeat_s", -1.0),
+        ("lease_timeout_s", 0),
+        ("rate_hz", 5),
+    ],
+)
+def test_bad_parameters_are_refused_by_name(key, value):
+    with pytest.raises(ValueError, match="watchdog_s" if key == "rate_hz" else key):
+        DriveConfig(**{key: value})

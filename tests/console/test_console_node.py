@@ -1,0 +1,344 @@
+"""The console node in lockstep: what goes to the page, and what comes from it to the bus."""
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.console import FrameKind, Look, ViewConfig
+from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix
+from instant_ic.msg import (
+    ControlState,
+    NodeStatus,
+    RenderedView,
+    compressed_image_message,
+    grid_message,
+    header,
+    message_type,
+    odometry_message,
+    path_message,
+    pose_message,
+    pose_stamped,
+    to_time,
+    transform_message,
+    twist_message,
+    twist_values,
+)
+from instant_ic.msg import pose_matrix as matrix_of
+from instant_ic.nodes.console import ConsoleConfig, ConsoleNode
+
+START = 1_000_000_000
+MS = 1_000_000
+
+
+class FakeServer:
+    """Keeps what the node sends, in place of sockets."""
+
+    def __init__(self, clock):
+        self.clock = clock
+        self.texts, self.frames, self.shown = {}, [], None
+
+    def now_ms(self):
+        return self.clock.now_ns() / 1e6 + 5000.0
+
+    def publish(self, kind, message):
+        self.texts[kind] = message
+
+    def send_frame(self, kind, header, payload):
+        self.frames.append((kind, header, payload))
+
+    def show(self, kind):
+        self.shown = kind
+
+    def stop(self):
+        pass
+
+
+@pytest.fixture
+def setup():
+    with LockstepBus(START) as bus:
+        node = bus.add(ConsoleNode, ConsoleConfig(view=ViewConfig(virtual_rate_hz=10, real_rate_hz=1)))
+        node.server = FakeServer(bus.clock)
+        yield bus, node, node.server
+
+
+def control(bus, mode, **values):
+    """A ControlState of now."""
+    pose = pose_message(np.eye(4))
+    fields = {
+        "header": header("map", bus.clock.now_ns()),
+        "mode": mode,
+        "reason": "",
+        "estop": False,
+        "blocked": False,
+        "transitions": 0,
+        "robot_pose": pose,
+        "vbot_start": pose,
+        "vbot_pose": pose,
+        "operator_command": twist_message(),
+        "applied_command": twist_message(),
+        "pose_gap_m": 0.0,
+        "yaw_gap_rad": 0.0,
+        "time_to_obstacle_s": math.inf,
+    }
+    return ControlState(**(fields | values))
+
+
+def publish_tree(bus, x=1.0, y=2.0, yaw=math.pi / 2):
+    """map → odom → base_link → camera."""
+    now = bus.clock.now_ns()
+    moving = [
+        transform_message(pose_matrix(x=x), "map", "odom", now),
+        transform_message(pose_matrix(y=y, yaw=yaw), "odom", "base_link", now),
+    ]
+    mount = [transform_message(pose_matrix(z=1.5), "base_link", "camera", now)]
+
+    tf = message_type("TFMessage")
+    bus.publish("/tf", tf(moving))
+    bus.publish("/tf_static", tf(mount), latched=True)
+
+
+def view_message(bus, request_id, fov=1.8):
+    return RenderedView(
+        header=header("map", bus.clock.now_ns()),
+        request_id=request_id,
+        keyframe_id=1,
+        pose=pose_message(pose_matrix(1, 2, 1.5, 0, 0, 0.3)),
+        fov_rad=fov,
+        width=320,
+        height=180,
+        confidence=0.9,
+        render_ms=math.nan,
+        image=compressed_image_message(b"VIEW", "map", bus.clock.now_ns()),
+    )
+
+
+def test_command_and_emergency_stop_go_to_the_bus(setup):
+    bus, node, _ = setup
+    node.on_drive(0.3, -0.2)
+    message = bus.last("/operator/cmd_vel")
+    assert twist_values(message) == (0.3, -0.2)
+    assert message.header.stamp.sec == 1
+    assert bus.messages("/operator/estop") == []  # a restarted console must not release a stop
+    node.on_estop(True)
+    assert bus.last("/operator/estop").data is True
+    node.on_estop(False)
+    assert bus.last("/operator/estop").data is False
+
+
+def test_panorama_passes_as_it_came_with_the_cameras_heading_and_age(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    stamp = bus.clock.now_ns()
+    bus.advance(0.08)
+    bus.publish("/camera/image/compressed", compressed_image_message(b"JPEG", "camera", stamp))
+    kind, frame_header, payload = server.frames[-1]
+    assert (kind, payload) == (FrameKind.PANORAMA, b"JPEG")
+    assert frame_header["captured_ms"] == pytest.approx(server.now_ms() - 80.0)
+    rotation = matrix_from_quaternion(frame_header["q"])[:3, :3]
+    np.testing.assert_allclose(rotation[:, 0], [0, 1, 0], atol=1e-9)  # looks along the map's y
+
+
+def test_panorama_without_a_pose_is_shown_all_the_same(setup):
+    bus, _, server = setup
+    bus.publish("/camera/image/compressed", compressed_image_message(b"JPEG", "camera", bus.clock.now_ns()))
+    assert server.frames[-1][1]["q"] is None
+
+
+def test_state_tells_mode_poses_and_reason(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    bus.publish("/ic/state", control(bus, ControlState.REAL, reason="why", blocked=True), latched=True)
+    bus.advance(0.06)
+    state = server.texts["state"]
+    assert (state["mode"], state["reason"], state["blocked"]) == ("real", "why", True)
+    assert state["robot"] == pytest.approx([1, 2, math.pi / 2], abs=1e-3)
+    assert state["vbot"] is None
+    assert state["time_to_obstacle_s"] is None  # inf is no JSON
+    assert server.shown is FrameKind.PANORAMA
+
+
+def test_silent_arbiter_is_no_mode(setup):
+    bus, _, server = setup
+    bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
+    bus.advance(0.5)
+    assert server.texts["state"]["mode"] == "real"
+    bus.advance(1.0)
+    assert server.texts["state"]["mode"] == "none"
+
+
+def test_virtual_mode_asks_for_the_view_from_the_vbot_where_the_operator_looks(setup):
+    bus, node, server = setup
+    publish_tree(bus)
+    node.on_look(Look(yaw=-math.pi / 2, pitch=0.0, hfov=1.2, vfov=0.7))
+    bus.publish("/ic/state", control(bus, ControlState.VIRTUAL), latched=True)
+    vbot = odometry_message(pose_matrix(x=3.0, y=2.0, yaw=math.pi / 2), 0.3, 0.0, "map", "vbot", bus.clock.now_ns())
+    bus.publish("/vbot/odom", vbot)
+    bus.advance(0.06)
+    request = bus.last("/view/request")
+    map_from_camera = matrix_of(request.pose)
+    np.testing.assert_allclose(map_from_camera[:3, 3], [3, 2, 1.5], atol=1e-6)  # mount of /tf_static
+    np.testing.assert_allclose(map_from_camera[:3, 0], [1, 0, 0], atol=1e-6)  # north, then 90° right: east
+    assert request.fov_rad >= 1.2 * 1.15 - 1e-6
+    assert server.shown is FrameKind.VIEW
+    assert server.texts["state"]["vbot"] == pytest.approx([3, 2, math.pi / 2], abs=1e-3)
+
+
+def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+
+    def ask(seconds, answer):
+        before = len(bus.messages("/view/request"))
+        for _ in range(round(seconds / 0.05)):
+            bus.publish("/ic/state", control(bus, ControlState.VIRTUAL), latched=True)
+            bus.advance(0.05)
+            if answer:
+                bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
+        return len(bus.messages("/view/request")) - before
+
+    assert ask(1.0, answer=False) in (2, 3)  # one each 0.5 s, by the time-out
+    ask(0.6, answer=True)
+    assert ask(1.0, answer=True) in (9, 10, 11)
+    _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
+    assert payload == b"VIEW"
+    assert frame_header["fov"] == pytest.approx(1.8)
+    assert frame_header["render_ms"] is None
+    assert frame_header["p"] == pytest.approx([1, 2, 1.5])
+
+
+def test_real_mode_keeps_the_renderer_warm_once_a_second(setup):
+    bus, _, _ = setup
+    publish_tree(bus)
+    for _ in range(60):
+        bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
+        bus.advance(0.05)
+        if bus.messages("/view/request"):
+            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
+    assert len(bus.messages("/view/request")) in (3, 4)
+
+
+def test_view_with_an_impossible_field_of_view_is_dropped_and_told(setup):
+    bus, node, server = setup
+    bus.publish("/vspace/view", view_message(bus, 1, fov=0.0))
+    assert not [f for f in server.frames if f[0] is FrameKind.VIEW]
+    assert "field of view" in node.diagnoses()["view"][1]
+
+
+def test_map_is_sent_when_changed_and_at_most_twice_a_second(setup):
+    bus, _, server = setup
+    grid = np.zeros((10, 10), np.int8)
+    for step in range(20):  # 2 s at 10 Hz, a new map each time
+        grid[0, 0] = step
+        bus.publish("/map", grid_message(grid, 0.1, (0, 0), "map", bus.clock.now_ns()), latched=True)
+        bus.advance(0.1)
+    sent = sum(kind is FrameKind.MAP for kind, _, _ in server.frames)
+    assert 3 <= sent <= 5
+    bus.advance(0.6)
+    server.frames.clear()
+    bus.publish("/map", grid_message(grid, 0.1, (0, 0), "map", bus.clock.now_ns()), latched=True)
+    bus.advance(1.0)
+    assert server.frames == []  # the same map again
+
+
+def test_plan_comes_in_the_maps_frame(setup):
+    bus, _, server = setup
+    publish_tree(bus, x=10.0)
+    now = bus.clock.now_ns()
+    bus.publish("/ic/state", control(bus, ControlState.VIRTUAL), latched=True)
+    bus.publish("/ic/trajectory", path_message([[0, 0, 0], [1, 0, 0]], "map", now))
+    bus.publish("/nav/path", path_message([[0, 0, 0], [0, 1, 0]], "odom", now))
+    bus.publish("/ic/subgoal", pose_stamped(pose_matrix(x=4, y=5, yaw=0.5), "map", now))
+    bus.advance(0.21)
+    plan = server.texts["plan"]
+    assert plan["trajectory"] == [[0, 0], [1, 0]]
+    assert plan["path"] == [[10, 0], [10, 1]]
+    assert plan["subgoal"] == pytest.approx([4, 5, 0.5], abs=1e-3)
+    bus.publish("/ic/state", control(bus, ControlState.REAL), latched=True)
+    bus.advance(0.4)
+    assert server.texts["plan"]["path"] == []
+    assert server.texts["plan"]["subgoal"] is None
+
+
+def diagnostics(level, name, text):
+
+    status = message_type("DiagnosticStatus")(level=level, name=name, message=text, hardware_id="", values=[])
+    return message_type("DiagnosticArray")(header=header("", 0), status=[status])
+
+
+def test_faults_are_told_in_the_words_of_the_node_that_found_them(setup):
+    bus, _, server = setup
+    bus.publish("/diagnostics", diagnostics(1, "vlp16_driver: packets", "no packets for 2 s"))
+    bus.publish("/diagnostics", diagnostics(2, "crawler_base: link", "no answer from /dev/ttyACM0"))
+    bus.publish("/diagnostics", diagnostics(0, "nerf: state", "ready"))
+    bus.advance(1.1)
+    faults = server.texts["health"]["faults"]
+    assert faults == [
+        {"level": "error", "name": "crawler_base", "text": "no answer from /dev/ttyACM0"},
+        {"level": "warn", "name": "vlp16_driver", "text": "no packets for 2 s"},
+    ]
+    bus.advance(4.0)
+    assert server.texts["health"]["faults"] == []  # told no more, so it is over
+
+
+def heartbeat(node, state):
+    return NodeStatus(
+        header=header("", 0), node=node, pid=1, state=state, message="", cpu_percent=0.0, rss_mb=0.0, inputs=[],
+        input_rates_hz=np.zeros(0, np.float32), input_ages_s=np.zeros(0, np.float32),
+        input_lost=np.zeros(0, np.uint64), outputs=[], output_rates_hz=np.zeros(0, np.float32),
+    )  # fmt: skip
+
+
+def test_dead_node_is_a_fault_and_one_that_ended_is_not(setup):
+    bus, _, server = setup
+    bus.publish("/heartbeat", heartbeat("grid_slam", NodeStatus.RUNNING))
+    bus.publish("/heartbeat", heartbeat("bag_player", NodeStatus.STOPPING))
+    bus.advance(5.0)
+    assert server.texts["health"]["faults"] == [{"level": "error", "name": "grid_slam", "text": "does not answer"}]
+
+
+def test_vspace_and_battery_are_told(setup):
+    from instant_ic.msg import BatteryState, VspaceStatus
+
+    bus, _, server = setup
+    pose = pose_message(np.eye(4))
+    bus.publish(
+        "/vspace/status",
+        VspaceStatus(
+            header=header("", 0), state=VspaceStatus.READY, keyframe_id=1, keyframe_pose=pose,
+            keyframe_stamp=to_time(0), ready_radius_m=2.0, psnr_db=27.5, train_seconds=9.0, ready_seconds=8.0,
+            iterations=1, ms_per_iteration=1.0, render_ms=20.0, render_fps=10.0, device="cpu", message="",
+        ),
+        latched=True,
+    )  # fmt: skip
+    empty = np.zeros(0, np.float32)
+    bus.publish(
+        "/battery",
+        BatteryState(
+            header=header("", 0), voltage=24.5, temperature=math.nan, current=0.0, charge=0.0, capacity=0.0,
+            design_capacity=0.0, percentage=math.nan, power_supply_status=0, power_supply_health=0,
+            power_supply_technology=0, present=True, cell_voltage=empty, cell_temperature=empty, location="",
+            serial_number="",
+        ),
+    )  # fmt: skip
+    bus.advance(1.1)
+    health = server.texts["health"]
+    assert health["vspace"]["state"] == "ready"
+    assert health["vspace"]["psnr_db"] == pytest.approx(27.5)
+    assert health["battery"] == {"voltage": 24.5, "percent": None}
+
+
+def test_configuration_file_holds_the_defaults():
+    from pathlib import Path
+
+    from instant_ic.bus.main import load_config
+
+    file = Path(__file__).resolve().parents[2] / "config" / "console.yaml"
+    assert load_config(ConsoleNode, "console", [file], [])[0] == ConsoleConfig()
+
+
+@pytest.mark.parametrize(("key", "value"), [("state_rate_hz", 0), ("dissolve_ms", -1), ("map_rate_hz", -2)])
+def test_bad_parameters_are_refused_by_name(key, value):
+    with pytest.raises(ValueError, match=key):
+        ConsoleConfig(**{key: value})

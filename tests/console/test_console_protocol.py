@@ -1,0 +1,85 @@
+"""Frames and messages of the page's WebSocket."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from instant_ic.console.protocol import (
+    Frame,
+    FrameKind,
+    ProtocolError,
+    decode_frame,
+    encode_frame,
+    number,
+    parse_text,
+    whole,
+)
+
+values = st.one_of(st.none(), st.booleans(), st.integers(-(2**53), 2**53), st.text(max_size=8))
+
+
+@given(
+    st.sampled_from(FrameKind),
+    st.integers(0, 2**32 - 1),
+    st.dictionaries(st.text(max_size=6), values, max_size=4),
+    st.binary(max_size=64),
+)
+def test_a_frame_comes_back_as_it_was(kind, sequence, header, payload):
+    frame = Frame(kind, sequence, header, payload)
+    assert decode_frame(encode_frame(frame)) == frame
+
+
+def test_layout_of_a_frame_by_hand():
+    # version 1, kind 2, 0, sequence 5, header of 7 bytes, all little endian
+    expected = bytes([1, 2, 0, 0, 5, 0, 0, 0, 7, 0, 0, 0]) + b'{"a":1}' + b"JPEG"
+    assert encode_frame(Frame(FrameKind.VIEW, 5, {"a": 1}, b"JPEG")) == expected
+
+
+@given(st.binary(max_size=80))
+def test_any_bytes_are_a_frame_or_a_protocol_error(data):
+    try:
+        frame = decode_frame(data)
+    except ProtocolError:
+        return
+    assert isinstance(frame.header, dict)
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"\x01\x01", "prefix"),
+        (bytes([9, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"{}", "version 9"),
+        (bytes([1, 77, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"{}", "77"),
+        (bytes([1, 1, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0]) + b"{}", "should end"),
+        (bytes([1, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"[]", "list"),
+        (bytes([1, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0]) + b"\xff\xff", "frame"),
+    ],
+)
+def test_what_is_wrong_with_a_frame_is_told(data, words):
+    with pytest.raises(ProtocolError, match=words):
+        decode_frame(data)
+
+
+@given(st.text(max_size=40))
+def test_any_text_is_a_message_or_a_protocol_error(text):
+    try:
+        message = parse_text(text)
+    except ProtocolError:
+        return
+    assert isinstance(message["type"], str)
+
+
+@pytest.mark.parametrize("value", ["NaN", "Infinity", "1e999", "true", '"1"', "null", "1" + "0" * 400, "[1]"])
+def test_only_finite_numbers_pass(value):
+    with pytest.raises(ProtocolError, match=r"drive\.linear"):
+        number(parse_text(f'{{"type":"drive","linear":{value}}}'), "linear")
+
+
+def test_limits_of_numbers_and_whole_numbers():
+    message = {"type": "look", "yaw": 7, "seq": 1.0, "minus": -1}
+    assert number(message, "yaw", 0, 7) == 7.0
+    with pytest.raises(ProtocolError, match="in"):
+        number(message, "yaw", -6.3, 6.3)
+    for key in ("seq", "minus", "missing"):
+        with pytest.raises(ProtocolError, match=key):
+            whole(message, key)

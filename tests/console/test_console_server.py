@@ -1,0 +1,403 @@
+"""The server by real sockets: lease, watchdog, origin, emergency stop, slow clients."""
+
+import asyncio
+import threading
+import time
+
+import aiohttp
+import pytest
+
+from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console.drive import DriveConfig
+from instant_ic.console.server import host_allowed, origin_allowed
+
+WAIT_S = 20.0
+# The watchdog is long where a test does not look at it: a busy machine must not trip it.
+PATIENT = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
+
+
+class Recorder:
+    """Backend that keeps what it is told."""
+
+    def __init__(self):
+        self.commands, self.estops, self.looks = [], [], []
+        self._news = threading.Condition()
+
+    def on_drive(self, linear, angular):
+        self._add(self.commands, (linear, angular))
+
+    def on_estop(self, stop):
+        self._add(self.estops, stop)
+
+    def on_look(self, look):
+        self._add(self.looks, look)
+
+    def _add(self, target, value):
+        with self._news:
+            target.append(value)
+            self._news.notify_all()
+
+    def wait(self, predicate):
+        with self._news:
+            assert self._news.wait_for(lambda: predicate(self), WAIT_S), (self.commands[-5:], self.estops, self.looks)
+
+
+@pytest.fixture
+def serve():
+    servers = []
+
+    def start(drive=PATIENT, **config):
+        backend = Recorder()
+        server = ConsoleServer(backend, ServerConfig(port=0, drive=drive, **config), {"dissolve_ms": 1})
+        server.start()
+        servers.append(server)
+        return server, backend
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+def frame_number(client, kind):
+    return client.frames[kind].header["n"] if kind in client.frames else None
+
+
+def in_thread(function, *args):
+    return asyncio.get_running_loop().run_in_executor(None, function, *args)
+
+
+def test_page_and_modules_are_served_with_a_content_policy(serve):
+    server, _ = serve()
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http:
+            async with http.get(server.url) as response:
+                page = await response.text()
+                assert response.status == 200
+                assert "default-src 'self'" in response.headers["Content-Security-Policy"]
+            assert "http://" not in page and "https://" not in page  # nothing from elsewhere
+            async with http.get(server.url + "static/app.js") as response:
+                assert response.status == 200
+                assert "javascript" in response.headers["Content-Type"]
+            async with http.get(server.url + "static/../server.py") as response:
+                assert response.status == 404
+
+    asyncio.run(scenario())
+
+
+def test_first_client_drives_and_others_watch_until_they_take_over(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as first, ConsoleClient(server.url) as second:
+            await first.acquire()
+            await second.send({"type": "lease", "take": False})
+            await second.send_drive(0.2, 0.0)
+            await second.wait_for(lambda c: c.refused == ["not_driver"] and c.session["driver"] == "other", WAIT_S)
+            assert backend.commands == []
+            await first.send_drive(0.3, 0.1)
+            await in_thread(backend.wait, lambda b: (0.3, 0.1) in b.commands)
+            await second.acquire(take=True)
+            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+            await first.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
+            await first.send_drive(0.3, 0.1)
+            await first.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
+            await second.send({"type": "yield"})
+            await first.wait_for(lambda c: c.session["driver"] == "none", WAIT_S)
+
+    asyncio.run(scenario())
+
+
+def test_server_watchdog_stops_a_robot_whose_page_is_silent(serve):
+    server, backend = serve(DriveConfig(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await client.send_drive(0.3, 0.0)  # one command, then none
+            await client.wait_for(lambda c: c.session["watchdog_trips"] == 1, WAIT_S)
+            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+
+    asyncio.run(scenario())
+    assert (0.3, 0.0) in backend.commands
+
+
+def test_cut_connection_stops_the_robot(serve):
+    server, backend = serve()
+
+    async def scenario():
+        client = ConsoleClient(server.url)
+        await client.connect()
+        await client.acquire()
+        await client.send_drive(0.3, 0.0)
+        await in_thread(backend.wait, lambda b: b.commands)
+        client._socket._response.connection.transport.abort()  # no closing handshake
+        await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+        await client.close()
+
+    asyncio.run(scenario())
+
+
+def test_driving_client_repeats_its_command_and_stops(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            client.drive(0.25, -0.5)
+            await in_thread(backend.wait, lambda b: b.commands.count((0.25, -0.5)) >= 5)
+            await client.stop()
+            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0))
+
+    asyncio.run(scenario())
+
+
+def test_old_command_is_dropped(serve):
+    server, backend = serve(DriveConfig(max_command_age_s=5.0, lease_timeout_s=60.0))
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await client.send_drive(0.3, 0.0, age_s=60.0)
+            await client.wait_for(lambda c: c.refused == ["old"], WAIT_S)
+            await client.send_drive(0.3, 0.0, age_s=-60.0)
+            await client.wait_for(lambda c: c.refused == ["old", "old"], WAIT_S)
+
+    asyncio.run(scenario())
+    assert backend.commands == []
+
+
+def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
+            await driver.acquire()
+            await driver.send_drive(0.3, 0.0)
+            await in_thread(backend.wait, lambda b: b.commands)
+            await watcher.estop()
+            await in_thread(backend.wait, lambda b: b.commands[-1] == (0.0, 0.0) and b.estops == [True])
+            await driver.wait_for(lambda c: c.session["estop"], WAIT_S)
+            await driver.send_drive(0.3, 0.0)
+            await driver.wait_for(lambda c: c.refused == ["stopped"], WAIT_S)
+            await watcher.release_estop()
+            await watcher.wait_for(lambda c: c.refused == ["not_driver"], WAIT_S)
+            assert backend.estops == [True]
+            await driver.release_estop()
+            await in_thread(backend.wait, lambda b: b.estops == [True, False])
+
+    asyncio.run(scenario())
+    assert backend.commands.count((0.3, 0.0)) >= 1
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
+def test_foreign_origin_is_refused(serve, origin):
+    server, _ = serve()
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http:
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await http.ws_connect(server.url + "ws", headers={"Origin": origin})
+            assert refused.value.status == 403
+
+    asyncio.run(scenario())
+
+
+def test_rebound_name_is_refused(serve):
+    """A foreign page may point its own name at 127.0.0.1; its Origin then equals its Host."""
+    server, _ = serve()
+
+    async def scenario():
+        host = f"evil.example:{server.port}"
+        async with aiohttp.ClientSession() as http:
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await http.ws_connect(server.url + "ws", headers={"Host": host, "Origin": f"http://{host}"})
+            assert refused.value.status == 403
+            async with http.get(server.url, headers={"Host": host}) as response:
+                assert response.status == 403
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(
+    ("host", "allowed", "expected"),
+    [
+        ("localhost:8080", (), True),
+        ("127.0.0.1:8080", (), True),
+        ("[::1]:8080", (), True),
+        ("192.168.1.5", (), True),
+        ("robot.local:8080", ("robot.local",), True),
+        ("robot.local:8080", (), False),
+        ("localhost.evil.example", (), False),
+        ("", (), False),
+        ("[::1", (), False),
+    ],
+)
+def test_hosts(host, allowed, expected):
+    assert host_allowed(host, allowed) is expected
+
+
+def test_origins():
+    assert origin_allowed(None, "a:1")
+    assert origin_allowed("http://a:1", "A:1")
+    assert not origin_allowed("http://a:2", "a:1")
+    assert not origin_allowed("ftp://a:1", "a:1")
+    assert not origin_allowed("http://", "")
+
+
+def test_pictures_wait_for_the_acknowledgement_and_only_the_newest_is_sent(serve):
+    server, _ = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url, acknowledge=False) as client:
+            server.send_frame(FrameKind.PANORAMA, {"n": 0}, b"0")
+            await client.wait_for(lambda c: c.frame_counts[FrameKind.PANORAMA] == 1, WAIT_S)
+            for n in range(1, 50):
+                server.send_frame(FrameKind.PANORAMA, {"n": n}, b"x" * 1000)
+            server.publish("state", {"mode": "real"})
+            await client.wait_for(lambda c: c.mode == "real", WAIT_S)
+            assert client.frame_counts[FrameKind.PANORAMA] == 1
+            await client.send({"type": "ack", "kind": 1, "seq": 999})  # of a frame never sent
+            await client.send({"type": "ack", "kind": 1, "seq": 1})
+            await client.wait_for(lambda c: c.frame_counts[FrameKind.PANORAMA] == 2, WAIT_S)
+            assert client.frames[FrameKind.PANORAMA].header == {"n": 49}
+
+    asyncio.run(scenario())
+
+
+def test_slow_client_never_slows_another(serve):
+    server, _ = serve()
+    picture = bytes(300_000)
+
+    async def scenario():
+        async with ConsoleClient(server.url) as quick, aiohttp.ClientSession() as http:
+            # Never reads after the handshake, so its socket fills; never acknowledges either.
+            slow = await http.ws_connect(server.url + "ws")
+            slow._response.connection.transport.pause_reading()
+            for n in range(40):
+                for kind in FrameKind:
+                    server.send_frame(kind, {"n": n}, picture)
+                server.publish("state", {"n": n, "filler": "x" * 500_000})
+                await quick.wait_for(
+                    lambda c, n=n: c.state.get("n") == n and frame_number(c, FrameKind.COSTMAP) == n, WAIT_S
+                )
+            slow._response.connection.transport.abort()
+
+    asyncio.run(scenario())
+
+
+def test_hidden_picture_is_sent_rarely(serve):
+    server, _ = serve(background_picture_hz=0.001)
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            server.show(FrameKind.VIEW)
+            for n in range(5):
+                server.send_frame(FrameKind.PANORAMA, {"n": n}, b"p")
+                server.send_frame(FrameKind.VIEW, {"n": n}, b"v")
+                await client.wait_for(lambda c, n=n: frame_number(c, FrameKind.VIEW) == n, WAIT_S)
+            assert client.frame_counts[FrameKind.PANORAMA] == 1
+            server.show(FrameKind.PANORAMA)
+            await client.wait_for(lambda c: frame_number(c, FrameKind.PANORAMA) == 4, WAIT_S)
+
+    asyncio.run(scenario())
+
+
+def test_late_client_gets_the_newest_state_and_map(serve):
+    server, _ = serve()
+    server.publish("state", {"mode": "virtual"})
+    server.send_frame(FrameKind.MAP, {"resolution": 0.05}, b"png")
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.wait_for(lambda c: c.mode == "virtual" and FrameKind.MAP in c.frames, WAIT_S)
+            assert client.messages["hello"]["page"] == {"dissolve_ms": 1}
+            assert client.messages["hello"]["max_linear"] == 0.4
+
+    asyncio.run(scenario())
+
+
+def test_look_of_the_driver_counts(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
+            await driver.acquire()
+            await watcher.look(1.0)
+            await watcher.send({"type": "lease", "take": False})
+            await watcher.wait_for(lambda c: c.session["driver"] == "other", WAIT_S)
+            await driver.look(-0.5, 0.1)
+            await in_thread(backend.wait, lambda b: b.looks)
+            assert [(look.yaw, look.pitch) for look in backend.looks] == [(-0.5, 0.1)]
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "no json",
+        "[]",
+        '{"type":"warp"}',
+        '{"type":"drive","seq":1,"time_ms":0,"linear":NaN,"angular":0}',
+        '{"type":"lease","take":1}',
+        '{"type":"ack","kind":9,"seq":1}',
+        '{"type":"look","yaw":99,"pitch":0,"hfov":1,"vfov":1}',
+    ],
+)
+def test_bad_message_is_answered_and_many_end_the_connection(serve, text):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await client._socket.send_str(text)
+            await client.wait_for(lambda c: len(c.errors) == 1, WAIT_S)
+            for _ in range(19):
+                await client._socket.send_str(text)
+            with pytest.raises(ConnectionError):
+                await client.wait_for(lambda c: False, WAIT_S)
+
+    asyncio.run(scenario())
+    assert backend.commands == []
+
+
+def test_too_many_clients_are_refused(serve):
+    server, _ = serve(max_clients=1)
+
+    async def scenario():
+        async with ConsoleClient(server.url), aiohttp.ClientSession() as http:
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await http.ws_connect(server.url + "ws")
+            assert refused.value.status == 503
+
+    asyncio.run(scenario())
+
+
+def test_end_of_the_server_stops_the_robot_and_closes_the_clients(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await client.send_drive(0.3, 0.0)
+            await in_thread(backend.wait, lambda b: b.commands)
+            await in_thread(server.stop)
+            with pytest.raises(ConnectionError):
+                await client.wait_for(lambda c: False, WAIT_S)
+
+    asyncio.run(scenario())
+    assert backend.commands[-1] == (0.0, 0.0)
+
+
+def test_used_port_is_told(serve):
+    server, _ = serve()
+    with pytest.raises(ConsoleError, match=f"{server.port}.*server.port"):
+        ConsoleServer(Recorder(), ServerConfig(port=server.port)).start()
+
+
+def test_idle_server_costs_little(serve):
+    serve()
+    before = time.process_time()
+    threading.Event().wait(0.5)
+    assert time.process_time() - before < 0.25

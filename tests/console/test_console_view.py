@@ -1,0 +1,96 @@
+"""Look direction, shape and pace of the rendered views; maps as PNG."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from instant_ic.console.gridimage import grid_image
+from instant_ic.console.view import Look, ViewConfig, ViewScheduler, view_shape
+
+
+def test_look_left_and_up():
+    line_of_sight = Look(yaw=math.pi / 2).rotation()[:3, 0]
+    np.testing.assert_allclose(line_of_sight, [0, 1, 0], atol=1e-12)  # left is +y
+    line_of_sight = Look(pitch=math.pi / 6).rotation()[:3, 0]
+    np.testing.assert_allclose(line_of_sight, [math.sqrt(3) / 2, 0, 0.5], atol=1e-12)  # up is +z
+    line_of_sight = Look(yaw=math.pi / 2, pitch=math.pi / 6).rotation()[:3, 0]
+    np.testing.assert_allclose(line_of_sight, [0, math.sqrt(3) / 2, 0.5], atol=1e-12)
+
+
+def test_view_covers_what_is_shown_with_the_margin():
+    # 16:9 window: tan(45°) = 1, tan(vfov/2) = 9/16
+    look = Look(hfov=math.pi / 2, vfov=2 * math.atan(9 / 16))
+    shape = view_shape(look, ViewConfig(width=320, height=180, fov_margin=1.15))
+    assert shape.fov_rad >= math.pi / 2 * 1.15 - 1e-9
+    vertical = 2 * math.atan(math.tan(shape.fov_rad / 2) * shape.height / shape.width)
+    assert vertical >= look.vfov * 1.15 - 0.03
+    assert shape.width % 8 == shape.height % 8 == 0
+    assert abs(shape.width * shape.height / (320 * 180) - 1) < 0.1
+
+
+def test_portrait_window_gets_a_portrait_view_of_as_many_pixels():
+    shape = view_shape(Look(hfov=0.6, vfov=1.2), ViewConfig())
+    assert shape.height > shape.width
+    assert abs(shape.width * shape.height / (320 * 180) - 1) < 0.1
+
+
+def test_extreme_windows_stay_within_a_drawable_field_of_view():
+    shape = view_shape(Look(hfov=2.6, vfov=0.1), ViewConfig())
+    assert shape.fov_rad <= math.radians(150) + 1e-9
+    assert shape.width / shape.height < 2.7
+
+
+def test_one_request_outstanding_and_the_rate_of_the_mode():
+    views = ViewScheduler(ViewConfig(virtual_rate_hz=10, real_rate_hz=1, response_timeout_s=0.5))
+    assert views.due(0.0, virtual=True)
+    first = views.asked(0.0)
+    assert not views.due(0.2, virtual=True)  # unanswered
+    assert not views.answered(first + 7)
+    assert not views.due(0.2, virtual=True)
+    assert views.answered(first)
+    assert views.due(0.2, virtual=True)
+    assert not views.due(0.2, virtual=False)  # 1 Hz in the real mode
+    assert views.due(1.0, virtual=False)
+
+
+def test_answer_that_never_comes_does_not_stop_the_requests():
+    views = ViewScheduler(ViewConfig(response_timeout_s=0.5))
+    views.asked(0.0)
+    assert not views.due(0.49, virtual=True)
+    assert views.due(0.5, virtual=True)
+    assert views.lost == 1
+
+
+def test_no_requests_at_rate_zero():
+    assert not ViewScheduler(ViewConfig(real_rate_hz=0)).due(100.0, virtual=False)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("width", 8), ("fov_margin", 0.9), ("virtual_rate_hz", 0), ("response_timeout_s", 0)]
+)
+def test_bad_view_parameters_are_refused_by_name(key, value):
+    with pytest.raises(ValueError, match=key):
+        ViewConfig(**{key: value})
+
+
+def test_grid_is_cropped_and_turned_top_down():
+    grid = np.full((20, 30), -1, np.int8)
+    grid[5, 10] = 100  # row 5: y = 2.5
+    grid[8, 14] = 0
+    image = grid_image(grid, 0.5, (-1.0, -2.0))
+    # 2 cells of margin: columns 8..16, rows 3..10
+    assert image.header == {"resolution": 0.5, "width": 9, "height": 8, "x": -1 + 8 * 0.5, "y": -2 + 3 * 0.5}
+    cells = cv2.imdecode(np.frombuffer(image.png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert cells.shape == (8, 9)
+    assert cells[7 - (5 - 3), 10 - 8] == 100
+    assert cells[7 - (8 - 3), 14 - 8] == 0
+    assert np.count_nonzero(cells == 255) == 70
+
+
+def test_unknown_grid_is_no_picture_and_same_grid_same_digest():
+    assert grid_image(np.full((4, 4), -1, np.int8), 0.1, (0, 0)) is None
+    grid = np.zeros((4, 4), np.int8)
+    assert grid_image(grid, 0.1, (0, 0)).digest == grid_image(grid.copy(), 0.1, (0, 0)).digest
+    assert grid_image(grid, 0.1, (0, 0)).digest != grid_image(grid, 0.1, (1, 0)).digest
