@@ -80,7 +80,7 @@ def main() -> int:
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     ports = free_ports()
     try:
-        with Stack("sim.yaml", run_dir, {**ports, "headless": True}, args.log) as stack:
+        with Stack("sim.yaml", run_dir, ports, args.log) as stack:
             result = measure(stack, run_dir, f"http://127.0.0.1:{ports['console_port']}/", args)
             started = time.monotonic()
             result["exit_status"] = stack.stop()

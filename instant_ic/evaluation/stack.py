@@ -65,7 +65,7 @@ class Stack:
 
     Example::
 
-        with Stack("sim.yaml", run_dir, {**free_ports(), "headless": True}) as stack:
+        with Stack("sim.yaml", run_dir, free_ports()) as stack:
             pose = stack.observer.latest("/pose", PoseWithCovarianceStamped, max_age_s=1.0)
             stack.wait_for(lambda: pose.message is not None, 60, "a pose")
     """

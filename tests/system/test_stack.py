@@ -47,7 +47,7 @@ def outcome(tmp_path_factory):
     bag = tmp_path_factory.mktemp("drive") / "bag"
     ports = free_ports()
     try:
-        with Stack("sim.yaml", run_dir, {**ports, "record": bag, "headless": True}) as stack:
+        with Stack("sim.yaml", run_dir, {**ports, "record": bag}) as stack:
             recorder = DriveRecorder(stack)
             url = f"http://127.0.0.1:{ports['console_port']}/"
             asyncio.run(drive_through_obstacle(stack, recorder, url, beyond_x_m=5.6))
