@@ -31,15 +31,15 @@ def points_at(
         (M, 3) float64 points in the camera's frame, in the order given.
     """
     usable = np.isfinite(points).all(axis=1) & np.isfinite(time_s)
-    points, time_s = points[usable].astype(np.float64), time_s[usable].astype(np.float64)
-    if len(points) == 0:
-        return points
+    measured, time_s = np.asarray(points[usable], np.float64), time_s[usable].astype(np.float64)
+    if len(measured) == 0:
+        return measured
     first, last = float(time_s.min()), float(time_s.max())
     width = max((last - first) / slices, 1e-9)
     index = np.minimum(((time_s - first) / width).astype(np.intp), slices - 1)
-    moved = np.empty_like(points)
+    moved = np.empty_like(measured)
     for number in np.unique(index):
         chosen = index == number
         middle_ns = start_ns + round((first + (number + 0.5) * width) * 1e9)
-        moved[chosen] = transform_points(camera_from_lidar(middle_ns), points[chosen])
+        moved[chosen] = transform_points(camera_from_lidar(middle_ns), measured[chosen])
     return moved

@@ -128,6 +128,6 @@ class DepthModel:
             shrinks = rgb.shape[1] >= size[0] and rgb.shape[0] >= size[1]
             rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
         picture = rgb[..., ::-1] if manifest.channels == "bgr" else rgb
-        values = picture.astype(np.float32) * np.float32(manifest.input_scale)
-        values = (values - np.array(manifest.mean, np.float32)) / np.array(manifest.std, np.float32)
+        mean, std = np.array(manifest.mean, np.float32), np.array(manifest.std, np.float32)
+        values = (picture.astype(np.float32) * np.float32(manifest.input_scale) - mean) / std
         return np.ascontiguousarray(values.transpose(2, 0, 1)[None])

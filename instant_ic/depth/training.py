@@ -219,7 +219,7 @@ class Trainer:
         return final
 
     def _checkpoint(self, metrics: DepthMetrics, losses: list[float]) -> None:
-        entry = {"step": self.step, "minutes": round(self.elapsed_s / 60, 1), **metrics.as_dict()}
+        entry: dict[str, Any] = {"step": self.step, "minutes": round(self.elapsed_s / 60, 1), **metrics.as_dict()}
         entry["loss"] = round(float(np.mean(losses[-100:])), 5) if losses else None
         self.history.append(entry)
         self.report(f"held-out worlds: {entry}")
