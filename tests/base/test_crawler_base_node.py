@@ -1,0 +1,194 @@
+"""The node in lockstep with an emulated controller: driving, stopping, losing and finding it again."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+import numpy as np
+import pytest
+from base_ports import EmulatorPort, opener
+
+from instant_ic.base.config import RoboclawConfig
+from instant_ic.base.controller import BaseController, ControllerConfig, ControllerThread
+from instant_ic.base.emulator import RoboclawEmulator
+from instant_ic.bus import ERROR, OK, WARN
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.msg import Twist, Vector3, pose_matrix, stamp_ns, twist_stamped, twist_values
+from instant_ic.nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
+
+MILLISECOND = 1_000_000
+
+
+class Bench:
+    """A bus with the node on it, and an emulator whose time moves with the bus."""
+
+    def __init__(self, **changes: object) -> None:
+        self.emulator = RoboclawEmulator()
+        self.port = EmulatorPort(self.emulator)
+
+        class Node(CrawlerBaseNode):
+            open_port = staticmethod(opener(self.port))
+
+        self.bus = LockstepBus(start_ns=1_000_000_000_000)
+        config = CrawlerBaseConfig(roboclaw=RoboclawConfig(port="memory"))
+        self.node = self.bus.add(Node, dataclasses.replace(config, **changes))
+
+    def run(self, seconds: float, v: float | None = None, w: float = 0.0) -> None:
+        """Move on in steps of a millisecond; with v, a command comes each 50 ms."""
+        for step in range(round(seconds * 1000)):
+            now_ns = self.bus.clock.now_ns()
+            if v is not None and step % 50 == 0:
+                self.bus.publish("/cmd_vel", twist_stamped(v, w, now_ns))
+            self.emulator.advance(0.001)
+            self.bus.advance_to(now_ns + MILLISECOND)
+
+    def level(self, name: str) -> int:
+        return self.node.diagnoses()[name][0]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_drives_forward_and_tells_odometry_transform_and_battery(bench: Bench) -> None:
+    bench.run(2.0, v=0.4)
+    # 4000 pulses a metre: 0.4 m/s are 1600 pulses/s on both motors.
+    np.testing.assert_allclose(bench.emulator.target_speed_pps, 1600.0, atol=1.0)
+    odometry = bench.bus.last("/wheel/odom")
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
+    assert twist_values(odometry)[0] == pytest.approx(0.4, abs=0.02)
+    # 0.5 s of ramp (0.8 m/s^2) lose 0.1 m of 0.8 m; connecting and steps lose a little more.
+    assert 0.60 < pose_matrix(odometry)[0, 3] < 0.71
+    assert len(bench.bus.messages("/wheel/odom")) > 50
+    transform = bench.bus.last("/tf").transforms[0]
+    assert transform.transform.translation.x == pytest.approx(pose_matrix(odometry)[0, 3])
+    assert stamp_ns(transform) == stamp_ns(odometry)
+    assert bench.bus.last("/battery").voltage == pytest.approx(24.1)
+    assert bench.level("link") == bench.level("battery") == bench.level("controller") == OK
+
+
+def test_turning_left_turns_the_odometry_left(bench: Bench) -> None:
+    bench.run(1.0, v=0.0, w=0.5)
+    left, right = bench.emulator.target_speed_pps
+    assert (left, right) == (-600, 600)  # 0.5 rad/s * 0.3 m * 4000 pulses/m
+    assert twist_values(bench.bus.last("/wheel/odom"))[1] == pytest.approx(0.5, abs=0.03)
+
+
+def test_stops_when_commands_cease(bench: Bench) -> None:
+    bench.run(1.0, v=0.5)
+    assert bench.emulator.speed_pps.min() > 1900
+    bench.run(0.3)
+    bench.run(0.5 / 0.8 + 0.1)  # the time-out, then the ramp
+    assert np.abs(bench.emulator.speed_pps).max() == 0.0
+    assert not bench.emulator.watchdog_fired  # it was the node that stopped, in time
+
+
+def test_old_and_senseless_commands_are_dropped_and_told(bench: Bench) -> None:
+    bench.run(0.2)
+    now_ns = bench.bus.clock.now_ns()
+    bench.bus.publish("/cmd_vel", twist_stamped(0.5, 0.0, now_ns - 310 * MILLISECOND))
+    assert bench.node.diagnoses()["command"][:2] == (WARN, "dropped: command is 0.31 s old")
+    bench.bus.publish("/cmd_vel", twist_stamped(0.5, 0.0, now_ns + 900 * MILLISECOND))
+    assert "0.90 s ahead" in bench.node.diagnoses()["command"][1]
+    bench.bus.publish("/cmd_vel", twist_stamped(float("nan"), 0.0, now_ns))
+    assert "not finite" in bench.node.diagnoses()["command"][1]
+    bench.run(0.2)
+    assert bench.emulator.target_speed_pps.tolist() == [0.0, 0.0]
+    assert bench.node.dropped == 3
+
+
+def test_unstamped_twist_counts_from_its_arrival(bench: Bench) -> None:
+    bench.run(0.1)
+    zero = Vector3(x=0.0, y=0.0, z=0.0)
+    bench.bus.publish("/cmd_vel", Twist(linear=Vector3(x=0.2, y=0.0, z=0.0), angular=zero))
+    bench.run(0.2)
+    assert bench.emulator.target_speed_pps.min() > 0.0
+    bench.run(0.7)
+    assert bench.emulator.target_speed_pps.max() == 0.0
+
+
+def test_controllers_watchdog_stops_the_motors_when_the_node_is_dead(bench: Bench) -> None:
+    bench.run(1.0, v=0.5)
+    bench.emulator.advance(0.51)  # nothing on the line: the node hangs or was killed
+    assert bench.emulator.watchdog_fired
+    assert np.abs(bench.emulator.speed_pps).max() == 0.0
+
+
+def test_closing_the_node_stops_the_motors_at_once(bench: Bench) -> None:
+    bench.run(1.0, v=0.5)
+    bench.bus.close()
+    assert bench.emulator.target_speed_pps.tolist() == [0.0, 0.0]
+    assert bench.port.closed
+
+
+def test_unplugged_and_plugged_in_again(bench: Bench) -> None:
+    bench.run(0.5, v=0.3)
+    bench.port.unplugged = True
+    bench.run(0.1)
+    assert bench.level("link") == ERROR
+    before = len(bench.bus.messages("/wheel/odom"))
+    bench.run(1.0)
+    assert len(bench.bus.messages("/wheel/odom")) == before
+    bench.port.unplugged = False
+    bench.run(2.0)  # within the backoff that has grown by now
+    assert bench.level("link") == OK
+    assert len(bench.bus.messages("/wheel/odom")) > before
+    assert bench.emulator.timeout_s == pytest.approx(0.5)  # the watchdog is set again
+
+
+def test_low_battery_and_faults_are_told(bench: Bench) -> None:
+    bench.emulator.battery_v = 20.4
+    bench.emulator.status = 0x0040
+    bench.run(1.5)
+    assert bench.node.diagnoses()["battery"][:2] == (WARN, "20.4 V, below 21.0 V: charge it")
+    assert bench.node.diagnoses()["controller"][:2] == (ERROR, "driver fault M1")
+    assert bench.bus.last("/battery").percentage == 0.0
+
+
+def test_repeats_are_told(bench: Bench) -> None:
+    bench.run(0.2)
+    damages = iter([True])
+    bench.port.damage = lambda reply: b"\x00" * len(reply) if next(damages, False) else reply
+    bench.run(0.1)
+    assert bench.node.diagnoses()["link"][:2] == (WARN, "1 commands had to be repeated")
+
+
+def test_thread_stops_the_motors_when_its_work_fails() -> None:
+    emulator = RoboclawEmulator()
+    port = EmulatorPort(emulator)
+    now = [10**12]
+    controller = BaseController(ControllerConfig(roboclaw=RoboclawConfig(port="memory")), lambda: now[0], opener(port))
+    ended = threading.Event()
+    told: list[object] = []
+    states = []
+
+    def on_state(state: object) -> None:
+        states.append(state)
+        now[0] += 30 * MILLISECOND
+        controller.command(0.5, 0.0, now[0])
+        if len(states) == 10:
+            assert emulator.target_speed_pps.max() > 0.0
+            raise RuntimeError("broken")
+
+    def on_end(fault: BaseException | None, unstopped: str) -> None:
+        told.extend((str(fault), unstopped))
+        ended.set()
+
+    thread = ControllerThread(controller, 500.0, on_state, on_end)
+    thread.start()
+    assert ended.wait(30.0)
+    assert thread.end()
+    assert told == ["broken", ""]
+    assert emulator.target_speed_pps.tolist() == [0.0, 0.0]
+    assert port.closed
+
+
+def test_shipped_parameters_are_the_defaults() -> None:
+    from pathlib import Path
+
+    from instant_ic.bus.params import build, load_file
+
+    path = Path(__file__).resolve().parents[2] / "config" / "base.yaml"
+    assert build(CrawlerBaseConfig, load_file(path, "crawler_base")) == CrawlerBaseConfig()
