@@ -67,7 +67,7 @@ class TrainConfig:
 class GeometryConfig:
     """How the keyframe's depth shapes the field and the occupancy grid."""
 
-    band_min: float = 0.03
+    band_min: float = 0.05
     """Half width of the band round the depth in which the signed distance is learnt, share of the depth."""
     band_max: float = 0.15
     band_sigmas: float = 2.0

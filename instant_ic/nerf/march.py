@@ -224,16 +224,15 @@ def trace(  # type: ignore[no-untyped-def]
                 if t[n] - last_t[n] > 3 * cell:
                     before = NOT_SEEN
                 hit = t[n]
-                if before != NOT_SEEN:
+                crossed = before != NOT_SEEN and (before > 0) != (value > 0)
+                if crossed:
                     hit = last_t[n] + (t[n] - last_t[n]) * before / (before - value)
-                from_front = before > 0 and value <= 0
-                from_behind = before <= 0 and value > 0
-                if from_front or from_behind:
+                if value <= 0 or crossed:
                     px, py, pz = along(camera_from_map, origin, directions[pixel], hit)
                     agrees = prior_agrees(px, py, pz, inverse, torn, known, band)
                     if agrees > 0:
                         depth[pixel] = hit
-                        confidence[pixel] = 1.0 if from_front and agrees == 2 else 0.0
+                        confidence[pixel] = 1.0 if before > 0 and value <= 0 and agrees == 2 else 0.0
                         continue
                 px, py, pz = along(camera_from_map, origin, directions[pixel], t[n])
                 reach = abs(value) * band * math.sqrt(px * px + py * py + pz * pz)

@@ -9,6 +9,7 @@ from .config import FieldConfig, TrainConfig
 from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size
 
 FIRST_STRIDE = 4
+"""Every so many pixels the rays are traced, the rest only where those between differ; a power of two, 1 traces all."""
 DEPTH_TOLERANCE = 0.08
 """Neighbours further apart than this share are traced, not interpolated."""
 
@@ -19,6 +20,7 @@ class NumbaDevice:
     name = "cpu (numba)"
 
     def __init__(self, field: FieldConfig, train: TrainConfig) -> None:
+        self.first_stride = FIRST_STRIDE
         self._train = train
         self._rays = train.ray_columns * train.ray_rows
         self._points = np.zeros((2 * self._rays, 3), np.float32)
@@ -89,9 +91,9 @@ class NumbaDevice:
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)
         index = np.arange(height * width, dtype=np.int32).reshape(height, width)
-        self._march(rays, index[::FIRST_STRIDE, ::FIRST_STRIDE].reshape(-1).copy(), depth, confidence)
+        self._march(rays, index[:: self.first_stride, :: self.first_stride].reshape(-1).copy(), depth, confidence)
         listed = np.empty(height * width, np.int32)
-        stride = FIRST_STRIDE // 2
+        stride = self.first_stride // 2
         while stride >= 1:
             count = march.interpolate_depth(
                 depth.reshape(height, width), confidence.reshape(height, width), stride, np.float32(DEPTH_TOLERANCE), listed

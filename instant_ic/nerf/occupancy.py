@@ -13,6 +13,7 @@ from .config import GeometryConfig
 from .prior import PanoramaPrior
 
 MAX_DISTANCE = 100
+MARGIN_CELLS = 2
 _MAX_PARTS = 16
 
 
@@ -69,19 +70,19 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
 
 
 def build_occupancy(prior: PanoramaPrior, config: GeometryConfig) -> Occupancy:
-    """Occupancy grid of a keyframe; one cell is added all round each surface."""
-    cloud = surface_points(prior, config.cell_m * 1.5)
+    """Occupancy grid of a keyframe; ``MARGIN_CELLS`` are added round each surface."""
+    cloud = surface_points(prior, config.cell_m)
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
     cell = max(config.cell_m, (volume / config.max_cells) ** (1 / 3))
-    origin = low - np.float32(3 * cell)
-    shape = tuple(int(n) for n in np.ceil((high - origin) / cell).astype(int) + 3)
+    origin = low - np.float32(4 * cell)
+    shape = tuple(int(n) for n in np.ceil((high - origin) / cell).astype(int) + 4)
     index = ((cloud - origin) * np.float32(1 / cell)).astype(np.intp)
     distance = np.full(shape, MAX_DISTANCE, np.uint8)
     distance.reshape(-1)[np.ravel_multi_index(tuple(index.T), shape)] = 0
     _spread(distance)
-    # One cell of margin: surfaces between the samples, and the field's own small differences from the prior.
-    np.subtract(distance, 1, out=distance, where=distance > 0)
+    # A margin for surfaces between the samples, for steps, and for the field's own small differences from the prior.
+    distance -= np.minimum(distance, np.uint8(MARGIN_CELLS))
     return Occupancy(distance, origin.astype(np.float32), float(cell))
 
 

@@ -1,0 +1,101 @@
+"""Training and rendering by plain torch: on CUDA, and on CPUs where numba is missing (slow)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import reference
+from .config import FieldConfig, TrainConfig
+from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size
+from .reference import TorchField, TorchGrid, TorchPrior
+
+RAYS_AT_ONCE = 1 << 18
+
+
+def torch_prior(scene: Scene, device: str) -> TorchPrior:
+    """A scene's prior as tensors."""
+    prior = scene.prior
+
+    def tensor(array: Any, kind: torch.dtype = torch.float32) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(device=device, dtype=kind)
+
+    return TorchPrior(
+        rgb=tensor(prior.rgb),
+        inverse_depth=tensor(prior.inverse_depth),
+        known=tensor(prior.known, torch.bool),
+        torn=tensor(prior.torn, torch.bool),
+        map_from_camera=tensor(prior.map_from_camera),
+        camera_from_map=tensor(np.linalg.inv(prior.map_from_camera)),
+        band=prior.band,
+    )
+
+
+class TorchDevice:
+    """See ``field.Device``."""
+
+    def __init__(self, field: FieldConfig, train: TrainConfig, device: str) -> None:
+        self._train = train
+        self._device = device
+        self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
+        rays = train.ray_columns * train.ray_rows
+        on_surface = torch.tensor([1.0, 0.0]).repeat(rays // 64).repeat_interleave(64)
+        self._colour_weight = (on_surface / (3 * rays)).to(device)
+        self._distance_weight = torch.full((2 * rays,), train.distance_weight / (2 * rays), device=device)
+        self.load(FieldParameters.random(field, train.seed))
+
+    def load(self, parameters: FieldParameters) -> None:
+        arrays = (parameters.table, *parameters.network())
+        tensors = [torch.from_numpy(a.copy()).to(self._device).requires_grad_() for a in arrays]
+        lattice = torch.zeros(parameters.table.shape[0], device=self._device), torch.zeros(3, device=self._device)
+        self._field = TorchField(*tensors, *lattice)
+        self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in tensors]
+        self._steps = 0
+
+    def set_scene(self, scene: Scene) -> None:
+        self._prior = torch_prior(scene, self._device)
+        grid = scene.occupancy
+        self._grid = TorchGrid(
+            torch.from_numpy(grid.distance).to(self._device), torch.from_numpy(grid.origin).to(self._device), grid.cell_m
+        )
+        self._field.cells_per_m = torch.from_numpy(scene.lattice.cells_per_m).to(self._device)
+        self._field.origin = torch.from_numpy(scene.lattice.origin).to(self._device)
+        self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
+        self._steps = 0
+
+    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
+        drawn = torch.from_numpy(uniform).to(self._device)
+        points, target = reference.sample_rays(drawn, self._train.ray_columns, self._train.ray_rows, self._prior)
+        output = reference.query(self._field, points)
+        colour, distance = reference.loss(output, target, self._colour_weight, self._distance_weight)
+        grads = torch.autograd.grad(colour + distance, self._field.parameters())
+        self._steps += 1
+        with torch.no_grad():
+            for index, (value, grad) in enumerate(zip(self._field.parameters(), grads, strict=True)):
+                lr = table_lr if index == 0 else network_lr
+                step_size = adam_step_size(lr, self._steps)
+                # A network's row is an entry like the table's: without a gradient it is left alone.
+                reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
+        return float(colour.detach()), float(distance.detach()) / self._train.distance_weight
+
+    @torch.no_grad()
+    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+        origin = torch.from_numpy(rays.origin).to(self._device)
+        directions = torch.from_numpy(rays.directions).to(self._device)
+        parts = [self._draw(origin, part) for part in directions.split(RAYS_AT_ONCE)]
+        colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
+        return colour, depth, confidence
+
+    def _draw(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        depth, confidence = reference.trace(self._field, self._grid, self._prior, origin, directions)
+        met = torch.nonzero(depth)[:, 0]
+        colour = torch.zeros_like(directions)
+        points = origin + depth[met, None] * directions[met]
+        colour[met] = (reference.query(self._field, points)[:, :3] + 0.5).clamp(0, 1)
+        return colour, depth, confidence
+
+    def parameters(self) -> FieldParameters:
+        return FieldParameters(*(p.detach().cpu().numpy().copy() for p in self._field.parameters()))
