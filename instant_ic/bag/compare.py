@@ -37,20 +37,22 @@ class TopicDifference:
         return not self.first
 
 
-def compare(a: Path, b: Path, ignore: tuple[str, ...] = ()) -> list[TopicDifference]:
+def compare(a: Path, b: Path, ignore: tuple[str, ...] = (), common: bool = False) -> list[TopicDifference]:
     """Every topic of two bags, by name.
 
     Args:
         a: first bag.
         b: second bag.
         ignore: topics to leave out.
+        common: only topics that both bags have.
 
     Raises:
         BagError: one of them cannot be read.
     """
     with BagReader(a) as one, BagReader(b) as two:
-        topics = sorted({t.topic for reader in (one, two) for t in reader.topics} - set(ignore))
-        return [_compare_topic(topic, one, two) for topic in topics]
+        names = [{t.topic for t in reader.topics} for reader in (one, two)]
+        topics = (names[0] & names[1] if common else names[0] | names[1]) - set(ignore)
+        return [_compare_topic(topic, one, two) for topic in sorted(topics)]
 
 
 def digest(bag: Path) -> str:

@@ -55,6 +55,9 @@ class _WithHealth:
             self._screen.health = HealthMonitor(self._description.nodes, self._run_dir)
         self._screen.refresh(processes)
 
+    def stopping(self) -> None:
+        self._screen.ending = True
+
     def close(self) -> None:
         if self._screen.health is not None:
             self._screen.health.close()

@@ -48,6 +48,8 @@ class Screen:
         self._told_nodes = self._told_ready = False
         self._address: str | None = None
         self.health: HealthMonitor | None = None
+        self.ending = False
+        """Set once the stack is being stopped: then nothing is waited for any more."""
 
     def __enter__(self) -> Screen:
         """Shows the table."""
@@ -72,7 +74,7 @@ class Screen:
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
         """Looks at the heartbeats; updates the table twice a second."""
         now = time.monotonic()
-        if self.health is not None:
+        if self.health is not None and not self.ending:
             self.health.poll()
             self._tell_progress(self.health, now)
         if self._live is not None and now >= self._next_table_s:
@@ -99,6 +101,8 @@ class Screen:
     def _footer(self) -> str:
         if self.health is None:
             return "starting"
+        if self.ending:
+            return "stopping"
         waiting = self.health.nodes_missing() or self.health.waiting_for()
         words = [f"waiting for {', '.join(waiting)}" if waiting else "ready"]
         if self._address:

@@ -35,6 +35,9 @@ class Output(Protocol):
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
         """Called several times a second."""
 
+    def stopping(self) -> None:
+        """Called once, when the end begins."""
+
 
 class Supervisor:
     """Runs a list of nodes as processes until they end, one that is required ends, or a stop is asked for.
@@ -188,6 +191,7 @@ class Supervisor:
 
     def _stop_all(self) -> None:
         self._stop = True
+        self._output.stopping()
         running = [process for process in self.processes if process.state is State.RUNNING]
         if running:
             self._output.event(f"stopping {len(running)} node{'s' if len(running) > 1 else ''}")

@@ -207,9 +207,7 @@ class Counter:
 
 
 def topic_info(topic: str, type_name: str, *presets: QoS) -> TopicInfo:
-    publishers = [
-        PublisherInfo(f"n{i}", 1, qos.name, Path("s"), type_name, "00", 0) for i, qos in enumerate(presets)
-    ]
+    publishers = [PublisherInfo(f"n{i}", 1, qos.name, Path("s"), type_name, "00", 0) for i, qos in enumerate(presets)]
     return TopicInfo(topic, type_name, publishers)
 
 

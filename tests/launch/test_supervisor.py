@@ -46,6 +46,9 @@ class Lines:
         if self.supervisor is not None and (self.until(self) or time.monotonic() > self.limit_s):
             self.supervisor.request_stop()
 
+    def stopping(self) -> None:
+        pass
+
     def of(self, node: str) -> list[str]:
         return [text for name, text in self.lines if name == node]
 
@@ -182,6 +185,7 @@ class Output:
     def node_line(self, node, text): print(text, flush=True)
     def event(self, text, bad=False): pass
     def refresh(self, processes): pass
+    def stopping(self): pass
 code = {("import os; print(os.getpid(), flush=True)" + IGNORES.format(signals="[signal.SIGINT, signal.SIGTERM]"))!r}
 nodes = [NodeSpec(name, name, (sys.executable, "-c", code)) for name in ("a", "b")]
 Supervisor(nodes, pathlib.Path({str(run_dir)!r}), Output()).run()

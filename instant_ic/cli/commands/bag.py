@@ -34,15 +34,11 @@ def add_parser(subparsers: Any) -> None:
     )
     recording.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
     recording.add_argument("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
-    recording.add_argument(
-        "-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out"
-    )
+    recording.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
     recording.add_argument("--duration", type=float, default=0.0, metavar="S", help="end after this time")
     recording.add_argument("--use-sim-time", action="store_true", help="file messages by /clock, as while a bag plays")
 
-    playing = verb(
-        "play", "plays a bag with /clock", play, "ic bag play drive --rate 2 --start 10"
-    )
+    playing = verb("play", "plays a bag with /clock", play, "ic bag play drive --rate 2 --start 10")
     playing.add_argument("bag", metavar="BAG")
     playing.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
     playing.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
@@ -52,9 +48,7 @@ def add_parser(subparsers: Any) -> None:
     playing.add_argument("--loop", action="store_true", help="begin again at the end")
     playing.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="other name; repeatable")
     playing.add_argument("--no-clock", action="store_true", help="send no /clock")
-    playing.add_argument(
-        "--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads"
-    )
+    playing.add_argument("--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads")
 
     looking = verb("info", "topics, types, counts and losses of a bag", info, "ic bag info drive")
     looking.add_argument("bag", metavar="BAG")
@@ -65,6 +59,8 @@ def add_parser(subparsers: Any) -> None:
     comparing.add_argument("a", metavar="A")
     comparing.add_argument("b", metavar="B")
     comparing.add_argument("--ignore", action="append", default=[], metavar="TOPIC", help="leave out")
+
+    comparing.add_argument("--common", action="store_true", help="only topics that both bags have")
 
     rescuing = verb(
         "recover", "makes a readable bag of one that was cut short", recover, "ic bag recover broken -o saved"
@@ -143,7 +139,9 @@ def diff(args: argparse.Namespace) -> int:
     """Compares topic by topic."""
     from instant_ic.bag.compare import compare
 
-    topics = compare(Path(args.a), Path(args.b), tuple(_topics(args.ignore)))
+    topics = compare(Path(args.a), Path(args.b), tuple(_topics(args.ignore)), args.common)
+    if not topics:
+        raise UserError("there is no topic to compare")
     width = max([len(topic.topic) for topic in topics], default=0)
     for topic in topics:
         print(f"{topic.topic:<{width}}  {topic.count_a:>6} {topic.count_b:>6}  {topic.first or 'same'}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,7 @@ def add_parser(subparsers: Any) -> None:
         "-p grid_slam.resolution:=0.1",
     )
     parser.add_argument("bag", metavar="BAG")
-    parser.add_argument(
-        "--nodes", required=True, metavar="A,B,...", help="nodes, in the order of their turns"
-    )
+    parser.add_argument("--nodes", required=True, metavar="A,B,...", help="nodes, in the order of their turns")
     parser.add_argument("-o", "--output", required=True, metavar="DIR", help="new bag")
     parser.add_argument(
         "--params-file",
@@ -70,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
     from instant_ic.bag.replay import make_node, replay
 
+    logging.basicConfig(level="WARNING", format="%(levelname)-7s %(name)s: %(message)s")
     nodes = [make_node(name, args.params_file, args.param) for name in names]
     with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
         task = progress.add_task(f"replaying {args.bag}", total=1.0)

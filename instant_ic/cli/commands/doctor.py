@@ -1,0 +1,66 @@
+"""``ic doctor``: what this machine lacks."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the verb."""
+    parser = subparsers.add_parser(
+        "doctor",
+        help="check machine, devices, ports, models and configuration",
+        description="Checks this machine, the devices, ports, models and configuration, and says what to do. "
+        "Exit status 1 when something would not work.",
+        epilog="example: ic doctor --robot --serial-port /dev/ttyACM0",
+    )
+    parser.add_argument("--robot", action="store_true", help="the real devices must be there")
+    parser.add_argument("--serial-port", metavar="PORT", help="of the RoboClaw (default: as in config/base.yaml)")
+    parser.add_argument("--camera-url", metavar="URL", help="of the Theta (default: as in config/camera.yaml)")
+    parser.add_argument("--lidar-port", type=int, metavar="PORT", help="UDP port of the VLP-16's data")
+    parser.add_argument("--listen", type=float, default=1.0, metavar="S", help="wait so long for LiDAR packets")
+    parser.set_defaults(func=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs the checks and prints a line each."""
+    from instant_ic import paths
+    from instant_ic.cli.doctor import FAIL, OK, WARN, run_checks
+
+    colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
+    counts = {OK: 0, WARN: 0, FAIL: 0}
+    for finding in run_checks(_expectation(args), paths.run_dir()):
+        counts[finding.level] += 1
+        level = f"{finding.level:<4}"
+        if finding.level in colours:
+            level = f"\033[{colours[finding.level]}m{level}\033[0m"
+        print(f"{level}  {finding.subject}: {finding.words}", flush=True)
+        if finding.advice and finding.level != OK:
+            print(f"      → {finding.advice}", flush=True)
+    print(f"{counts[OK]} ok, {counts[WARN]} warnings, {counts[FAIL]} failures")
+    return 1 if counts[FAIL] else 0
+
+
+def _expectation(args: argparse.Namespace) -> Any:
+    """Addresses from the command line, else as the shipped configuration has them."""
+    from instant_ic import paths
+    from instant_ic.bus.params import ParameterError, load_file
+    from instant_ic.cli.doctor import Expectation
+
+    def shipped(file: str, node: str, key: str, default: Any) -> Any:
+        try:
+            found = load_file(paths.share_dir("config") / file, node).get(key)
+        except (ParameterError, FileNotFoundError):
+            return default  # check_configuration tells what is wrong with the file
+        return default if found is None else found.value
+
+    plain = Expectation()
+    return Expectation(
+        real_devices=args.robot,
+        serial_port=args.serial_port or shipped("base.yaml", "crawler_base", "roboclaw.port", plain.serial_port),
+        camera_url=args.camera_url or shipped("camera.yaml", "theta_camera", "url", plain.camera_url),
+        lidar_port=args.lidar_port or shipped("lidar.yaml", "vlp16_driver", "port", plain.lidar_port),
+        listen_seconds=args.listen,
+    )

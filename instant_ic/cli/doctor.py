@@ -1,0 +1,346 @@
+"""The checks of ``ic doctor``: each looks at one thing and says what to do when it is wrong."""
+
+from __future__ import annotations
+
+import grp
+import importlib.metadata
+import importlib.util
+import os
+import pwd
+import shutil
+import socket
+import stat
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+OK, WARN, FAIL = "ok", "warn", "fail"
+
+MIN_PYTHON = (3, 11)
+MIN_CORES = 2
+MIN_MEMORY_GB = 4.0
+MIN_DISK_GB = 2.0
+MIN_SHM_MB = 64.0
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a check found.
+
+    Attributes:
+        level: OK, WARN (something will be missing or slow) or FAIL (it will not work).
+        subject: what was looked at.
+        words: what is so.
+        advice: what to do; empty where all is well.
+    """
+
+    level: str
+    subject: str
+    words: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What this machine is to do, by the parameters of the nodes that would run on it.
+
+    Attributes:
+        real_devices: missing devices are failures, not warnings.
+        serial_port: of the RoboClaw.
+        camera_url: of the Theta.
+        lidar_port: UDP port of the VLP-16's data.
+        listen_seconds: how long to wait for its packets.
+        tcp_ports: port → what needs it.
+        udp_ports: port → what needs it.
+    """
+
+    real_devices: bool = False
+    serial_port: str = "/dev/ttyACM0"
+    camera_url: str = "http://192.168.1.1"
+    lidar_port: int = 2368
+    listen_seconds: float = 1.0
+    tcp_ports: tuple[tuple[int, str], ...] = ((8080, "operator's page"), (8089, "simulated Theta"))
+    udp_ports: tuple[tuple[int, str], ...] = ((2368, "VLP-16 data"), (8308, "VLP-16 position"))
+
+
+def run_checks(expectation: Expectation, run_dir: Path) -> Iterator[Finding]:
+    """Every check, one after another; the slow ones last."""
+    yield from check_machine(run_dir)
+    yield from check_packages()
+    yield from check_configuration()
+    yield from check_models()
+    yield from check_ports(expectation)
+    yield from check_gpu()
+    yield from check_browser()
+    yield from check_network_filter()
+    yield from check_serial(expectation)
+    yield from check_camera(expectation)
+    yield from check_lidar(expectation)
+
+
+def check_machine(run_dir: Path) -> Iterator[Finding]:
+    """Python, cores, memory, disk, shared memory, run directory."""
+    import psutil
+
+    version = ".".join(map(str, sys.version_info[:3]))
+    if sys.version_info >= MIN_PYTHON:
+        yield Finding(OK, "python", version)
+    else:
+        yield Finding(FAIL, "python", f"{version} is too old", "use Python 3.11 or newer")
+    cores = len(os.sched_getaffinity(0))
+    yield _at_least("cores", cores, MIN_CORES, "", "the stack will run at lower rates")
+    memory_gb = psutil.virtual_memory().total / 1e9
+    yield _at_least("memory", memory_gb, MIN_MEMORY_GB, " GB", "close other programs, or run station.yaml elsewhere")
+    disk_gb = shutil.disk_usage(Path.cwd()).free / 1e9
+    yield _at_least("disk", disk_gb, MIN_DISK_GB, " GB free here", "make room before recording bags")
+    if Path("/dev/shm").is_dir():
+        shm_mb = shutil.disk_usage("/dev/shm").free / 1e6
+        yield _at_least("/dev/shm", shm_mb, MIN_SHM_MB, " MB free", "in a container: --shm-size=256m")
+    else:
+        yield Finding(WARN, "/dev/shm", "is missing", "mount a tmpfs there")
+    yield _check_run_dir(run_dir)
+
+
+def _at_least(subject: str, value: float, least: float, unit: str, advice: str) -> Finding:
+    words = f"{value:.0f}{unit}" if value >= 10 or float(value).is_integer() else f"{value:.1f}{unit}"
+    if value >= least:
+        return Finding(OK, subject, words)
+    return Finding(WARN, subject, f"{words}, at least {least:g} wanted", advice)
+
+
+def _check_run_dir(run_dir: Path) -> Finding:
+    from instant_ic.bus import RegistryError, registry
+
+    try:
+        registry.prepare(run_dir)
+        longest = registry.topic_dir(run_dir, "/camera/image/compressed") / "depth_estimator.sock"
+    except RegistryError as error:
+        return Finding(FAIL, "run directory", str(error), "set INSTANT_IC_RUN_DIR to a folder of your own")
+    if len(os.fsencode(longest)) > 107:
+        return Finding(FAIL, "run directory", f"{run_dir} is too long for sockets", "set INSTANT_IC_RUN_DIR shorter")
+    nodes = registry.list_nodes(run_dir)
+    return Finding(OK, "run directory", f"{run_dir}, {len(nodes)} nodes running")
+
+
+def check_packages() -> Iterator[Finding]:
+    """Every package that the installed distribution asks for."""
+    try:
+        requirements = importlib.metadata.requires("instant-ic") or []
+    except importlib.metadata.PackageNotFoundError:
+        yield Finding(FAIL, "package", "instant-ic is not installed", "make run, or pip install -e .")
+        return
+    missing = []
+    for requirement in requirements:
+        if "extra ==" in requirement:
+            continue
+        name = requirement.split(";")[0].strip()
+        for mark in "<>=!~[ ":
+            name = name.split(mark)[0]
+        try:
+            importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        yield Finding(FAIL, "packages", f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
+    else:
+        yield Finding(OK, "packages", f"instant-ic {importlib.metadata.version('instant-ic')} with all that it needs")
+
+
+def check_configuration() -> Iterator[Finding]:
+    """Every shipped launch file with the parameters of its nodes."""
+    from instant_ic import paths
+    from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
+    from instant_ic.launch.parameters import check_parameters
+
+    try:
+        files = sorted(paths.share_dir("launch").glob("*.yaml"))
+    except FileNotFoundError as error:
+        yield Finding(FAIL, "launch files", str(error), "install the package again")
+        return
+    for file in files:
+        try:
+            needed = {a.name: "placeholder" for a in read_arguments(file) if a.default is None}
+            description = read_launch_file(file, needed)
+            problems = check_parameters(description.nodes)
+        except LaunchFileError as error:
+            problems = [str(problem) for problem in error.problems]
+        if problems:
+            more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+            yield Finding(FAIL, f"launch/{file.name}", problems[0] + more, f"ic launch {file.stem} --check")
+        else:
+            yield Finding(OK, f"launch/{file.name}", f"{len(description.nodes)} nodes, parameters are good")
+
+
+def check_models() -> Iterator[Finding]:
+    """Every model file loads."""
+    from instant_ic import paths
+
+    try:
+        models = sorted(paths.share_dir("models").glob("*.onnx"))
+    except FileNotFoundError:
+        models = []
+    if not models:
+        yield Finding(FAIL, "models", "there is no model file", "install the package again, or ic depth export")
+        return
+    import onnxruntime
+
+    for model in models:
+        size = f"{model.stat().st_size / 1e6:.1f} MB"
+        try:
+            session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+        except Exception as error:  # noqa: BLE001 - onnxruntime's errors share no base class
+            yield Finding(FAIL, f"models/{model.name}", str(error).splitlines()[0], "install the package again")
+            continue
+        shape = "x".join(str(size) for size in session.get_inputs()[0].shape)
+        yield Finding(OK, f"models/{model.name}", f"{size}, input {shape}")
+
+
+def check_ports(expectation: Expectation) -> Iterator[Finding]:
+    """Ports that the stack listens on are free."""
+    kinds = ((socket.SOCK_STREAM, "tcp", expectation.tcp_ports), (socket.SOCK_DGRAM, "udp", expectation.udp_ports))
+    for kind, word, ports in kinds:
+        for port, need in ports:
+            try:
+                with socket.socket(socket.AF_INET, kind) as probe:
+                    if kind == socket.SOCK_STREAM:
+                        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                    probe.bind(("127.0.0.1", port))
+            except OSError as error:
+                yield Finding(
+                    WARN,
+                    f"{word} port {port}",
+                    f"{need}: {error.strerror}",
+                    "a stack already runs, or give another port: ic launch sim --show-args",
+                )
+            else:
+                yield Finding(OK, f"{word} port {port}", f"free for the {need}")
+
+
+def check_gpu() -> Iterator[Finding]:
+    """A CUDA device that torch can use."""
+    if importlib.util.find_spec("torch") is None:
+        yield Finding(FAIL, "gpu", "torch is not installed", "pip install torch")
+        return
+    import torch
+
+    if torch.cuda.is_available():
+        yield Finding(OK, "gpu", torch.cuda.get_device_name(0))
+    elif Path("/proc/driver/nvidia/version").exists():
+        yield Finding(WARN, "gpu", f"torch {torch.__version__} sees none", "install a CUDA build of torch")
+    else:
+        yield Finding(OK, "gpu", "none: the virtual space is trained on the CPU")
+
+
+def check_browser() -> Iterator[Finding]:
+    """A browser for the operator's page."""
+    found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if found:
+        yield Finding(OK, "browser", found)
+    else:
+        yield Finding(
+            WARN, "browser", "none found here", "open the operator's page from another machine (docs/console.md)"
+        )
+
+
+def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterator[Finding]:
+    """Reverse-path filtering: strict, it drops a sensor's packets from a foreign subnet without a word."""
+    strict = []
+    for file in sorted(root.glob("*/rp_filter")):
+        try:
+            if file.read_text().strip() == "1" and file.parent.name not in ("lo", "default"):
+                strict.append(file.parent.name)
+        except OSError:
+            continue
+    if strict:
+        yield Finding(
+            WARN,
+            "rp_filter",
+            f"strict on {', '.join(strict)}: packets of a VLP-16 in another subnet are dropped",
+            f"sysctl -w net.ipv4.conf.{strict[-1]}.rp_filter=2, or give the interface an address in its subnet",
+        )
+    else:
+        yield Finding(OK, "rp_filter", "not strict")
+
+
+def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | None = None) -> Iterator[Finding]:
+    """The RoboClaw's serial port is there and may be opened."""
+    if devices is None:
+        from serial.tools.list_ports import comports as devices  # type: ignore[no-redef]
+    assert devices is not None
+    port = Path(expectation.serial_port)
+    missing = FAIL if expectation.real_devices else WARN
+    if not port.exists():
+        others = ", ".join(device.device for device in devices()) or "none"
+        advice = "plug in the RoboClaw, or give serial_port:=... (not needed for sim.yaml)"
+        yield Finding(missing, f"serial {port}", f"does not exist (there are: {others})", advice)
+        return
+    if os.access(port, os.R_OK | os.W_OK):
+        yield Finding(OK, f"serial {port}", "may be opened")
+        return
+    info = port.stat()
+    try:
+        group = grp.getgrgid(info.st_gid).gr_name
+    except KeyError:
+        group = str(info.st_gid)
+    user = pwd.getpwuid(os.getuid()).pw_name
+    advice = f"sudo usermod -aG {group} {user}, then log in again"
+    yield Finding(missing, f"serial {port}", f"no permission ({stat.filemode(info.st_mode)} {group})", advice)
+
+
+def check_camera(expectation: Expectation) -> Iterator[Finding]:
+    """The Theta answers on its Web API."""
+    import requests
+
+    url = expectation.camera_url.rstrip("/")
+    missing = FAIL if expectation.real_devices else WARN
+    try:
+        with requests.Session() as session:
+            session.trust_env = False  # a proxy has no way to a camera in the local network
+            reply = session.get(f"{url}/osc/info", timeout=2.0)
+        info = reply.json() if reply.status_code == 200 else {}
+    except (requests.RequestException, ValueError) as error:
+        advice = "join the camera's wireless network, or give camera_url:=... (not needed for sim.yaml)"
+        yield Finding(missing, f"camera {url}", _short(error), advice)
+        return
+    if reply.status_code != 200:
+        advice = "in client mode the camera wants its user and password: docs/camera.md"
+        yield Finding(missing, f"camera {url}", f"answers {reply.status_code}", advice)
+        return
+    model, firmware = info.get("model", "unknown model"), info.get("firmwareVersion", "?")
+    yield Finding(OK, f"camera {url}", f"{model}, firmware {firmware}")
+
+
+def check_lidar(expectation: Expectation) -> Iterator[Finding]:
+    """Packets of a VLP-16 arrive."""
+    subject = f"lidar udp {expectation.lidar_port}"
+    missing = FAIL if expectation.real_devices else WARN
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+            receiver.bind(("", expectation.lidar_port))
+            receiver.settimeout(expectation.listen_seconds)
+            packet, sender = receiver.recvfrom(2048)
+    except TimeoutError:
+        advice = "check cable and address of the sensor (default 192.168.1.201; not needed for sim.yaml)"
+        yield Finding(missing, subject, f"no packet in {expectation.listen_seconds:g} s", advice)
+    except OSError as error:
+        yield Finding(missing, subject, f"cannot listen: {error.strerror}", "a driver already has the port")
+    else:
+        if len(packet) == 1206:
+            yield Finding(OK, subject, f"packets from {sender[0]}")
+        else:
+            advice = "something else sends to this port"
+            yield Finding(missing, subject, f"{len(packet)} bytes from {sender[0]} are no VLP-16 packet", advice)
+
+
+def _short(error: Exception) -> str:
+    from requests.exceptions import ConnectionError as RequestsConnectionError
+    from requests.exceptions import Timeout
+
+    if isinstance(error, Timeout):
+        return "no answer in 2 s"
+    if isinstance(error, RequestsConnectionError):
+        return "cannot be reached"
+    return f"no Web API there ({type(error).__name__})"
