@@ -65,7 +65,7 @@ def _colours(points: Array, axis: NDArray[np.int8], material: NDArray[np.int8]) 
     wall = (material == WALL) & (axis != 2)
     along = np.where(axis == 0, y, x)
     stripe = 0.04 * np.sin(along * 9) * np.sin(z * 7)
-    colour[:] = (np.float32([0.66, 0.70, 0.72])[None] + stripe[:, None]).astype(np.float32)
+    colour[:] = (np.array([0.66, 0.70, 0.72], np.float32) + stripe[:, None]).astype(np.float32)
     colour[wall & (z < 0.9)] = (0.47, 0.42, 0.33)
     colour[wall & (z < 0.1)] = (0.20, 0.18, 0.17)
     poster = wall & (np.abs(z - 1.6) < 0.42) & (np.abs((along + 0.7) % 3.0 - 1.5) < 0.55)
@@ -78,14 +78,14 @@ def _colours(points: Array, axis: NDArray[np.int8], material: NDArray[np.int8]) 
     tone = 0.80 + 0.10 * np.sin(plank * 12.9) + 0.05 * np.sin(x * 3 + plank * 5) + 0.03 * np.sin(x * 41)
     seam = (np.abs((y / 0.24) % 1.0 - 0.5) > 0.475) | (np.abs((x / 1.6 + plank * 0.37) % 1.0 - 0.5) > 0.494)
     tone = np.where(seam, tone * 0.55, tone)
-    colour[floor] = (np.float32([0.30, 0.46, 0.62])[None] * tone[:, None])[floor]
+    colour[floor] = (np.array([0.30, 0.46, 0.62], np.float32) * tone[:, None])[floor]
     ceiling = (axis == 2) & (z > 2.69)
     colour[ceiling] = (0.80, 0.81, 0.80)
     lamp = ceiling & (np.abs(y) < 0.2) & (np.abs(x % 2.6 - 1.3) < 0.7)
     colour[material == WHITE] = (0.74, 0.77, 0.78)
     crate = material == CRATE
     board = 0.75 + 0.25 * np.sign(np.sin(z * 24))
-    colour[crate] = (np.float32([0.28, 0.44, 0.60])[None] * board[:, None])[crate]
+    colour[crate] = (np.array([0.28, 0.44, 0.60], np.float32) * board[:, None])[crate]
     side = np.choose(axis, (0.86, 0.95, 1.0)).astype(np.float32)
     glow = 0.72 + 0.28 * np.exp(-(((x % 2.6) - 1.3) ** 2 + y**2) / 5)
     colour *= (side * glow)[:, None]

@@ -345,7 +345,7 @@ class ConsoleNode(Node[ConsoleConfig]):
             map_from_frame = self.lookup("map", path.header.frame_id)
             if map_from_frame is None:
                 return []
-            xyz = transform_points(map_from_frame, xyz)
+            xyz = transform_points(map_from_frame, xyz).astype(np.float64)
         points: list[list[float]] = xyz[np.isfinite(xyz).all(axis=1), :2].round(3).tolist()
         return points
 

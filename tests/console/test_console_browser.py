@@ -1,17 +1,22 @@
 """The page in Debian's Chromium, against the server with a made-up robot."""
 
 import io
+import math
 import os
 import shutil
 import time
 
+import cv2
 import numpy as np
 import pytest
 
+from instant_ic.console import demo_world
 from instant_ic.console.demo import Demo, DemoConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import ServerConfig
 from instant_ic.console.view import ViewConfig
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import perspective_directions
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 FLAGS = [
@@ -46,11 +51,12 @@ def browser():
         browser.close()
 
 
-def make_demo(port=0):
+def make_demo(port=0, panorama_width=192, view_width=160):
     # No watchdog in the server's way: what stops the robot here must be the page.
     drive = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
-    view = ViewConfig(width=160, height=96, virtual_rate_hz=5)
-    demo = Demo(ServerConfig(port=port, drive=drive), DemoConfig(panorama_width=192, panorama_hz=4, view=view))
+    view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
+    config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
+    demo = Demo(ServerConfig(port=port, drive=drive), config)
     demo.start()
     return demo
 
@@ -63,10 +69,18 @@ def demo():
 
 
 @pytest.fixture
+def sharp_demo():
+    """With pictures fine enough to be compared with the room."""
+    demo = make_demo(panorama_width=640, view_width=384)
+    yield demo
+    demo.stop()
+
+
+@pytest.fixture
 def open_page(browser, demo):
     contexts = []
 
-    def open_one(query="", driver="you", **options):
+    def open_one(query="", driver="you", at=None, **options):
         context = browser.new_context(**({"viewport": SIZE} | options))
         context.set_default_timeout(WAIT_MS)
         contexts.append(context)
@@ -74,7 +88,7 @@ def open_page(browser, demo):
         page.faults = []
         page.on("pageerror", lambda error: page.faults.append(str(error)))
         page.on("console", lambda m: page.faults.append(m.text) if m.type == "error" else None)
-        page.goto(demo.server.url + query)
+        page.goto((at or demo).server.url + query)
         expect_body(page, "driver", driver)
         return page
 
@@ -298,6 +312,60 @@ def test_looking_round_by_drag_turns_the_picture_at_once_and_tells_the_robot(ope
     assert 120 <= max(scores, key=scores.get) <= 240
     page.keyboard.press("c")
     wait_until(lambda: abs(demo.look.yaw) < 0.01, page, "straight ahead again")
+
+
+def room_seen(pose, yaw, pitch, vfov_deg=60.0):
+    """What the page should show, drawn from the room itself: (H, W, 3) RGB."""
+    width, height = SIZE["width"] // 4, SIZE["height"] // 4
+    hfov = 2 * math.atan(math.tan(math.radians(vfov_deg) / 2) * width / height)
+    map_from_look = pose_matrix(yaw=pose[2]) @ pose_matrix(pitch=-pitch, yaw=yaw)
+    directions = perspective_directions(width, height, hfov) @ map_from_look[:3, :3].T.astype(np.float32)
+    return demo_world.shade((pose[0], pose[1], 1.2), directions)[..., ::-1].astype(float)
+
+
+def likeness(page, expected):
+    """Correlation of the page's picture with ``expected``, softened to the same sharpness."""
+    shown = cv2.resize(picture_of(page), expected.shape[1::-1], interpolation=cv2.INTER_AREA)
+    return np.corrcoef(cv2.blur(shown, (5, 5)).ravel(), cv2.blur(expected, (5, 5)).ravel())[0, 1]
+
+
+def wait_alike(page, expected):
+    deadline = time.monotonic() + WAIT_MS / 1000
+    while (found := likeness(page, expected)) < 0.97:
+        assert time.monotonic() < deadline, f"correlation with what should be seen: {found:.3f}"
+        page.wait_for_timeout(100)
+
+
+@pytest.mark.parametrize("mode", ["real", "virtual"])
+def test_picture_is_what_stands_in_the_look_direction(open_page, sharp_demo, mode):
+    """Camera and rendered view through the same projection, against the room drawn without either."""
+    demo = sharp_demo
+    demo.robot = demo.vbot = np.array([-1.0, -0.5, 0.4])
+    demo.forced_mode = mode
+    page = open_page(at=demo, bypass_csp=True)
+    expect_body(page, "blend", "1.00" if mode == "virtual" else "0.00")
+    page.mouse.move(480, 300)
+    page.mouse.down()
+    page.mouse.move(330, 350, steps=3)  # turns right and up
+    page.mouse.up()
+    wait_until(lambda: demo.look.yaw < -0.2, page, "the look direction arrives")
+    look = demo.look
+    assert look.pitch > math.radians(-10)
+    wait_alike(page, room_seen(demo.robot, look.yaw, look.pitch))
+    # The test can fail: the mirrored room, and a look 10° beside, are less alike.
+    assert likeness(page, room_seen(demo.robot, look.yaw, look.pitch)[:, ::-1]) < 0.93
+    assert likeness(page, room_seen(demo.robot, look.yaw + math.radians(10), look.pitch)) < 0.95
+
+
+def test_old_panorama_is_aimed_anew_when_the_robot_turns(open_page, sharp_demo):
+    demo = sharp_demo
+    demo.forced_mode = "real"
+    page = open_page(at=demo, bypass_csp=True)
+    expect_body(page, "picture", "live")
+    demo.pictures = False
+    page.wait_for_timeout(300)
+    demo.robot = np.array([0.0, 0.0, 0.5])
+    wait_alike(page, room_seen(demo.robot, 0.0, math.radians(-10)))
 
 
 def touch(page, kind, x, y):
