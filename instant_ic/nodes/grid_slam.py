@@ -1,0 +1,293 @@
+"""Grid SLAM: /scan and wheel odometry to /map, /pose and the transform map→odom."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, QoS, main
+from instant_ic.geometry.poses import Matrix, matrix_from_pose2, pose2_from_matrix
+from instant_ic.geometry.transforms import TransformError
+from instant_ic.msg import (
+    LaserScan,
+    OccupancyGrid,
+    Odometry,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    grid_message,
+    header,
+    pose_matrix,
+    pose_message,
+    stamp_ns,
+)
+from instant_ic.slam import (
+    FieldConfig,
+    GridSlam,
+    KeyframeConfig,
+    MapConfig,
+    MatchConfig,
+    OdometryNoise,
+    Scan,
+    SlamConfig,
+    SlamResult,
+    SlamStatus,
+)
+from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.odometry import CorrectionLimiter, OdometryBuffer
+
+ODOMETRY_QUEUE = QoS("sensor", depth=100)
+"""Every odometry message counts, because scans are placed between two of them."""
+
+
+@dataclass(frozen=True)
+class GridSlamConfig:
+    """Parameters; `config/slam.yaml` explains each."""
+
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    use_wheel_odom: bool = True
+    odom_wait_s: float = 0.1
+    odom_startup_wait_s: float = 1.0
+    odom_extrapolate_s: float = 0.2
+    max_scan_age_s: float = 1.0
+    reset_on_time_jump_s: float = 1.0
+    map_period_s: float = 1.0
+    correction_speed_mps: float = 1.0
+    correction_yaw_rate_radps: float = 1.0
+    odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
+    keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
+    map: MapConfig = dataclasses.field(default_factory=MapConfig)
+
+    def __post_init__(self) -> None:
+        for key in ("max_scan_age_s", "reset_on_time_jump_s", "map_period_s"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        for key in ("correction_speed_mps", "correction_yaw_rate_radps"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        for key in ("odom_wait_s", "odom_startup_wait_s", "odom_extrapolate_s"):
+            if not getattr(self, key) >= 0:
+                raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
+
+    @property
+    def slam(self) -> SlamConfig:
+        """The library's part."""
+        return SlamConfig(self.odometry, self.field, self.match, self.keyframe, self.map)
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A scan that waits for the odometry of its moment."""
+
+    scan: Scan
+    base_from_laser: np.ndarray
+    arrived_ns: int
+
+
+_LEVELS = {
+    SlamStatus.FIRST: (OK, "map started"),
+    SlamStatus.TRACKED: (OK, "tracking"),
+    SlamStatus.RECOVERED: (WARN, "odometry was far off; the scan was found again by the wide search"),
+    SlamStatus.LOST: (ERROR, "the scan fits nowhere near; going on by odometry"),
+    SlamStatus.RESTARTED: (ERROR, "lost for long; a new local map begins where odometry says"),
+    SlamStatus.NO_POINTS: (WARN, "the scan has too few points; going on by odometry"),
+}
+
+
+class GridSlamNode(Node[GridSlamConfig]):
+    name = "grid_slam"
+
+    def setup(self) -> None:
+        warm_up(self.config.slam)
+        self.wheel = OdometryBuffer()
+        self.limiter = CorrectionLimiter(self.config.correction_speed_mps, self.config.correction_yaw_rate_radps)
+        self.pending: deque[_Pending] = deque()
+        self.last_scan_ns: int | None = None
+        self.first_wait_ns: int | None = None
+        self.dropped = 0
+        self.map_out = self.publisher("/map", OccupancyGrid, qos=LATCHED)
+        self.pose_out = self.publisher("/pose", PoseWithCovarianceStamped, qos=SENSOR)
+        self._restart()
+        self.tf  # noqa: B018 - listens from now on, so that the laser's mount is known when the first scan comes
+        if self.config.use_wheel_odom:
+            self.subscribe("/wheel/odom", Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
+            self.timer(0.02, self.place_pending)
+        self.subscribe("/scan", LaserScan, self.on_scan, qos=SENSOR)
+        self.timer(self.config.map_period_s, self.publish_map)
+        self.timer(1.0, self.watch)
+
+    def _restart(self) -> None:
+        self.slam = GridSlam(self.config.slam)
+        self.published_version = 0
+        self.last_scan_ns = None
+        self.pending.clear()
+        self.limiter.reset()
+
+    # -- in --------------------------------------------------------------------------------------
+
+    def on_odometry(self, message: Any) -> None:
+        stamp = stamp_ns(message)
+        newest = self.wheel.newest_ns
+        if newest is not None and newest - stamp > self.config.reset_on_time_jump_s * 1e9:
+            self.wheel.clear()
+        if not self.wheel.add(stamp, pose2_from_matrix(pose_matrix(message))):
+            self.diagnose("odometry", WARN, "a message that is not newer than the last, or not finite, was left out")
+            return
+        self.place_pending()
+
+    def on_scan(self, message: Any) -> None:
+        stamp = stamp_ns(message)
+        age_s = (self.clock.now_ns() - stamp) * 1e-9
+        if abs(age_s) > self.config.max_scan_age_s:
+            when = f"{age_s:.2f} s old" if age_s > 0 else f"{-age_s:.2f} s in the future"
+            self._drop(f"the scan is {when}: check the clocks, or set use_sim_time for a recording")
+            return
+        if self.last_scan_ns is not None and stamp <= self.last_scan_ns:
+            back_s = (self.last_scan_ns - stamp) * 1e-9
+            if back_s <= self.config.reset_on_time_jump_s:
+                self._drop(f"the scan is not newer than the one before ({back_s:.3f} s back in time)")
+                return
+            self.diagnose("time", WARN, f"time went back by {back_s:.1f} s: a new map begins")
+            self._restart()
+        try:
+            base_from_laser = self._mount(self.tf.lookup(self.config.base_frame, message.header.frame_id))
+            scan = Scan(
+                np.asarray(message.ranges),
+                float(message.angle_min),
+                float(message.angle_increment),
+                float(message.range_min),
+                float(message.range_max),
+                stamp,
+            )
+        except TransformError as error:
+            self._drop(f"where the laser stands is not known yet: {error}")
+            return
+        except ValueError as error:
+            self._drop(f"the scan cannot be used: {error}")
+            return
+        self.diagnose("scan", OK, "fresh", dropped=self.dropped)
+        self.last_scan_ns = stamp
+        self.pending.append(_Pending(scan, base_from_laser, self.clock.now_ns()))
+        self.place_pending()
+
+    def _mount(self, base_from_laser: Matrix) -> np.ndarray:
+        if base_from_laser[2, 2] < 0.9:
+            raise ValueError("the laser's z axis is more than 25° off the vertical: check its mount (mount_rpy_deg)")
+        return pose2_from_matrix(base_from_laser)
+
+    def _drop(self, why: str) -> None:
+        self.dropped += 1
+        self.diagnose("scan", WARN, why, dropped=self.dropped)
+
+    # -- scans meet odometry ----------------------------------------------------------------------
+
+    def place_pending(self) -> None:
+        """Place the scans whose odometry is there, or has been waited for long enough."""
+        while self.pending:
+            entry = self.pending[0]
+            odometry = None
+            if self.config.use_wheel_odom:
+                odometry = self.wheel.at(entry.scan.stamp_ns)
+                if odometry is None:
+                    if self._worth_waiting(entry):
+                        return
+                    odometry = self.wheel.at(entry.scan.stamp_ns, self.config.odom_extrapolate_s)
+            self.pending.popleft()
+            self.place(entry, odometry)
+
+    def _worth_waiting(self, entry: _Pending) -> bool:
+        """Whether odometry for this scan may still come."""
+        config, now = self.config, self.clock.now_ns()
+        newest = self.wheel.newest_ns
+        if newest is None:
+            self.first_wait_ns = self.first_wait_ns or entry.arrived_ns
+            return now - self.first_wait_ns < config.odom_startup_wait_s * 1e9
+        if not -0.5e9 < entry.scan.stamp_ns - newest < 0.5e9:
+            return False  # the wheels have been silent for long, or the scan is older than what is kept
+        return now - entry.arrived_ns < config.odom_wait_s * 1e9
+
+    def place(self, entry: _Pending, odometry: np.ndarray | None) -> None:
+        """One call into the library, and its answer to the topics."""
+        result = self.slam.process(entry.scan, odometry, entry.base_from_laser)
+        if result.status is SlamStatus.TIME_BACKWARDS:  # on_scan lets none through; a fault here if one comes
+            self._drop("the scan is not newer than the one before")
+            return
+        self._tell(result, odometry)
+        stamp = entry.scan.stamp_ns
+        if odometry is None:
+            self.tf_broadcast(
+                self.config.odom_frame, self.config.base_frame, matrix_from_pose2(self.slam.odom_from_base), stamp
+            )
+        map_from_odom = self.limiter.follow(self.slam.map_from_odom, self.slam.odom_from_base, stamp)
+        self.tf_broadcast(self.config.map_frame, self.config.odom_frame, matrix_from_pose2(map_from_odom), stamp)
+        self.pose_out.publish(
+            PoseWithCovarianceStamped(
+                header=header(self.config.map_frame, stamp),
+                pose=PoseWithCovariance(
+                    pose=pose_message(matrix_from_pose2(result.map_from_base)),
+                    covariance=_covariance6(result.covariance),
+                ),
+            )
+        )
+        if self.published_version == 0:
+            self.publish_map()
+
+    def _tell(self, result: SlamResult, odometry: np.ndarray | None) -> None:
+        level, text = _LEVELS[result.status]
+        self.diagnose(
+            "slam",
+            level,
+            text,
+            score=round(result.score, 3),
+            keyframes=len(self.slam.front_end.trajectory),
+            sigma_xy_m=round(float(np.sqrt(max(np.diag(result.covariance)[:2]))), 4),
+        )
+        if odometry is not None:
+            correction_m = round(float(np.hypot(*self.slam.map_from_odom[:2])), 3)
+            self.diagnose("odometry", OK, "wheel odometry", correction_m=correction_m)
+        elif self.config.use_wheel_odom:
+            self.diagnose("odometry", WARN, "no wheel odometry comes on /wheel/odom: LiDAR odometry stands in")
+        else:
+            self.diagnose("odometry", OK, "LiDAR odometry (use_wheel_odom is false)")
+        if self.slam.map.clipped:
+            self.diagnose("map", WARN, "the map has reached max_size_m", points_left_out=self.slam.map.clipped)
+
+    # -- out, on time -----------------------------------------------------------------------------
+
+    def publish_map(self) -> None:
+        """The map, when it has changed."""
+        if self.slam.map.version == self.published_version:
+            return
+        grid = self.slam.grid()
+        stamp = self.slam.front_end.trajectory.keyframes[-1].stamp_ns
+        origin = (float(grid.origin[0]), float(grid.origin[1]))
+        self.map_out.publish(grid_message(grid.values, grid.resolution, origin, self.config.map_frame, stamp))
+        self.published_version = self.slam.map.version
+
+    def watch(self) -> None:
+        """Tell when no scan comes."""
+        if self.last_scan_ns is None:
+            if self.dropped == 0:
+                self.diagnose("scan", WARN, "no scan has come yet on /scan: is vlp16_driver running?")
+            return
+        age_s = (self.clock.now_ns() - self.last_scan_ns) * 1e-9
+        if age_s > self.config.max_scan_age_s:
+            self.diagnose("scan", ERROR, f"no scan for {age_s:.1f} s", dropped=self.dropped)
+
+
+def _covariance6(covariance: np.ndarray) -> np.ndarray:
+    """(36,) in the order x y z rx ry rz of a planar covariance (3, 3) x y yaw."""
+    full = np.zeros((6, 6))
+    full[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
+    return full.reshape(36)
+
+
+if __name__ == "__main__":
+    main(GridSlamNode)

@@ -1,0 +1,30 @@
+"""Grid SLAM in the plane: scan matching, keyframes, occupancy grid. Arrays in, arrays out.
+
+```python
+from instant_ic.slam import GridSlam, Scan, SlamConfig
+
+slam = GridSlam(SlamConfig())
+result = slam.process(scan, odom_pose=np.array([0.1, 0.0, 0.0]))
+grid, resolution, origin = slam.grid()
+```
+"""
+
+from instant_ic.slam.config import FieldConfig, KeyframeConfig, MapConfig, MatchConfig, OdometryNoise, SlamConfig
+from instant_ic.slam.grid_slam import GridSlam, SlamResult, SlamStatus
+from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
+from instant_ic.slam.scan import Scan
+
+__all__ = [
+    "FieldConfig",
+    "GridSlam",
+    "KeyframeConfig",
+    "MapConfig",
+    "MatchConfig",
+    "OccupancyGrid",
+    "OccupancyMap",
+    "OdometryNoise",
+    "Scan",
+    "SlamConfig",
+    "SlamResult",
+    "SlamStatus",
+]

@@ -1,0 +1,160 @@
+"""Parameters of the grid SLAM: one frozen dataclass a concept. `config/slam.yaml` explains each to its user."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+
+def _require(config: Any, key: str, condition: bool, rule: str) -> None:
+    if not condition:
+        raise ValueError(f"{type(config).__name__}.{key} must be {rule} (got {getattr(config, key)!r})")
+
+
+def _require_positive(config: Any, *keys: str) -> None:
+    for key in keys:
+        value = getattr(config, key)
+        _require(config, key, math.isfinite(value) and value > 0, "> 0")
+
+
+def _require_not_negative(config: Any, *keys: str) -> None:
+    for key in keys:
+        value = getattr(config, key)
+        _require(config, key, math.isfinite(value) and value >= 0, ">= 0")
+
+
+@dataclass(frozen=True)
+class OdometryNoise:
+    """One standard deviation of an odometry step of ``d`` metres and ``a`` radians.
+
+    Translation: ``translation_floor_m + translation_per_m·d``; rotation:
+    ``rotation_floor_rad + rotation_per_rad·a + rotation_per_m·d``.
+    """
+
+    translation_floor_m: float = 0.01
+    translation_per_m: float = 0.2
+    rotation_floor_rad: float = 0.01
+    rotation_per_rad: float = 0.2
+    rotation_per_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "translation_floor_m", "rotation_floor_rad")
+        _require_not_negative(self, "translation_per_m", "rotation_per_rad", "rotation_per_m")
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Local map that scans are matched against: a likelihood field drawn from recent keyframes."""
+
+    resolution_m: float = 0.05
+    sigma_m: float = 0.06
+    surface_sigma_m: float = 0.04
+    keyframes: int = 40
+    max_range_m: float = 25.0
+    join_gap_m: float = 0.3
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "resolution_m", "sigma_m", "surface_sigma_m", "max_range_m")
+        _require_not_negative(self, "join_gap_m")
+        _require(self, "keyframes", self.keyframes >= 1, ">= 1")
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """Correlative search and Gauss-Newton refinement."""
+
+    max_points: int = 240
+    min_points: int = 20
+    point_spacing_m: float = 0.04
+    search_translation_m: float = 0.3
+    search_translation_per_m: float = 0.4
+    search_rotation_rad: float = 0.3
+    search_rotation_per_rad: float = 0.4
+    search_rotation_per_m: float = 0.2
+    coarse_rotation_step_rad: float = 0.02
+    fine_rotation_step_rad: float = 0.005
+    residual_sigma: float = 0.6
+    odometry_cutoff: float = 2.0
+    refine_iterations: int = 20
+    recovery_score: float = 0.6
+    recovery_translation_m: float = 1.2
+    recovery_rotation_rad: float = 1.2
+    min_score: float = 0.35
+    restart_after_lost_scans: int = 10
+    free_motion_speed_mps: float = 1.0
+    free_motion_yaw_rate_radps: float = 1.5
+
+    def __post_init__(self) -> None:
+        _require_positive(
+            self,
+            "search_translation_m",
+            "search_rotation_rad",
+            "coarse_rotation_step_rad",
+            "fine_rotation_step_rad",
+            "residual_sigma",
+            "odometry_cutoff",
+            "recovery_translation_m",
+            "recovery_rotation_rad",
+            "free_motion_speed_mps",
+            "free_motion_yaw_rate_radps",
+        )
+        _require_not_negative(
+            self,
+            "point_spacing_m",
+            "search_translation_per_m",
+            "search_rotation_per_rad",
+            "search_rotation_per_m",
+        )
+        _require(self, "min_points", self.min_points >= 3, ">= 3")
+        _require(self, "max_points", self.max_points >= self.min_points, ">= min_points")
+        _require(self, "refine_iterations", self.refine_iterations >= 0, ">= 0")
+        _require(self, "min_score", 0 < self.min_score < 1, "between 0 and 1")
+        _require(self, "recovery_score", self.min_score <= self.recovery_score < 1, "between min_score and 1")
+        _require(self, "restart_after_lost_scans", self.restart_after_lost_scans >= 1, ">= 1")
+
+
+@dataclass(frozen=True)
+class KeyframeConfig:
+    """A scan becomes a keyframe when the pose has moved this far from the last one."""
+
+    distance_m: float = 0.25
+    rotation_rad: float = 0.2
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "distance_m", "rotation_rad")
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """Occupancy grid drawn by ray casting from the keyframes."""
+
+    resolution_m: float = 0.05
+    max_range_m: float = 20.0
+    no_return_clear_m: float = 0.0
+    hit_probability: float = 0.7
+    miss_probability: float = 0.4
+    min_probability: float = 0.03
+    max_probability: float = 0.97
+    max_size_m: float = 400.0
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "resolution_m", "max_range_m", "max_size_m")
+        _require_not_negative(self, "no_return_clear_m")
+        _require(self, "hit_probability", 0.5 < self.hit_probability < 1, "between 0.5 and 1")
+        _require(self, "miss_probability", 0 < self.miss_probability < 0.5, "between 0 and 0.5")
+        _require(self, "min_probability", 0 < self.min_probability < 0.5, "between 0 and 0.5")
+        _require(self, "max_probability", 0.5 < self.max_probability < 1, "between 0.5 and 1")
+        _require(self, "max_size_m", self.max_size_m >= 2 * self.max_range_m, ">= 2 max_range_m")
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """Everything `GridSlam` needs."""
+
+    odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)
+    field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
+    keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
+    map: MapConfig = dataclasses.field(default_factory=MapConfig)

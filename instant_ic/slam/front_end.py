@@ -1,0 +1,180 @@
+"""Front end: places each scan in the local map of recent keyframes."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from instant_ic.geometry.poses import compose2, relative2, wrap_angle
+from instant_ic.slam.config import SlamConfig
+from instant_ic.slam.keyframes import Keyframe, Trajectory
+from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.matcher import Match, Matcher, Window
+from instant_ic.slam.scan import FloatArray, ScanPoints, thin
+
+
+class TrackStatus(enum.StrEnum):
+    """How a scan was placed."""
+
+    FIRST = "first"
+    TRACKED = "tracked"
+    RECOVERED = "recovered"
+    LOST = "lost"
+    RESTARTED = "restarted"
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where odometry, or constant velocity, expects the base.
+
+    Attributes:
+        pose: (3,).
+        sigma: (3,) along, across, rotation.
+        window: how far round it to search.
+    """
+
+    pose: FloatArray
+    sigma: FloatArray
+    window: Window
+
+
+@dataclass(frozen=True)
+class Track:
+    """The front end's answer for one scan."""
+
+    pose: FloatArray
+    covariance: FloatArray
+    score: float
+    status: TrackStatus
+    keyframe: Keyframe | None
+
+
+class FrontEnd:
+    """Scan-to-local-map matching with keyframes; ``trajectory`` holds these."""
+
+    def __init__(self, config: SlamConfig) -> None:
+        self.config = config
+        self.trajectory = Trajectory()
+        self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
+        self._matcher = Matcher(
+            config.match.residual_sigma,
+            config.match.odometry_cutoff,
+            config.match.coarse_rotation_step_rad,
+            config.match.fine_rotation_step_rad,
+            config.match.refine_iterations,
+        )
+        self._lost_scans = 0
+        self._covariance = np.zeros((3, 3))
+
+    def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
+        """Guess at ``pose`` after odometry moved by ``step`` (3,) in the base's own frame."""
+        noise, match = self.config.odometry, self.config.match
+        distance, turn = math.hypot(step[0], step[1]), abs(step[2])
+        translation = noise.translation_floor_m + noise.translation_per_m * distance
+        rotation = noise.rotation_floor_rad + noise.rotation_per_rad * turn + noise.rotation_per_m * distance
+        window = Window(
+            match.search_translation_m + match.search_translation_per_m * distance,
+            match.search_rotation_rad + match.search_rotation_per_rad * turn + match.search_rotation_per_m * distance,
+        )
+        return Guess(pose, np.array([translation, translation, rotation]), self._within_recovery(window))
+
+    def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
+        """Guess at ``pose`` without odometry: anything the robot can do in the time is possible."""
+        match = self.config.match
+        translation = 0.5 * match.free_motion_speed_mps * elapsed_s + 0.05
+        rotation = 0.5 * match.free_motion_yaw_rate_radps * elapsed_s + 0.05
+        window = Window(match.search_translation_m + translation, match.search_rotation_rad + rotation)
+        sigma = np.array([translation, translation, rotation])
+        return Guess(pose, sigma, self._within_recovery(window))
+
+    def _within_recovery(self, window: Window) -> Window:
+        match = self.config.match
+        return Window(
+            min(window.translation_m, match.recovery_translation_m),
+            min(window.rotation_rad, match.recovery_rotation_rad),
+        )
+
+    def track(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
+        """Place a scan that has at least ``match.min_points`` points."""
+        config = self.config.match
+        points = self._match_points(scan)
+        if len(self.trajectory) == 0:
+            keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns, dead_reckoned=False)
+            return Track(guess.pose, np.zeros((3, 3)), 1.0, TrackStatus.FIRST, keyframe)
+
+        status = TrackStatus.TRACKED
+        match = self._matcher.match(self._field, points, guess.pose, guess.sigma, guess.window)
+        if match.score < config.recovery_score:
+            recovered = self._recover(points, guess)
+            # The wide search must be clearly better: a window this large always finds something a little better.
+            if recovered.score >= max(config.min_score, match.score + 0.1):
+                match, status = recovered, TrackStatus.RECOVERED
+        if match.score < config.min_score:
+            return self._lost(scan, guess, match.score, stamp_ns)
+
+        self._lost_scans = 0
+        self._covariance = match.covariance
+        keyframe = None
+        if self._moved(match.pose):
+            keyframe = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
+        return Track(match.pose, match.covariance, match.score, status, keyframe)
+
+    def dead_reckon(self, guess: Guess) -> Track:
+        """Believe the guess, for a scan that shows nothing."""
+        return Track(guess.pose, self._grown_covariance(guess), 0.0, TrackStatus.LOST, None)
+
+    def _match_points(self, scan: ScanPoints) -> FloatArray:
+        near = (scan.points**2).sum(axis=1) <= self.config.field.max_range_m**2
+        return thin(
+            scan.points[near], scan.joined[near], self.config.match.point_spacing_m, self.config.match.max_points
+        )
+
+    def _recover(self, points: FloatArray, guess: Guess) -> Match:
+        config = self.config.match
+        window = Window(config.recovery_translation_m, config.recovery_rotation_rad)
+        return self._matcher.match(self._field, points, guess.pose, guess.sigma, window)
+
+    def _lost(self, scan: ScanPoints, guess: Guess, score: float, stamp_ns: int) -> Track:
+        """Nothing fits: go on by odometry, and start a new local map when that lasts."""
+        self._lost_scans += 1
+        covariance = self._grown_covariance(guess)
+        if self._lost_scans < self.config.match.restart_after_lost_scans:
+            return Track(guess.pose, covariance, score, TrackStatus.LOST, None)
+        self._lost_scans = 0
+        keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
+        return Track(guess.pose, covariance, score, TrackStatus.RESTARTED, keyframe)
+
+    def _grown_covariance(self, guess: Guess) -> FloatArray:
+        cos_yaw, sin_yaw = math.cos(guess.pose[2]), math.sin(guess.pose[2])
+        turn = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
+        self._covariance = self._covariance + turn @ np.diag(guess.sigma**2) @ turn.T
+        return self._covariance
+
+    def _moved(self, pose: FloatArray) -> bool:
+        last = self.trajectory.keyframes[-1].map_from_base
+        config = self.config.keyframe
+        step = relative2(last, pose)
+        return math.hypot(step[0], step[1]) >= config.distance_m or abs(step[2]) >= config.rotation_rad
+
+    def _add_keyframe(
+        self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int, dead_reckoned: bool
+    ) -> Keyframe:
+        keyframe = Keyframe(stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned)
+        self.trajectory.add(keyframe)
+        self.redraw()
+        return keyframe
+
+    def redraw(self) -> None:
+        """Draw the local map anew from the recent keyframes, for instance after their poses were optimised."""
+        recent = self.trajectory.recent(self.config.field.keyframes)
+        surfaces = [Surface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
+        self._field.draw(recent[-1].map_from_base, surfaces)
+
+
+def constant_velocity(pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
+    """The pose ``elapsed_s`` on, moving as in the last ``step`` (3,), which took ``step_s`` seconds."""
+    part = elapsed_s / step_s if step_s > 0 else 0.0
+    return compose2(pose, np.array([part * step[0], part * step[1], wrap_angle(part * step[2])]))

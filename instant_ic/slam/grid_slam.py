@@ -1,0 +1,168 @@
+"""Grid SLAM: scans and odometry in, pose, map and map→odom out."""
+
+from __future__ import annotations
+
+import enum
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from instant_ic.geometry.poses import compose2, inverse2, relative2
+from instant_ic.slam.config import SlamConfig
+from instant_ic.slam.front_end import FrontEnd, Guess, Track, TrackStatus, constant_velocity
+from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
+from instant_ic.slam.scan import FloatArray, Scan, scan_points
+
+MAX_ODOMETRY_GAP_S = 5.0
+
+
+class SlamStatus(enum.StrEnum):
+    """What became of a scan."""
+
+    FIRST = "first"
+    """The first scan: the origin of the map."""
+    TRACKED = "tracked"
+    """Matched near the guess."""
+    RECOVERED = "recovered"
+    """Matched by the wide search: odometry was far off."""
+    LOST = "lost"
+    """Nothing matches; the pose is odometry's, and its covariance grows."""
+    RESTARTED = "restarted"
+    """Lost for long: a new local map begins at odometry's pose."""
+    NO_POINTS = "no points"
+    """Empty, all infinite or too few points; the pose is odometry's."""
+    TIME_BACKWARDS = "time backwards"
+    """Not newer than the scan before; left out, the pose is the last one."""
+
+    @property
+    def matched(self) -> bool:
+        """Whether the pose comes from the scan."""
+        return self in (SlamStatus.FIRST, SlamStatus.TRACKED, SlamStatus.RECOVERED)
+
+
+@dataclass(frozen=True)
+class SlamResult:
+    """Answer for one scan.
+
+    Attributes:
+        map_from_base: (3,) at the scan's stamp.
+        covariance: (3, 3) x, y, yaw in the map frame; of this pose against the local map, so without drift.
+        score: 0..1, mean likelihood field value over the points.
+        status: what became of the scan.
+        keyframe_added: whether the map has changed.
+    """
+
+    map_from_base: FloatArray
+    covariance: FloatArray
+    score: float
+    status: SlamStatus
+    keyframe_added: bool
+
+
+class GridSlam:
+    """Online SLAM with a planar laser.
+
+    The first scan's pose is odometry's, or the origin without odometry. `map_from_odom` takes up all corrections;
+    `odom_from_base` is the odometry as given, or, for scans without one, LiDAR odometry that goes on from it.
+    """
+
+    def __init__(self, config: SlamConfig | None = None) -> None:
+        self.config = config or SlamConfig()
+        self.front_end = FrontEnd(self.config)
+        self.map = OccupancyMap(self.config.map)
+        self.map_from_base: FloatArray = np.zeros(3)
+        self.odom_from_base: FloatArray = np.zeros(3)
+        self.map_from_odom: FloatArray = np.zeros(3)
+        self._covariance: FloatArray = np.zeros((3, 3))
+        self._stamp_ns: int | None = None
+        self._step: FloatArray = np.zeros(3)
+        self._step_s = 0.0
+        # Where odometry and map stood at the last scan that came with odometry.
+        self._odometry_stamp_ns: int | None = None
+        self._odometry_pose: FloatArray = np.zeros(3)
+        self._pose_at_odometry: FloatArray = np.zeros(3)
+
+    def process(
+        self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> SlamResult:
+        """Place a scan, and enter it into the map when it is a keyframe.
+
+        Args:
+            scan: newer than the one before.
+            odom_pose: odom_from_base (3,) at the scan's stamp, or None.
+            base_from_laser: where the laser stands on the robot, (3,).
+        """
+        if self._stamp_ns is not None and scan.stamp_ns <= self._stamp_ns:
+            return SlamResult(self.map_from_base, self._covariance, 0.0, SlamStatus.TIME_BACKWARDS, False)
+        odometry = None if odom_pose is None else np.asarray(odom_pose, dtype=np.float64)
+        if odometry is not None and not np.isfinite(odometry).all():
+            raise ValueError(f"odometry at {scan.stamp_ns} ns is not finite: {odometry}")
+        mount = np.asarray(base_from_laser, dtype=np.float64)
+        points = scan_points(scan, mount, self.config.field.join_gap_m, self.config.map.no_return_clear_m)
+        guess = self._guess(odometry, scan.stamp_ns)
+        if len(points.points) < self.config.match.min_points:
+            if self._stamp_ns is None:
+                # Nothing to build on yet: the next scan is the first one.
+                return SlamResult(self.map_from_base, self._covariance, 0.0, SlamStatus.NO_POINTS, False)
+            track, status = self.front_end.dead_reckon(guess), SlamStatus.NO_POINTS
+        else:
+            track = self.front_end.track(points, guess, scan.stamp_ns)
+            status = _STATUS[track.status]
+        if track.keyframe is not None:
+            self.map.insert(track.keyframe.map_from_base, track.keyframe.scan)
+        self._follow(track, odometry, scan.stamp_ns)
+        return SlamResult(track.pose, track.covariance, track.score, status, track.keyframe is not None)
+
+    def grid(self) -> OccupancyGrid:
+        """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
+        return self.map.grid()
+
+    def _guess(self, odometry: FloatArray | None, stamp_ns: int) -> Guess:
+        if self._stamp_ns is None:
+            start = np.zeros(3) if odometry is None else odometry
+            return self.front_end.guess_from_odometry(start, np.zeros(3))
+        elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
+        if odometry is not None and self._odometry_stamp_ns is not None:
+            # Across a short gap the encoders have gone on counting; after a long one they may have been reset.
+            if (stamp_ns - self._odometry_stamp_ns) * 1e-9 <= max(MAX_ODOMETRY_GAP_S, 2 * elapsed_s):
+                step = relative2(self._odometry_pose, odometry)
+                return self.front_end.guess_from_odometry(compose2(self._pose_at_odometry, step), step)
+        pose = constant_velocity(self.map_from_base, self._step, self._step_s, elapsed_s)
+        return self.front_end.guess_from_velocity(pose, elapsed_s)
+
+    def _follow(self, track: Track, odometry: FloatArray | None, stamp_ns: int) -> None:
+        """Take over the pose; corrections into map_from_odom."""
+        step = relative2(self.map_from_base, track.pose)
+        if self._stamp_ns is not None:
+            self._step, self._step_s = step, (stamp_ns - self._stamp_ns) * 1e-9
+            if track.status not in (TrackStatus.TRACKED, TrackStatus.RECOVERED):
+                # A robot that cannot see must not run on in the estimate for ever.
+                self._step = 0.5 * self._step
+        if odometry is None:
+            self.odom_from_base = compose2(self.odom_from_base, step)
+        else:
+            self.odom_from_base = odometry
+            self._odometry_stamp_ns, self._odometry_pose, self._pose_at_odometry = stamp_ns, odometry, track.pose
+            self.map_from_odom = compose2(track.pose, inverse2(odometry))
+        self.map_from_base, self._covariance, self._stamp_ns = track.pose, track.covariance, stamp_ns
+
+
+_STATUS = {
+    TrackStatus.FIRST: SlamStatus.FIRST,
+    TrackStatus.TRACKED: SlamStatus.TRACKED,
+    TrackStatus.RECOVERED: SlamStatus.RECOVERED,
+    TrackStatus.LOST: SlamStatus.LOST,
+    TrackStatus.RESTARTED: SlamStatus.RESTARTED,
+}
+
+
+def warm_up(config: SlamConfig | None = None) -> None:
+    """Compile the kernels, or load them from their cache, so that the first scan is not held up by it."""
+    slam = GridSlam(config)
+    angles = np.linspace(-math.pi, math.pi, 181)[:-1]
+    ranges = np.minimum(2.0 / np.maximum(np.abs(np.cos(angles)), 1e-6), 3.0 / np.maximum(np.abs(np.sin(angles)), 1e-6))
+    for index in range(2):
+        slam.process(Scan(ranges, -math.pi, 2 * math.pi / 180, 0.1, 30.0, index + 1))
+    slam.grid()

@@ -1,0 +1,195 @@
+"""Likelihood field: how well a point lies on the surfaces that recent keyframes saw.
+
+The value at a place is ``exp(−d²/2σ²)`` with ``d`` the distance to the nearest seen surface (Thrun, Burgard, Fox,
+Probabilistic Robotics, 6.4), on a square grid round the robot. The surface in a cell is the mean of all hits in it and
+near it: were every hit drawn by itself, range noise would make each wall a flat ridge on which scans drift.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from instant_ic.slam.config import FieldConfig
+from instant_ic.slam.scan import FloatArray
+
+GAP_WEIGHT = 0.1
+"""What a place between two joined hits counts for against a hit."""
+
+
+@njit(cache=True)
+def _add(weight, sum_x, sum_y, touched, count, x, y, w, margin):  # type: ignore[no-untyped-def]
+    """Enter a surface point into its cell; returns the number of touched cells."""
+    height, width = weight.shape
+    ix, iy = math.floor(x + 0.5), math.floor(y + 0.5)
+    if ix < margin or iy < margin or ix >= width - margin or iy >= height - margin:
+        return count
+    if weight[iy, ix] == 0.0:
+        if count == touched.shape[0]:
+            return count
+        touched[count, 0] = iy
+        touched[count, 1] = ix
+        count += 1
+    weight[iy, ix] += w
+    sum_x[iy, ix] += w * x
+    sum_y[iy, ix] += w * y
+    return count
+
+
+@njit(cache=True)
+def accumulate(  # type: ignore[no-untyped-def]
+    weight, sum_x, sum_y, touched, count, origin, resolution, pose, points, joined, margin
+):
+    """Enter the hits of one keyframe, and the surface between joined ones, into the cells' sums.
+
+    Args:
+        weight: float64 (H, W), as sum_x and sum_y, changed in place; coordinates in cells.
+        sum_x: weighted sum of the hits' x.
+        sum_y: weighted sum of the hits' y.
+        touched: int32 (n, 2), row and column of the cells with weight; the first ``count`` are in use.
+        count: see ``touched``.
+        origin: (2,) centre of cell (0, 0), metres.
+        resolution: metres a cell.
+        pose: field_from_base (3,).
+        points: (n, 2) in the base frame.
+        joined: (n,) whether point ``i`` continues point ``i - 1``.
+        margin: cells at the border that take nothing.
+
+    Returns:
+        The new count.
+    """
+    cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
+    last_x = 0.0
+    last_y = 0.0
+    for i in range(points.shape[0]):
+        x = (pose[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1] - origin[0]) / resolution
+        y = (pose[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1] - origin[1]) / resolution
+        if i > 0 and joined[i]:
+            # Beams leave gaps on far walls; a dotted wall would hold the scan at the place it was drawn from.
+            steps = int(math.hypot(x - last_x, y - last_y))
+            for k in range(1, steps + 1):
+                part = k / (steps + 1.0)
+                count = _add(
+                    weight, sum_x, sum_y, touched, count,
+                    last_x + part * (x - last_x), last_y + part * (y - last_y), GAP_WEIGHT, margin,
+                )  # fmt: skip
+        count = _add(weight, sum_x, sum_y, touched, count, x, y, 1.0, margin)
+        last_x = x
+        last_y = y
+    return count
+
+
+@njit(cache=True)
+def draw_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # type: ignore[no-untyped-def]
+    """Draw a Gaussian round the surface in each touched cell.
+
+    Args:
+        field: float32 (H, W), changed in place.
+        weight: as in `accumulate`, with sum_x, sum_y, touched and count.
+        sum_x: see there.
+        sum_y: see there.
+        touched: see there.
+        count: see there.
+        sigma: of the field, in cells.
+        pull: σ, in cells, within which the hits of neighbouring cells count as the same surface.
+    """
+    radius = math.ceil(3.0 * sigma)
+    scale = -0.5 / (sigma * sigma)
+    pull_scale = -0.5 / (pull * pull)
+    across = np.empty(2 * radius + 1)
+    for t in range(count):
+        iy, ix = touched[t, 0], touched[t, 1]
+        cx, cy = sum_x[iy, ix] / weight[iy, ix], sum_y[iy, ix] / weight[iy, ix]
+        # One step of mean shift: a wall along a border of cells has its hits in two rows of them.
+        total = 0.0
+        x = 0.0
+        y = 0.0
+        for j in range(iy - 1, iy + 2):
+            for i in range(ix - 1, ix + 2):
+                w = weight[j, i]
+                if w > 0.0:
+                    nx, ny = sum_x[j, i] / w, sum_y[j, i] / w
+                    w *= math.exp(pull_scale * ((nx - cx) ** 2 + (ny - cy) ** 2))
+                    total += w
+                    x += w * nx
+                    y += w * ny
+        x /= total
+        y /= total
+        ix, iy = math.floor(x + 0.5), math.floor(y + 0.5)
+        for i in range(-radius, radius + 1):
+            across[i + radius] = math.exp(scale * (ix + i - x) ** 2)
+        for j in range(-radius, radius + 1):
+            down = math.exp(scale * (iy + j - y) ** 2)
+            for i in range(-radius, radius + 1):
+                value = np.float32(down * across[i + radius])
+                if value > field[iy + j, ix + i]:
+                    field[iy + j, ix + i] = value
+
+
+@njit(cache=True)
+def _forget(weight, sum_x, sum_y, touched, count):  # type: ignore[no-untyped-def]
+    for t in range(count):
+        iy, ix = touched[t, 0], touched[t, 1]
+        weight[iy, ix] = 0.0
+        sum_x[iy, ix] = 0.0
+        sum_y[iy, ix] = 0.0
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a keyframe gives to the field: pose (3,), points (n, 2) in its base frame, joined (n,)."""
+
+    pose: FloatArray
+    points: FloatArray
+    joined: NDArray[np.bool_]
+
+
+class LikelihoodField:
+    """A square likelihood field round the robot.
+
+    Attributes:
+        values: float32 (n, n).
+        origin: (2,) metres, centre of cell (0, 0).
+        resolution: metres a cell.
+
+    Args:
+        config: resolution, σ, range.
+        margin_m: how far beyond ``max_range_m`` it reaches to each side.
+    """
+
+    def __init__(self, config: FieldConfig, margin_m: float = 0.0) -> None:
+        self.config = config
+        self.resolution = config.resolution_m
+        half = math.ceil((config.max_range_m + margin_m) / config.resolution_m)
+        size = 2 * half + 1
+        self.values = np.zeros((size, size), dtype=np.float32)
+        self.origin = np.array([-half * config.resolution_m, -half * config.resolution_m])
+        self._weight = np.zeros((size, size))
+        self._sum_x = np.zeros((size, size))
+        self._sum_y = np.zeros((size, size))
+        self._touched = np.zeros((200_000, 2), dtype=np.int32)
+
+    def draw(self, centre: FloatArray, surfaces: Sequence[Surface]) -> None:
+        """Draw the field anew from ``surfaces``, moved in whole cells so that ``centre`` (2,) is in the middle."""
+        config = self.config
+        half = self.values.shape[0] // 2
+        self.origin = (np.round(np.asarray(centre[:2]) / self.resolution) - half) * self.resolution
+        self.values.fill(0.0)
+        sigma = config.sigma_m / self.resolution
+        margin = math.ceil(3.0 * sigma) + 2
+        count = 0
+        for surface in surfaces:
+            count = accumulate(
+                self._weight, self._sum_x, self._sum_y, self._touched, count, self.origin, self.resolution,
+                surface.pose, surface.points, surface.joined, margin,
+            )  # fmt: skip
+        draw_cells(
+            self.values, self._weight, self._sum_x, self._sum_y, self._touched, count, sigma,
+            config.surface_sigma_m / self.resolution,
+        )  # fmt: skip
+        _forget(self._weight, self._sum_x, self._sum_y, self._touched, count)

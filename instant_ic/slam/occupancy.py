@@ -1,0 +1,206 @@
+"""Occupancy grid by ray casting: log-odds cells, grows with the map, updated scan by scan.
+
+Log-odds as in Thrun, Burgard, Fox, Probabilistic Robotics, 9.2. A scan changes a cell at most once, and a hit outweighs
+the rays of the same scan that pass through the cell, so that walls met at a grazing angle stay.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from instant_ic.slam.config import MapConfig
+from instant_ic.slam.scan import FloatArray, ScanPoints
+
+GROW_CELLS = 64
+
+
+class OccupancyGrid(NamedTuple):
+    """A map as in nav_msgs/OccupancyGrid.
+
+    Attributes:
+        values: int8 (H, W), −1 unknown, 0..100 probability of being occupied; row 0 has the lowest y.
+        resolution: metres a cell.
+        origin: (2,) map coordinates of the lower left corner of cell (0, 0).
+    """
+
+    values: NDArray[np.int8]
+    resolution: float
+    origin: FloatArray
+
+
+@njit(cache=True)
+def _log_odds(probability):  # type: ignore[no-untyped-def]
+    return math.log(probability / (1.0 - probability))
+
+
+@njit(cache=True)
+def _cast(cells, seen, mark, x0, y0, x1, y1, change, low):  # type: ignore[no-untyped-def]
+    """Every cell from (x0, y0) up to, not including, the one of (x1, y1) gets ``change`` (Amanatides and Woo, 1987).
+
+    Coordinates in cells; cell i covers i..i + 1.
+    """
+    height, width = cells.shape
+    ix, iy = math.floor(x0), math.floor(y0)
+    end_x, end_y = math.floor(x1), math.floor(y1)
+    dx, dy = x1 - x0, y1 - y0
+    step_x = 1 if dx > 0 else -1
+    step_y = 1 if dy > 0 else -1
+    delta_x = abs(1.0 / dx) if dx != 0 else 1e30
+    delta_y = abs(1.0 / dy) if dy != 0 else 1e30
+    next_x = ((ix + 1 - x0) if dx > 0 else (x0 - ix)) * delta_x if dx != 0 else 1e30
+    next_y = ((iy + 1 - y0) if dy > 0 else (y0 - iy)) * delta_y if dy != 0 else 1e30
+    for _ in range(abs(end_x - ix) + abs(end_y - iy)):
+        if 0 <= ix < width and 0 <= iy < height and seen[iy, ix] != mark:
+            seen[iy, ix] = mark
+            cells[iy, ix] = max(cells[iy, ix] + change, low)
+        if next_x < next_y:
+            next_x += delta_x
+            ix += step_x
+        else:
+            next_y += delta_y
+            iy += step_y
+
+
+@njit(cache=True)
+def cast_scan(  # type: ignore[no-untyped-def]
+    cells, seen, mark, origin, resolution, pose, laser, points, clear_ends, max_range, hit, miss, low, high
+):
+    """Enter one scan into log-odds ``cells`` float32 (H, W).
+
+    Args:
+        cells: changed in place.
+        seen: int32 (H, W), ``mark`` where this scan has changed the cell.
+        mark: > 0, grows from scan to scan.
+        origin: (2,) corner of cell (0, 0).
+        resolution: metres a cell.
+        pose: map_from_base (3,).
+        laser: (2,) the laser's centre in the base frame.
+        points: (n, 2) hits in the base frame.
+        clear_ends: (m, 2) ends of free rays in the base frame.
+        max_range: metres; hits beyond it only clear the way up to it.
+        hit: log-odds added to the cell of a hit.
+        miss: log-odds added to the cells that a ray passes.
+        low: least log-odds of a cell.
+        high: greatest log-odds of a cell.
+    """
+    height, width = cells.shape
+    cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
+    laser_x = (pose[0] + cos_yaw * laser[0] - sin_yaw * laser[1] - origin[0]) / resolution
+    laser_y = (pose[1] + sin_yaw * laser[0] + cos_yaw * laser[1] - origin[1]) / resolution
+    reach = max_range / resolution
+    n = points.shape[0]
+    m = clear_ends.shape[0]
+    ends = np.empty((n + m, 2))
+    for i in range(n + m):
+        if i < n:
+            px, py = points[i, 0], points[i, 1]
+        else:
+            px, py = clear_ends[i - n, 0], clear_ends[i - n, 1]
+        x = (pose[0] + cos_yaw * px - sin_yaw * py - origin[0]) / resolution
+        y = (pose[1] + sin_yaw * px + cos_yaw * py - origin[1]) / resolution
+        length = math.hypot(x - laser_x, y - laser_y)
+        if length > reach:
+            x = laser_x + (x - laser_x) * reach / length
+            y = laser_y + (y - laser_y) * reach / length
+        elif i < n:
+            ix, iy = math.floor(x), math.floor(y)
+            if 0 <= ix < width and 0 <= iy < height and seen[iy, ix] != mark:
+                seen[iy, ix] = mark
+                cells[iy, ix] = min(cells[iy, ix] + hit, high)
+        ends[i, 0] = x
+        ends[i, 1] = y
+    for i in range(n + m):
+        _cast(cells, seen, mark, laser_x, laser_y, ends[i, 0], ends[i, 1], miss, low)
+
+
+@njit(cache=True)
+def _percentages(cells, seen):  # type: ignore[no-untyped-def]
+    height, width = cells.shape
+    values = np.empty((height, width), dtype=np.int8)
+    for j in range(height):
+        for i in range(width):
+            if seen[j, i] == 0:
+                values[j, i] = -1
+            else:
+                values[j, i] = round(100.0 / (1.0 + math.exp(-cells[j, i])))
+    return values
+
+
+class OccupancyMap:
+    """A growing occupancy grid.
+
+    Attributes:
+        version: grows with every change.
+        clipped: points that fell outside ``max_size_m`` and were left out.
+    """
+
+    def __init__(self, config: MapConfig) -> None:
+        self.config = config
+        self.version = 0
+        self.clipped = 0
+        self._mark = 0
+        self._hit = _log_odds(config.hit_probability)
+        self._miss = _log_odds(config.miss_probability)
+        self._low = _log_odds(config.min_probability)
+        self._high = _log_odds(config.max_probability)
+        self._first = np.zeros(2, dtype=np.int64)  # cell index of the corner; the corner is first·resolution
+        self._cells = np.zeros((0, 0), dtype=np.float32)
+        self._seen = np.zeros((0, 0), dtype=np.int32)
+
+    @property
+    def origin(self) -> FloatArray:
+        """Map coordinates (2,) of the lower left corner."""
+        corner: FloatArray = self._first * self.config.resolution_m
+        return corner
+
+    def insert(self, map_from_base: FloatArray, scan: ScanPoints) -> None:
+        """Enter a scan at a pose (3,)."""
+        self._grow(map_from_base, scan)
+        self._mark += 1
+        cast_scan(
+            self._cells, self._seen, self._mark, self.origin, self.config.resolution_m, map_from_base, scan.origin,
+            scan.points, scan.clear_ends, self.config.max_range_m, self._hit, self._miss, self._low, self._high,
+        )  # fmt: skip
+        self.version += 1
+
+    def grid(self) -> OccupancyGrid:
+        """The map so far; 0×0 before the first scan."""
+        return OccupancyGrid(_percentages(self._cells, self._seen), self.config.resolution_m, self.origin)
+
+    def _grow(self, pose: FloatArray, scan: ScanPoints) -> None:
+        """Make room for what the scan touches, in steps of GROW_CELLS, up to ``max_size_m`` about the map's origin."""
+        cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
+        rotation = np.array([[cos_yaw, -sin_yaw], [sin_yaw, cos_yaw]])
+        rays = np.concatenate([scan.points, scan.clear_ends, scan.origin[None]]) - scan.origin
+        length = np.sqrt((rays**2).sum(axis=1, keepdims=True))
+        rays *= np.minimum(1.0, self.config.max_range_m / np.maximum(length, 1e-9))
+        places = (rays + scan.origin) @ rotation.T + pose[:2]
+        resolution = self.config.resolution_m
+        limit = int(self.config.max_size_m / 2 / resolution)
+        cells = np.floor(places / resolution).astype(np.int64)
+        inside = (np.abs(cells) < limit).all(axis=1)
+        self.clipped += int((~inside).sum())
+        cells = cells[inside]
+        if len(cells) == 0:
+            return
+        low = (cells.min(axis=0) // GROW_CELLS) * GROW_CELLS
+        high = (cells.max(axis=0) // GROW_CELLS + 1) * GROW_CELLS
+        if self._cells.size:
+            low = np.minimum(low, self._first)
+            high = np.maximum(high, self._first + np.array(self._cells.shape[::-1]))
+        width, height = (int(v) for v in high - low)
+        if (height, width) == self._cells.shape:
+            return
+        old_height, old_width = self._cells.shape
+        column, row = (int(v) for v in self._first - low) if self._cells.size else (0, 0)
+        for name in ("_cells", "_seen"):
+            old = getattr(self, name)
+            new = np.zeros((height, width), dtype=old.dtype)
+            new[row : row + old_height, column : column + old_width] = old
+            setattr(self, name, new)
+        self._first = low

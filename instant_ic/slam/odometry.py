@@ -1,0 +1,125 @@
+"""Wheel odometry over time, asked for at the stamps of scans; and the smoothing of map→odom."""
+
+from __future__ import annotations
+
+import bisect
+import math
+
+import numpy as np
+
+from instant_ic.geometry.poses import compose2, relative2, wrap_angle
+from instant_ic.slam.scan import FloatArray
+
+
+class OdometryBuffer:
+    """The last seconds of odometry: poses odom_from_base (3,) by time.
+
+    Args:
+        keep_s: how much of the past is kept.
+    """
+
+    def __init__(self, keep_s: float = 10.0) -> None:
+        self._keep_ns = int(keep_s * 1e9)
+        self._stamps: list[int] = []
+        self._poses: list[FloatArray] = []
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest pose; None when empty."""
+        return self._stamps[-1] if self._stamps else None
+
+    def add(self, stamp_ns: int, odom_from_base: FloatArray) -> bool:
+        """Append a pose; False, and left out, when it is not newer than the last or not finite."""
+        if not np.isfinite(odom_from_base).all() or (self._stamps and stamp_ns <= self._stamps[-1]):
+            return False
+        self._stamps.append(stamp_ns)
+        self._poses.append(np.asarray(odom_from_base, dtype=np.float64))
+        old = bisect.bisect_left(self._stamps, stamp_ns - self._keep_ns)
+        if old > 0:
+            del self._stamps[:old], self._poses[:old]
+        return True
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._stamps.clear()
+        self._poses.clear()
+
+    def at(self, stamp_ns: int, extrapolate_s: float = 0.0) -> FloatArray | None:
+        """Pose (3,) at a time, along the arc between its neighbours.
+
+        After the newest pose the last motion goes on for at most ``extrapolate_s``. None: the time is not covered.
+        """
+        if not self._stamps or stamp_ns < self._stamps[0]:
+            return None
+        after = bisect.bisect_left(self._stamps, stamp_ns)
+        if after < len(self._stamps) and self._stamps[after] == stamp_ns:
+            return self._poses[after].copy()
+        if after == len(self._stamps):
+            if stamp_ns - self._stamps[-1] > extrapolate_s * 1e9:
+                return None
+            if after < 2:
+                return self._poses[-1].copy()
+            after -= 1
+        before = after - 1
+        part = (stamp_ns - self._stamps[before]) / (self._stamps[after] - self._stamps[before])
+        return compose2(self._poses[before], _part_of_arc(relative2(self._poses[before], self._poses[after]), part))
+
+
+def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
+    """``part`` of a planar step (3,) along the circle that it lies on."""
+    turn = float(step[2])
+    if abs(turn) < 1e-9:
+        return np.array([part * step[0], part * step[1], part * turn])
+    # v = V(turn)⁻¹ t is the constant body velocity of the step (logarithm of SE(2)).
+    a, b = math.sin(turn) / turn, (1 - math.cos(turn)) / turn
+    norm = a * a + b * b
+    vx, vy = (a * step[0] + b * step[1]) / norm, (-b * step[0] + a * step[1]) / norm
+    angle = part * turn
+    c, d = math.sin(angle) / turn, (1 - math.cos(angle)) / turn
+    return np.array([c * vx - d * vy, d * vx + c * vy, angle])
+
+
+class CorrectionLimiter:
+    """Lets map_from_odom follow its estimate at a limited speed.
+
+    The robot's place in the map then moves on smoothly where a recovered track, or later a closed loop, corrects it by
+    decimetres at once. Ordinary corrections of a few centimetres a scan pass unchanged.
+
+    Args:
+        speed_mps: of the base's place in the map, m/s.
+        yaw_rate_radps: rad/s.
+    """
+
+    def __init__(self, speed_mps: float, yaw_rate_radps: float) -> None:
+        self.speed_mps = speed_mps
+        self.yaw_rate_radps = yaw_rate_radps
+        self._map_from_odom: FloatArray | None = None
+        self._stamp_ns = 0
+
+    def reset(self) -> None:
+        """The next value is taken as it is."""
+        self._map_from_odom = None
+
+    def follow(self, map_from_odom: FloatArray, odom_from_base: FloatArray, stamp_ns: int) -> FloatArray:
+        """The value to broadcast (3,): as near to the estimate as the speed allows, measured at the base."""
+        if self._map_from_odom is None:
+            limited = map_from_odom.copy()
+        else:
+            elapsed_s = max(0.0, (stamp_ns - self._stamp_ns) * 1e-9)
+            shown = compose2(self._map_from_odom, odom_from_base)
+            wanted = compose2(map_from_odom, odom_from_base)
+            way = wanted[:2] - shown[:2]
+            turn = wrap_angle(float(wanted[2] - shown[2]))
+            distance = math.hypot(way[0], way[1])
+            part = 1.0
+            if distance > 0:
+                part = min(part, self.speed_mps * elapsed_s / distance)
+            if turn != 0:
+                part = min(part, self.yaw_rate_radps * elapsed_s / abs(turn))
+            if part >= 1.0:
+                limited = map_from_odom.copy()
+            else:
+                base = np.array([*(shown[:2] + part * way), shown[2] + part * turn])
+                limited = compose2(base, relative2(odom_from_base, np.zeros(3)))
+        self._map_from_odom, self._stamp_ns = limited, stamp_ns
+        return limited

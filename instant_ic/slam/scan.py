@@ -1,0 +1,121 @@
+"""A planar laser scan and its points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One scan, as in sensor_msgs/LaserScan, ranges by REP-117.
+
+    ``ranges`` is (n,) in metres: −inf too close, NaN erroneous, +inf nothing within range. Beam ``i`` points to
+    ``angle_min + i·angle_increment`` radians in the laser's frame; all beams belong to ``stamp_ns``.
+    """
+
+    ranges: NDArray[np.floating]
+    angle_min: float
+    angle_increment: float
+    range_min: float
+    range_max: float
+    stamp_ns: int
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.ranges) != 1:
+            raise ValueError(f"ranges must be one-dimensional (got shape {np.shape(self.ranges)})")
+        if not self.range_max > self.range_min >= 0:
+            raise ValueError(f"need range_max > range_min >= 0 (got {self.range_max} and {self.range_min})")
+        if not (np.isfinite(self.angle_min) and np.isfinite(self.angle_increment)):
+            raise ValueError(f"angles must be finite (got {self.angle_min}, {self.angle_increment})")
+
+
+@dataclass(frozen=True)
+class ScanPoints:
+    """What SLAM keeps of a scan, in the robot's base frame.
+
+    Attributes:
+        points: hits in beam order, (n, 2).
+        joined: (n,) whether point ``i`` continues the surface of point ``i - 1``.
+        origin: the laser's centre, (2,).
+        clear_ends: ends of the rays that met nothing, (m, 2).
+    """
+
+    points: FloatArray
+    joined: NDArray[np.bool_]
+    origin: FloatArray
+    clear_ends: FloatArray
+
+
+COLLINEAR_M = 0.05
+COLLINEAR_GAP_M = 8.0
+COLLINEAR_GAP_RATIO = 2.0
+
+
+def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArray[np.bool_]:
+    """Which points (n, 2) continue the surface of the one before.
+
+    Those of neighbouring beams that are near each other; and, for a wall seen at a grazing angle, where the hits lie
+    metres apart, those that stand in line with the next hit to either side.
+    """
+    joined = np.zeros(len(points), dtype=np.bool_)
+    if len(points) < 2:
+        return joined
+    step = points[1:] - points[:-1]
+    length = np.sqrt((step**2).sum(axis=1))
+    neighbours = np.diff(beams) == 1
+    in_line = np.zeros(len(step), dtype=np.bool_)
+    if len(step) > 1:
+        # How far the far end of one step lies from the line of the step beside it; shared by both steps.
+        cross = np.abs(step[:-1, 0] * step[1:, 1] - step[:-1, 1] * step[1:, 0])
+        forward = (step[:-1] * step[1:]).sum(axis=1) > 0
+        straight = neighbours[:-1] & neighbours[1:] & forward
+        shorter, longer = np.minimum(length[:-1], length[1:]), np.maximum(length[:-1], length[1:])
+        straight &= (cross <= COLLINEAR_M * shorter) & (longer <= COLLINEAR_GAP_RATIO * shorter)
+        in_line[:-1] |= straight
+        in_line[1:] |= straight
+    joined[1:] = neighbours & ((length <= gap_m) | (in_line & (length <= COLLINEAR_GAP_M)))
+    return joined
+
+
+def scan_points(scan: Scan, base_from_laser: FloatArray, join_gap_m: float, clear_m: float) -> ScanPoints:
+    """Hits and free rays of ``scan``; a hit is what ``range_min <= r <= range_max`` (REP-117).
+
+    Neighbouring beams whose hits lie no more than ``join_gap_m`` apart, or in a line, are taken for one surface. Rays of +inf are
+    free for ``clear_m`` metres (0: nothing is known of them).
+    """
+    ranges = np.asarray(scan.ranges, dtype=np.float64)
+    angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size) + base_from_laser[2]
+    origin = np.array([base_from_laser[0], base_from_laser[1]])
+    with np.errstate(invalid="ignore"):
+        hit = (ranges >= scan.range_min) & (ranges <= scan.range_max)
+    beams = np.flatnonzero(hit)
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    points = origin + ranges[beams, None] * directions[beams]
+    joined = _joined(points, beams, join_gap_m)
+    free = np.isposinf(ranges) if clear_m > 0 else np.zeros(ranges.size, dtype=np.bool_)
+    return ScanPoints(points, joined, origin, origin + clear_m * directions[free])
+
+
+def thin(points: FloatArray, joined: NDArray[np.bool_], spacing_m: float, max_points: int) -> FloatArray:
+    """Points for matching: at least ``spacing_m`` apart along a surface, at most ``max_points``, evenly chosen.
+
+    Without this a near wall, which many beams meet, outweighs the far ones that fix the heading.
+    """
+    if len(points) == 0:
+        return points
+    step = np.zeros(len(points))
+    step[1:] = np.where(joined[1:], np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)), np.inf)
+    # Arc length along each surface; a point stays where the length enters a new stretch of spacing_m.
+    step[~np.isfinite(step)] = spacing_m
+    stretch = np.floor(np.cumsum(step) / spacing_m) if spacing_m > 0 else np.arange(len(points), dtype=np.float64)
+    keep = np.ones(len(points), dtype=np.bool_)
+    keep[1:] = stretch[1:] != stretch[:-1]
+    kept = points[keep]
+    if len(kept) > max_points:
+        kept = kept[(np.arange(max_points) * len(kept)) // max_points]
+    return np.ascontiguousarray(kept)
