@@ -111,14 +111,18 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             self._out[message.topic].publish_bytes(payload)
 
     def _wait_for_readers(self) -> None:
-        """Until each node of ``wait_for`` is in the registry and connected to every topic of the bag that it reads."""
+        """Until each node of ``wait_for`` runs, reads something of the bag, and is connected to all that it reads."""
         if not self.config.wait_for or not isinstance(self._transport, ZmqTransport):
             return
         deadline_s = time.monotonic() + self.config.wait_timeout_s
         missing = ""
         while time.monotonic() < deadline_s:
             nodes = {info.name: info for info in registry.list_nodes(self._transport.run_dir)}
-            absent = [name for name in self.config.wait_for if name not in nodes]
+            played = {publisher.topic for publisher in self._out.values()}
+            # A recorder subscribes only once it has found the topics: it is ready when it reads one of them.
+            absent = [
+                name for name in self.config.wait_for if name not in nodes or played.isdisjoint(nodes[name].subscribes)
+            ]
             readers = [topic for name in self.config.wait_for if name in nodes for topic in nodes[name].subscribes]
             unread = [
                 topic
@@ -127,7 +131,10 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             ]
             if not absent and not unread:
                 return
-            missing = ", ".join([f"node {name}" for name in absent] + [f"a reader of {topic}" for topic in unread])
+            missing = ", ".join(
+                [f"node {name} to read what is played" for name in absent]
+                + [f"a reader of {topic}" for topic in unread]
+            )
             if self._stop.wait(0.1):
                 return
         raise NodeError(f"waited {self.config.wait_timeout_s:.0f} s for {missing}")

@@ -1,0 +1,369 @@
+"""Every verb of ``ic`` against a node in a process of its own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag2 import Reader
+
+from instant_ic.bag import BagReader
+from instant_ic.bus import registry
+from instant_ic.cli.main import build_parser, main
+
+TALKER = '''
+"""Talks."""
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from instant_ic.bus import LATCHED, SENSOR, Node, main
+from instant_ic.msg import Bool, scan_message, LaserScan
+
+
+@dataclass(frozen=True)
+class Inner:
+    depth: int = 3
+
+
+@dataclass(frozen=True)
+class TalkerConfig:
+    rate_hz: float = 50.0
+    label: str = "hello"
+    inner: Inner = field(default_factory=Inner)
+
+
+class Talker(Node[TalkerConfig]):
+    name = "talker"
+
+    def setup(self) -> None:
+        self.scans = self.publisher("/scan", LaserScan, qos=SENSOR)
+        self.flag = self.publisher("/flag", Bool, qos=LATCHED)
+        self.flag.publish(Bool(data=True))
+        self.subscribe("/order", Bool, lambda message: None)
+        self.timer(1 / self.config.rate_hz, self.tick)
+
+    def tick(self) -> None:
+        ranges = np.arange(40, dtype=np.float32)
+        self.scans.publish(scan_message(ranges, -1.0, 0.05, 0.1, 30.0, "velodyne", self.clock.now_ns()))
+
+
+if __name__ == "__main__":
+    main(Talker)
+'''
+
+
+def wait_for(condition: object, what: str, seconds: float = 40.0) -> None:
+    deadline_s = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline_s, f"waited {seconds} s for {what}"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A run directory in which the talker runs."""
+    folder = tmp_path_factory.mktemp("r")
+    program = folder / "talker.py"
+    program.write_text(TALKER)
+    run_dir = folder / "run"
+    process = subprocess.Popen(
+        [sys.executable, str(program), "--run-dir", str(run_dir), "-p", "inner.depth:=7"],
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        wait_for(lambda: any(node.subscribes.get("/order") for node in registry.list_nodes(run_dir)), "the talker")
+        yield run_dir
+    finally:
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=20) == 0
+
+
+@pytest.fixture(autouse=True)
+def in_run_dir(run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    monkeypatch.chdir(tmp_path)
+
+
+def ic(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    capsys.readouterr()
+    try:
+        status = main(words)
+    except SystemExit as end:
+        status = int(end.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    def parsers(parser: object) -> Iterator[object]:
+        yield parser
+        for action in parser._actions:  # type: ignore[attr-defined]
+            for child in (getattr(action, "choices", None) or {}).values() if action.dest == "==SUPPRESS==" else []:
+                yield from parsers(child)
+
+    found = list(parsers(build_parser()))
+    names = {parser.prog for parser in found}  # type: ignore[attr-defined]
+    ours = {
+        "ic": {"run", "launch", "node", "topic", "bag", "replay", "param", "doctor"},
+        "ic node": {"list", "info"},
+        "ic topic": {"list", "info", "echo", "hz", "bw"},
+        "ic bag": {"record", "play", "info", "diff", "recover"},
+        "ic param": {"list", "get"},
+    }
+    wanted = {f"{prefix} {verb}" for prefix, verbs in ours.items() for verb in verbs}
+    assert wanted <= names
+    for parser in found:
+        if parser.prog in wanted:  # type: ignore[attr-defined]
+            text = parser.format_help()  # type: ignore[attr-defined]
+            assert "example: ic" in text and len(parser.description) > 10, parser.prog  # type: ignore[attr-defined]
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys; from instant_ic.cli.main import build_parser; build_parser(); "
+        "print([m for m in ('numpy', 'torch', 'zmq', 'rosbags', 'onnxruntime', 'rich', 'cv2') if m in sys.modules])"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert result.stdout.strip() == "[]"
+
+
+def test_node_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = ic(capsys, "node", "list")
+    assert status == 0 and out.startswith("talker  pid ")
+    status, out, _ = ic(capsys, "node", "info", "talker")
+    assert status == 0 and "  /scan: sensor_msgs/msg/LaserScan" in out and "  /order: std_msgs/msg/Bool" in out
+    status, _, error = ic(capsys, "node", "info", "nobody")
+    assert status == 1 and "node 'nobody' does not run" in error and "running: talker" in error
+
+
+def test_topic_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = ic(capsys, "topic", "list")
+    assert status == 0 and {"/scan", "/flag", "/heartbeat"} <= set(out.split())
+    assert "/scan         sensor_msgs/msg/LaserScan  talker (sensor)" in ic(capsys, "topic", "list", "-v")[1]
+    status, out, _ = ic(capsys, "topic", "info", "scan")
+    assert status == 0 and "type: sensor_msgs/msg/LaserScan\npublishers: 1\n  talker (pid" in out
+    assert "publishers: 0\nsubscribers: 1\n  talker" in ic(capsys, "topic", "info", "/order")[1]
+    status, _, error = ic(capsys, "topic", "info", "/nothing")
+    assert status == 1 and "nobody publishes or subscribes it" in error
+
+
+def test_topic_echo(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = ic(capsys, "topic", "echo", "/flag", "-n", "1", "--timeout", "30")
+    assert (status, out) == (0, "data: true\n---\n")  # latched: sent before we came
+    status, out, _ = ic(capsys, "topic", "echo", "/scan", "-n", "2", "--timeout", "30")
+    assert status == 0 and out.count("---") == 2
+    assert "  frame_id: 'velodyne'" in out and "ranges: [0, 1, 2, 3, 4, 5, ... 40 values]" in out
+    status, out, _ = ic(capsys, "topic", "echo", "/scan", "-n", "1", "--field", "ranges.39", "--timeout", "30")
+    assert (status, out) == (0, "39\n---\n")
+    status, out, _ = ic(capsys, "topic", "echo", "/scan", "-n", "1", "--field", "ranges", "--full", "--timeout", "30")
+    assert "38, 39]" in out
+    status, _, error = ic(capsys, "topic", "echo", "/scan", "-n", "1", "--field", "header.frame", "--timeout", "30")
+    assert status == 2 and "no field 'frame'" in error and "frame_id" in error
+    status, _, error = ic(capsys, "topic", "echo", "/nothing", "--timeout", "0.2")
+    assert status == 1 and "nobody publishes it" in error
+
+
+def test_topic_hz_and_bw(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = ic(capsys, "topic", "hz", "/scan", "--duration", "2.5")
+    last = out.strip().splitlines()[-1]
+    assert status == 0 and last.startswith("all: ") and last.endswith(" lost")
+    assert 5 < float(last.split()[1]) < 60  # 50 Hz on an idle machine, less on a busy one, never more
+    status, out, _ = ic(capsys, "topic", "bw", "/scan", "--duration", "2.5")
+    assert status == 0 and "MB/s" in out.splitlines()[-1]
+    with BagReader(record_scan(capsys)) as reader:
+        size = len(next(reader.messages({"/scan"})).payload)
+    assert out.splitlines()[-1].endswith(f"{size / 1000:.1f} kB a message")
+    assert ic(capsys, "topic", "hz", "/nothing", "--duration", "0.2")[0] == 1
+
+
+def record_scan(capsys: pytest.CaptureFixture[str]) -> Path:
+    words = ("bag", "record", "-o", "probe", "/scan", "/flag", "--duration", "1.5")
+    status, _, error = ic_process(*words)
+    assert status == 0, error
+    return Path("probe")
+
+
+def ic_process(*words: str, interrupt_after: object = None) -> tuple[int, str, str]:
+    """Runs ``ic`` in a process: what installs signal handlers must have the main thread."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "instant_ic.cli.main", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if interrupt_after is not None:
+        threading.Thread(target=_interrupt, args=(process, interrupt_after), daemon=True).start()
+    out, error = process.communicate(timeout=90)
+    return process.returncode, out, error
+
+
+def _interrupt(process: subprocess.Popen[str], condition: object) -> None:
+    wait_for(condition, "the moment to interrupt")
+    process.send_signal(signal.SIGINT)
+
+
+def test_param_list_and_get(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = ic(capsys, "param", "list", "talker")
+    assert status == 0
+    assert out == "talker:\n  inner.depth: 7\n  label: hello\n  rate_hz: 50.0\n  use_sim_time: false\n"
+    assert ic(capsys, "param", "list")[1] == out
+    assert ic(capsys, "param", "get", "talker", "inner.depth")[:2] == (0, "7\n")
+    status, _, error = ic(capsys, "param", "get", "talker", "inner.dept")
+    assert status == 1 and "did you mean 'inner.depth'?" in error
+
+
+def test_bag_record_play_info_diff_recover(capsys: pytest.CaptureFixture[str], run_dir: Path, tmp_path: Path) -> None:
+    def recording() -> bool:
+        return any(node.name.startswith("bag_recorder") for node in registry.list_nodes(run_dir)) and bool(
+            list(tmp_path.glob("drive/*.mcap"))
+        )
+
+    def enough() -> bool:
+        return recording() and sum(f.stat().st_size for f in tmp_path.glob("drive/*.mcap")) > 10_000
+
+    status, _, error = ic_process("bag", "record", "-o", "drive", "-x", "/rosout", interrupt_after=enough)
+    assert status == 0, error
+    with Reader(tmp_path / "drive") as reader:
+        topics = {c.topic: (c.msgtype, c.msgcount) for c in reader.connections}
+        custom = reader.storage.metadata.custom
+    assert {"/scan", "/flag", "/heartbeat"} <= set(topics) and "/rosout" not in topics
+    assert topics["/flag"] == ("std_msgs/msg/Bool", 1)  # latched: published long before the recording
+    assert topics["/scan"][1] >= 10
+    assert custom is not None and json.loads(custom["instant_ic.lost"]) == {}
+    assert json.loads(custom["instant_ic.parameters"])["talker"]["params"]["label"] == "hello"
+
+    status, out, _ = ic(capsys, "bag", "info", "drive")
+    assert status == 0 and "sensor_msgs/msg/LaserScan" in out and f"messages: {reader_count(tmp_path / 'drive')}" in out
+    status, _, error = ic(capsys, "bag", "record", "-o", "drive")
+    assert status == 1 and "drive exists already" in error
+
+    (tmp_path / "drive" / "metadata.yaml").unlink()
+    status, _, error = ic(capsys, "bag", "info", "drive")
+    assert status == 1 and "ic bag recover drive" in error
+    status, out, _ = ic(capsys, "bag", "recover", "drive", "-o", "saved")
+    assert status == 0 and out.startswith("saved: ")
+    status, out, _ = ic(capsys, "bag", "diff", "drive/drive.mcap", "saved")
+    assert status == 0 and " topics are the same" in out
+    status, out, _ = ic(capsys, "bag", "diff", "saved", str(record_scan(capsys)), "--common")
+    assert status == 1 and "/scan" in out and "/heartbeat" not in out
+
+    # Played on another topic, the bytes come back as they were recorded; the player ends with the bag.
+    heard = subprocess.Popen(
+        [sys.executable, "-m", "instant_ic.cli.main", "bag", "record", "-o", "again", "/replayed", "--use-sim-time"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for(lambda: list(tmp_path.glob("again/*.mcap")), "the second recorder")
+    recorder = f"bag_recorder_{heard.pid}"
+    words = ("bag", "play", "saved", "/scan", "--remap", "/scan:=/replayed", "--rate", "3", "--wait-for", recorder)
+    status, _, error = ic_process(*words)
+    assert status == 0 and "played to the end" in error, error
+    heard.send_signal(signal.SIGINT)
+    assert heard.wait(timeout=30) == 0, heard.stderr and heard.stderr.read()
+    assert heard.stderr is not None
+    heard.stderr.close()
+    with BagReader(tmp_path / "saved") as saved, BagReader(tmp_path / "again") as again:
+        sent = [(m.stamp_ns, m.payload) for m in saved.messages({"/scan"})]
+        came = [(m.stamp_ns, m.payload) for m in again.messages({"/replayed"})]
+    assert came == sent  # the stamps are the bag's: recorder and player follow its clock
+
+
+def reader_count(path: Path) -> int:
+    with BagReader(path) as reader:
+        return reader.count
+
+
+def test_launch_in_a_process_ends_in_time_and_leaves_nothing(run_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "talker.py").write_text(TALKER)
+    (tmp_path / "two.yaml").write_text(
+        "launch:\n"
+        "- arg: {name: rate, default: 20.0, description: how often}\n"
+        "- node: {exec: talker.py, name: first, param: [{name: rate_hz, value: $(var rate)}],"
+        " remap: [{from: /scan, to: /one}]}\n"
+        "- node: {exec: talker.py, name: second, remap: [{from: /scan, to: /two}], namespace: side}\n"
+    )
+    other = tmp_path / "r"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "instant_ic.cli.main", "launch", "two.yaml", "rate:=30", "--run-dir", str(other)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert process.stdout is not None
+    lines: list[str] = []
+    try:
+        for line in process.stdout:
+            lines.append(line)
+            if "all 2 nodes are up" in line:
+                break
+        nodes = {node.name: node for node in registry.list_nodes(other)}
+        assert nodes["first"].params["rate_hz"] == 30 and "/one" in nodes["first"].publishes
+        assert "/side/two" in nodes["second"].publishes
+        second = subprocess.run(
+            [sys.executable, "-m", "instant_ic.cli.main", "launch", "two.yaml", "--run-dir", str(other)],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+        assert second.returncode == 1 and f"a stack already runs in {other} (pid {process.pid}" in second.stderr
+        began_s = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        rest, _ = process.communicate(timeout=30)
+        assert time.monotonic() - began_s < 10  # 5 s, and the patience of a busy machine
+    finally:
+        process.kill()
+    assert process.returncode == 0, "".join(lines) + rest
+    assert "stopping 2 nodes" in rest
+    assert registry.list_nodes(other) == [] and registry.list_topics(other) == []
+    for node in nodes.values():
+        assert not Path(f"/proc/{node.pid}").exists()
+    assert "running" in (other / "log" / "first.log").read_text()
+
+
+def test_launch_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    Path("bad.yaml").write_text("launch:\n- node: {exec: warp}\n- nod: {}\n")
+    status, _, error = ic(capsys, "launch", "bad.yaml")
+    assert status == 2 and "ic: bad.yaml:2: unknown exec 'warp'" in error and "bad.yaml:3: unknown key 'nod'" in error
+    assert ic(capsys, "launch", "nowhere.yaml")[0] == 2
+    assert ic(capsys, "launch", "bad.yaml", "x=1")[0] == 2
+    Path("player.yaml").write_text("launch:\n- node: {exec: bag_player, param: [{name: rat, value: 1}]}\n")
+    status, _, error = ic(capsys, "launch", "player.yaml", "--check")
+    assert status == 2 and "player.yaml:2: node bag_player: -p rat:=1: unknown parameter 'rat'" in error
+    status, out, _ = ic(capsys, "launch", "replay", "--show-args")
+    assert status == 0 and "bag (must be given)" in out
+
+
+def test_run_wants_a_node(capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, error = ic(capsys, "run", "warp_drive")
+    assert status == 2 and "there is no node 'warp_drive'; there are" in error and "bag_player" in error
+    status, _, error = ic_process("run", "bag_player", "-p", "bag:=nowhere")
+    assert status == 1 and "bag nowhere does not exist" in error and "Traceback" not in error
+    status, _, error = ic_process("run", "bag_player", "-p", "rate:=-1", "-p", "bag:=x")
+    assert status == 2 and "rate must be > 0" in error
+
+
+def test_replay_mistakes(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "there is no node 'warp'" in ic(capsys, "replay", "x", "--nodes", "warp", "-o", "y")[2]
+    status, _, error = ic(capsys, "replay", "x", "--nodes", "bag_player", "-o", "y", "-p", "rate:=1")
+    assert status == 2 and "expected NODE.KEY:=VALUE" in error
+    status, _, error = ic(capsys, "replay", "x", "--nodes", "bag_player", "-o", "y")
+    assert status == 1 and "bag x does not exist" in error
+
+
+def test_usage_is_status_two(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in ((), ("warp",), ("topic",), ("topic", "hz"), ("topic", "hz", "/a", "--duration", "0")):
+        assert ic(capsys, *words)[0] == 2, words
+
+
+def test_pipe_that_is_closed_early() -> None:
+    command = f"{sys.executable} -m instant_ic.cli.main topic echo /scan --timeout 30 | head -n 1"
+    result = subprocess.run(command, shell=True, capture_output=True, text=True, timeout=90, env=os.environ, check=True)
+    assert result.stdout == "header:\n" and result.stderr == ""
