@@ -20,6 +20,9 @@ INSCRIBED = 253
 LETHAL = 254
 UNKNOWN = 255
 
+SLACK_M = 1e-6
+"""For comparing distances: five cells of 0.05 m are not quite 0.25 m in floating point."""
+
 
 @dataclass(frozen=True)
 class CostmapConfig:
@@ -67,13 +70,18 @@ class Costmap:
         """Centres (..., 2) of cells in metres."""
         return self.origin + (np.stack([columns, rows], axis=-1) + 0.5) * self.resolution
 
+    def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether points (..., 2) lie in the window."""
+        rows, columns = self.cells(points)
+        height, width = self.costs.shape
+        return (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
+
     def cost_at(self, points: NDArray[np.float64]) -> NDArray[np.uint8]:
         """Cost (...) at points (..., 2); UNKNOWN outside the window."""
         rows, columns = self.cells(points)
         height, width = self.costs.shape
-        inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         found = self.costs[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-        return np.where(inside, found, UNKNOWN).astype(np.uint8)
+        return np.where(self.contains(points), found, UNKNOWN).astype(np.uint8)
 
     def lethal_overlap(self, poses: NDArray[np.float64], body: NDArray[np.float64]) -> NDArray[np.int64]:
         """How many of the ``body`` points (M, 2) lie in a lethal cell, for each pose (N, 3)."""
@@ -266,9 +274,8 @@ class RollingCostmap:
         )
         distance *= self.config.resolution
         inscribed = self.footprint.inscribed_radius_m
-        # A hair of slack: a cell five whole cells away is at exactly the inscribed radius.
-        within = ~lethal & (distance <= inscribed + 1e-6)
-        near = ~lethal & ~within & (master != UNKNOWN) & (distance <= self.config.inflation_radius)
+        within = ~lethal & (distance <= inscribed + SLACK_M)
+        near = ~lethal & ~within & (master != UNKNOWN) & (distance <= self.config.inflation_radius + SLACK_M)
         master[near] = (252.0 * np.exp(-self.config.cost_scaling_factor * (distance[near] - inscribed))).astype(
             np.uint8
         )
@@ -280,9 +287,9 @@ def inflated_cost(distance_m: float, config: CostmapConfig, footprint: Footprint
     """Cost of a place ``distance_m`` from the nearest obstacle."""
     if distance_m <= 0:
         return LETHAL
-    if distance_m <= footprint.inscribed_radius_m + 1e-6:
+    if distance_m <= footprint.inscribed_radius_m + SLACK_M:
         return INSCRIBED
-    if distance_m > config.inflation_radius:
+    if distance_m > config.inflation_radius + SLACK_M:
         return FREE
     return int(252.0 * math.exp(-config.cost_scaling_factor * (distance_m - footprint.inscribed_radius_m)))
 

@@ -12,6 +12,23 @@ from .costmap import Costmap
 from .follower import FollowerCommand, PathFollower
 from .planner import GridPlanner, Plan
 
+
+@dataclass(frozen=True)
+class RecoveryConfig:
+    """When the robot counts as stuck, and how it gets free."""
+
+    stuck_after_s: float = 1.5
+    duration_s: float = 1.5
+    speed_m_s: float = 0.15
+    moved_m: float = 0.03
+    turned_rad: float = 0.05
+
+    def __post_init__(self) -> None:
+        for key, value in vars(self).items():
+            if not (math.isfinite(value) and value > 0):
+                raise ValueError(f"recovery.{key} must be > 0 (got {value})")
+
+
 _NO_PLAN = Plan(np.zeros((0, 3)), False, "no plan yet", math.inf)
 
 
@@ -26,12 +43,23 @@ class NavigatorStep:
 
 
 class Navigator:
-    """Planner and follower behind one call."""
+    """Planner and follower behind one call, and a way out when the collision monitor lets nothing through.
 
-    def __init__(self, planner: GridPlanner, follower: PathFollower, replan_period_s: float = 0.2) -> None:
+    A robot that is told to move and does not (a corner would touch when it turns, say) backs off a little, the next
+    time forwards, and plans again. The collision monitor stands behind that as behind everything.
+    """
+
+    def __init__(
+        self,
+        planner: GridPlanner,
+        follower: PathFollower,
+        replan_period_s: float = 0.2,
+        recovery: RecoveryConfig | None = None,
+    ) -> None:
         self.planner = planner
         self.follower = follower
         self.replan_period_s = replan_period_s
+        self.recovery = recovery or RecoveryConfig()
         self.reset()
 
     def reset(self) -> None:
@@ -39,6 +67,10 @@ class Navigator:
         self.follower.reset()
         self._plan = _NO_PLAN
         self._planned_ns: int | None = None
+        self._moved_ns: int | None = None  # when the robot last moved, or was not told to
+        self._moved_pose: NDArray[np.float64] = np.zeros(3)
+        self._recovering_ns: int | None = None
+        self._direction = -1.0
 
     def step(
         self,
@@ -55,8 +87,29 @@ class Navigator:
             self._plan = self.planner.plan(costmap, pose, subgoal)
             self._planned_ns = now_ns
         plan = _with_end(self._plan, subgoal)
+        if self._recovering(pose, now_ns):
+            return NavigatorStep((self._direction * self.recovery.speed_m_s, 0.0), "recover", plan, due)
         step: FollowerCommand = self.follower.step(pose, speed_m_s, plan, subgoal_velocity)
+        if step.command == (0.0, 0.0):
+            self._moved_ns = now_ns
         return NavigatorStep(step.command, step.state, plan, due)
+
+    def _recovering(self, pose: NDArray[np.float64], now_ns: int) -> bool:
+        recovery = self.recovery
+        if self._recovering_ns is not None:
+            if now_ns - self._recovering_ns < recovery.duration_s * 1e9:
+                return True
+            self._recovering_ns, self._moved_ns = None, None
+            self._direction = -self._direction
+            self.follower.reset()
+        moved = float(np.linalg.norm(pose[:2] - self._moved_pose[:2])) > recovery.moved_m
+        turned = abs(math.remainder(float(pose[2] - self._moved_pose[2]), 2 * math.pi)) > recovery.turned_rad
+        if self._moved_ns is None or moved or turned:
+            self._moved_ns, self._moved_pose = now_ns, np.array(pose, dtype=np.float64)
+        if now_ns - self._moved_ns < recovery.stuck_after_s * 1e9:
+            return False
+        self._recovering_ns = now_ns
+        return True
 
 
 def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:

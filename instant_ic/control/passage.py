@@ -64,7 +64,7 @@ def find_passage(
     if walls is not None:
         at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < config.wall_clearance_m)
         if at_wall.size:
-            return Passage(False, "a wall is ahead")
+            return Passage(False, "a wall is in the way")
     if exit_index == len(ahead):
         return Passage(False, f"no free space within {config.max_pass_m:.1f} m behind the obstacle")
     goal = ahead[exit_index]

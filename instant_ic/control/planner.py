@@ -20,7 +20,9 @@ class PlannerConfig:
 
     cost_travel_multiplier: float = 3.0
     allow_unknown: bool = True
-    unknown_penalty: float = 2.0
+    unknown_penalty: float = 5.0
+    tight_cost: int = 165
+    tight_penalty: float = 6.0
     unknown_standoff_m: float = 0.3
     escape_radius_m: float = 0.6
     tolerance_m: float = 0.5
@@ -29,12 +31,15 @@ class PlannerConfig:
         for key in (
             "cost_travel_multiplier",
             "unknown_penalty",
+            "tight_penalty",
             "unknown_standoff_m",
             "escape_radius_m",
             "tolerance_m",
         ):
             if not getattr(self, key) >= 0:
                 raise ValueError(f"planner.{key} must be >= 0 (got {getattr(self, key)})")
+        if not 0 <= self.tight_cost < INSCRIBED - 1:
+            raise ValueError(f"planner.tight_cost must be 0..251 (got {self.tight_cost})")
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,7 @@ def _nothing(reason: str) -> Plan:
 class GridPlanner:
     """A* with eight neighbours; a step costs its length times (1 + cost_travel_multiplier·cost/252).
 
+    Above ``tight_cost``, where the robot cannot turn on the spot, up to ``tight_penalty`` comes on top.
     Lethal and inscribed cells are never entered; a robot that stands in them is led out. With ``allow_unknown`` a
     way through unknown cells is taken into account, but the path ends ``unknown_standoff_m`` before the first of
     them: the robot drives up, sees more, and plans again. Without it, unknown cells are walls.
@@ -88,6 +94,8 @@ class GridPlanner:
             goal_row,
             goal_column,
             self.config.cost_travel_multiplier,
+            self.config.tight_cost,
+            self.config.tight_penalty,
             self.config.unknown_penalty if self.config.allow_unknown else -1.0,
             self.config.escape_radius_m / costmap.resolution,
         )
@@ -158,6 +166,8 @@ def _search(
     goal_row: int,
     goal_column: int,
     multiplier: float,
+    tight_cost: int,
+    tight_penalty: float,
     unknown_penalty: float,
     escape_cells: float,
 ) -> tuple[NDArray[np.int64], bool]:
@@ -201,9 +211,11 @@ def _search(
                     from_start = math.hypot(r - start_row, c - start_column)
                     if from_start > (escape_cells if cost == 253 else 0.25 * escape_cells):
                         continue
-                    weight = 1.0 + 4.0 * multiplier
+                    weight = 1.0 + 4.0 * (multiplier + tight_penalty)
                 else:
                     weight = 1.0 + multiplier * cost / 252.0
+                    if cost > tight_cost:
+                        weight += tight_penalty * (cost - tight_cost) / (252.0 - tight_cost)
                 length = 1.4142135623730951 if dr != 0 and dc != 0 else 1.0
                 new = best[cell] + length * weight
                 other = r * width + c

@@ -106,7 +106,7 @@ class Predictor:
             poses.append(move(poses[-1], v[0], v[1], step))
             travelled.append(travelled[-1] + _speed(v, self.reach_m) * step)
         path = np.array(poses)
-        times = step * np.arange(len(path))
+        times: NDArray[np.float64] = step * np.arange(len(path), dtype=np.float64)
         hit = None
         if costmap is not None:
             overlap = costmap.lethal_overlap(path, self.body)

@@ -48,10 +48,12 @@ def extend_ahead(pose: NDArray[np.float64], length_m: float, step_m: float) -> N
     return np.concatenate([ahead, np.full((len(ahead), 1), pose[2])], axis=1)
 
 
-def _free(costs: NDArray[np.uint8], config: SubgoalConfig) -> NDArray[np.bool_]:
+def _free(costmap: Costmap, points: NDArray[np.float64], config: SubgoalConfig) -> NDArray[np.bool_]:
+    """Which points (..., 2) may be the subgoal."""
+    costs = costmap.cost_at(points)
     # The place behind an obstacle has not been seen yet: unknown may be a goal. The planner does not drive into
     # it; it goes on as the robot sees more.
-    return (costs <= config.max_cost) | (costs == UNKNOWN)
+    return (costs <= config.max_cost) | ((costs == UNKNOWN) & costmap.contains(points))
 
 
 def choose_subgoal(
@@ -70,14 +72,14 @@ def choose_subgoal(
     up to the obstacle and turn there.
     """
     vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
-    if _free(costmap.cost_at(vbot_pose[:2]), config):
+    if _free(costmap, vbot_pose[:2], config):
         if config.anticipate and prediction.hit_index is not None:
             behind = _straight_on(costmap, prediction.poses[prediction.hit_index], forward, walls, config)
             if behind is not None:
                 return Subgoal(behind, "ahead")
         return Subgoal(vbot_pose, "vbot")
     trajectory = prediction.poses
-    free = np.flatnonzero(_free(costmap.cost_at(trajectory[:, :2]), config))
+    free = np.flatnonzero(_free(costmap, trajectory[:, :2], config))
     if free.size:
         return Subgoal(trajectory[free[-1]], "trajectory")
     beyond = _straight_on(costmap, trajectory[-1], forward, walls, config)
@@ -104,7 +106,7 @@ def _straight_on(
     """First free pose (3,) behind the obstacle that ``pose`` runs into; None when a wall comes first."""
     heading = pose if forward else pose + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, config.extend_m, costmap.resolution)
-    free = _free(costmap.cost_at(ahead[:, :2]), config)
+    free = _free(costmap, ahead[:, :2], config)
     taken = np.flatnonzero(~free)
     free[: taken[0] if taken.size else 0] = False
     index = np.flatnonzero(free)

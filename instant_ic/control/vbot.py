@@ -8,17 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .footprint import Footprint
 from .kinematics import MotionLimits, accelerate, clip_twist, move
 from .walls import WallMap
 
 
 @dataclass(frozen=True)
 class VbotConfig:
-    """How far the v-bot may draw ahead, and how near it comes to walls."""
+    """How far the v-bot may draw ahead, and how near its outline comes to walls.
+
+    The wall clearance leaves room for the r-bot at the same place, or the two could never meet there.
+    """
 
     max_lead_m: float = 3.0
     slow_lead_m: float = 1.0
-    wall_clearance_m: float = 0.25
+    wall_clearance_m: float = 0.12
 
     def __post_init__(self) -> None:
         if not 0 <= self.slow_lead_m < self.max_lead_m:
@@ -30,9 +34,10 @@ class VbotConfig:
 class VirtualRobot:
     """The r-bot's kinematics and limits, without the r-bot's obstacles."""
 
-    def __init__(self, config: VbotConfig, limits: MotionLimits) -> None:
+    def __init__(self, config: VbotConfig, limits: MotionLimits, footprint: Footprint | None = None) -> None:
         self.config = config
         self.limits = limits
+        self._body = (footprint or Footprint()).points(0.1)
         self.pose: NDArray[np.float64] = np.zeros(3)
         self.velocity: tuple[float, float] = (0.0, 0.0)
         self.slowed_by = ""
@@ -61,7 +66,8 @@ class VirtualRobot:
             target = (0.0, angular)
         self.velocity = accelerate(self.velocity, target, self.limits, dt_s)
         pose = move(self.pose, self.velocity[0], self.velocity[1], dt_s)
-        if walls is not None and self._into_wall(pose, walls):
+        # Turning on the spot is never held: a corner that grazes a wall is less harm than controls that stick.
+        if walls is not None and self.velocity[0] != 0.0 and self._into_wall(pose, walls):
             self.slowed_by = "wall"
             self.velocity = (0.0, self.velocity[1])
             pose = move(self.pose, 0.0, self.velocity[1], dt_s)
@@ -82,5 +88,12 @@ class VirtualRobot:
         return max(0.0, left)
 
     def _into_wall(self, pose: NDArray[np.float64], walls: WallMap) -> bool:
-        now, then = walls.distance(np.stack([self.pose[:2], pose[:2]]))
-        return bool(then < self.config.wall_clearance_m and then < now)
+        now = float(walls.distance(_placed(self._body, self.pose)).min())
+        then = float(walls.distance(_placed(self._body, pose)).min())
+        return then < self.config.wall_clearance_m and then < now
+
+
+def _placed(body: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    placed: NDArray[np.float64] = body @ np.array([[c, s], [-s, c]]) + pose[:2]
+    return placed

@@ -12,7 +12,7 @@ from instant_ic.control.arbiter import Mode
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.kinematics import MotionLimits
-from instant_ic.control.navigator import Navigator
+from instant_ic.control.navigator import Navigator, RecoveryConfig
 from instant_ic.control.planner import GridPlanner, PlannerConfig
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import pose2_from_matrix
@@ -41,6 +41,7 @@ class NavigatorConfig:
     subgoal_timeout_s: float = 0.5
     costmap_timeout_s: float = 1.0
     state_timeout_s: float = 0.3
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     limits: MotionLimits = field(default_factory=MotionLimits)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     follower: FollowerConfig = field(default_factory=FollowerConfig)
@@ -67,7 +68,7 @@ class NavigatorNode(Node[NavigatorConfig]):
             warm_up()
         c = self.config
         follower = PathFollower(c.follower, c.limits)
-        self.navigator = Navigator(GridPlanner(c.planner), follower, c.replan_period_s)
+        self.navigator = Navigator(GridPlanner(c.planner), follower, c.replan_period_s, c.recovery)
         self.speed = 0.0
         self.cmd_vel = self.publisher("/nav/cmd_vel", TwistStamped, qos=SENSOR)
         self.path = self.publisher("/nav/path", Path, qos=SENSOR)

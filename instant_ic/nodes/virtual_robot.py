@@ -9,6 +9,7 @@ import numpy as np
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.control.arbiter import Mode
 from instant_ic.control.costmap import StaticMap
+from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
@@ -36,6 +37,7 @@ class VirtualRobotConfig:
     wall_min_length_m: float = 1.5
     walls_block: bool = True
     limits: MotionLimits = field(default_factory=MotionLimits)
+    footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
 
     def __post_init__(self) -> None:
@@ -50,7 +52,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     name = "virtual_robot"
 
     def setup(self) -> None:
-        self.robot = VirtualRobot(self.config.vbot, self.config.limits)
+        self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
         self.walls: WallMap | None = None
         self.transitions: int | None = None
         self.stepped_ns = self.clock.now_ns()

@@ -141,7 +141,9 @@ class Loop:
         static: StaticMap | None,
         config: ArbiterConfig | None = None,
         start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        noise: np.random.Generator | None = None,
     ) -> None:
+        self.noise, self.error = noise, np.zeros(3)
         self.world, self.static = world, static
         self.walls = WallMap(static) if static is not None else None
         self.costmaps = RollingCostmap(CostmapConfig(), Footprint())
@@ -163,9 +165,12 @@ class Loop:
 
     def step(self, operator: tuple[float, float]) -> Frame:
         now_ns = round(self.k * self.dt * 1e9)
-        robot = self.base.pose.copy()
+        truth = self.base.pose.copy()
+        robot = self.measured(truth)
         if self.k % 2 == 0:
-            self.ranges, self.scan_pose = self.world.cast(*robot), robot
+            self.ranges, self.scan_pose = self.world.cast(*truth), robot
+            if self.noise is not None:
+                self.ranges = self.ranges + self.noise.normal(0.0, 0.015, len(self.ranges))
         scan = (self.ranges, -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M)
         if self.k % 4 == 0:
             rays = scan_rays(*scan, matrix(self.scan_pose), self.costmap_config)
@@ -208,7 +213,7 @@ class Loop:
         frame = Frame(
             self.k * self.dt,
             self.decision,
-            robot,
+            truth,
             self.vbot.pose.copy(),
             self.decision.command,
             self.base.v,
@@ -217,6 +222,13 @@ class Loop:
         self.frames.append(frame)
         self.k += 1
         return frame
+
+    def measured(self, truth: np.ndarray) -> np.ndarray:
+        """What SLAM says: the truth, or with noise an error that wanders by centimetres."""
+        if self.noise is None:
+            return truth
+        self.error = 0.95 * self.error + self.noise.normal(0.0, [0.005, 0.005, 0.002])
+        return truth + self.error
 
     def start(self) -> None:
         """Hands off until the arbiter lets the operator drive."""

@@ -116,8 +116,8 @@ class Stack:
 
     def status(self, now: int) -> VspaceStatus:
         fields = {field.name: 0 for field in dataclasses.fields(VspaceStatus)}
-        fields |= {name: 0.0 for name in ("ready_radius_m", "psnr_db", "train_seconds", "ready_seconds")}
-        fields |= {name: 0.0 for name in ("ms_per_iteration", "render_ms", "render_fps")}
+        fields |= dict.fromkeys(("ready_radius_m", "psnr_db", "train_seconds", "ready_seconds"), 0.0)
+        fields |= dict.fromkeys(("ms_per_iteration", "render_ms", "render_fps"), 0.0)
         fields.pop("__msgtype__", None)
         return VspaceStatus(
             **fields

@@ -1,0 +1,163 @@
+"""Costmap: inflation by hand, marking and clearing, the rolling window, the published form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.control.costmap import (
+    FREE,
+    INSCRIBED,
+    LETHAL,
+    UNKNOWN,
+    Costmap,
+    CostmapConfig,
+    RollingCostmap,
+    ScanRays,
+    StaticMap,
+    inflated_cost,
+    scan_points,
+    scan_rays,
+)
+from instant_ic.control.footprint import Footprint
+
+CONFIG = CostmapConfig(width_m=4.0, footprint_clearing_enabled=False)
+
+
+def one_hit(x: float, y: float, hit: bool = True) -> ScanRays:
+    return ScanRays(np.zeros(2), np.array([[x, y]]), np.array([hit]))
+
+
+def update(rays: ScanRays | None, static: StaticMap | None = None, config: CostmapConfig = CONFIG) -> Costmap:
+    return RollingCostmap(config, Footprint()).update(np.zeros(3), static, rays)
+
+
+def open_map(size_m: float = 6.0) -> StaticMap:
+    n = round(size_m / 0.05)
+    return StaticMap(np.zeros((n, n), np.int8), 0.05, np.array([-size_m / 2, -size_m / 2]))
+
+
+@pytest.mark.parametrize(
+    ("metres", "cost"),
+    [
+        (0.0, LETHAL),
+        (0.05, INSCRIBED),
+        (0.25, INSCRIBED),  # the inscribed radius of 0.60 by 0.50 is 0.25
+        (0.30, 216),  # 252 exp(-3 * 0.05) = 216.9
+        (0.50, 119),  # 252 exp(-3 * 0.25) = 119.04
+        (0.70, 65),  # 252 exp(-3 * 0.45) = 65.3
+        (0.75, FREE),  # beyond the inflation radius
+    ],
+)
+def test_inflation_follows_nav2s_formula(metres: float, cost: int) -> None:
+    costmap = update(one_hit(1.025, 0.025), open_map())
+    assert int(costmap.cost_at(np.array([1.025, 0.025 + metres]))) == cost
+    assert inflated_cost(metres, CONFIG, Footprint()) == cost
+
+
+def test_a_beam_clears_up_to_its_hit_and_no_farther() -> None:
+    costmap = update(one_hit(1.525, 0.025))
+    assert costmap.cost_at(np.array([1.525, 0.025])) == LETHAL
+    assert costmap.cost_at(np.array([0.525, 0.025])) == FREE
+    assert costmap.cost_at(np.array([1.275, 0.025])) == INSCRIBED
+    # Behind it nothing was seen: unknown but for what the robot could not stand on anyway.
+    assert costmap.cost_at(np.array([1.675, 0.025])) == INSCRIBED
+    assert costmap.cost_at(np.array([1.925, 0.025])) == UNKNOWN
+
+
+def test_a_thing_that_goes_away_is_cleared_by_the_next_beam() -> None:
+    rolling = RollingCostmap(CONFIG, Footprint())
+    assert rolling.update(np.zeros(3), None, one_hit(1.0, 0.0)).cost_at(np.array([1.0, 0.0])) == LETHAL
+    assert rolling.update(np.zeros(3), None, one_hit(1.8, 0.0)).cost_at(np.array([1.0, 0.0])) == FREE
+
+
+def test_a_beam_without_a_hit_clears_its_last_cell_too() -> None:
+    rolling = RollingCostmap(CONFIG, Footprint())
+    rolling.update(np.zeros(3), None, one_hit(1.0, 0.0))
+    assert rolling.update(np.zeros(3), None, one_hit(1.0, 0.0, hit=False)).cost_at(np.array([1.0, 0.0])) == FREE
+
+
+def test_every_cell_on_a_slanted_beam_is_cleared() -> None:
+    costmap = update(one_hit(1.7, 1.1, hit=False))
+    for share in np.linspace(0.0, 1.0, 200):
+        assert costmap.cost_at(share * np.array([1.7, 1.1])) == FREE
+
+
+def test_marks_stay_where_they_are_while_the_window_moves() -> None:
+    rolling = RollingCostmap(CONFIG, Footprint())
+    rolling.update(np.zeros(3), None, one_hit(1.025, 0.525))
+    for pose in ([0.7, -0.6, 0.0], [-0.3, 0.4, 0.0], [0.2, 0.0, 0.0]):
+        costmap = rolling.update(np.array(pose), None, None)
+        assert costmap.cost_at(np.array([1.025, 0.525])) == LETHAL
+    assert (rolling.update(np.array([9.0, 0.0, 0.0]), None, None).costs == UNKNOWN).all()
+    assert (rolling.update(np.zeros(3), None, None).costs == UNKNOWN).all()  # what left the window is forgotten
+
+
+def test_static_map_and_scan_are_joined_by_the_larger() -> None:
+    static = open_map()
+    static.occupancy[60 + 10, 60 + 20] = 100  # x 1.025, y 0.525
+    static.occupancy[:, 100:] = -1  # x > 2: unknown
+    costmap = update(one_hit(1.825, 0.025), static)
+    assert costmap.cost_at(np.array([1.025, 0.525])) == LETHAL
+    assert costmap.cost_at(np.array([1.825, 0.025])) == LETHAL
+    assert costmap.cost_at(np.array([-1.5, -1.5])) == FREE
+
+
+def test_the_robot_stands_on_free_ground() -> None:
+    rays = ScanRays(np.zeros(2), np.array([[0.2, 0.1]]), np.array([True]))
+    cleared = update(rays, config=CostmapConfig(width_m=4.0))
+    assert cleared.cost_at(np.array([0.2, 0.1])) == FREE
+    assert update(rays).cost_at(np.array([0.2, 0.1])) == LETHAL
+
+
+def test_scan_values_by_rep_117() -> None:
+    ranges = np.array([1.0, np.inf, -np.inf, np.nan, 0.1, 30.0])
+    config = CostmapConfig(raytrace_max_range=5.0, obstacle_max_range=4.0)
+    rays = scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), config)
+    # The hit, and the beam that met nothing; not the near, the absent, the one out of range.
+    np.testing.assert_allclose(rays.ends, [[1.0, 0.0], [5.0, 0.0]])
+    assert rays.hits.tolist() == [True, False]
+    assert len(scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), CostmapConfig(inf_is_valid=False)).ends) == 1
+    np.testing.assert_allclose(scan_points(ranges, 0.0, 0.0, 0.5, 20.0), [[1.0, 0.0]])
+
+
+def test_scan_is_placed_by_the_sensors_pose() -> None:
+    map_from_lidar = np.eye(4)
+    map_from_lidar[:2, :2] = [[0, -1], [1, 0]]  # looking along +y
+    map_from_lidar[:2, 3] = [2.0, 3.0]
+    rays = scan_rays(np.array([1.5]), 0.0, 0.01, 0.1, 20.0, map_from_lidar, CONFIG)
+    np.testing.assert_allclose(rays.ends, [[2.0, 4.5]], atol=1e-12)
+    np.testing.assert_allclose(rays.origin, [2.0, 3.0])
+
+
+def test_published_form_comes_back() -> None:
+    costs = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    costmap = Costmap(costs, 0.05, np.zeros(2))
+    occupancy = costmap.occupancy()
+    assert occupancy.ravel()[[0, 1, 252, 253, 254, 255]].tolist() == [0, 1, 98, 99, 100, -1]  # nav2's own table
+    back = Costmap.from_occupancy(occupancy, 0.05, np.zeros(2)).costs.astype(int)
+    assert np.abs(back - costs).max() <= 2
+    for value in (FREE, INSCRIBED, LETHAL, UNKNOWN):
+        assert back.ravel()[value] == value
+
+
+def test_footprint_overlap_counts_lethal_points_under_the_rectangle() -> None:
+    costs = np.zeros((80, 80), np.uint8)
+    costs[40, 40 + 6] = LETHAL  # x 0.30..0.35, y 0..0.05
+    costmap = Costmap(costs, 0.05, np.array([-2.0, -2.0]))
+    body = Footprint().points(0.045)
+    # Nose at 0.30 less 2 cm; at 0.35; the side, at 0.25, towards it; the nose past it, tail still over it.
+    poses = np.array([[-0.02, 0.0, 0.0], [0.05, 0.0, 0.0], [0.0, 0.0, math.pi / 2], [0.5, 0.0, 0.0]])
+    overlap = costmap.lethal_overlap(poses, body)
+    assert (overlap > 0).tolist() == [False, True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("resolution", 0.0), ("width_m", math.nan), ("inflation_radius", -1.0), ("occupied_threshold", 0)],
+)
+def test_bad_parameters_are_named(key: str, value: float) -> None:
+    with pytest.raises(ValueError, match=key):
+        CostmapConfig(**{key: value})

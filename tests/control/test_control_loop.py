@@ -1,0 +1,269 @@
+"""The whole control part in a closed loop with a flat world: the paper's section III.A, and what may go wrong."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from control_world import Loop, World, corridor, draw_map, rectangle
+
+from instant_ic.control import diagram
+from instant_ic.control.arbiter import (
+    ACTIONS,
+    GUARDS,
+    SOURCES,
+    TRANSITIONS,
+    Arbiter,
+    ArbiterInputs,
+    Mode,
+    SwitchConfig,
+    TimeoutConfig,
+    Vspace,
+)
+
+BOX = (2.5, -0.25, 3.0, 0.25)
+FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "control.md"
+
+
+def loop(box: tuple[float, float, float, float] | None = BOX, mapped: bool = True, length: float = 16.0) -> Loop:
+    """A corridor 2.4 m wide; the box is never in the map, the walls are when ``mapped``."""
+    walls = corridor(length)
+    world = World(walls if box is None else np.concatenate([walls, rectangle(*box)]))
+    made = Loop(world, draw_map(walls, (-2, -1.2, length - 2, 1.2)) if mapped else None)
+    made.start()
+    return made
+
+
+def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
+    for _ in range(round(seconds * 20)):
+        frame = made.step(command)
+        assert not made.world.contact(frame.robot), f"contact at {frame.t:.2f} s, {frame.robot}"
+
+
+@pytest.mark.parametrize("mapped", [True, False])
+@pytest.mark.parametrize("box", [BOX, (2.2, -0.6, 3.0, 0.1), (2.5, -1.2, 3.0, 0.1)])
+def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped: bool) -> None:
+    made = loop(box, mapped)
+    drive(made, 20.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    virtual = [f for f in made.frames if f.decision.mode == Mode.VIRTUAL]
+    # The v-bot starts at the r-bot's pose and goes straight through; the r-bot goes round.
+    np.testing.assert_allclose(virtual[0].decision.vbot_start, virtual[0].robot)
+    inside = [f for f in virtual if box[0] < f.vbot[0] < box[2] and box[1] < f.vbot[1] < box[3]]
+    assert len(inside) > 10
+    assert max(abs(f.robot[1]) for f in virtual) > 0.4
+    # At the return the two agree, and the operator was obeyed all the way.
+    last = virtual[-1]
+    assert np.linalg.norm(last.vbot[:2] - last.robot[:2]) <= 0.15 + 0.03
+    assert abs(last.vbot[2] - last.robot[2]) <= math.radians(10.0)
+    assert min(made.vbot.limits.max_linear_m_s, 0.4) == pytest.approx(made.frames[-1].command[0])
+    moved = np.linalg.norm(np.diff([f.decision.vbot_pose[:2] for f in virtual], axis=0), axis=1)
+    assert np.mean(moved[20:]) / 0.05 == pytest.approx(0.4, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("vspace", "words"),
+    [
+        (Vspace(ready=False, message="training 1.2 s"), "not ready (training 1.2 s)"),
+        (Vspace(ready=True, position=np.array([-1.0, 0.0]), ready_radius_m=1.5), "fit to show 1.5 m round"),
+    ],
+)
+def test_without_a_virtual_space_the_robot_stops_and_says_why(vspace: Vspace, words: str) -> None:
+    made = loop()
+    made.vspace = vspace
+    drive(made, 14.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL"]
+    end = made.frames[-1]
+    assert end.decision.blocked
+    assert words in end.decision.reason
+    assert end.command == NOTHING
+    assert 2.0 < end.robot[0] + 0.30 < 2.5  # near the face at 2.5, not touching
+    made.vspace = Vspace(ready=True, ready_radius_m=100.0)
+    drive(made, 1.0, FORWARD)
+    assert made.modes()[-1] == "VIRTUAL"
+
+
+def test_a_silent_virtual_space_is_no_virtual_space() -> None:
+    made = loop()
+    made.ages["vspace"] = math.inf
+    drive(made, 12.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL"]
+    assert "no virtual space is running" in made.frames[-1].decision.reason
+
+
+@pytest.mark.parametrize(
+    ("box", "length", "words"),
+    [(None, 6.0, "a wall is in the way"), ((2.5, -1.2, 3.0, 0.8), 16.0, "no way round")],
+)
+def test_where_the_robot_cannot_follow_there_is_no_switch(
+    box: tuple[float, float, float, float] | None, length: float, words: str
+) -> None:
+    made = loop(box, length=length)
+    drive(made, 14.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL"]
+    assert words in made.frames[-1].decision.reason
+    assert made.frames[-1].command == NOTHING
+
+
+def test_side_walls_block_but_let_go() -> None:
+    made = loop(None)
+    drive(made, 12.0, (0.4, 0.1))
+    assert made.modes() == ["STOPPED", "REAL"]
+    assert made.frames[-1].decision.blocked
+    before = made.base.pose.copy()
+    drive(made, 3.0, (-0.3, 0.0))
+    assert np.linalg.norm(made.base.pose[:2] - before[:2]) > 0.5
+
+
+def test_tapping_forward_before_the_obstacle_does_not_flicker() -> None:
+    made = loop()
+    for _ in range(40):
+        drive(made, 0.3, FORWARD)
+        drive(made, 0.5, NOTHING)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL"]
+    drive(made, 20.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+
+
+def test_stopping_inside_the_obstacle_the_robot_waits_and_goes_on() -> None:
+    made = loop()
+    drive(made, 7.0, FORWARD)
+    drive(made, 12.0, NOTHING)
+    assert BOX[0] < made.vbot.pose[0] < BOX[2]
+    waiting = made.frames[-1]
+    assert waiting.decision.mode == Mode.VIRTUAL
+    assert waiting.speed == pytest.approx(0.0, abs=0.01)
+    drive(made, 14.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+
+
+def test_turning_away_before_the_obstacle_gives_the_real_view_back() -> None:
+    made = loop()
+    drive(made, 4.2, FORWARD)
+    assert made.modes()[-1] == "VIRTUAL"
+    drive(made, 3.0, (0.0, 0.8))
+    drive(made, 12.0, NOTHING)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+
+
+def test_emergency_stop_in_both_modes() -> None:
+    for seconds in (2.0, 7.0):
+        made = loop()
+        drive(made, seconds, FORWARD)
+        made.estop = True
+        assert made.step(FORWARD).command == NOTHING
+        drive(made, 2.0, FORWARD)
+        assert made.frames[-1].decision.mode == Mode.STOPPED
+        assert made.base.v == pytest.approx(0.0, abs=1e-9)
+        made.estop = False
+        drive(made, 1.0, FORWARD)
+        assert made.frames[-1].decision.mode == Mode.STOPPED  # not while the key is down
+        drive(made, 0.2, NOTHING)
+        assert made.frames[-1].decision.mode == Mode.REAL
+
+
+@pytest.mark.parametrize("key", [source.key for source in SOURCES if Mode.VIRTUAL in source.modes])
+def test_each_source_lost_while_virtual_holds_then_stops(key: str) -> None:
+    made = loop()
+    drive(made, 7.0, FORWARD)
+    timeout = getattr(TimeoutConfig(), key)
+    made.ages[key] = timeout + 0.01
+    frame = made.step(FORWARD)
+    assert (frame.decision.mode, frame.command) == (Mode.VIRTUAL, NOTHING)
+    made.ages[key] = max(1.5, timeout) + 0.01
+    assert made.step(FORWARD).decision.mode == Mode.STOPPED
+
+
+def test_a_stale_command_stops_the_robot_and_the_vbot() -> None:
+    made = loop()
+    drive(made, 2.0, FORWARD)
+    made.ages["command"] = 0.31
+    assert made.step(FORWARD).command == NOTHING
+    made.ages["command"] = 0.0
+    drive(made, 4.0, FORWARD)
+    assert made.modes()[-1] == "VIRTUAL"
+    made.ages["command"] = 0.31
+    drive(made, 2.0, FORWARD)
+    assert made.vbot.velocity == NOTHING
+
+
+def test_a_failed_virtual_space_gives_the_real_view_back_by_way_of_a_stop() -> None:
+    made = loop()
+    drive(made, 6.0, FORWARD)
+    made.vspace = Vspace(failed=True, message="out of memory")
+    frame = made.step(FORWARD)
+    assert frame.decision.mode == Mode.STOPPED
+    assert "out of memory" in frame.decision.reason
+    drive(made, 1.0, NOTHING)
+    assert made.frames[-1].decision.mode == Mode.REAL
+
+
+def test_the_vbot_waits_for_a_robot_that_cannot_follow() -> None:
+    made = loop()
+    drive(made, 5.0, FORWARD)
+    assert made.modes()[-1] == "VIRTUAL"
+    held = made.base.pose.copy()
+    made.base.step = lambda command, dt: None  # type: ignore[method-assign]  # tracks off the ground
+    drive(made, 30.0, (0.5, 0.0))
+    assert 2.5 < np.linalg.norm(made.vbot.pose[:2] - held[:2]) <= 3.0
+
+
+def test_commands_that_are_no_numbers_are_zero() -> None:
+    made = loop(None)
+    drive(made, 2.0, FORWARD)
+    assert made.step((math.nan, 0.0)).command == NOTHING
+    assert made.step((0.4, math.inf)).command == NOTHING
+
+
+def test_nothing_moves_before_everything_is_there() -> None:
+    arbiter = Arbiter()
+    decision = arbiter.step(ArbiterInputs(operator_command=FORWARD), 0)
+    assert (decision.mode, decision.command) == (Mode.STOPPED, NOTHING)
+    assert "no LiDAR scan yet" in decision.reason
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_one_switch_each_way_with_noise(seed: int) -> None:
+    """Scan noise of 1.5 cm, a pose that wanders by centimetres: still one switch in, one out, no contact."""
+    rng = np.random.default_rng(seed)
+    y, side = rng.uniform(-0.3, 0.3), rng.uniform(0.3, 0.7)
+    walls, x = corridor(), rng.uniform(2.0, 3.0)
+    world = World(np.concatenate([walls, rectangle(x, y - side / 2, x + 0.5, y + side / 2)]))
+    made = Loop(world, draw_map(walls, (-2, -1.2, 14, 1.2)), noise=rng)
+    made.start()
+    drive(made, 26.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+
+
+def test_at_the_return_the_way_is_free_beyond_the_horizon_that_switches_in() -> None:
+    made = loop()
+    drive(made, 20.0, FORWARD)
+    (back,) = [f for f in made.frames if f.decision.changed and f.t > 3.0 and f.decision.mode == Mode.REAL]
+    predictor, switch = made.arbiter.predictor, SwitchConfig()
+    speed = (back.speed, 0.0)
+    free = predictor.predict(back.robot, speed, FORWARD, made.costmap, switch.return_margin_m)
+    assert free.hit_index is None
+    longest = free.poses[-1, 0] - back.robot[0]
+    entering = predictor.predict(back.robot, speed, FORWARD, made.costmap)
+    assert longest - (entering.poses[-1, 0] - back.robot[0]) == pytest.approx(0.5, abs=0.03)
+    with pytest.raises(ValueError, match="return_margin_m"):
+        SwitchConfig(return_margin_m=0.0)
+
+
+class TestTable:
+    def test_every_guard_and_action_is_explained_and_there(self) -> None:
+        arbiter = Arbiter()
+        assert {row.guard for row in TRANSITIONS} == set(GUARDS) == set(arbiter._guards)
+        assert {row.action for row in TRANSITIONS} == set(ACTIONS) == set(arbiter._actions)
+
+    def test_every_moving_state_can_be_stopped_first(self) -> None:
+        for mode in (Mode.REAL, Mode.VIRTUAL):
+            rows = [row for row in TRANSITIONS if row.source == mode]
+            assert (rows[0].guard, rows[0].target) == ("estop_pressed", Mode.STOPPED)
+
+    @pytest.mark.parametrize("text", [diagram.state_diagram(), diagram.guard_table(), diagram.source_table()])
+    def test_the_docs_show_the_table_as_it_is(self, text: str) -> None:
+        assert text in DOCS.read_text(), "docs/control.md is old: print instant_ic.control.diagram into it"
