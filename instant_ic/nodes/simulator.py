@@ -164,7 +164,9 @@ class SimulatorNode(Node[SimulatorConfig]):
             self.diagnose("pace", OK, "real time")
         if isinstance(self.scanner, Vlp16Server):
             lost, self._skipped = self.scanner.skipped - self._skipped, self.scanner.skipped
-            level, text = (WARN, f"{lost} packets left out: the machine is too slow") if lost else (OK, "all packets sent")
+            level, text = (
+                (WARN, f"{lost} packets left out: the machine is too slow") if lost else (OK, "all packets sent")
+            )
             self.diagnose("lidar", level, text, sent=self.scanner.sent, left_out=self.scanner.skipped)
         elif isinstance(self.scanner, CaptureReplay):
             done = "the recording has ended" if self.scanner.finished else "recording runs"

@@ -223,9 +223,7 @@ class Building:
         corner = np.asarray([*at, size[2]]) - x * (size[0] / 2 + 0.001) + y * size[1] / 2
         self.builder.panel(corner, -y * size[1], np.asarray([0, 0, -size[2]]), face)
 
-    def world(
-        self, name: str, spawn: tuple[float, float, float], light_cell_m: float = 0.1, rays: int = 48
-    ) -> World:
+    def world(self, name: str, spawn: tuple[float, float, float], light_cell_m: float = 0.1, rays: int = 48) -> World:
         """Mesh, textures and baked light of the building."""
         for zone in self.zones:
             self._shell(zone)

@@ -14,7 +14,9 @@ def _turned(centre: Point, yaw: float, offset: Point) -> Point:
     return centre[0] + c * offset[0] - s * offset[1], centre[1] + s * offset[0] + c * offset[1]
 
 
-def table(build: WorldBuilder, centre: Point, yaw: float, size: Point = (1.4, 0.7), top: Material | None = None) -> None:
+def table(
+    build: WorldBuilder, centre: Point, yaw: float, size: Point = (1.4, 0.7), top: Material | None = None
+) -> None:
     """Table: a top 40 mm thick, 0.74 m high, on four legs."""
     top = top or Material("wood", 0.8)
     leg = Material("metal", 0.5)

@@ -34,7 +34,15 @@ def surfaces_of(face: I32, face_surface: I32) -> None:
 
 @_jit
 def refine(
-    surface: I32, range_m: F32, directions: F32, origin: F32, normal: F32, offset: F32, step: int, wraps: bool, todo: I32
+    surface: I32,
+    range_m: F32,
+    directions: F32,
+    origin: F32,
+    normal: F32,
+    offset: F32,
+    step: int,
+    wraps: bool,
+    todo: I32,
 ) -> int:
     """Fills in the pixels between those of a coarse grid.
 
@@ -89,47 +97,51 @@ def _bilinear(
     texels: npt.NDArray[np.uint32], first: int, width: int, height: int, u: float, v: float, clamp: bool
 ) -> tuple[float, float, float]:
     """Square-root-coded colour 0..255 squared (linear · 65025) at texture coordinates 0..1."""
-    x = np.float32(u * width - 0.5)
-    y = np.float32(v * height - 0.5)
-    x0 = int(np.floor(x))
-    y0 = int(np.floor(y))
-    fx = x - np.float32(x0)
-    fy = y - np.float32(y0)
-    x1 = x0 + 1
-    y1 = y0 + 1
+    x = u * np.float32(width) - np.float32(0.5)
+    y = v * np.float32(height) - np.float32(0.5)
+    floor_x = np.floor(x)
+    floor_y = np.floor(y)
+    fx = x - floor_x
+    fy = y - floor_y
+    x0 = np.int32(floor_x)
+    y0 = np.int32(floor_y)
+    x1 = x0 + np.int32(1)
+    y1 = y0 + np.int32(1)
     if clamp:
-        x0 = min(max(x0, 0), width - 1)
-        x1 = min(max(x1, 0), width - 1)
-        y0 = min(max(y0, 0), height - 1)
-        y1 = min(max(y1, 0), height - 1)
+        x0 = max(x0, np.int32(0))
+        y0 = max(y0, np.int32(0))
+        x1 = min(x1, np.int32(width - 1))
+        y1 = min(y1, np.int32(height - 1))
     else:
         if x0 < 0:
-            x0 += width
+            x0 += np.int32(width)
         if y0 < 0:
-            y0 += height
+            y0 += np.int32(height)
         if x1 >= width:
-            x1 -= width
+            x1 -= np.int32(width)
         if y1 >= height:
-            y1 -= height
-    r = np.float32(0.0)
-    g = np.float32(0.0)
-    b = np.float32(0.0)
-    for k in range(4):
-        if k == 0:
-            texel, weight = texels[first + y0 * width + x0], (np.float32(1) - fx) * (np.float32(1) - fy)
-        elif k == 1:
-            texel, weight = texels[first + y0 * width + x1], fx * (np.float32(1) - fy)
-        elif k == 2:
-            texel, weight = texels[first + y1 * width + x0], (np.float32(1) - fx) * fy
-        else:
-            texel, weight = texels[first + y1 * width + x1], fx * fy
-        cr = np.float32(texel & np.uint32(255))
-        cg = np.float32((texel >> np.uint32(8)) & np.uint32(255))
-        cb = np.float32((texel >> np.uint32(16)) & np.uint32(255))
-        r += weight * cr * cr
-        g += weight * cg * cg
-        b += weight * cb * cb
-    return r, g, b
+            y1 -= np.int32(height)
+    row0 = first + np.int64(y0) * np.int64(width)
+    row1 = first + np.int64(y1) * np.int64(width)
+    a, b, c, d = texels[row0 + x0], texels[row0 + x1], texels[row1 + x0], texels[row1 + x1]
+    w11 = fx * fy
+    w10 = fx - w11
+    w01 = fy - w11
+    w00 = np.float32(1) - fx - w01
+    mask = np.uint32(255)
+    ra, rb = np.float32(np.int32(a & mask)), np.float32(np.int32(b & mask))
+    rc, rd = np.float32(np.int32(c & mask)), np.float32(np.int32(d & mask))
+    e = np.uint32(8)
+    ga, gb = np.float32(np.int32((a >> e) & mask)), np.float32(np.int32((b >> e) & mask))
+    gc, gd = np.float32(np.int32((c >> e) & mask)), np.float32(np.int32((d >> e) & mask))
+    e = np.uint32(16)
+    ba, bb = np.float32(np.int32(a >> e)), np.float32(np.int32(b >> e))
+    bc, bd = np.float32(np.int32(c >> e)), np.float32(np.int32(d >> e))
+    return (
+        w00 * ra * ra + w10 * rb * rb + w01 * rc * rc + w11 * rd * rd,
+        w00 * ga * ga + w10 * gb * gb + w01 * gc * gc + w11 * gd * gd,
+        w00 * ba * ba + w10 * bb * bb + w01 * bc * bc + w11 * bd * bd,
+    )
 
 
 @_jit
@@ -155,11 +167,9 @@ def _albedo(
     top = levels[t] - 1
     lod = min(max(lod, np.float32(0.0)), np.float32(top))
     level = int(lod)
-    part = lod - np.float32(level)
-    r, g, b = _bilinear(
-        texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp
-    )
-    if part > np.float32(0.02) and level < top:
+    part = np.float32(lod - np.float32(level))
+    r, g, b = _bilinear(texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp)
+    if part > np.float32(0.03) and level < top:
         level += 1
         r1, g1, b1 = _bilinear(
             texels, level_offset[t, level], level_size[t, level, 0], level_size[t, level, 1], u, v, clamp
@@ -169,6 +179,34 @@ def _albedo(
         b += part * (b1 - b)
     scale = np.float32(1.0 / 65025.0)
     return r * scale, g * scale, b * scale
+
+
+@_jit
+def _log2(value: float) -> float:
+    """Binary logarithm of a positive float32."""
+    return np.float32(np.log2(value))
+
+
+@_jit
+def _light_texel(light: F32, first: int, width: int, height: int, a: float, b: float) -> tuple[float, float, float]:
+    """Light map at texel coordinates (a, b), bilinear."""
+    a = min(max(a, np.float32(0.0)), np.float32(width) - np.float32(1.001))
+    b = min(max(b, np.float32(0.0)), np.float32(height) - np.float32(1.001))
+    i = np.int32(a)
+    j = np.int32(b)
+    fa = a - np.float32(i)
+    fb = b - np.float32(j)
+    at = first + np.int64(j) * width + np.int64(i)
+    below = at + width
+    w11 = fa * fb
+    w10 = fa - w11
+    w01 = fb - w11
+    w00 = np.float32(1) - fa - w01
+    return (
+        w00 * light[at, 0] + w10 * light[at + 1, 0] + w01 * light[below, 0] + w11 * light[below + 1, 0],
+        w00 * light[at, 1] + w10 * light[at + 1, 1] + w01 * light[below, 1] + w11 * light[below + 1, 1],
+        w00 * light[at, 2] + w10 * light[at + 1, 2] + w01 * light[below, 2] + w11 * light[below + 1, 2],
+    )
 
 
 @_jit
@@ -183,21 +221,7 @@ def _irradiance(
         return e, e, e
     a = light_uv[s, 0, 0] * x + light_uv[s, 0, 1] * y + light_uv[s, 0, 2] * z + light_uv[s, 0, 3]
     b = light_uv[s, 1, 0] * x + light_uv[s, 1, 1] * y + light_uv[s, 1, 2] * z + light_uv[s, 1, 3]
-    a = min(max(a, np.float32(0.0)), np.float32(width - 1.001))
-    b = min(max(b, np.float32(0.0)), np.float32(height - 1.001))
-    i = int(a)
-    j = int(b)
-    fa = a - np.float32(i)
-    fb = b - np.float32(j)
-    at = light_at[s, 0] + j * width + i
-    w00 = (np.float32(1) - fa) * (np.float32(1) - fb)
-    w10 = fa * (np.float32(1) - fb)
-    w01 = (np.float32(1) - fa) * fb
-    w11 = fa * fb
-    r = w00 * light[at, 0] + w10 * light[at + 1, 0] + w01 * light[at + width, 0] + w11 * light[at + width + 1, 0]
-    g = w00 * light[at, 1] + w10 * light[at + 1, 1] + w01 * light[at + width, 1] + w11 * light[at + width + 1, 1]
-    bl = w00 * light[at, 2] + w10 * light[at + 1, 2] + w01 * light[at + width, 2] + w11 * light[at + width + 1, 2]
-    return r, g, bl
+    return _light_texel(light, light_at[s, 0], width, height, a, b)
 
 
 @_jit
@@ -229,6 +253,18 @@ def shade(
     The texture is averaged over the pixel's footprint on the surface: two trilinear lookups along its long axis where
     the surface is seen aslant, one elsewhere.
     """
+    last = np.int32(-1)
+    one = np.float32(1)
+    half = np.float32(0.5)
+    angle = np.float32(pixel_rad)
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    # What belongs to the surface is loaded when it changes, which is seldom along a row.
+    nx = ny = nz = ux = uy = uz = uw = vx = vy = vz = vw = np.float32(0)
+    tr = tg = tb = glow = density = np.float32(0)
+    ax = ay = az = aw = bx = by = bz = bw = np.float32(0)
+    columns = rows = np.int64(0)
+    first = np.int64(0)
+    t = np.int32(0)
     for i in range(surface.shape[0]):
         s = surface[i]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
@@ -239,36 +275,51 @@ def shade(
             out[i, 1] = np.float32(0.72) - np.float32(0.22) * up
             out[i, 2] = np.float32(0.85) - np.float32(0.05) * up
             continue
+        if s != last:
+            last = s
+            nx, ny, nz = normal[s, 0], normal[s, 1], normal[s, 2]
+            ux, uy, uz, uw = uv[s, 0, 0], uv[s, 0, 1], uv[s, 0, 2], uv[s, 0, 3]
+            vx, vy, vz, vw = uv[s, 1, 0], uv[s, 1, 1], uv[s, 1, 2], uv[s, 1, 3]
+            tr, tg, tb = tint[s, 0], tint[s, 1], tint[s, 2]
+            glow, density, t = emission[s], texel_per_m[s], texture[s]
+            first, columns, rows = light_at[s, 0], light_at[s, 1], light_at[s, 2]
+            if columns == 0:
+                ax, ay, az, aw = light_linear[s, 0], light_linear[s, 1], light_linear[s, 2], light_linear[s, 3]
+            else:
+                ax, ay, az, aw = light_uv[s, 0, 0], light_uv[s, 0, 1], light_uv[s, 0, 2], light_uv[s, 0, 3]
+                bx, by, bz, bw = light_uv[s, 1, 0], light_uv[s, 1, 1], light_uv[s, 1, 2], light_uv[s, 1, 3]
         r = range_m[i]
-        x, y, z = origin[0] + r * dx, origin[1] + r * dy, origin[2] + r * dz
-        u = uv[s, 0, 0] * x + uv[s, 0, 1] * y + uv[s, 0, 2] * z + uv[s, 0, 3]
-        v = uv[s, 1, 0] * x + uv[s, 1, 1] * y + uv[s, 1, 2] * z + uv[s, 1, 3]
-        cosine = abs(normal[s, 0] * dx + normal[s, 1] * dy + normal[s, 2] * dz)
-        minor = r * np.float32(pixel_rad)
-        stretch = min(np.float32(1.0) / max(cosine, np.float32(0.02)), np.float32(16.0))
-        t = texture[s]
+        x, y, z = ox + r * dx, oy + r * dy, oz + r * dz
+        u = ux * x + uy * y + uz * z + uw
+        v = vx * x + vy * y + vz * z + vw
+        side = nx * dx + ny * dy + nz * dz
+        minor = r * angle
+        stretch = min(one / max(abs(side), np.float32(0.02)), np.float32(16.0))
         if stretch < np.float32(1.5):
-            lod = np.log2(minor * stretch * texel_per_m[s])
+            lod = _log2(minor * stretch * density)
             cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u, v, lod)
         else:
-            side = normal[s, 0] * dx + normal[s, 1] * dy + normal[s, 2] * dz
-            px, py, pz = dx - side * normal[s, 0], dy - side * normal[s, 1], dz - side * normal[s, 2]
+            px, py, pz = dx - side * nx, dy - side * ny, dz - side * nz
             reach = np.float32(0.25) * minor * stretch / np.sqrt(px * px + py * py + pz * pz)
-            du = (uv[s, 0, 0] * px + uv[s, 0, 1] * py + uv[s, 0, 2] * pz) * reach
-            dv = (uv[s, 1, 0] * px + uv[s, 1, 1] * py + uv[s, 1, 2] * pz) * reach
-            lod = np.log2(minor * max(stretch * np.float32(0.5), np.float32(1.0)) * texel_per_m[s])
+            du = (ux * px + uy * py + uz * pz) * reach
+            dv = (vx * px + vy * py + vz * pz) * reach
+            lod = _log2(minor * max(stretch * half, one) * density)
             cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u + du, v + dv, lod)
             r2, g2, b2 = _albedo(texels, level_offset, level_size, levels, clamps, t, u - du, v - dv, lod)
-            cr = np.float32(0.5) * (cr + r2)
-            cg = np.float32(0.5) * (cg + g2)
-            cb = np.float32(0.5) * (cb + b2)
-        if emission[s] > 0:
-            er = eg = eb = emission[s]
+            cr = half * (cr + r2)
+            cg = half * (cg + g2)
+            cb = half * (cb + b2)
+        if glow > 0:
+            er = eg = eb = glow
+        elif columns == 0:
+            er = eg = eb = max(ax * x + ay * y + az * z + aw, np.float32(0.02))
         else:
-            er, eg, eb = _irradiance(s, x, y, z, light_at, light_uv, light_linear, light)
-        out[i, 0] = cr * tint[s, 0] * er
-        out[i, 1] = cg * tint[s, 1] * eg
-        out[i, 2] = cb * tint[s, 2] * eb
+            a = ax * x + ay * y + az * z + aw
+            b = bx * x + by * y + bz * z + bw
+            er, eg, eb = _light_texel(light, first, columns, rows, a, b)
+        out[i, 0] = cr * tr * er
+        out[i, 1] = cg * tg * eg
+        out[i, 2] = cb * tb * eb
 
 
 @_jit

@@ -124,9 +124,7 @@ def _direct(world: World, points: F32, normals: F32) -> F32:
     distance = np.linalg.norm(to, axis=1)
     seen = ~world.caster.occluded(start, to / distance[:, None], distance - 0.02)
     for k in range(3):
-        light[:, k] = np.bincount(
-            texel[seen], weights=weight[seen] * power[source[seen], k], minlength=len(points)
-        )
+        light[:, k] = np.bincount(texel[seen], weights=weight[seen] * power[source[seen], k], minlength=len(points))
     return light
 
 

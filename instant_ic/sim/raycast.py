@@ -50,9 +50,7 @@ class RayCaster:
         range_m[face < 0] = np.inf
         return range_m, face
 
-    def occluded(
-        self, origins: FloatArray, directions: FloatArray, distance_m: FloatArray
-    ) -> npt.NDArray[np.bool_]:
+    def occluded(self, origins: FloatArray, directions: FloatArray, distance_m: FloatArray) -> npt.NDArray[np.bool_]:
         """Whether something stands within ``distance_m`` (N,) along each ray (N, 3)."""
         hit = self._scene.run(
             np.ascontiguousarray(origins, np.float32),

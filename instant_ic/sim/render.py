@@ -16,6 +16,10 @@ FloatArray = npt.NDArray[np.floating]
 #: Where edge pixels are sampled (rows, columns, in pixels from the centre): rotated grid, one sample a row and column.
 _SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 
+#: Share of a pixel over which a texture is averaged. Trilinear lookup blurs by itself: against 16 samples a pixel,
+#: 0.65 gives 41-44 dB in the corridor, 1.0 gives 38-40 dB, 0.5 gives 39-43 dB and begins to alias.
+_FOOTPRINT = 0.65
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -127,9 +131,7 @@ class EquirectRenderer:
             radiance, depth = self._radiance(map_from_camera, lens)
         else:
             n = supersample
-            fine, fine_depth = self._radiance(
-                map_from_camera, _Lens(lens.width * n, lens.height * n, lens.hfov_rad)
-            )
+            fine, fine_depth = self._radiance(map_from_camera, _Lens(lens.width * n, lens.height * n, lens.hfov_rad))
             # Averaged as light, cut off at white as a sensor does, so that lamps keep smooth borders.
             radiance = np.ascontiguousarray(
                 np.minimum(fine, 1.5).reshape(lens.height, n, lens.width, n, 3).mean(axis=(1, 3)), np.float32
@@ -150,7 +152,8 @@ class EquirectRenderer:
         kernels.rotate(_all_rays(lens), rotation, directions)
         surface, range_m = self._visible(directions, origin, lens)
         radiance = np.empty((height * width, 3), np.float32)
-        self._shade(surface.ravel(), range_m.ravel(), directions, origin, lens.pixel_rad, radiance)
+        footprint = _FOOTPRINT * lens.pixel_rad
+        self._shade(surface.ravel(), range_m.ravel(), directions, origin, footprint, radiance)
 
         listed = np.empty(height * width, np.int32)
         world = self.world
@@ -165,7 +168,7 @@ class EquirectRenderer:
             sub_range, sub_surface = self._caster.cast(origin, rays)
             kernels.surfaces_of(sub_surface, world.face_surface)
             colour = np.empty((len(rays), 3), np.float32)
-            self._shade(sub_surface, sub_range, rays, origin, lens.pixel_rad, colour)
+            self._shade(sub_surface, sub_range, rays, origin, 0.6 * footprint, colour)
             radiance[at] = np.minimum(colour, 1.5).reshape(len(_SUBPIXELS), count, 3).mean(axis=0)
         depth = np.where(surface >= 0, range_m, 0.0).astype(np.float32)
         return radiance.reshape(height, width, 3), depth
@@ -179,7 +182,7 @@ class EquirectRenderer:
         surface = np.full((height, width), -1, np.int32)
         range_m = np.zeros((height, width), np.float32)
         wraps = lens.hfov_rad is None
-        coarse = 4 if wraps and width % 4 == 0 else 2
+        coarse = 4
         listed = (np.arange(0, height, coarse)[:, None] * width + np.arange(0, width, coarse)[None, :]).ravel()
         step = coarse
         todo = np.empty(height * width, np.int32)
@@ -191,9 +194,7 @@ class EquirectRenderer:
             if step == 1:
                 break
             step //= 2
-            count = kernels.refine(
-                surface, range_m, directions, origin, world.normal, world.offset, step, wraps, todo
-            )
+            count = kernels.refine(surface, range_m, directions, origin, world.normal, world.offset, step, wraps, todo)
             listed = todo[:count].astype(np.int64)
             if count == 0 and step == 1:
                 break
@@ -205,12 +206,12 @@ class EquirectRenderer:
         range_m: npt.NDArray[np.float32],
         directions: npt.NDArray[np.float32],
         origin: npt.NDArray[np.float32],
-        pixel_rad: float,
+        footprint_rad: float,
         out: npt.NDArray[np.float32],
     ) -> None:
         w, t = self.world, self.world.textures
         kernels.shade(
-            surface, range_m, directions, origin, pixel_rad, w.normal, w.uv, w.texture, w.tint, w.emission,
+            surface, range_m, directions, origin, footprint_rad, w.normal, w.uv, w.texture, w.tint, w.emission,
             w.texel_per_m, t.texels, t.level_offset, t.level_size, t.levels, t.clamp, w.light_at, w.light_uv,
             w.light_linear, w.light, out,
         )  # fmt: skip

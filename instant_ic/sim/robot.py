@@ -12,6 +12,9 @@ from instant_ic.sim.contact import OccupancyMask
 
 FloatArray = npt.NDArray[np.float64]
 
+#: A contact is over when the robot is this far from where it was held, metres and radians.
+_LET_GO = 0.015
+
 
 @dataclass(frozen=True)
 class RobotConfig:
@@ -81,6 +84,7 @@ class TrackedRobot:
         self._slip: FloatArray = np.zeros(3)
         self._travelled: FloatArray = np.zeros(2)
         self._jitter: FloatArray = np.zeros(2)
+        self._held_at: FloatArray = self.pose
         self._outline = _outline(config.length, config.width, mask.cell_m)
         if self.touches(self.pose):
             raise ValueError(f"the robot would start inside something at x={pose[0]:.2f}, y={pose[1]:.2f}")
@@ -134,10 +138,12 @@ class TrackedRobot:
             if not self.contact:
                 self.contacts += 1
             self.contact = True
+            self._held_at = self.pose
             self.twist = np.zeros(3)
             return
         self.pose, self.twist = target, twist
-        if bool(np.any(np.abs(twist) > 1e-6)):
+        # Creeping by less than a cell while it is held is the same contact still.
+        if self.contact and float(np.abs(self.pose - self._held_at).max()) > _LET_GO:
             self.contact = False
 
 

@@ -47,7 +47,7 @@ class ThetaConfig:
     width: int = 1024
     height: int = 512
     rate: float = 5.0
-    latency_s: float = 0.15
+    latency_s: float = 0.20
     quality: int = 92
     noise: float = 0.0
     user: str = ""
@@ -246,7 +246,9 @@ class ThetaServer:
         else:
             expected = md5(f"{secret}:{fields.get('nonce')}:{request}")
         right_nonce = fields.get("nonce") == self._nonce and fields.get("username") == self.config.user
-        return right_nonce and fields.get("uri") == path and secrets.compare_digest(expected, fields.get("response", ""))
+        return (
+            right_nonce and fields.get("uri") == path and secrets.compare_digest(expected, fields.get("response", ""))
+        )
 
     @property
     def challenge(self) -> str:

@@ -108,9 +108,7 @@ def _bin(building: Building, centre: tuple[float, float]) -> None:
     building.builder.box(centre, (0.28, 0.28, 0.55), side=grey, top=Material("white", 0.4, (0.1, 0.1, 0.1)))
 
 
-def _furnish_corridor_rooms(
-    building: Building, rooms: dict[str, Zone], rng: np.random.Generator, seed: int
-) -> None:
+def _furnish_corridor_rooms(building: Building, rooms: dict[str, Zone], rng: np.random.Generator, seed: int) -> None:
     build = building.builder
     half = math.pi / 2
     office, store, library = rooms["office"], rooms["store"], rooms["library"]
@@ -257,13 +255,21 @@ def _decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
                     )
                     at += width + 0.3
                 elif choice < 0.33 and zone.height > 2.2:
-                    building.closed_door(zone, side, at + 0.55, int(rng.integers(0, 4)), Material("door", 0, _tint(rng, 0.5)))
+                    building.closed_door(
+                        zone, side, at + 0.55, int(rng.integers(0, 4)), Material("door", 0, _tint(rng, 0.5))
+                    )
                     at += 1.15
                 elif choice < 0.6:
                     w = float(rng.uniform(0.35, 0.95))
-                    name = f"poster:{int(rng.integers(0, 40))}" if rng.random() < 0.8 else f"notices:{int(rng.integers(0, 4))}"
+                    name = (
+                        f"poster:{int(rng.integers(0, 40))}"
+                        if rng.random() < 0.8
+                        else f"notices:{int(rng.integers(0, 4))}"
+                    )
                     height = float(rng.uniform(1.2, 1.7))
-                    building.picture(zone, side, at + w / 2 + 0.05, height, (w, w * float(rng.uniform(0.6, 1.4))), Material(name))
+                    building.picture(
+                        zone, side, at + w / 2 + 0.05, height, (w, w * float(rng.uniform(0.6, 1.4))), Material(name)
+                    )
                     at += w + 0.2
                 at += float(rng.uniform(0.3, 1.5))
 
@@ -286,8 +292,12 @@ def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tup
         inward = {"north": -math.pi / 2, "south": math.pi / 2, "east": math.pi, "west": 0.0}[side]
         gap = 0.45
         if against:
-            x = {"east": zone.x1 - gap, "west": zone.x0 + gap}.get(side, float(rng.uniform(zone.x0 + 0.7, zone.x1 - 0.7)))
-            y = {"north": zone.y1 - gap, "south": zone.y0 + gap}.get(side, float(rng.uniform(zone.y0 + 0.7, zone.y1 - 0.7)))
+            x = {"east": zone.x1 - gap, "west": zone.x0 + gap}.get(
+                side, float(rng.uniform(zone.x0 + 0.7, zone.x1 - 0.7))
+            )
+            y = {"north": zone.y1 - gap, "south": zone.y0 + gap}.get(
+                side, float(rng.uniform(zone.y0 + 0.7, zone.y1 - 0.7))
+            )
         elif narrow:
             continue
         else:
@@ -301,25 +311,37 @@ def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tup
         _piece(rng, build, (x, y), inward if against else float(rng.uniform(-math.pi, math.pi)), zone.height)
 
 
-def _piece(rng: np.random.Generator, build: "furniture.WorldBuilder", at: tuple[float, float], yaw: float, height: float) -> None:
+def _piece(
+    rng: np.random.Generator, build: "furniture.WorldBuilder", at: tuple[float, float], yaw: float, height: float
+) -> None:
     cloth = Material("fabric", 0.5, _tint(rng, 0.15))
     wood = Material("wood", float(rng.uniform(0.6, 1.2)), _tint(rng, 0.4))
     choice = rng.choice(["table", "chair", "bookcase", "cabinet", "sofa", "boxes", "block"])
     if choice == "table":
-        furniture.table(build, at, yaw + math.pi / 2, (float(rng.uniform(0.8, 1.3)), float(rng.uniform(0.5, 0.8))), wood)
+        furniture.table(
+            build, at, yaw + math.pi / 2, (float(rng.uniform(0.8, 1.3)), float(rng.uniform(0.5, 0.8))), wood
+        )
     elif choice == "chair":
         furniture.chair(build, at, yaw, cloth)
     elif choice == "bookcase":
         furniture.bookcase(build, at, yaw, int(rng.integers(0, 10)), min(height - 0.1, float(rng.uniform(1.0, 2.2))))
     elif choice == "cabinet":
-        size = (float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.6, 1.2)), min(height - 0.1, float(rng.uniform(0.7, 2.0))))
+        size = (
+            float(rng.uniform(0.35, 0.6)),
+            float(rng.uniform(0.6, 1.2)),
+            min(height - 0.1, float(rng.uniform(0.7, 2.0))),
+        )
         furniture.cabinet(build, at, yaw, size, wood if rng.random() < 0.5 else Material("metal", 0.8, _tint(rng, 0.4)))
     elif choice == "sofa":
         furniture.sofa(build, at, yaw, cloth, float(rng.uniform(0.9, 1.4)))
     elif choice == "boxes":
         furniture.boxes(build, at, rng)
     else:
-        size = (float(rng.uniform(0.2, 0.6)), float(rng.uniform(0.2, 0.6)), float(rng.uniform(0.3, min(height - 0.1, 2.4))))
+        size = (
+            float(rng.uniform(0.2, 0.6)),
+            float(rng.uniform(0.2, 0.6)),
+            float(rng.uniform(0.3, min(height - 0.1, 2.4))),
+        )
         texture = str(rng.choice(["white", "concrete", "metal", "wood", "brick"]))
         build.box(at, size, 0.0, yaw, side=Material(texture, 1.0, _tint(rng, 0.4)))
 
