@@ -41,7 +41,7 @@ class ScalerConfig:
         min_scale, max_scale: a scale outside makes the fit not ok (``metric`` and ``scale_invariant``).
     """
 
-    method: str = "max_ratio"
+    method: str = "median_ratio"
     maxima: str = "lidar"
     confidence: float = 0.995
     output_kind: str = "metric"

@@ -118,8 +118,10 @@ def test_room_gets_its_scale_back(method: str, factor: float) -> None:
 def test_maximum_of_the_image_counts_what_the_lidar_cannot_see() -> None:
     depth = room_depth()
     depth[:16] = 50.0  # a high ceiling, far above the LiDAR's 15 degrees
-    assert DepthScaler(ScalerConfig(maxima="lidar")).fit(depth, room_points()).scale == pytest.approx(1.0, rel=0.03)
-    assert DepthScaler(ScalerConfig(maxima="image")).fit(depth, room_points()).scale < 0.2
+    assert DepthScaler(ScalerConfig("max_ratio", "lidar")).fit(depth, room_points()).scale == pytest.approx(
+        1.0, rel=0.03
+    )
+    assert DepthScaler(ScalerConfig("max_ratio", "image")).fit(depth, room_points()).scale < 0.2
 
 
 def test_quality_is_the_share_within_fifteen_percent() -> None:
