@@ -72,7 +72,7 @@ def decode_packets(
 
     Axes are those of ROS: x ahead (azimuth 0), y left, z up. The azimuth of each ray is interpolated by the
     mean turn rate of its packet and rounded to the sensor's own unit, 0.01 degrees. In dual return mode a ray
-    gives its last return and then its strongest (or second strongest) one; an identical pair gives one point.
+    gives its last return and then its strongest (or second strongest) one; a pair of one distance gives one point.
 
     Args:
         packets: payloads, (P, 1206); all of them with the return mode of the first.
@@ -150,15 +150,14 @@ def _decode(  # type: ignore[no-untyped-def]
                     before = -1
                     for _ in range(pair):
                         units = packet[offset] | np.int32(packet[offset + 1]) << 8
-                        reflectivity = np.int32(packet[offset + 2])
+                        reflectivity = packet[offset + 2]
                         offset += 100
                         if units < min_units:
                             too_close |= units > 0
                             continue
-                        both = units << 8 | reflectivity
-                        if units > max_units or both == before:
+                        if units > max_units or units == before:
                             continue
-                        before = both
+                        before = units
                         if index < 0:
                             azimuth = block_azimuth + per_us * np.float32(ray_us)
                             index = int(azimuth + np.float32(0.5) + np.float32(36000.0)) % 36000

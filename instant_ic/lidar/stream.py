@@ -27,6 +27,8 @@ _MAX_GAP_US = 20_000
 """A longer silence ends the revolution: at 1200 rpm the head may pass the cut unseen in half a turn, 25 ms."""
 _LATE_US = -100_000
 """A packet this much older than the newest is a late one; older still, and the sensor's clock was reset."""
+_CLOCK_SET_US = 500_000
+"""The sensor's time ran ahead of the host's by this much over a silence: it was set, no packets are missing."""
 _MAX_PACKETS = 400
 """Above one revolution at 300 rpm in dual mode (302): without a cut until then the head does not turn."""
 
@@ -100,6 +102,7 @@ class PacketStream:
         self._dual = False
         self._cut_before = False
         self._turned: int | None = None
+        self._received_ns = 0
 
     def feed(self, payload: bytes, received_ns: int) -> Revolution | None:
         """Take one payload.
@@ -126,11 +129,13 @@ class PacketStream:
         period_us = PACKET_PERIOD_US / 2 if dual else PACKET_PERIOD_US
         done = None
         step_us = self.clock.step_us(timestamp_us)
+        elapsed_us = (received_ns - self._received_ns) * 1e-3
+        self._received_ns = received_ns
         if step_us is not None:
             if _LATE_US < step_us <= 0:
                 self.counters.late += 1
                 return None
-            if step_us <= _LATE_US:
+            if step_us <= _LATE_US or (step_us > _MAX_GAP_US and step_us - elapsed_us > _CLOCK_SET_US):
                 self.counters.clock_resets += 1
                 done = self._end_early()
                 self.clock.restart()

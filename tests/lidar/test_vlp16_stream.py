@@ -1,0 +1,195 @@
+"""Revolutions, gaps and clocks from a stream of packets."""
+
+import numpy as np
+import pytest
+from lidar_streams import DATA, SECOND, random_stream, wall_stream
+
+from instant_ic.lidar.clock import DeviceClock
+from instant_ic.lidar.config import DecoderConfig
+from instant_ic.lidar.packets import HOUR_US, PACKET_PERIOD_US
+from instant_ic.lidar.recording import Recording
+from instant_ic.lidar.stream import PacketStream, Revolution
+
+START = 1_700_000_000 * SECOND
+
+
+def received(index: int, start_ns: int = START, period_us: float = PACKET_PERIOD_US) -> int:
+    """When a packet arrives that is sent as soon as it is full."""
+    return start_ns + round((index + 1) * period_us * 1000.0)
+
+
+def feed(stream: PacketStream, payloads: list[bytes], skip: tuple[int, ...] = ()) -> list[Revolution]:
+    found = [stream.feed(payload, received(index)) for index, payload in enumerate(payloads) if index not in skip]
+    return [revolution for revolution in found if revolution is not None]
+
+
+def test_revolutions_are_cut_at_the_angle_and_hold_every_firing_once() -> None:
+    payloads = wall_stream(300, 5.0, azimuth_cdeg=20000)
+    stream = PacketStream(DecoderConfig(cut_angle_deg=180.0))
+    revolutions = feed(stream, payloads)
+    last = stream.finish()
+    assert last is not None
+    assert [revolution.complete for revolution in revolutions] == [False, True, True, True]
+    for revolution in revolutions[1:]:
+        azimuth = np.degrees(revolution.firing_azimuth)
+        assert 180.0 <= azimuth[0] < 180.4
+        assert 179.4 < azimuth[-1] < 180.0 + 0.2  # cut between blocks: a block's second firing may pass it
+        assert revolution.end_ns - revolution.stamp_ns == pytest.approx(0.1 * SECOND, rel=2e-3)
+    assert sum(len(r.firing_time) for r in [*revolutions, last]) == 300 * 24
+    assert sum(len(r.points) for r in [*revolutions, last]) == 300 * 384
+
+
+def test_stamps_are_the_time_of_firing_on_the_hosts_clock() -> None:
+    payloads = wall_stream(200, 5.0, start_us=1_000_000, azimuth_cdeg=18000)
+    stream = PacketStream()
+    revolutions = feed(stream, payloads)
+    # Ends follow starts without a hole; the first firing of all was at START.
+    assert revolutions[0].stamp_ns == pytest.approx(START, abs=2000)
+    for before, after in zip(revolutions, revolutions[1:], strict=False):
+        assert after.stamp_ns == pytest.approx(before.end_ns, abs=2000)
+    times = revolutions[1].points["time"]
+    assert times[0] >= 0.0
+    assert (np.diff(times) >= 0.0).all()
+    assert times[-1] == pytest.approx(0.1, abs=5e-4)
+
+
+def test_late_delivery_does_not_move_the_stamps() -> None:
+    # Packets that wait up to 10 ms on their way, as in bursts; one in eight comes at once.
+    payloads = wall_stream(200, 5.0)
+    prompt, bursty = PacketStream(), PacketStream()
+    expected = feed(prompt, payloads)
+    found = []
+    for index, payload in enumerate(payloads):
+        revolution = bursty.feed(payload, received(index | 7))
+        if revolution is not None:
+            found.append(revolution)
+    # The first packets have no other to judge by; from the first burst's end on the offset is right.
+    assert len(found) == len(expected) == 2
+    assert found[1].stamp_ns == pytest.approx(expected[1].stamp_ns, abs=20_000)
+
+
+def test_missing_packets_are_found_by_the_sensors_clock_and_counted() -> None:
+    payloads = wall_stream(230, 5.0)
+    stream = PacketStream()
+    revolutions = feed(stream, payloads, skip=(100, 101, 102, 180))
+    assert stream.counters.missing == 4
+    assert [revolution.missing_packets for revolution in revolutions] == [0, 3, 1]
+    assert [revolution.complete for revolution in revolutions] == [False, False, False]
+    assert stream.counters.packets == 226
+
+
+def test_long_gap_ends_the_revolution() -> None:
+    payloads = wall_stream(160, 5.0)
+    stream = PacketStream()
+    revolutions = feed(stream, payloads, skip=tuple(range(100, 120)))  # 26.5 ms
+    assert stream.counters.missing == 20
+    assert len(revolutions) == 3
+    assert sum(len(r.points) for r in revolutions) == (160 - 20) * 384 - len(stream.finish().points)  # type: ignore[union-attr]
+
+
+def test_dual_return_is_cut_between_pairs() -> None:
+    payloads = random_stream(500, dual=True)
+    stream = PacketStream()
+    revolutions = []
+    for index, payload in enumerate(payloads):
+        revolution = stream.feed(payload, received(index, period_us=PACKET_PERIOD_US / 2))
+        if revolution is not None:
+            revolutions.append(revolution)
+    assert len(revolutions) == 4 or len(revolutions) == 3
+    assert stream.counters.missing == 0
+    assert all(revolution.dual for revolution in revolutions)
+    assert [revolution.complete for revolution in revolutions] == [False] + [True] * (len(revolutions) - 1)
+    assert revolutions[1].end_ns - revolutions[1].stamp_ns == pytest.approx(0.1 * SECOND, rel=0.02)
+
+
+def test_hour_of_the_sensors_clock_rolls_over_unseen() -> None:
+    payloads = wall_stream(230, 5.0, start_us=HOUR_US - 100_000)
+    stream = PacketStream()
+    revolutions = feed(stream, payloads)
+    assert (stream.counters.missing, stream.counters.late, stream.counters.clock_resets) == (0, 0, 0)
+    assert len(revolutions) == 3
+    assert revolutions[2].stamp_ns - revolutions[1].stamp_ns == pytest.approx(0.1 * SECOND, rel=2e-3)
+
+
+def test_repeated_late_and_foreign_packets_are_dropped_and_counted() -> None:
+    payloads = wall_stream(10, 5.0)
+    stream = PacketStream()
+    for index in (0, 1, 2, 2, 1, 3):
+        stream.feed(payloads[index], received(index))
+    stream.feed(b"\0" * 1206, received(4))
+    stream.feed(b"\xff\xee", received(4))
+    stream.feed(payloads[4][:1200] + b"\xff\xff\xff\xff\x37\x22", received(4))
+    assert (stream.counters.packets, stream.counters.late, stream.counters.bad) == (4, 2, 3)
+    assert len(stream.counters.bad_reasons) == 3
+
+
+@pytest.mark.parametrize("before_us", [900_000_000, 2_700_000_000])  # back by a quarter of an hour, by three
+def test_sensor_that_was_switched_on_anew_starts_a_new_clock(before_us: int) -> None:
+    payloads = wall_stream(120, 5.0, start_us=before_us) + wall_stream(160, 5.0, start_us=5)
+    stream = PacketStream()
+    revolutions = feed(stream, payloads)
+    assert stream.counters.clock_resets == 1
+    assert stream.counters.missing == 0
+    assert revolutions[-1].complete
+    assert revolutions[-1].stamp_ns == pytest.approx(START + (120 + 75.35) * PACKET_PERIOD_US * 1000, abs=2e6)
+
+
+def test_standing_head_does_not_fill_the_memory() -> None:
+    payload = wall_stream(1, 5.0)[0]
+    stream = PacketStream()
+    revolutions = []
+    for index in range(1000):
+        timed = payload[:1200] + round(index * PACKET_PERIOD_US).to_bytes(4, "little") + payload[1204:]
+        revolution = stream.feed(timed, received(index))
+        if revolution is not None:
+            revolutions.append(revolution)
+    assert len(revolutions) == 2
+    assert not any(revolution.complete for revolution in revolutions)
+
+
+def test_clock_follows_drift_and_jumps_of_the_host() -> None:
+    clock = DeviceClock()
+    rng = np.random.default_rng(3)
+    device_us = 0
+    host_ns = START
+    for index in range(2000):
+        device_us += 1327
+        host_ns += round(1_327_000 * (1.0 + 20e-6))  # 20 ppm apart
+        unrolled = clock.take(device_us, host_ns + round(rng.exponential(300_000)))
+        if index > 100:
+            assert abs(clock.host_ns(unrolled) - host_ns) < 500_000
+    host_ns += 3600 * SECOND  # somebody sets the host's clock
+    for _ in range(30):
+        device_us += 1327
+        host_ns += 1_327_000
+        unrolled = clock.take(device_us, host_ns)
+    assert clock.resets == 1
+    assert abs(clock.host_ns(unrolled) - host_ns) < 1000
+
+
+@pytest.mark.real_data
+def test_revolutions_of_a_recording() -> None:
+    path = DATA / "einride_recording.pcap"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    recording = Recording(path)
+    revolutions = list(recording)
+    # 1000 packets, about 600 rpm, no gaps: 13 whole revolutions.
+    assert [r.complete for r in revolutions] == [False] + [True] * 13 + [False]
+    durations = np.array([r.end_ns - r.stamp_ns for r in revolutions[1:-1]]) * 1e-9
+    np.testing.assert_allclose(durations, 0.1, rtol=2e-3)
+    assert sum(len(r.firing_time) for r in revolutions) == 24000
+    assert recording.stream.counters.missing == 0
+
+
+@pytest.mark.real_data
+def test_gaps_of_a_malformed_recording_are_told() -> None:
+    path = DATA / "btlad_my.pcap"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    recording = Recording(path)
+    revolutions = list(recording)
+    assert len(revolutions) == 3  # two gaps
+    assert recording.stream.counters.missing == 235
+    assert sum(r.missing_packets for r in revolutions) == 235
+    assert not any(r.complete for r in revolutions)
