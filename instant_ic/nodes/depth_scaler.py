@@ -32,7 +32,7 @@ from instant_ic.msg import (
 # Pictures and clouds older than this against the newest depth are let go of.
 _KEEP_NS = 4_000_000_000
 _MAX_PICTURES = 150
-_MAX_CLOUDS = 60
+_MAX_CLOUDS = 40
 
 
 @dataclass(frozen=True)
