@@ -1,5 +1,7 @@
 """Revolutions, gaps and clocks from a stream of packets."""
 
+import itertools
+
 import numpy as np
 import pytest
 from lidar_streams import DATA, SECOND, random_stream, wall_stream
@@ -45,7 +47,7 @@ def test_stamps_are_the_time_of_firing_on_the_hosts_clock() -> None:
     revolutions = feed(stream, payloads)
     # Ends follow starts without a hole; the first firing of all was at START.
     assert revolutions[0].stamp_ns == pytest.approx(START, abs=2000)
-    for before, after in zip(revolutions, revolutions[1:], strict=False):
+    for before, after in itertools.pairwise(revolutions):
         assert after.stamp_ns == pytest.approx(before.end_ns, abs=2000)
     times = revolutions[1].points["time"]
     assert times[0] >= 0.0

@@ -1,0 +1,183 @@
+"""Client and preview against a Theta that misbehaves, over real HTTP."""
+
+import threading
+
+import pytest
+from fake_theta import Behaviour, FakeTheta, jpeg, part
+
+from instant_ic.camera.config import ThetaConfig
+from instant_ic.camera.loop import CameraLoop, ReconnectConfig
+from instant_ic.camera.source import CameraError, Frame
+from instant_ic.camera.theta import NEVER, ThetaCamera, ThetaClient, ThetaError
+
+FRAMES = [jpeg(value) for value in (40, 80, 120, 160)]
+CONFIG = ThetaConfig(settle_s=0.0, busy_wait_s=0.01, connect_timeout_s=20.0, read_timeout_s=20.0)
+SERIAL = "THETAYL00105307"
+
+
+def one_by_one(behaviour: Behaviour) -> Behaviour:
+    """Make sure that the reader can take each frame before the next comes: newest-only would skip some."""
+    behaviour.previews = [[part(frame)] for frame in FRAMES]
+    return behaviour
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+@pytest.mark.parametrize("boundary", ["---osclivepreview---", "-----osclivepreview---"])
+def test_frames_pass_byte_for_byte_and_the_newest_counts(chunked: bool, boundary: str) -> None:
+    pieces = [b"".join(part(frame, boundary) for frame in FRAMES)]
+    with FakeTheta(Behaviour(previews=[pieces], chunked=chunked)) as theta:
+        with ThetaCamera(theta.url, CONFIG, now_ns=lambda: 5_000_000_000) as camera:
+            frame = camera.read()
+            assert frame == Frame(FRAMES[-1], 4_800_000_000, 64, 32)  # 0.2 s of latency
+            with pytest.raises(CameraError, match="the camera ended it"):
+                camera.read()
+
+
+def test_options_are_set_then_a_second_is_waited_then_the_preview_starts() -> None:
+    waits: list[float] = []
+    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]])) as theta:
+        camera = ThetaCamera(theta.url, ThetaConfig(), sleep=lambda s: waits.append(s))
+        text = camera.connect()
+        camera.close()
+        assert theta.behaviour.commands == ["camera.setOptions", "camera.getLivePreview"]
+    assert waits == [1.0]
+    assert theta.behaviour.options == {
+        "sleepDelay": NEVER,
+        "offDelay": NEVER,
+        "previewFormat": {"width": 1024, "height": 512, "framerate": 30},
+    }
+    assert text.startswith("RICOH THETA Z1 (firmware 3.10.2)")
+
+
+def test_digest_authentication_for_commands_and_preview() -> None:
+    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]], password="00105307")) as theta:
+        with ThetaCamera(theta.url, CONFIG, SERIAL, "00105307") as camera:
+            assert camera.read().jpeg == FRAMES[0]
+        # One challenge for each of the two connections; after it the nonce is kept.
+        assert theta.behaviour.unauthorised == 2
+        with pytest.raises(ThetaError, match="INSTANT_IC_THETA_USER") as caught:
+            ThetaClient(theta.url, CONFIG, SERIAL, "wrong").info()
+        assert caught.value.code == "http 401"
+
+
+def test_busy_camera_is_asked_again_with_growing_waits() -> None:
+    waits: list[float] = []
+    with FakeTheta(Behaviour(busy=3)) as theta:
+        client = ThetaClient(theta.url, ThetaConfig(busy_wait_s=0.25), sleep=waits.append)
+        assert client.info()["model"] == "RICOH THETA Z1"
+        assert (waits, client.busy_replies) == ([0.25, 0.5, 1.0], 3)
+        theta.behaviour.busy = 99
+        with pytest.raises(ThetaError, match="serviceUnavailable") as caught:
+            client.info()
+        assert caught.value.code == "serviceUnavailable"
+
+
+def test_refused_command_gives_the_cameras_words() -> None:
+    with FakeTheta() as theta:
+        client = ThetaClient(theta.url, CONFIG)
+        with pytest.raises(ThetaError, match=r"camera.fly refused: unknownCommand Unknown command camera.fly"):
+            client.execute("camera.fly")
+        with pytest.raises(ThetaError, match="disabledCommand"):
+            client.open_preview()
+
+
+def test_command_in_progress_is_waited_for() -> None:
+    with FakeTheta(Behaviour(in_progress=1)) as theta:
+        ThetaClient(theta.url, CONFIG, sleep=lambda s: None).set_options({"iso": 100})
+        assert theta.behaviour.options == {"iso": 100}
+
+
+def test_state_with_errors() -> None:
+    with FakeTheta() as theta:
+        client = ThetaClient(theta.url, CONFIG)
+        state = client.state()
+        assert (state.battery, state.battery_temperature_c, state.board_temperature_c) == (0.83, 30.0, 41.0)
+        theta.behaviour.state = {"_cameraError": ["HIGH_TEMPERATURE"]}
+        assert client.state().errors == ("HIGH_TEMPERATURE",)
+        assert client.state().battery is None
+
+
+def test_stall_is_given_up_after_the_read_timeout() -> None:
+    config = ThetaConfig(settle_s=0.0, read_timeout_s=0.2)
+    with FakeTheta(Behaviour(previews=[[part(FRAMES[0])]], stall=True)) as theta:
+        with ThetaCamera(theta.url, config) as camera:
+            assert camera.read().jpeg == FRAMES[0]
+            with pytest.raises(CameraError, match=r"preview ended: .*[Tt]ime"):
+                camera.read()
+
+
+def test_frame_that_stalls_in_the_middle_is_never_given_out() -> None:
+    config = ThetaConfig(settle_s=0.0, read_timeout_s=0.2)
+    half = part(FRAMES[1])[:300]
+    with FakeTheta(Behaviour(previews=[[part(FRAMES[0]) + half]], stall=True)) as theta:
+        with ThetaCamera(theta.url, config) as camera:
+            assert camera.read().jpeg == FRAMES[0]
+            with pytest.raises(CameraError):
+                camera.read()
+
+
+def test_cut_frame_is_counted_and_the_next_one_given() -> None:
+    stream = part(FRAMES[0][:200], length=len(FRAMES[0])) + part(FRAMES[1])
+    with FakeTheta(Behaviour(previews=[[stream]])) as theta:
+        with ThetaCamera(theta.url, CONFIG) as camera:
+            assert camera.read().jpeg == FRAMES[1]
+            assert camera.bad_frames == 1
+
+
+def test_nobody_there_is_told_in_words() -> None:
+    with FakeTheta() as theta:
+        url = theta.url
+    with pytest.raises(CameraError, match=r"no answer .*is the camera on"):
+        ThetaClient(url, CONFIG).info()
+
+
+def test_loop_connects_again_after_each_end_and_backs_off() -> None:
+    """Four previews of one frame each, then refusals: all frames arrive, and the waits double up to the limit."""
+    received: list[bytes] = []
+    events: list[tuple[bool, str]] = []
+    enough = threading.Event()
+
+    def on_event(connected: bool, text: str) -> None:
+        events.append((connected, text))
+        if sum("disabledCommand" in text for _, text in events) >= 4:
+            enough.set()
+
+    with FakeTheta(one_by_one(Behaviour())) as theta:
+        loop = CameraLoop(
+            ThetaCamera(theta.url, CONFIG),
+            lambda frame: received.append(frame.jpeg),
+            on_event,
+            ReconnectConfig(min_s=0.1, max_s=0.4),
+        )
+        loop.start()
+        assert enough.wait(60.0)
+        assert loop.end(30.0)
+    assert received == FRAMES
+    assert loop.frames == loop.connections == 4
+    waits = [text.rsplit(" in ", 1)[1] for connected, text in events if not connected]
+    # A picture makes the next wait short again; refusals make it longer.
+    assert waits[:7] == ["0.1 s"] * 4 + ["0.2 s", "0.4 s", "0.4 s"]
+    assert [connected for connected, _ in events[:8]] == [True, False] * 4
+
+
+def test_loop_ends_while_it_waits() -> None:
+    with FakeTheta() as theta:
+        failed = threading.Event()
+        loop = CameraLoop(
+            ThetaCamera(theta.url, CONFIG),
+            lambda frame: None,
+            lambda connected, text: failed.set(),
+            ReconnectConfig(min_s=600.0, max_s=600.0),
+        )
+        loop.start()
+        assert failed.wait(30.0)
+        assert loop.end(30.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [({"width": 800}, "1024x512@30"), ({"latency_s": -1.0}, "latency_s"), ({"read_timeout_s": 0.0}, "read_timeout_s")],
+)
+def test_bad_parameters_are_named(changes: dict[str, float], key: str) -> None:
+    with pytest.raises(ValueError, match=key):
+        ThetaConfig(**changes)  # type: ignore[arg-type]
