@@ -43,7 +43,7 @@ MODES = {0: "real", 1: "virtual", 2: "stopped"}
 VSPACE_STATES = {0: "empty", 1: "training", 2: "ready", 3: "failed"}
 HEARTBEAT_TIMEOUT_S = 3.0
 PICTURE_TIMEOUT_S = 2.0
-MAX_FAULTS = 6
+MAX_FAULTS = 4
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Asks the virtual space for the picture where the operator looks, if one is due."""
         now = self.clock.now_ns()
         virtual = self.mode == "virtual"
-        if not self.views.due(now / 1e9, virtual=virtual):
+        if not self.views.due(now / 1e9, virtual=virtual) or not (virtual or self.vspace_alive()):
             return
         map_from_base = self.vbot_pose() if virtual else self.robot_pose()
         if map_from_base is None:
@@ -195,6 +195,11 @@ class ConsoleNode(Node[ConsoleConfig]):
                 height=shape.height,
             )
         )
+
+    def vspace_alive(self) -> bool:
+        """Whether the virtual space has anything to draw."""
+        status = self.vspace.message
+        return status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
 
     # ---- state ----------------------------------------------------------------------------------
 
@@ -258,7 +263,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.diagnose(name, OK if fine else WARN, "" if fine else fault, **values)
 
     def faults(self) -> list[dict[str, str]]:
-        """Present faults, the worst first: ``level`` (warn, error), ``name``, ``text``."""
+        """Present faults, the worst of each node, the worst first: ``level`` (warn, error), ``name``, ``text``."""
         now = self.clock.now_ns() / 1e9
         found = [
             (level, name.partition(":")[0], text)
@@ -270,10 +275,12 @@ class ConsoleNode(Node[ConsoleConfig]):
             for name, (seen, stopping) in self._heartbeats.items()
             if not stopping and now - seen > HEARTBEAT_TIMEOUT_S
         ]
-        found.sort(key=lambda fault: -fault[0])
+        worst: dict[str, tuple[int, str]] = {}
+        for level, name, text in sorted(found, key=lambda fault: -fault[0]):
+            worst.setdefault(name, (level, text))
         return [
             {"level": "error" if level >= ERROR else "warn", "name": name, "text": text}
-            for level, name, text in dict.fromkeys(found[:MAX_FAULTS])
+            for name, (level, text) in list(worst.items())[:MAX_FAULTS]
         ]
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:

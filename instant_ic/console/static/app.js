@@ -12,6 +12,9 @@ import { Pictures } from "./pictures.js";
 import { GlViewer } from "./viewer.js";
 
 const LOOK_MS = 100; // look direction sent at most this often
+const SLOW_FRAME_MS = 45; // without a graphics card: at most this often, and with fewer pixels
+const SLOW_PIXELS = 0.5;
+const SLOW_MAP_MS = 200;
 const byId = (id) => document.getElementById(id);
 const options = new URLSearchParams(location.search);
 const reducedMotion = matchMedia("(prefers-reduced-motion: reduce)");
@@ -21,6 +24,9 @@ const link = new Link(`${location.protocol === "https:" ? "wss" : "ws"}://${loca
 const drive = new Drive(link);
 const look = new Look(picture);
 const viewer = makeViewer();
+if (options.get("quality") === "full") viewer.slow = false;
+hud.mark("viewer", viewer.name);
+hud.mark("quality", viewer.slow ? "plain" : "full");
 const pictures = new Pictures(viewer, link);
 const minimap = new MiniMap(byId("map-canvas"));
 
@@ -29,7 +35,9 @@ let state = null, session = { driver: "none", clients: 0, estop: false };
 let plan = { trajectory: [], path: [], subgoal: null };
 let everConnected = false;
 let sentLook = "", sentLookAt = 0;
-let mapChanged = true, lastFrame = performance.now(), lastHud = 0, lastGuide = "", lastMapKey = "";
+let yielded = false; // the operator handed the lease over
+let mapChanged = true, lastFrame = performance.now(), lastHud = 0, lastMap = 0;
+let lastPicture = "", lastGuide = "", lastMapKey = "";
 
 function makeViewer() {
   if (options.get("viewer") !== "canvas") {
@@ -64,18 +72,18 @@ link.addEventListener("message", ({ detail: message }) => {
       break;
     case "state":
       state = message;
-      mapChanged = true;
       hud.showMode(state);
       showBanner();
       break;
     case "plan":
       plan = message;
-      mapChanged = true;
       break;
     case "health":
       hud.showHealth(message);
       break;
     case "session":
+      // Lost by silence, not given away: ask for it again. The keys must be pressed anew.
+      if (session.driver === "you" && message.driver === "none" && !yielded) link.send({ type: "lease", take: false });
       session = message;
       drive.setEnabled(session.driver === "you" && !session.estop);
       hud.showSession(session);
@@ -158,8 +166,14 @@ window.addEventListener("keyup", (event) => {
 
 byId("estop").addEventListener("pointerdown", stopNow);
 byId("estop").addEventListener("click", stopNow);
-byId("take").addEventListener("click", () => link.send({ type: "lease", take: true }));
-byId("yield").addEventListener("click", () => link.send({ type: "yield" }));
+byId("take").addEventListener("click", () => {
+  yielded = false;
+  link.send({ type: "lease", take: true });
+});
+byId("yield").addEventListener("click", () => {
+  yielded = true;
+  link.send({ type: "yield" });
+});
 byId("compass").addEventListener("click", () => look.centre());
 byId("map-size").addEventListener("click", enlargeMap);
 byId("map-canvas").addEventListener("click", enlargeMap);
@@ -178,8 +192,8 @@ function showBanner() {
   hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), session.driver);
 }
 
-function fit(canvas) {
-  const ratio = Math.min(devicePixelRatio, 2);
+function fit(canvas, pixels = 1) {
+  const ratio = Math.min(devicePixelRatio, 2) * pixels;
   const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
   if (canvas.width === width && canvas.height === height) return false;
   canvas.width = width;
@@ -218,55 +232,75 @@ function cameraPosition() {
 
 const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
 
+const rounded = (values, digits) => (values ? values.map((value) => value.toFixed(digits)).join() : "");
+
 function frame(now) {
   requestAnimationFrame(frame);
+  if (viewer.slow && now - lastFrame < SLOW_FRAME_MS) return;
   const elapsed = Math.min(now - lastFrame, 200);
   lastFrame = now;
   look.step(elapsed / 1000);
   const tanHalf = shownFov();
   sendLook(tanHalf, now);
   const scene = pictures.scene(state, look, tanHalf, elapsed);
-  const colour = COLOURS[state?.mode] ?? COLOURS.none;
-
-  const key = `${look.yaw.toFixed(4)},${look.pitch.toFixed(4)},${look.vfov.toFixed(4)}`;
-  const moved = fit(picture) | (key !== lastGuide) | pictures.changed;
-  if (moved && !viewer.lost) {
-    viewer.draw(scene);
-    pictures.changed = false;
-  }
-  if (fit(guide) | moved | mapChanged) {
-    const position = cameraPosition();
-    const camera = { lookFromMap: transpose(scene.mapFromLook), position };
-    drawGuide(guide, position && link.connected ? plan.trajectory : [], camera, tanHalf, page.footprint[1] / 2, colour);
-    fit(compass);
-    drawCompass(compass, look.yaw, colour);
-    lastGuide = key;
-  }
-  const mapKey = `${key},${picture.clientWidth}`;
-  if (fit(minimap.canvas) | mapChanged | (mapKey !== lastMapKey)) {
-    mapChanged = false;
-    lastMapKey = mapKey;
-    minimap.draw({
-      mode: state?.mode ?? "none",
-      robot: state?.robot ?? null,
-      vbot: state?.vbot ?? null,
-      plan,
-      footprint: page.footprint,
-      lookYaw: look.yaw,
-      hfov: 2 * Math.atan(tanHalf[0]),
-    });
-  }
+  drawPicture(scene);
+  drawOverlay(scene, tanHalf);
+  drawMap(scene, tanHalf, now);
   hud.showCommand(drive);
   for (const cap of document.querySelectorAll("#keys kbd")) cap.classList.toggle("held", drive.holds(cap.dataset.code));
   if (now - lastHud > 250) {
     lastHud = now;
     hud.showLatency(link, pictures);
-    document.body.dataset.picture = pictures.shown ? (pictures.stale ? "stale" : "live") : "none";
+    hud.mark("picture", pictures.shown ? (pictures.stale ? "stale" : "live") : "none");
   }
   // For tests and for whoever debugs: what the page shows.
-  document.body.dataset.blend = scene.blend.toFixed(2);
-  document.body.dataset.viewer = viewer.name;
-  document.body.dataset.map = minimap.hasMap ? "drawn" : "none";
+  hud.mark("blend", scene.blend.toFixed(2));
+  hud.mark("map", minimap.hasMap ? "drawn" : "none");
+}
+
+/** Draws where a picture came, the direction changed by half a pixel, or the window by any. */
+function drawPicture(scene) {
+  const key = rounded([...scene.mapFromLook, look.yaw, look.vfov], 4);
+  const resized = fit(picture, viewer.slow ? SLOW_PIXELS : 1);
+  if (viewer.lost || !(resized || pictures.changed || key !== lastPicture)) return;
+  lastPicture = key;
+  pictures.changed = false;
+  viewer.draw(scene);
+}
+
+function drawOverlay(scene, tanHalf) {
+  const position = cameraPosition(), colour = COLOURS[state?.mode] ?? COLOURS.none;
+  const trajectory = position && link.connected ? plan.trajectory : [];
+  // With no trajectory there is nothing that could move.
+  const place = trajectory.length ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
+  const key = [place, colour, rounded([look.yaw, look.vfov], 3)].join();
+  const resized = fit(guide, viewer.slow ? SLOW_PIXELS : 1) | fit(compass);
+  if (!resized && key === lastGuide) return;
+  lastGuide = key;
+  const camera = { lookFromMap: transpose(scene.mapFromLook), position };
+  drawGuide(guide, trajectory, camera, tanHalf, page.footprint[1] / 2, colour);
+  drawCompass(compass, look.yaw, colour);
+}
+
+function drawMap(scene, tanHalf, now) {
+  const resized = fit(minimap.canvas);
+  if (viewer.slow && !resized && !mapChanged && now - lastMap < SLOW_MAP_MS) return;
+  const key = [
+    state?.mode, rounded(state?.robot, 2), rounded(state?.vbot, 2), JSON.stringify(plan), rounded([look.yaw, look.vfov], 2),
+  ].join(";");
+  if (!resized && !mapChanged && key === lastMapKey) return;
+  lastMapKey = key;
+  lastMap = now;
+  mapChanged = false;
+  minimap.draw({
+    mode: state?.mode ?? "none",
+    robot: state?.robot ?? null,
+    vbot: state?.vbot ?? null,
+    plan,
+    footprint: page.footprint,
+    lookYaw: look.yaw,
+    hfov: 2 * Math.atan(tanHalf[0]),
+  });
 }
 
 setScale(70);

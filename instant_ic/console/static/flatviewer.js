@@ -8,6 +8,7 @@ export class FlatViewer {
     this.canvas = canvas;
     this.context = canvas.getContext("2d", { alpha: false });
     this.name = "canvas";
+    this.slow = true;
     this.lost = false;
     this._panorama = null;
     this._view = null;

@@ -83,8 +83,10 @@ export function showCommand(drive) {
 }
 
 function bar(element, share) {
-  element.style.left = `${50 + Math.min(share, 0) * 50}%`;
-  element.style.width = `${Math.abs(share) * 50}%`;
+  const left = `${50 + Math.min(share, 0) * 50}%`, width = `${Math.abs(share) * 50}%`;
+  if (element.style.left === left && element.style.width === width) return;
+  element.style.left = left;
+  element.style.width = width;
 }
 
 export function showSession(session) {
@@ -114,6 +116,11 @@ export function showBanner(connected, everConnected, estop, driver) {
     ? "The robot was told to stop. Connecting again…"
     : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
   byId("release").hidden = lost || driver !== "you";
+}
+
+/** Sets a data attribute of the page, where styles and tests look; writes only what has changed. */
+export function mark(name, value) {
+  if (document.body.dataset[name] !== value) document.body.dataset[name] = value;
 }
 
 let toastTimer = null;

@@ -119,12 +119,9 @@ export class Pictures {
     const target = pose[2] + ((turned ?? 0) * since) / 1000;
     if (this._heading === null || Math.abs(wrapAngle(target - this._heading)) > SNAP_RAD) {
       this._heading = target;
-      this.changed = true;
       return;
     }
     const move = wrapAngle(target - this._heading) * (1 - Math.exp(-elapsedMs / HEADING_SMOOTHING_MS));
-    if (Math.abs(move) < 1e-5) return;
     this._heading = wrapAngle(this._heading + move);
-    this.changed = true;
   }
 }

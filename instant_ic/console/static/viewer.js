@@ -74,6 +74,10 @@ export class GlViewer {
     this.gl = gl;
     this.canvas = canvas;
     this.name = "webgl";
+    const info = gl.getExtension("WEBGL_debug_renderer_info");
+    const renderer = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    // Drawn by the CPU: the page then does with fewer pixels and no blur.
+    this.slow = /swiftshader|llvmpipe|software|basic render/i.test(renderer);
     this.lost = false;
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
     this._program = link(gl, VERTEX, FRAGMENT);
