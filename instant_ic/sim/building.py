@@ -18,11 +18,11 @@ DOOR_M = 2.05
 class Finish:
     """Materials of a zone."""
 
-    wall: Material = Material("paint", 1.6)
-    floor: Material = Material("lino", 2.0)
-    ceiling: Material = Material("ceiling_tiles", 2.4)
-    skirting: Material | None = Material("wood", 1.0, (0.5, 0.5, 0.5))
-    trim: Material = Material("wood", 1.0)
+    wall: Material = field(default_factory=lambda: Material("paint", 1.6))
+    floor: Material = field(default_factory=lambda: Material("lino", 2.0))
+    ceiling: Material = field(default_factory=lambda: Material("ceiling_tiles", 2.4))
+    skirting: Material | None = field(default_factory=lambda: Material("wood", 1.0, (0.5, 0.5, 0.5)))
+    trim: Material = field(default_factory=lambda: Material("wood", 1.0))
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Zone:
     x1: float
     y1: float
     height: float = 2.7
-    finish: Finish = Finish()
+    finish: Finish = field(default_factory=Finish)
     doorway: bool = False
 
     @property

@@ -1,5 +1,6 @@
 """A recording's UDP payloads, sent again at their own pace."""
 
+import contextlib
 import socket
 from pathlib import Path
 
@@ -51,11 +52,9 @@ class CaptureReplay:
         """Sends what is due at ``time_s`` (seconds since the start)."""
         while not self.finished and self._items[self._next][0] + self._began_s <= time_s:
             _, address, payload = self._items[self._next]
-            try:
+            # An earlier datagram that nobody read is told of here; a sensor would not know.
+            with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(payload, address)
-            except ConnectionRefusedError:
-                # Told of an earlier datagram that nobody read; a sensor would not know.
-                pass
             self.sent += 1
             self._next += 1
             if self.finished and self._loop:

@@ -1,5 +1,7 @@
 """Compiled loops of the renderer: adaptive ray casting, filtered texture lookup, shading. They release the GIL."""
 
+from typing import Any
+
 import numba
 import numpy as np
 import numpy.typing as npt
@@ -7,6 +9,8 @@ import numpy.typing as npt
 F32 = npt.NDArray[np.float32]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
+#: float32 in compiled code; numpy's stubs call it by several names.
+Scalar = Any
 
 #: Entries of the tone table, which maps radiance 0..TONE_MAX to sRGB.
 TONE_SIZE = 8192
@@ -17,7 +21,7 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "
 
 @_jit
 def rotate(directions: F32, rotation: F32, out: F32) -> None:
-    """out (N, 3) = rotation (3, 3) applied to directions (N, 3)."""
+    """Writes to ``out`` (N, 3) the rotation (3, 3) applied to directions (N, 3)."""
     for i in range(directions.shape[0]):
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
         for k in range(3):
@@ -46,10 +50,9 @@ def refine(
 ) -> int:
     """Fills in the pixels between those of a coarse grid.
 
-    ``surface`` and ``range_m`` (H, W) are known where both row and column are multiples of ``2 * step`` (and in the last
-    row and column where they are not). A pixel at multiples of ``step`` whose known neighbours all lie on one surface
-    lies on it too (surfaces are planar and convex), so its range is worked out; others are listed in ``todo`` (flat
-    indices).
+    ``surface`` and ``range_m`` (H, W) are known where both row and column are multiples of ``2 * step``. A pixel at
+    multiples of ``step`` whose known neighbours all lie on one surface lies on it too (surfaces are planar and convex),
+    so its range is worked out; others are listed in ``todo`` (flat indices).
 
     Returns:
         Number of pixels listed.
@@ -94,8 +97,8 @@ def refine(
 
 @_jit
 def _bilinear(
-    texels: npt.NDArray[np.uint32], first: int, width: int, height: int, u: float, v: float, clamp: bool
-) -> tuple[float, float, float]:
+    texels: npt.NDArray[np.uint32], first: int, width: int, height: int, u: Scalar, v: Scalar, clamp: bool
+) -> tuple[Scalar, Scalar, Scalar]:
     """Square-root-coded colour 0..255 squared (linear · 65025) at texture coordinates 0..1."""
     x = u * np.float32(width) - np.float32(0.5)
     y = v * np.float32(height) - np.float32(0.5)
@@ -152,10 +155,10 @@ def _albedo(
     levels: I32,
     clamps: U8,
     t: int,
-    u: float,
-    v: float,
-    lod: float,
-) -> tuple[float, float, float]:
+    u: Scalar,
+    v: Scalar,
+    lod: Scalar,
+) -> tuple[Scalar, Scalar, Scalar]:
     """Linear albedo of texture ``t``, trilinear."""
     clamp = clamps[t] != 0
     if clamp:
@@ -182,13 +185,15 @@ def _albedo(
 
 
 @_jit
-def _log2(value: float) -> float:
+def _log2(value: Scalar) -> Scalar:
     """Binary logarithm of a positive float32."""
     return np.float32(np.log2(value))
 
 
 @_jit
-def _light_texel(light: F32, first: int, width: int, height: int, a: float, b: float) -> tuple[float, float, float]:
+def _light_texel(
+    light: F32, first: int, width: int, height: int, a: Scalar, b: Scalar
+) -> tuple[Scalar, Scalar, Scalar]:
     """Light map at texel coordinates (a, b), bilinear."""
     a = min(max(a, np.float32(0.0)), np.float32(width) - np.float32(1.001))
     b = min(max(b, np.float32(0.0)), np.float32(height) - np.float32(1.001))
@@ -211,8 +216,15 @@ def _light_texel(light: F32, first: int, width: int, height: int, a: float, b: f
 
 @_jit
 def _irradiance(
-    s: int, x: float, y: float, z: float, light_at: npt.NDArray[np.int64], light_uv: F32, light_linear: F32, light: F32
-) -> tuple[float, float, float]:
+    s: int,
+    x: Scalar,
+    y: Scalar,
+    z: Scalar,
+    light_at: npt.NDArray[np.int64],
+    light_uv: F32,
+    light_linear: F32,
+    light: F32,
+) -> tuple[Scalar, Scalar, Scalar]:
     """Baked light at a point of surface ``s``, bilinear in its light map."""
     width, height = light_at[s, 1], light_at[s, 2]
     if width == 0:
@@ -230,7 +242,7 @@ def shade(
     range_m: F32,
     directions: F32,
     origin: F32,
-    pixel_rad: float,
+    pixel_rad: Scalar,
     normal: F32,
     uv: F32,
     texture: I32,
@@ -371,7 +383,7 @@ def edges(surface: I32, range_m: F32, normal: F32, texture: I32, wraps: bool, ou
 
 @_jit
 def tone(radiance: F32, table: U8, out: U8) -> None:
-    """sRGB bytes (N, 3) of radiance (N, 3) by the tone table."""
+    """Writes sRGB bytes (N, 3) of radiance (N, 3) by the tone table."""
     scale = np.float32((TONE_SIZE - 1) / TONE_MAX)
     for i in range(radiance.shape[0]):
         for k in range(3):

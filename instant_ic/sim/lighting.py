@@ -27,8 +27,8 @@ def _texel_points(world: World) -> tuple[F32, npt.NDArray[np.int32]]:
     for s, (_, width, height) in enumerate(world.light_at):
         origin = corners[s, 0]
         du, dv = corners[s, 1] - origin, corners[s, 3] - origin
-        edge_u = min(0.015 / np.linalg.norm(du), 0.25)
-        edge_v = min(0.015 / np.linalg.norm(dv), 0.25)
+        edge_u = min(0.015 / float(np.linalg.norm(du)), 0.25)
+        edge_v = min(0.015 / float(np.linalg.norm(dv)), 0.25)
         a = np.clip(np.linspace(0, 1, width), edge_u, 1 - edge_u)[None, :, None]
         b = np.clip(np.linspace(0, 1, height), edge_v, 1 - edge_v)[:, None, None]
         points.append((origin + a * du + b * dv).reshape(-1, 3).astype(np.float32))
@@ -154,7 +154,7 @@ def _gather(world: World, points: F32, normals: F32, rays: int) -> tuple[F32, np
         )  # fmt: skip
         openness = np.where(hit, np.minimum(distance / _AMBIENT_REACH_M, 1.0), 1.0)
         result += bounce + _AMBIENT * (0.25 + 0.75 * openness[:, None].astype(np.float32))
-    return result / rays, inside < 0.5 * rays
+    return np.asarray(result / rays, np.float32), inside < 0.5 * rays
 
 
 def _smooth(light: F32, valid: npt.NDArray[np.bool_], world: World) -> None:
@@ -165,7 +165,7 @@ def _smooth(light: F32, valid: npt.NDArray[np.bool_], world: World) -> None:
         part = slice(int(first), int(first + width * height))
         known = valid[part].reshape(height, width).astype(np.float32)
         image = light[part].reshape(height, width, 3) * known[..., None]
-        # Unknown texels take the light of the nearest known ones: the blur is normalised, and widened until all have it.
+        # Unknown texels take the light of known ones near them: the blur is normalised, and widened until all have it.
         total = cv2.GaussianBlur(image, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE).reshape(height, width, 3)
         share = cv2.GaussianBlur(known, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
         size = 3

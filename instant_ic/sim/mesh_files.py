@@ -16,7 +16,7 @@ _Z_UP_FROM_Y_UP = np.asarray([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 def _look(material: Any) -> tuple[npt.NDArray[np.float32] | None, tuple[float, float, float]]:
-    """sRGB picture (H, W, 3) in 0..1 or None, and linear colour factor, of a trimesh material."""
+    """Picture (H, W, 3) in sRGB in 0..1 or None, and linear colour factor, of a trimesh material."""
     image = getattr(material, "baseColorTexture", None)
     if image is None:
         image = getattr(material, "image", None)

@@ -36,7 +36,7 @@ class Frame:
 
 @lru_cache(maxsize=1)
 def _tone_table() -> npt.NDArray[np.uint8]:
-    """sRGB of radiance: linear up to 0.6, then a soft shoulder, so that lamps are white and do not cut off hard."""
+    """Tone table, sRGB of radiance: linear up to 0.6, then a soft shoulder; lamps are white without a hard cut."""
     radiance = np.linspace(0.0, kernels.TONE_MAX, kernels.TONE_SIZE)
     knee = 0.6
     shoulder = knee + (1 - knee) * (1 - np.exp(-(radiance - knee) / (1 - knee)))

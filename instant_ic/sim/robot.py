@@ -1,7 +1,7 @@
 """Dynamics of the tracked robot: motors, tracks that slip, encoders, contact with the world."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +42,7 @@ class RobotConfig:
     turn_slip: float = 0.05
     slip_time_s: float = 1.0
     encoder_noise_pulses: float = 2.0
-    steering: SkidSteerConfig = SkidSteerConfig()
+    steering: SkidSteerConfig = field(default_factory=SkidSteerConfig)
 
     def __post_init__(self) -> None:
         """Check the values."""

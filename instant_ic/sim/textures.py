@@ -38,7 +38,7 @@ class TextureSet:
 
 
 def srgb_to_linear(value: FloatArray) -> npt.NDArray[np.float32]:
-    """sRGB values in 0..1 to linear light (IEC 61966-2-1)."""
+    """Linear light of sRGB values in 0..1 (IEC 61966-2-1)."""
     value = np.asarray(value, np.float32)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
@@ -69,9 +69,9 @@ def pyramid(albedo: FloatArray) -> list[npt.NDArray[np.float32]]:
 
 
 def _pack(image: FloatArray) -> npt.NDArray[np.uint32]:
-    root = np.rint(np.sqrt(np.clip(image, 0.0, 1.0)) * 255.0).astype(np.uint32)
-    packed: npt.NDArray[np.uint32] = root[..., 0] | (root[..., 1] << 8) | (root[..., 2] << 16)
-    return packed.ravel()
+    root: npt.NDArray[np.uint32] = np.rint(np.sqrt(np.clip(image, 0.0, 1.0)) * 255.0).astype(np.uint32)
+    shift = np.asarray([0, 8, 16], np.uint32)
+    return np.asarray(np.bitwise_or.reduce(root << shift, axis=-1).ravel(), np.uint32)
 
 
 @cache

@@ -70,9 +70,8 @@ def test_a_turning_sensor_sees_the_room_turned_until_its_own_motion_is_taken_out
     scan = scans[-2]
     xyz = np.column_stack([scan["x"], scan["y"], scan["z"]]).astype(float) + (0, 0, 0.6)
     # Time of each point since the start, by the packets' own clock: the decoder's times are relative to a scan's end.
-    ends = [i for i in range(len(scans)) if i == len(scans) - 2][0]
-    first = sum(len(s) for s in scans[:ends])
-    times = np.concatenate([firing_times(packets)])[first : first + len(scan)]
+    first = sum(len(s) for s in scans[:-2])
+    times = firing_times(packets)[first : first + len(scan)]
     pose = simulation.poses_at(times)
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     world = np.column_stack(

@@ -82,7 +82,7 @@ def test_random_interiors_follow_their_seed() -> None:
 
 
 def test_no_place_is_told(box_room: World) -> None:
-    with pytest.raises(ValueError, match="no place with 2.5 m"):
+    with pytest.raises(ValueError, match=r"no place with 2\.5 m"):
         box_room.sample_free_poses(np.random.default_rng(0), 1, clearance_m=2.5)
 
 
