@@ -27,8 +27,9 @@ BROADCASTS: Mapping[str, tuple[str, ...]] = {
     "theta_camera": ("camera",),
     "vlp16_driver": ("velodyne",),
 }
-"""Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed. What else a
-replayed node broadcasts is left out from its first broadcast on."""
+"""Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed. Only these: what
+such a node broadcasts for a while in another's place (the SLAM without wheel odometry) stays the other's. Of other
+nodes every frame is left out from its first broadcast on."""
 
 
 class ReplayError(RuntimeError):
@@ -154,7 +155,7 @@ def replay(
 
             def record(entry: Record) -> None:
                 result.made[entry.topic] += 1
-                if entry.topic in TRANSFORM_TOPICS:
+                if entry.topic in TRANSFORM_TOPICS and entry.node not in BROADCASTS:
                     transforms = deserialize(entry.payload, entry.type_name).transforms
                     made_frames.update(t.child_frame_id for t in transforms)
                 writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)

@@ -268,7 +268,7 @@ def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterat
 def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | None = None) -> Iterator[Finding]:
     """The RoboClaw's serial port is there and may be opened."""
     if devices is None:
-        from serial.tools.list_ports import comports as devices  # type: ignore[no-redef]
+        from serial.tools.list_ports import comports as devices
     assert devices is not None
     port = Path(expectation.serial_port)
     missing = FAIL if expectation.real_devices else WARN

@@ -24,7 +24,7 @@ MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("camera", "theta_camera", "/camera/image/compressed"),
     ("lidar", "vlp16_driver", "/scan"),
     ("base", "crawler_base", "/wheel/odom"),
-    ("map", "grid_slam", "/map"),
+    ("map", "grid_slam", "/pose"),  # the map itself is sent only when it changes
     ("depth", "depth_scaler", "/depth/scaled"),
 )
 """What an operator waits for at the start: word, module of the node, topic whose flow says that it is there."""

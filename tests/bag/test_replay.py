@@ -153,6 +153,27 @@ def test_transforms_that_a_replayed_node_broadcasts_are_not_fed(
     assert (recorded, own) == ((0, 9) if drop else (1, 9))
 
 
+def test_frame_that_a_slam_broadcasts_in_anothers_place_is_still_fed(bag: Path, tmp_path: Path) -> None:
+    made: list[MeanNode] = []
+
+    class StandIn(MeanNode):
+        """Broadcasts the base's frame once, as a SLAM does before the wheel odometry comes."""
+
+        def setup(self) -> None:
+            super().setup()
+            made.append(self)
+
+        def on_scan(self, message: LaserScan) -> None:
+            if not self.seen:
+                self.tf_broadcast("odom", "base_link", shift(50.0), stamp_ns(message))
+            super().on_scan(message)
+
+    replay(bag, [ReplayNode("grid_slam", StandIn, MeanConfig())], tmp_path / "out")
+    odometry = [entry for entry in made[0].seen if entry.startswith("odom->base_link")]
+    assert odometry[-1] == "odom->base_link 9"  # the wheels' own, to the end
+    assert "map->odom 99" not in made[0].seen  # while the SLAM's own frame is left out from the beginning
+
+
 def test_what_cannot_be_replayed_is_told(bag: Path, tmp_path: Path) -> None:
     with pytest.raises(ReplayError, match="no node 'warp'"):
         make_node("warp", None, [])

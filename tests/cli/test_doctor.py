@@ -1,0 +1,161 @@
+import http.server
+import json
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from instant_ic.cli import doctor
+from instant_ic.cli.doctor import FAIL, OK, WARN, Expectation, Finding
+from instant_ic.cli.main import main
+
+
+class Theta(http.server.BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        body = json.dumps({"model": "RICOH THETA Z1", "firmwareVersion": "2.21.1"}).encode()
+        self.send_response(200 if self.path == "/osc/info" else 404)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def theta() -> Iterator[str]:
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Theta)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_address[1]}"
+    server.shutdown()
+    server.server_close()
+
+
+def one(findings: Iterator[Finding]) -> Finding:
+    found = list(findings)
+    assert len(found) == 1
+    return found[0]
+
+
+def free_port(kind: socket.SocketKind) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_camera_that_answers(theta: str) -> None:
+    found = one(doctor.check_camera(Expectation(camera_url=theta)))
+    assert (found.level, found.words) == (OK, "RICOH THETA Z1, firmware 2.21.1")
+
+
+@pytest.mark.parametrize(("real", "level"), [(False, WARN), (True, FAIL)])
+def test_devices_that_are_missing(real: bool, level: str, tmp_path: Path) -> None:
+    """A missing device is a failure only where the real ones are asked for."""
+    expected = Expectation(
+        real_devices=real,
+        serial_port=str(tmp_path / "ttyACM7"),
+        camera_url=f"http://127.0.0.1:{free_port(socket.SOCK_STREAM)}",
+        lidar_port=free_port(socket.SOCK_DGRAM),
+        listen_seconds=0.05,
+    )
+    for check in (doctor.check_camera, doctor.check_lidar):
+        found = one(check(expected))
+        assert found.level == level and found.advice
+    assert "cannot be reached" in one(doctor.check_camera(expected)).words
+    serial = one(doctor.check_serial(expected, list))
+    assert serial.level == level and "does not exist (there are: none)" in serial.words
+
+
+@pytest.mark.parametrize(("size", "level"), [(1206, OK), (100, WARN)])
+def test_lidar_packets(size: int, level: str) -> None:
+    port = free_port(socket.SOCK_DGRAM)
+    stop = threading.Event()
+
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            while not stop.wait(0.01):
+                sender.sendto(bytes(size), ("127.0.0.1", port))
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    found = one(doctor.check_lidar(Expectation(lidar_port=port, listen_seconds=20.0)))
+    stop.set()
+    thread.join()
+    assert found.level == level and "127.0.0.1" in found.words
+
+
+def test_serial_port_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = tmp_path / "ttyACM0"
+    port.touch()
+    assert one(doctor.check_serial(Expectation(serial_port=str(port)), list)).level == OK
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    found = one(doctor.check_serial(Expectation(serial_port=str(port), real_devices=True), list))
+    assert found.level == FAIL and "usermod -aG" in found.advice
+
+
+def test_port_in_use() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        found = one(doctor.check_ports(Expectation(tcp_ports=((port, "operator's page"),), udp_ports=())))
+    assert found.level == WARN and found.words == "operator's page: Address already in use"
+    assert one(doctor.check_ports(Expectation(tcp_ports=((port, "page"),), udp_ports=()))).level == OK
+
+
+def test_strict_reverse_path_filter(tmp_path: Path) -> None:
+    for name, value in (("lo", "1"), ("eth0", "2"), ("eth1", "1"), ("default", "1")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "rp_filter").write_text(value + "\n")
+    found = one(doctor.check_network_filter(tmp_path))
+    assert found.level == WARN and "strict on eth1:" in found.words
+    (tmp_path / "eth1" / "rp_filter").write_text("0\n")
+    assert one(doctor.check_network_filter(tmp_path)).level == OK
+
+
+def test_run_directory_of_somebody_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    uid = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: uid + 1)
+    found = [f for f in doctor.check_machine(tmp_path / "run") if f.subject == "run directory"]
+    assert [f.level for f in found] == [FAIL] and "belongs to" in found[0].words
+
+
+def test_models_and_launch_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for folder in ("launch", "models"):
+        (tmp_path / folder).mkdir()
+    monkeypatch.setattr("instant_ic.paths.share_dir", lambda name: tmp_path / name)
+    assert one(doctor.check_models()).level == FAIL
+    (tmp_path / "models" / "torn.onnx").write_bytes(b"not a model")
+    assert one(doctor.check_models()).level == FAIL
+    node = "launch:\n- arg: {name: b}\n- node: {exec: bag_player, param: [{name: KEY, value: $(var b)}]}\n"
+    (tmp_path / "launch" / "bad.yaml").write_text(node.replace("KEY", "bagg"))
+    (tmp_path / "launch" / "good.yaml").write_text(node.replace("KEY", "bag"))
+    bad, good = doctor.check_configuration()
+    assert bad.level == FAIL and "bad.yaml:3" in bad.words and "did you mean 'bag'" in bad.words
+    assert (good.level, good.subject) == (OK, "launch/good.yaml")
+
+
+def test_exit_status_follows_the_worst(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
+    findings = [Finding(OK, "a", "good"), Finding(WARN, "b", "not so good", "do this")]
+    monkeypatch.setattr(doctor, "run_checks", lambda expectation, run_dir: iter(findings))
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    assert out == "ok    a: good\nwarn  b: not so good\n      → do this\n1 ok, 1 warnings, 0 failures\n"
+    findings.append(Finding(FAIL, "c", "bad", "do that"))
+    assert main(["doctor"]) == 1
+
+
+def test_addresses_come_from_the_shipped_configuration() -> None:
+    from instant_ic.cli.commands.doctor import _expectation
+    from instant_ic.cli.main import build_parser
+
+    args = build_parser().parse_args(["doctor", "--robot", "--lidar-port", "9"])
+    expected = _expectation(args)
+    assert (expected.real_devices, expected.lidar_port) == (True, 9)
+    assert expected.camera_url.startswith("http://") and expected.serial_port.startswith("/dev/")

@@ -1,0 +1,84 @@
+"""The shipped launch files: every node's parameters are accepted, arguments arrive where they should."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from instant_ic import paths
+from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
+from instant_ic.launch.parameters import check_parameters
+
+NAMES = sorted(file.stem for file in paths.share_dir("launch").glob("*.yaml"))
+NEEDED = {"replay": {"bag": "drive"}}
+EVERYTHING = {
+    "replay": {"bag": "drive", "record": "again", "nerf": "true"},
+    "sim": {"panorama": "photo.jpg", "pcap": "drive.pcap", "record": "drive"},
+    "robot": {"camera_url": "http://10.0.0.9", "lidar_port": "3000", "serial_port": "/dev/ttyUSB1", "record": "x"},
+    "full": {"serial_port": "/dev/ttyUSB1", "console_port": "9000", "record": "x"},
+    "station": {"console_port": "9000"},
+}
+PERCEPTION = {"grid_slam", "depth_estimator", "depth_scaler"}
+ROBOT = {"theta_camera", "vlp16_driver", "crawler_base", "grid_slam", "virtual_robot", "navigator", "arbiter"}
+STATION = {"depth_estimator", "depth_scaler", "nerf", "console"}
+
+
+def nodes(name: str, **arguments: str) -> dict[str, str]:
+    """Command line of each node, as one text."""
+    given = {**NEEDED.get(name, {}), **arguments}
+    description = read_launch_file(find_launch_file(name), given, Path("/run/here"))
+    return {node.name: " ".join(node.command) for node in description.nodes}
+
+
+def test_there_are_the_five() -> None:
+    assert {"sim", "robot", "station", "full", "replay"} <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("given", [NEEDED, EVERYTHING], ids=["defaults", "everything"])
+def test_every_node_accepts_its_parameters(name: str, given: dict[str, dict[str, str]]) -> None:
+    description = read_launch_file(find_launch_file(name), given.get(name, {}))
+    assert check_parameters(description.nodes) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_argument_is_described(name: str) -> None:
+    for argument in read_arguments(find_launch_file(name)):
+        assert argument.description, argument.name
+
+
+def test_which_nodes_run() -> None:
+    assert set(nodes("robot")) == ROBOT
+    assert set(nodes("station")) == STATION
+    assert set(nodes("full")) == ROBOT | STATION
+    assert set(nodes("sim")) == ROBOT | STATION | {"simulator"}
+    without = {"console", "nerf"}
+    assert set(nodes("sim", headless="true", vspace="false")) == (ROBOT | STATION | {"simulator"}) - without
+    assert set(nodes("sim", record="drive")) == ROBOT | STATION | {"simulator", "bag_recorder"}
+    assert set(nodes("replay")) == PERCEPTION | {"bag_player"}
+    assert set(nodes("replay", nerf="true", record="again")) == PERCEPTION | {"bag_player", "bag_recorder", "nerf"}
+
+
+def test_simulated_devices_and_drivers_meet() -> None:
+    found = nodes("sim", camera_port="9001", lidar_port="9002", lidar_position_port="9003", console_port="9004")
+    assert "camera.port:=9001" in found["simulator"] and "url:=http://127.0.0.1:9001" in found["theta_camera"]
+    assert "lidar.data_port:=9002" in found["simulator"] and " port:=9002" in found["vlp16_driver"]
+    assert "lidar.position_port:=9003" in found["simulator"] and "position_port:=9003" in found["vlp16_driver"]
+    assert "host:=127.0.0.1" in found["vlp16_driver"]
+    assert "roboclaw.port:=/run/here/dev/roboclaw" in found["crawler_base"]
+    assert "server.port:=9004" in found["console"]
+    link = yaml.safe_load(paths.shipped_file("config", "sim.yaml").read_text())["simulator"]["ros__parameters"]["base"]
+    assert link["link"] == "roboclaw"
+
+
+def test_robot_leaves_to_the_configuration_what_is_not_given() -> None:
+    found = nodes("robot")
+    assert "url:=" not in found["theta_camera"] and "roboclaw.port" not in found["crawler_base"]
+    assert "roboclaw.port:=/dev/ttyUSB1" in nodes("robot", serial_port="/dev/ttyUSB1")["crawler_base"]
+
+
+def test_replay_runs_on_the_bags_clock() -> None:
+    found = nodes("replay", nerf="true")
+    assert all("use_sim_time:=true" in command for command in found.values())
+    assert "wait_for:=[grid_slam, depth_estimator, depth_scaler, nerf]" in found["bag_player"]
+    assert "wait_for:=[grid_slam, depth_estimator, depth_scaler]" in nodes("replay")["bag_player"]
