@@ -23,6 +23,9 @@ _TAIL = struct.Struct("<H96xIBB")
 _TAIL_AT = 1102
 """From the last block's azimuth to the end: azimuth, 96 bytes of returns, time, return mode, product."""
 
+_OTHER_PRODUCTS = (0x21, 0x24, 0x28)
+"""HDL-32E, Puck Hi-Res, VLP-32C: same packets, other elevations. Old firmware tells no product."""
+
 _MAX_GAP_US = 20_000
 """A longer silence ends the revolution: at 1200 rpm the head may pass the cut unseen in half a turn, 25 ms."""
 _LATE_US = -100_000
@@ -117,8 +120,10 @@ class PacketStream:
         reason = check_data_packet(payload)
         azimuth = timestamp_us = mode = 0
         if reason is None:
-            azimuth, timestamp_us, mode, _ = _TAIL.unpack_from(payload, _TAIL_AT)
-            if timestamp_us >= HOUR_US or azimuth >= 36000:
+            azimuth, timestamp_us, mode, product = _TAIL.unpack_from(payload, _TAIL_AT)
+            if product in _OTHER_PRODUCTS:
+                reason = f"product 0x{product:02x}, which is no VLP-16"
+            elif timestamp_us >= HOUR_US or azimuth >= 36000:
                 reason = "time or azimuth out of range"
         if reason is not None:
             self.counters.bad += 1

@@ -121,8 +121,10 @@ def test_repeated_late_and_foreign_packets_are_dropped_and_counted() -> None:
     stream.feed(b"\0" * 1206, received(4))
     stream.feed(b"\xff\xee", received(4))
     stream.feed(payloads[4][:1200] + b"\xff\xff\xff\xff\x37\x22", received(4))
-    assert (stream.counters.packets, stream.counters.late, stream.counters.bad) == (4, 2, 3)
-    assert len(stream.counters.bad_reasons) == 3
+    stream.feed(payloads[4][:-1] + b"\x24", received(4))
+    assert (stream.counters.packets, stream.counters.late, stream.counters.bad) == (4, 2, 4)
+    assert len(stream.counters.bad_reasons) == 4
+    assert stream.counters.bad_reasons["product 0x24, which is no VLP-16"] == 1
 
 
 @pytest.mark.parametrize("before_us", [900_000_000, 2_700_000_000])  # back by a quarter of an hour, by three
