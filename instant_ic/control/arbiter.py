@@ -499,7 +499,7 @@ class Arbiter:
             wanted = clip_twist(*situation.inputs.nav_command, self.config.limits)
             if situation.inputs.age("nav") > self._timeout("nav"):
                 wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
-            sent = self.monitor.limit(wanted, situation.inputs.scan_points)
+            sent = self.monitor.limit(wanted, self._close_points(situation))
             if self._subgoal is None:
                 return (0.0, 0.0), False, "you drive the virtual robot; no free place for the robot near it"
             held = "" if sent.action == "free" else "; the robot slows down for something close"
@@ -514,11 +514,19 @@ class Arbiter:
             why = self._why_not_virtual(situation) or "obstacle ahead"
             reason = f"blocked: obstacle in {prediction.distance_m:.1f} m; {why}"
             command = self._slowed(command, prediction.distance_m)
-        sent = self.monitor.limit(command, situation.inputs.scan_points)
+        sent = self.monitor.limit(command, self._close_points(situation))
         if sent.action != "free" and not blocked:
             blocked = True
             reason = f"blocked: contact in {sent.time_to_collision_s:.1f} s"
         return sent.command, blocked, reason
+
+    def _close_points(self, situation: _Situation) -> NDArray[np.float64]:
+        """Scan hits, and what the costmap remembers where the LiDAR is blind: right beside the robot."""
+        inputs = situation.inputs
+        if inputs.costmap is None or inputs.robot_pose is None:
+            return inputs.scan_points
+        blind = self.config.collision_monitor.blind_radius_m
+        return np.concatenate([inputs.scan_points, inputs.costmap.lethal_near(inputs.robot_pose, blind)])
 
     def _slowed(self, command: Twist2, distance_m: float) -> Twist2:
         """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""

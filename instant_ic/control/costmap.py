@@ -34,7 +34,7 @@ class CostmapConfig:
     cost_scaling_factor: float = 3.0
     obstacle_max_range: float = 8.0
     raytrace_max_range: float = 8.5
-    inf_is_valid: bool = True
+    inf_is_valid: bool = False
     occupied_threshold: int = 65
     footprint_clearing_enabled: bool = True
 
@@ -90,6 +90,19 @@ class Costmap:
         ox, oy = float(self.origin[0]), float(self.origin[1])
         overlap: NDArray[np.int64] = _lethal_overlap(self.costs, ox, oy, self.resolution, poses, body)
         return overlap
+
+    def lethal_near(self, pose: NDArray[np.float64], radius_m: float) -> NDArray[np.float64]:
+        """Centres (N, 2) of lethal cells within ``radius_m`` of ``pose`` (x, y, yaw), in the frame of ``pose``."""
+        row, column = (int(i) for i in self.cells(np.asarray(pose)[:2]))
+        reach = math.ceil(radius_m / self.resolution) + 1
+        top, left = max(0, row - reach), max(0, column - reach)
+        window = self.costs[top : max(0, row + reach + 1), left : max(0, column + reach + 1)]
+        rows, columns = np.nonzero(window == LETHAL)
+        away = self.centres(rows + top, columns + left) - np.asarray(pose)[:2]
+        away = away[(away**2).sum(axis=-1) <= radius_m**2]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        seen: NDArray[np.float64] = away @ np.array([[c, -s], [s, c]])
+        return seen
 
     def occupancy(self) -> NDArray[np.int8]:
         """The costs in the -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
@@ -166,8 +179,9 @@ def scan_rays(
 ) -> ScanRays:
     """Beams of a scan in the map frame.
 
-    +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` where ``inf_is_valid``; NaN, -inf and
-    what is closer than ``range_min`` neither mark nor clear.
+    +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` where ``inf_is_valid``: only for sensors
+    that tell «nothing there» from «too near to be seen», which a VLP-16 does not. NaN, -inf and what is closer than
+    ``range_min`` neither mark nor clear.
 
     Args:
         ranges: (N,) metres.

@@ -1,7 +1,7 @@
 """Collision monitor: the last thing before ``/cmd_vel`` (nav2_collision_monitor's ``approach`` and ``stop``).
 
-It looks only at the newest scan and the true footprint: no map, no costmap, nothing that may be wrong together
-with the rest of the stack.
+It looks at the newest scan and the true footprint; what is too near for the LiDAR to see is the costmap's memory
+(``blind_radius_m``), which the caller adds to the points.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ class CollisionMonitorConfig:
     simulation_time_step: float = 0.05
     padding_m: float = 0.04
     min_points: int = 2
+    blind_radius_m: float = 0.45
 
     def __post_init__(self) -> None:
         for key in ("time_before_collision", "simulation_time_step"):
@@ -34,8 +35,9 @@ class CollisionMonitorConfig:
             raise ValueError(
                 f"collision_monitor.stop_time_s must be in 0..time_before_collision (got {self.stop_time_s})"
             )
-        if not self.padding_m >= 0:
-            raise ValueError(f"collision_monitor.padding_m must be >= 0 (got {self.padding_m})")
+        for key in ("padding_m", "blind_radius_m"):
+            if not getattr(self, key) >= 0:
+                raise ValueError(f"collision_monitor.{key} must be >= 0 (got {getattr(self, key)})")
         if self.min_points < 1:
             raise ValueError(f"collision_monitor.min_points must be >= 1 (got {self.min_points})")
 

@@ -23,7 +23,7 @@ from instant_ic.control.walls import WallMap
 
 LENGTH_M, WIDTH_M = 0.60, 0.50
 BEAMS = 720
-LIDAR_MIN_M, LIDAR_MAX_M = 0.30, 20.0
+LIDAR_MIN_M, LIDAR_MAX_M = 0.40, 20.0
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> np.ndarray:
@@ -39,7 +39,7 @@ class World:
     segments: np.ndarray
 
     def cast(self, x: float, y: float, yaw: float) -> np.ndarray:
-        """Ranges (BEAMS,), the first beam at -pi from the heading; +inf where nothing is met."""
+        """Ranges (BEAMS,), the first beam at -pi from the heading; +inf for nothing, and for too near, as a VLP-16."""
         angle = yaw - math.pi + 2 * math.pi * np.arange(BEAMS) / BEAMS
         d = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         a, e = self.segments[:, 0][None], (self.segments[:, 1] - self.segments[:, 0])[None]
@@ -50,7 +50,7 @@ class World:
             u = (to_a[..., 0] * d[..., 1] - to_a[..., 1] * d[..., 0]) / cross
             t = np.where((np.abs(cross) > 1e-12) & (t > 0) & (u >= 0) & (u <= 1), t, np.inf)
         r = t.min(axis=1)
-        return np.where(r < LIDAR_MIN_M, -np.inf, np.where(r > LIDAR_MAX_M, np.inf, r))
+        return np.where((r < LIDAR_MIN_M) | (r > LIDAR_MAX_M), np.inf, r)
 
     def contact(self, pose: np.ndarray) -> bool:
         """Whether the true footprint touches a segment (sampled each centimetre)."""
@@ -175,7 +175,8 @@ class Loop:
         if self.k % 4 == 0:
             rays = scan_rays(*scan, matrix(self.scan_pose), self.costmap_config)
             self.costmap = self.costmaps.update(robot, self.static, rays)
-        points = np.column_stack([scan_points(*scan), np.zeros((np.isfinite(self.ranges)).sum())])
+        hits = scan_points(*scan)
+        points = np.column_stack([hits, np.zeros(len(hits))])
         base_from_scan = np.linalg.inv(matrix(robot)) @ matrix(self.scan_pose)
         in_base = points @ base_from_scan[:3, :3].T + base_from_scan[:3, 3]
         last = self.decision

@@ -114,12 +114,12 @@ def test_the_robot_stands_on_free_ground() -> None:
 
 def test_scan_values_by_rep_117() -> None:
     ranges = np.array([1.0, np.inf, -np.inf, np.nan, 0.1, 30.0])
-    config = CostmapConfig(raytrace_max_range=5.0, obstacle_max_range=4.0)
+    config = CostmapConfig(raytrace_max_range=5.0, obstacle_max_range=4.0, inf_is_valid=True)
     rays = scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), config)
     # The hit, and the beam that met nothing; not the near, the absent, the one out of range.
     np.testing.assert_allclose(rays.ends, [[1.0, 0.0], [5.0, 0.0]])
     assert rays.hits.tolist() == [True, False]
-    assert len(scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), CostmapConfig(inf_is_valid=False)).ends) == 1
+    assert len(scan_rays(ranges, 0.0, 0.0, 0.5, 20.0, np.eye(4), CONFIG).ends) == 1
     np.testing.assert_allclose(scan_points(ranges, 0.0, 0.0, 0.5, 20.0), [[1.0, 0.0]])
 
 
@@ -130,6 +130,17 @@ def test_scan_is_placed_by_the_sensors_pose() -> None:
     rays = scan_rays(np.array([1.5]), 0.0, 0.01, 0.1, 20.0, map_from_lidar, CONFIG)
     np.testing.assert_allclose(rays.ends, [[2.0, 4.5]], atol=1e-12)
     np.testing.assert_allclose(rays.origin, [2.0, 3.0])
+
+
+def test_lethal_cells_near_the_robot_in_its_own_frame() -> None:
+    costs = np.zeros((80, 80), np.uint8)
+    costs[40 + 6, 40] = LETHAL  # centre (0.025, 0.325)
+    costs[40 + 20, 40] = LETHAL  # a metre off
+    costmap = Costmap(costs, 0.05, np.array([-2.0, -2.0]))
+    found = costmap.lethal_near(np.array([0.025, 0.0, math.pi / 2]), 0.45)
+    np.testing.assert_allclose(found, [[0.325, 0.0]], atol=1e-9)  # the robot looks at it
+    assert costmap.lethal_near(np.array([0.0, -1.5, 0.0]), 0.45).shape == (0, 2)
+    assert costmap.lethal_near(np.array([9.0, 9.0, 0.0]), 0.45).shape == (0, 2)
 
 
 def test_published_form_comes_back() -> None:

@@ -108,6 +108,25 @@ def test_where_the_robot_cannot_follow_there_is_no_switch(
     assert made.frames[-1].command == NOTHING
 
 
+def test_a_post_in_the_blind_zone_is_remembered() -> None:
+    """Seen from afar, then nearer than the LiDAR can see: turning would strike it with a corner."""
+    made = Loop(World(np.concatenate([corridor(), rectangle(1.0, 0.35, 1.06, 0.41)])), None)
+    made.vspace = Vspace(ready=False)
+    made.start()
+    while made.base.pose[0] < 0.93:
+        drive(made, 0.05, FORWARD)
+    drive(made, 1.0, NOTHING)
+    post = np.array([1.03, 0.38]) - made.base.pose[:2]
+    assert np.linalg.norm(post) < 0.40  # abreast: not in the scan any more
+    assert len(made.costmap.lethal_near(made.base.pose, 0.45)) > 0
+    drive(made, 4.0, (0.0, 0.8))
+    assert abs(made.base.pose[2]) < 0.5
+    assert made.frames[-1].decision.blocked
+    # The collision monitor alone, as in virtual mode, holds too.
+    points = made.costmap.lethal_near(made.base.pose, 0.45)
+    assert made.arbiter.monitor.limit((0.0, 0.8), points).action != "free"
+
+
 def test_side_walls_block_but_let_go() -> None:
     made = loop(None)
     drive(made, 12.0, (0.4, 0.1))
