@@ -71,21 +71,21 @@ def add_parser(subparsers: Any) -> None:
 
 def record(args: argparse.Namespace) -> int:
     """Runs the recorder node in this process."""
+    from instant_ic.bag.replay import find_node_class
     from instant_ic.bus.main import run
-    from instant_ic.nodes.bag_recorder import BagRecorderNode
 
     if args.output and Path(args.output).exists():
         raise UserError(f"{args.output} exists already, not overwriting")
     words = ["--name", f"bag_recorder_{os.getpid()}", *_parameters(path=args.output, duration_s=args.duration)]
     words += _parameters(topics=_topics(args.topics), exclude=_topics(args.exclude))
     words += _parameters(use_sim_time=True) if args.use_sim_time else []
-    return run(BagRecorderNode, words)
+    return run(find_node_class("bag_recorder"), words)
 
 
 def play(args: argparse.Namespace) -> int:
     """Runs the player node in this process."""
+    from instant_ic.bag.replay import find_node_class
     from instant_ic.bus.main import run
-    from instant_ic.nodes.bag_player import BagPlayerNode
 
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")
@@ -95,7 +95,7 @@ def play(args: argparse.Namespace) -> int:
     words += _parameters(publish_clock=not args.no_clock, wait_for=args.wait_for)
     for remap in args.remap:
         words += ["-r", remap]
-    return run(BagPlayerNode, words)
+    return run(find_node_class("bag_player"), words)
 
 
 def _topics(names: list[str]) -> list[str]:

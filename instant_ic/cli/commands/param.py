@@ -30,7 +30,7 @@ def add_parser(subparsers: Any) -> None:
         "get",
         help="one parameter",
         description="Prints the value of one parameter.",
-        epilog="example: ic param get grid_slam resolution",
+        epilog="example: ic param get grid_slam field.resolution_m",
     )
     get.add_argument("node", metavar="NODE")
     get.add_argument("key", metavar="KEY", help="nested keys with dots")

@@ -21,7 +21,7 @@ def add_parser(subparsers: Any) -> None:
             "The result does not depend on how fast the machine is: twice the same command gives twice the same bytes."
         ),
         epilog="example: ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again "
-        "-p grid_slam.resolution:=0.1",
+        "-p grid_slam.field.resolution_m:=0.1",
     )
     parser.add_argument("bag", metavar="BAG")
     parser.add_argument("--nodes", required=True, metavar="A,B,...", help="nodes, in the order of their turns")
