@@ -51,6 +51,8 @@ class TrainConfig:
     """Share of the learning rates when a keyframe refreshes a trained field."""
     distance_weight: float = 0.1
     """Weight of the signed-distance error against the colour error."""
+    band_colour_weight: float = 0.3
+    """Weight of the colour error of samples beside the surface against those on it."""
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -60,6 +62,7 @@ class TrainConfig:
         _require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
         for key in ("table_lr", "network_lr", "final_lr_share", "refresh_lr_share"):
             _require(0 < getattr(self, key) <= 1, key, getattr(self, key), "in (0, 1]")
+        _require(0 <= self.band_colour_weight <= 1, "band_colour_weight", self.band_colour_weight, "in 0..1")
         _require(self.distance_weight > 0, "distance_weight", self.distance_weight, "above 0")
 
 

@@ -14,7 +14,7 @@ from .occupancy import Occupancy
 from .prior import PanoramaPrior
 
 Floats = NDArray[np.float32]
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+BETA1, BETA2, EPSILON = 0.9, 0.99, 3e-7
 """Adam's constants, as in instant-ngp."""
 
 
@@ -86,6 +86,12 @@ class Scene:
     lattice: Lattice
     occupancy: Occupancy
 
+    @property
+    def focus(self) -> Floats:
+        """Place of the keyframe's camera and radians of a panorama's pixel, (4,): how fine the field may be where."""
+        pixel = 2 * math.pi / self.prior.rgb.shape[1]
+        return np.array([*self.prior.map_from_camera[:3, 3], pixel], np.float32)
+
 
 @dataclass(frozen=True)
 class Rays:
@@ -142,6 +148,19 @@ class Schedule:
         if self.refresh:
             share *= self.config.refresh_lr_share
         return self.config.table_lr * share, self.config.network_lr * share
+
+
+def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
+    """Weights of a batch's samples in the loss, colour's and distance's, each (2 · rays,).
+
+    Samples in the band carry their ray's colour too, at less weight: a view from aside may meet the surface a little
+    off its place.
+    """
+    rays = config.ray_columns * config.ray_rows
+    on_surface = np.repeat(np.tile([True, False], rays // 64), 64)
+    colour = np.where(on_surface, 1.0, config.band_colour_weight) / (3 * rays)
+    distance = np.full(2 * rays, config.distance_weight / (2 * rays))
+    return colour.astype(np.float32), distance.astype(np.float32)
 
 
 def adam_step_size(lr: float, step: int) -> float:

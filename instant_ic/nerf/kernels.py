@@ -23,7 +23,18 @@ _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "err
 
 
 @njit(**_OPTIONS)
-def encode_block(table, cells_per_m, origin, points, start, count, x):  # type: ignore[no-untyped-def]
+def level_share(points, index, focus, scale):  # type: ignore[no-untyped-def]
+    """How much a level counts at a point: 1 while its cells are wider than a picture's pixel there, 0 from half of it.
+
+    ``focus``: place of the keyframe's camera and radians of a pixel, (4,).
+    """
+    dx, dy, dz = points[index, 0] - focus[0], points[index, 1] - focus[1], points[index, 2] - focus[2]
+    pixel = np.float32(math.sqrt(dx * dx + dy * dy + dz * dz)) * focus[3]
+    return min(max(np.float32(2) - pixel * scale, np.float32(0)), np.float32(1))
+
+
+@njit(**_OPTIONS)
+def encode_block(table, cells_per_m, origin, focus, points, start, count, x):  # type: ignore[no-untyped-def]
     """Trilinear features of ``points[start:start + count]`` into ``x`` (levels·features, BLOCK)."""
     levels, size, features = table.shape
     mask = size - 1
@@ -32,6 +43,11 @@ def encode_block(table, cells_per_m, origin, points, start, count, x):  # type: 
         scale = cells_per_m[level]
         row = level * features
         for i in range(count):
+            share = level_share(points, start + i, focus, scale)
+            if share == 0:
+                for f in range(features):
+                    x[row + f, i] = 0
+                continue
             px = (points[start + i, 0] - ox) * scale
             py = (points[start + i, 1] - oy) * scale
             pz = (points[start + i, 2] - oz) * scale
@@ -48,7 +64,7 @@ def encode_block(table, cells_per_m, origin, points, start, count, x):  # type: 
             w0, w1, w2, w3 = gx * w00, fx * w00, gx * w10, fx * w10
             w4, w5, w6, w7 = gx * w01, fx * w01, gx * w11, fx * w11
             for f in range(features):
-                x[row + f, i] = (
+                x[row + f, i] = share * (
                     w0 * table[level, i0, f]
                     + w1 * table[level, i1, f]
                     + w2 * table[level, i2, f]
@@ -62,7 +78,7 @@ def encode_block(table, cells_per_m, origin, points, start, count, x):  # type: 
 
 @njit(**_OPTIONS)
 def encode_backward_block(  # type: ignore[no-untyped-def]
-    table_grad, touched, cells_per_m, origin, points, start, count, dx
+    table_grad, touched, cells_per_m, origin, focus, points, start, count, dx
 ):
     """Adds the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``."""
     levels, size, features = table_grad.shape
@@ -72,6 +88,9 @@ def encode_backward_block(  # type: ignore[no-untyped-def]
         scale = cells_per_m[level]
         row = level * features
         for i in range(count):
+            share = level_share(points, start + i, focus, scale)
+            if share == 0:
+                continue
             px = (points[start + i, 0] - ox) * scale
             py = (points[start + i, 1] - oy) * scale
             pz = (points[start + i, 2] - oz) * scale
@@ -88,7 +107,7 @@ def encode_backward_block(  # type: ignore[no-untyped-def]
             w0, w1, w2, w3 = gx * w00, fx * w00, gx * w10, fx * w10
             w4, w5, w6, w7 = gx * w01, fx * w01, gx * w11, fx * w11
             for f in range(features):
-                d = dx[row + f, i]
+                d = share * dx[row + f, i]
                 table_grad[level, i0, f] += w0 * d
                 table_grad[level, i1, f] += w1 * d
                 table_grad[level, i2, f] += w2 * d
@@ -157,14 +176,14 @@ def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
-def query(table, w1, b1, w2, b2, cells_per_m, origin, points, out):  # type: ignore[no-untyped-def]
+def query(table, w1, b1, w2, b2, cells_per_m, origin, focus, points, out):  # type: ignore[no-untyped-def]
     """The field at ``points`` (N, 3) into ``out`` (N, 4): colour minus 0.5, signed distance."""
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
     h = np.zeros((w1.shape[0], BLOCK), np.float32)
     y = np.zeros((4, BLOCK), np.float32)
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
-        encode_block(table, cells_per_m, origin, points, start, count, x)
+        encode_block(table, cells_per_m, origin, focus, points, start, count, x)
         layer_block(w1, b1, x, h)
         relu_block(h)
         layer_block(w2, b2, h, y)
@@ -175,7 +194,7 @@ def query(table, w1, b1, w2, b2, cells_per_m, origin, points, out):  # type: ign
 
 @njit(**_OPTIONS)
 def gradient(  # type: ignore[no-untyped-def]
-    table, w1, b1, w2, b2, cells_per_m, origin, points, target, colour_weight, distance_weight,
+    table, w1, b1, w2, b2, cells_per_m, origin, focus, points, target, colour_weight, distance_weight,
     table_grad, touched, g1, gb1, g2, gb2
 ):  # fmt: skip
     """Adds the gradient of the training loss to the ``*_grad`` arrays.
@@ -197,7 +216,7 @@ def gradient(  # type: ignore[no-untyped-def]
     colour_error, distance_error = 0.0, 0.0
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
-        encode_block(table, cells_per_m, origin, points, start, count, x)
+        encode_block(table, cells_per_m, origin, focus, points, start, count, x)
         layer_block(w1, b1, x, h)
         relu_block(h)
         layer_block(w2, b2, h, y)
@@ -218,7 +237,7 @@ def gradient(  # type: ignore[no-untyped-def]
                 if h[j, i] <= 0:
                     dh[j, i] = 0
         layer_backward_block(w1, x, dh, g1, gb1, dx)
-        encode_backward_block(table_grad, touched, cells_per_m, origin, points, start, count, dx)
+        encode_backward_block(table_grad, touched, cells_per_m, origin, focus, points, start, count, dx)
     return colour_error, distance_error
 
 

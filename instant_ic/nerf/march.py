@@ -45,7 +45,8 @@ def sample_rays(  # type: ignore[no-untyped-def]
         rgb, inverse, torn, band: of the ``PanoramaPrior``.
         map_from_camera: (4, 4) float32.
         points: out, (2 N, 3). Rays go by tiles of 8 × 8 strata: 64 points on the surface, then 64 in the band.
-        target: out, (2 N, 4): colour minus 0.5, signed distance in units of the band (in front positive).
+        target: out, (2 N, 4): colour minus 0.5, the ray's for both; signed distance in units of the band (in front
+            positive).
     """
     height, width = rgb.shape[:2]
     h, w = inverse.shape
@@ -71,7 +72,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
             bottom = np.float32(rgb[v1, left, c]) * (np.float32(1) - fu) + np.float32(rgb[v1, right, c]) * fu
             value = top * (np.float32(1) - fv) + bottom * fv
             target[surface, c] = value * np.float32(1 / 255) - np.float32(0.5)
-            target[near, c] = 0
+            target[near, c] = target[surface, c]
         depth = np.float32(1) / prior_inverse_depth(
             inverse, torn, turn * np.float32(w) - np.float32(0.5), fall * np.float32(h) - np.float32(0.5)
         )
@@ -163,7 +164,7 @@ def along(target_from_source, origin, direction, t):  # type: ignore[no-untyped-
 
 @njit(**_OPTIONS)
 def trace(  # type: ignore[no-untyped-def]
-    table, w1, b1, w2, b2, cells_per_m, lattice_origin, grid, low, cell,
+    table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, grid, low, cell,
     inverse, torn, known, camera_from_map, band, origin, directions, pixels, depth, confidence
 ):  # fmt: skip
     """Marches rays to the first zero of the signed distance that agrees with the keyframe's depth.
@@ -174,13 +175,15 @@ def trace(  # type: ignore[no-untyped-def]
         origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
         pixels: (N,) which of them to march.
         depth: out, (P,): metres along the ray, 0 where it meets nothing.
-        confidence: out, (P,): 1 on a surface that the keyframe has seen from its front.
+        confidence: out, (P,): 1 on a surface that the keyframe has seen from its front, 0.5 where its depth was filled.
     """
     count = pixels.shape[0]
     t = np.zeros(count, np.float32)
     leave = np.zeros(count, np.float32)
     last_t = np.zeros(count, np.float32)
     last_s = np.full(count, NOT_SEEN, np.float32)
+    spare = np.zeros(count, np.float32)  # nearest to the surface so far, should the field show no crossing
+    spare_s = np.full(count, NOT_SEEN, np.float32)
     active = np.zeros(count, np.int32)
     points = np.zeros((BLOCK, 3), np.float32)
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
@@ -206,6 +209,9 @@ def trace(  # type: ignore[no-untyped-def]
                 t[n] = found
                 active[queries] = n
                 queries += 1
+            elif spare[n] > 0:
+                depth[pixels[n]] = spare[n]
+                confidence[pixels[n]] = 1
         size = 0
         for start in range(0, queries, BLOCK):
             block = min(BLOCK, queries - start)
@@ -213,7 +219,7 @@ def trace(  # type: ignore[no-untyped-def]
                 n = active[start + i]
                 for c in range(3):
                     points[i, c] = origin[c] + t[n] * directions[pixels[n], c]
-            encode_block(table, cells_per_m, lattice_origin, points, 0, block, x)
+            encode_block(table, cells_per_m, lattice_origin, focus, points, 0, block, x)
             layer_block(w1, b1, x, h)
             relu_block(h)
             layer_block(head, bias, h, s)
@@ -227,13 +233,15 @@ def trace(  # type: ignore[no-untyped-def]
                 crossed = before != NOT_SEEN and (before > 0) != (value > 0)
                 if crossed:
                     hit = last_t[n] + (t[n] - last_t[n]) * before / (before - value)
-                if value <= 0 or crossed:
-                    px, py, pz = along(camera_from_map, origin, directions[pixel], hit)
-                    agrees = prior_agrees(px, py, pz, inverse, torn, known, band)
-                    if agrees > 0:
+                px, py, pz = along(camera_from_map, origin, directions[pixel], hit)
+                agrees = prior_agrees(px, py, pz, inverse, torn, known, band)
+                if agrees > 0:
+                    if value <= 0 or crossed:
                         depth[pixel] = hit
-                        confidence[pixel] = 1.0 if before > 0 and value <= 0 and agrees == 2 else 0.0
+                        confidence[pixel] = 0.5 * agrees if before > 0 and value <= 0 else 0.0
                         continue
+                    if agrees == 2 and value < spare_s[n]:
+                        spare[n], spare_s[n] = hit, value
                 px, py, pz = along(camera_from_map, origin, directions[pixel], t[n])
                 reach = abs(value) * band * math.sqrt(px * px + py * py + pz * pz)
                 last_t[n], last_s[n] = t[n], value

@@ -6,7 +6,7 @@ import numpy as np
 
 from . import kernels, march
 from .config import FieldConfig, TrainConfig
-from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size
+from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size, sample_weights
 
 FIRST_STRIDE = 4
 """Every so many pixels the rays are traced, the rest only where those between differ; a power of two, 1 traces all."""
@@ -25,9 +25,7 @@ class NumbaDevice:
         self._rays = train.ray_columns * train.ray_rows
         self._points = np.zeros((2 * self._rays, 3), np.float32)
         self._target = np.zeros((2 * self._rays, 4), np.float32)
-        on_surface = np.repeat(np.tile([True, False], self._rays // 64), 64)
-        self._colour_weight = np.where(on_surface, 1 / (3 * self._rays), 0).astype(np.float32)
-        self._distance_weight = np.full(2 * self._rays, train.distance_weight / (2 * self._rays), np.float32)
+        self._colour_weight, self._distance_weight = sample_weights(train)
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -42,6 +40,7 @@ class NumbaDevice:
 
     def set_scene(self, scene: Scene) -> None:
         self._scene = scene
+        self._focus = scene.focus
         self._map_from_camera = scene.prior.map_from_camera.astype(np.float32)
         self._camera_from_map = np.linalg.inv(scene.prior.map_from_camera).astype(np.float32)
         for moments in (self._table_moments, *self._network_moments):
@@ -57,7 +56,7 @@ class NumbaDevice:
         )  # fmt: skip
         g1, gb1, g2, gb2 = self._network_grads
         colour, distance = kernels.gradient(
-            p.table, *p.network(), lattice.cells_per_m, lattice.origin, self._points, self._target,
+            p.table, *p.network(), lattice.cells_per_m, lattice.origin, self._focus, self._points, self._target,
             self._colour_weight, self._distance_weight, self._table_grad, self._touched, g1, gb1, g2, gb2,
         )  # fmt: skip
         self._steps += 1
@@ -70,7 +69,7 @@ class NumbaDevice:
             v += (1 - betas[1]) * (grad * grad - v)
             value -= step_size * m / (np.sqrt(v) + betas[2])
             grad[...] = 0
-        return float(colour), float(distance) / self._train.distance_weight
+        return colour / (1 + self._train.band_colour_weight), distance / self._train.distance_weight
 
     def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         height, width = rays.shape
@@ -80,7 +79,7 @@ class NumbaDevice:
         points = rays.origin + depth[met, None] * rays.directions[met]
         out = np.empty((met.size, 4), np.float32)
         p, lattice = self._p, self._scene.lattice
-        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, points, out)
+        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, self._focus, points, out)
         colour = np.zeros((height * width, 3), np.float32)
         colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
         return colour, depth, confidence
@@ -106,7 +105,7 @@ class NumbaDevice:
         scene, p = self._scene, self._p
         prior, grid = scene.prior, scene.occupancy
         march.trace(
-            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin,
+            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, self._focus,
             grid.distance, grid.origin, np.float32(grid.cell_m),
             prior.inverse_depth, prior.torn, prior.known, self._camera_from_map, np.float32(prior.band),
             rays.origin, rays.directions, pixels, depth, confidence,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,13 +41,15 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     """Points of the prior's surfaces in the map frame, dense enough to leave no gap of a cell, (N, 3).
 
     Quads that are not torn are divided where their corners are further apart than a cell (planes that lean away), up to
-    16 × 16 parts. Along a quad the inverse depth is linear.
+    16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels' own points.
     """
     height, width = prior.inverse_depth.shape
     directions = equirect_directions(width, height) @ prior.map_from_camera[:3, :3].T.astype(np.float32)
     inverse = prior.inverse_depth
     points = directions / inverse[..., None]
     clouds = [points.reshape(-1, 3)]
+    if math.isinf(cell_m):
+        return clouds[0] + prior.map_from_camera[:3, 3].astype(np.float32)
     down = np.linalg.norm(points[1:] - points[:-1], axis=2)
     across = np.linalg.norm(np.roll(points, -1, 1) - points, axis=2)[:-1]
     parts = np.ceil(np.maximum(down, across) / cell_m)
@@ -71,12 +74,13 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
 
 def build_occupancy(prior: PanoramaPrior, config: GeometryConfig) -> Occupancy:
     """Occupancy grid of a keyframe; ``MARGIN_CELLS`` are added round each surface."""
-    cloud = surface_points(prior, config.cell_m)
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    corners = surface_points(prior, math.inf)
+    low, high = corners.min(axis=0), corners.max(axis=0)  # parts of quads lie between their corners
     volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
     cell = max(config.cell_m, (volume / config.max_cells) ** (1 / 3))
     origin = low - np.float32(4 * cell)
     shape = tuple(int(n) for n in np.ceil((high - origin) / cell).astype(int) + 4)
+    cloud = surface_points(prior, cell)
     index = ((cloud - origin) * np.float32(1 / cell)).astype(np.intp)
     distance = np.full(shape, MAX_DISTANCE, np.uint8)
     distance.reshape(-1)[np.ravel_multi_index(tuple(index.T), shape)] = 0

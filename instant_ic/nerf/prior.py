@@ -167,13 +167,13 @@ def fill_holes(
     while min(levels[-1][1].shape) > 1:
         total, w = levels[-1]
         levels.append((_halve(total), _halve(w)))
+    # Sums and weights go down together, so that where two sides meet the heavier counts more.
     total, w = levels[-1]
-    coarse = total / np.maximum(w, 1e-12)[..., None]
-    for total, w in reversed(levels[:-1]):
-        finer = _double(coarse, w.shape)
-        known = w > 1e-12
-        finer[known] = total[known] / w[known][:, None]
-        coarse = finer
+    for finer_total, finer_w in reversed(levels[:-1]):
+        known = finer_w > 0
+        total, w = _double(total, known.shape) / 4, _double(w, known.shape) / 4
+        total[known], w[known] = finer_total[known], finer_w[known]
+    coarse = total / np.maximum(w, 1e-30)[..., None]
     coarse[valid] = channels[valid]
     return coarse if values.ndim == 3 else coarse[..., 0]
 

@@ -19,7 +19,7 @@ FIRST_STEP = 0.7
 
 @dataclass
 class TorchField:
-    """Parameters and lattice as tensors; shapes as in ``field.FieldParameters`` and ``field.Lattice``."""
+    """Parameters and lattice as tensors; shapes as in ``field.FieldParameters``, ``field.Lattice``, ``field.Scene``."""
 
     table: Tensor
     w1: Tensor
@@ -28,6 +28,7 @@ class TorchField:
     b2: Tensor
     cells_per_m: Tensor
     origin: Tensor
+    focus: Tensor
 
     def parameters(self) -> list[Tensor]:
         return [self.table, self.w1, self.b1, self.w2, self.b2]
@@ -55,19 +56,22 @@ class TorchGrid:
     cell_m: float
 
 
-def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, points: Tensor) -> Tensor:
+def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, focus: Tensor, points: Tensor) -> Tensor:
     """Trilinear hash-grid features.
 
     Args:
         table: (levels, size, features); size is a power of two.
         cells_per_m: (levels,).
         origin: (3,).
+        focus: place of the keyframe's camera and radians of a picture's pixel, (4,): levels whose cells are narrower
+            than a pixel count less, from half a pixel on not at all.
         points: (N, 3).
 
     Returns:
         (N, levels · features).
     """
     levels, size, _ = table.shape
+    pixel = (points - focus[:3]).norm(dim=1) * focus[3]
     features = []
     for level in range(levels):
         place = (points - origin) * cells_per_m[level]
@@ -83,13 +87,13 @@ def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, points: Tensor) -
             x, y, z = (cell[:, axis] + offset[axis] for axis in range(3))
             index = (x ^ (y * _P1) ^ (z * _P2)) & (size - 1)
             total = total + weight[:, None] * table[level][index]
-        features.append(total)
+        features.append(total * (2 - pixel * cells_per_m[level]).clamp(0, 1)[:, None])
     return torch.cat(features, dim=1)
 
 
 def query(field: TorchField, points: Tensor) -> Tensor:
     """Colour minus 0.5 and signed distance, (N, 4)."""
-    features = encode(field.table, field.cells_per_m, field.origin, points)
+    features = encode(field.table, field.cells_per_m, field.origin, field.focus, points)
     hidden = torch.relu(features @ field.w1.T + field.b1)
     return hidden @ field.w2.T + field.b2
 
@@ -157,7 +161,7 @@ def sample_rays(uniform: Tensor, columns: int, rows: int, prior: TorchPrior) -> 
     near = camera + (depth * (1 + prior.band * offset))[:, None] * direction
     zero = torch.zeros_like(offset)[:, None]
     surface_target = torch.cat([colour, zero], dim=1)
-    near_target = torch.cat([torch.zeros_like(colour), -offset[:, None]], dim=1)
+    near_target = torch.cat([colour, -offset[:, None]], dim=1)
     points = torch.stack([surface.view(-1, 64, 3), near.view(-1, 64, 3)], dim=1).reshape(-1, 3)
     target = torch.stack([surface_target.view(-1, 64, 4), near_target.view(-1, 64, 4)], dim=1).reshape(-1, 4)
     return points, target
@@ -193,6 +197,8 @@ def trace(
     active = torch.nonzero(t < leave)[:, 0]
     last_t = torch.zeros_like(t)
     last_s = torch.full_like(t, NOT_SEEN)
+    spare = torch.zeros_like(t)
+    spare_s = torch.full_like(t, NOT_SEEN)
     camera = prior.map_from_camera[:3, 3]
     while active.numel():
         t[active] = _next_occupied(origin, directions[active], t[active], leave[active], grid)
@@ -209,13 +215,18 @@ def trace(
         places = places @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]
         front = (value <= 0) & (before > 0)
         agrees = prior_agrees(prior, places)
+        closer = (agrees == 2) & (value > 0) & ~crossed & (value < spare_s[active])
+        spare[active[closer]], spare_s[active[closer]] = hit[closer], value[closer]
         met = ((value <= 0) | crossed) & (agrees > 0)
         depth[active[met]] = hit[met]
-        confidence[active[met]] = (front & (agrees == 2))[met].float()
+        confidence[active[met]] = torch.where(front, 0.5 * agrees, torch.zeros_like(value))[met]
         last_t[active], last_s[active] = here, value
         reach = 0.9 * value.abs() * prior.band * (points - camera).norm(dim=1)
         t[active] = here + reach.clamp(0.5 * grid.cell_m, 2 * grid.cell_m)
         active = active[~met]
+    without = (depth == 0) & (spare > 0)
+    depth[without] = spare[without]
+    confidence[without] = 1
     return depth, confidence
 
 

@@ -65,7 +65,8 @@ class Status:
 @dataclass(frozen=True)
 class View:
     """A picture of the space: ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) radial, 0 where unknown; ``confidence``
-    (H, W) in 0..1, 0 where no keyframe has seen the place (``rgb`` is continued from the surroundings there).
+    (H, W): 1 where the keyframe has seen the place, 0.5 where it has but its depth was filled from around, 0 where it has
+    not (``rgb`` is continued from the surroundings there).
     """
 
     rgb: NDArray[np.uint8]
@@ -221,12 +222,13 @@ class VirtualSpace:
         colour, depth, confidence = self._device.draw(rays)
         image = colour.reshape(height, width, 3)
         depth = depth.reshape(height, width)
-        if np.any(depth == 0):
-            # What nothing is known of is continued from around it, more from the far side than from the near:
-            # it opens up behind the nearer surface.
-            image = fill_holes(image, depth > 0, weight=depth * depth)
+        confidence = confidence.reshape(height, width)
+        if np.any(confidence == 0):
+            # What is not known is continued from around it, more from the far side than from the near: it opens up
+            # behind the nearer surface.
+            image = fill_holes(image, confidence > 0, weight=depth * depth)
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence.reshape(height, width))
+        return View(rgb, depth, confidence)
 
     def _view_rays(self, pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
         key = (width, height, round(fov_rad, 6))

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from . import reference
 from .config import FieldConfig, TrainConfig
-from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size
+from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size, sample_weights
 from .reference import TorchField, TorchGrid, TorchPrior
 
 RAYS_AT_ONCE = 1 << 18
@@ -41,16 +41,15 @@ class TorchDevice:
         self._train = train
         self._device = device
         self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
-        rays = train.ray_columns * train.ray_rows
-        on_surface = torch.tensor([1.0, 0.0]).repeat(rays // 64).repeat_interleave(64)
-        self._colour_weight = (on_surface / (3 * rays)).to(device)
-        self._distance_weight = torch.full((2 * rays,), train.distance_weight / (2 * rays), device=device)
+        weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
+        self._colour_weight, self._distance_weight = weights
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
         arrays = (parameters.table, *parameters.network())
         tensors = [torch.from_numpy(a.copy()).to(self._device).requires_grad_() for a in arrays]
-        lattice = torch.zeros(parameters.table.shape[0], device=self._device), torch.zeros(3, device=self._device)
+        levels = parameters.table.shape[0]
+        lattice = [torch.zeros(n, device=self._device) for n in (levels, 3, 4)]  # until a scene comes
         self._field = TorchField(*tensors, *lattice)
         self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in tensors]
         self._steps = 0
@@ -63,6 +62,7 @@ class TorchDevice:
         )
         self._field.cells_per_m = torch.from_numpy(scene.lattice.cells_per_m).to(self._device)
         self._field.origin = torch.from_numpy(scene.lattice.origin).to(self._device)
+        self._field.focus = torch.from_numpy(scene.focus).to(self._device)
         self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
         self._steps = 0
 
@@ -79,7 +79,8 @@ class TorchDevice:
                 step_size = adam_step_size(lr, self._steps)
                 # A network's row is an entry like the table's: without a gradient it is left alone.
                 reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
-        return float(colour.detach()), float(distance.detach()) / self._train.distance_weight
+        colour_error = float(colour.detach()) / (1 + self._train.band_colour_weight)
+        return colour_error, float(distance.detach()) / self._train.distance_weight
 
     @torch.no_grad()
     def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:

@@ -18,6 +18,7 @@ from instant_ic.nerf.reference import TorchField
 from instant_ic.nerf.torch_device import TorchDevice, torch_prior
 
 F = np.float32
+FOCUS = np.array([0.3, 0.2, -0.5, 0.01], F)  # pixels of 1 cm a metre: levels of 1 cm and less fade away
 
 
 def random_field(levels, features, hidden=16, log2_table=10, seed=3):
@@ -33,7 +34,7 @@ def random_field(levels, features, hidden=16, log2_table=10, seed=3):
 
 def torch_field(p, lattice):
     tensors = [torch.from_numpy(a.copy()).requires_grad_() for a in (p.table, *p.network())]
-    return TorchField(*tensors, torch.from_numpy(lattice.cells_per_m), torch.from_numpy(lattice.origin))
+    return TorchField(*tensors, torch.from_numpy(lattice.cells_per_m), torch.from_numpy(lattice.origin), torch.from_numpy(FOCUS))
 
 
 def random_points(count, seed=5):
@@ -45,7 +46,7 @@ def test_query_agrees_with_the_reference(levels, features, count):
     p, lattice = random_field(levels, features)
     points = random_points(count)
     out = np.empty((count, 4), F)
-    kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, points, out)
+    kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, FOCUS, points, out)
     expected = reference.query(torch_field(p, lattice), torch.from_numpy(points)).detach().numpy()
     np.testing.assert_allclose(out, expected, rtol=2e-3, atol=2e-3)
 
@@ -56,8 +57,8 @@ def test_encoding_by_hand():
     table = np.zeros((1, 16, 4), F)
     table[0, 0], table[0, 1] = 1.0, 10.0
     x = np.zeros((4, kernels.BLOCK), F)
-    kernels.encode_block(table, np.array([1.0], F), np.zeros(3, F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x)
-    # 0.75·0.5·1 + 0.25·0.5·10 + 0.75·0.5·10 + 0.25·0.5·1 = 5.5
+    kernels.encode_block(table, np.array([1.0], F), np.zeros(3, F), np.zeros(4, F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x)
+    # A pixel of 0 rad leaves all levels whole. 0.75·0.5·1 + 0.25·0.5·10 + 0.75·0.5·10 + 0.25·0.5·1 = 5.5
     assert x[:, 0] == pytest.approx([5.5] * 4)
 
 
@@ -72,7 +73,7 @@ def test_gradient_agrees_with_autograd(levels, features, count):
     table_grad, touched = np.zeros_like(p.table), np.zeros(p.table.shape[:2], np.uint8)
     g1, gb1, g2, gb2 = (np.zeros_like(a) for a in p.network())
     errors = kernels.gradient(
-        p.table, *p.network(), lattice.cells_per_m, lattice.origin, points, target, colour_weight, distance_weight,
+        p.table, *p.network(), lattice.cells_per_m, lattice.origin, FOCUS, points, target, colour_weight, distance_weight,
         table_grad, touched, g1, gb1, g2, gb2,
     )  # fmt: skip
     field = torch_field(p, lattice)
@@ -175,7 +176,7 @@ def test_a_rays_direction_and_colour_by_hand():
     assert points[0] == pytest.approx([2 * d for d in direction], abs=1e-5)
     assert points[64] == pytest.approx([2.1 * d for d in direction], abs=1e-5)  # 2 m · (1 + 0.1 · 0.5)
     assert target[0] == pytest.approx([0.5, 51 / 255 - 0.5, -0.5, 0], abs=1e-6)
-    assert target[64] == pytest.approx([0, 0, 0, -0.5], abs=1e-6)  # behind the surface: negative
+    assert target[64] == pytest.approx([0.5, 51 / 255 - 0.5, -0.5, -0.5], abs=1e-6)  # behind the surface: negative
 
 
 def test_rendering_agrees_with_the_reference(scene):
@@ -220,28 +221,28 @@ def test_training_steps_agree_with_the_reference(scene):
         assert ours == pytest.approx(theirs, rel=0.05)
 
 
-def test_the_march_finds_a_plane_by_hand():
-    # A field whose distance is linear in x cannot be had from a table by hand, but its zero can: the network's output
-    # is its bias, +1 everywhere, so that nothing is met; −1 everywhere, so that the first occupied cell is met.
+def test_the_march_by_hand():
+    # The network's output is its bias, the same everywhere, with the colour (0.6, 0.7, 0.8). The scene is a sphere of
+    # 2 m round the camera, the band 5 %.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
-    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(), 2048)
+    prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
     scene = Scene(prior, Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
-    space = VirtualSpace(VirtualSpaceConfig(device="cpu", field=config))
-    rays = space._view_rays(np.eye(4), 32, 16, 1.0)
-    for bias, met in ((1.0, False), (-1.0, True)):
+    rays = VirtualSpace(VirtualSpaceConfig(device="cpu", field=config))._view_rays(np.eye(4), 32, 16, 1.0)
+    for distance in (-1.0, 1.0):
         p = FieldParameters.random(config, 1)
-        p.w2[...], p.b2[...] = 0, [0.1, 0.2, 0.3, bias]
+        p.w2[...], p.b2[...] = 0, [0.1, 0.2, 0.3, distance]
         device = NumbaDevice(config, TrainConfig())
         device.load(p)
         device.set_scene(scene)
-        colour, depth, confidence = device.draw(rays)
-        if met:
-            # The first place in an occupied cell that agrees with the sphere of 2 m to 5 %.
-            assert depth.min() > 1.88
-            assert depth.max() < 2.1
-            assert colour == pytest.approx(np.tile([0.6, 0.7, 0.8], (512, 1)), abs=1e-5)
-            assert confidence.mean() > 0.5
-        else:
-            assert not depth.any()
-            assert not confidence.any()
+        # Behind the surface everywhere: met at the first place in the band. In front everywhere, so that the field shows
+        # no crossing: the place in the band that came nearest. Never outside of the band
+        # (but for the interpolation between traced pixels, which takes the sphere for flat).
+        colour, depth, _ = device.draw(rays)
+        assert depth.min() > 1.88
+        assert depth.max() < 2.12
+        assert colour == pytest.approx(np.tile([0.6, 0.7, 0.8], (512, 1)), abs=1e-5)
+    scene.occupancy.distance[...] = 30  # nothing anywhere
+    _, depth, confidence = device.draw(rays)
+    assert not depth.any()
+    assert not confidence.any()

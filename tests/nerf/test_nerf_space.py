@@ -1,0 +1,290 @@
+"""The virtual space as a whole, and the making of a keyframe's prior."""
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.nerf import (
+    FieldConfig,
+    KeyframeError,
+    NotReadyError,
+    ReadinessConfig,
+    State,
+    TrainConfig,
+    VirtualSpace,
+    VirtualSpaceConfig,
+    box_room,
+)
+from instant_ic.nerf.config import GeometryConfig
+from instant_ic.nerf.occupancy import build_occupancy, surface_points
+from instant_ic.nerf.prior import area_average, fill_holes, prepare, torn_quads
+from instant_ic.nerf.warm_up import warm_up
+
+CONFIG = VirtualSpaceConfig(
+    device="cpu",
+    field=FieldConfig(log2_table=14),
+    train=TrainConfig(ray_columns=64, ray_rows=32, iterations=120),
+)
+CAMERA = pose_matrix(x=0.4, y=0.1, z=0.05, yaw=-0.5)
+
+
+def psnr_db(a, b):
+    return 10 * math.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
+
+
+def trained(iterations, config=CONFIG, sigma=0.02):
+    space = VirtualSpace(config)
+    picture = box_room.panorama(CAMERA, 192)
+    space.set_keyframe(picture.rgb, picture.depth_m, CAMERA, sigma)
+    if iterations:
+        space.train(iterations=iterations)
+    return space
+
+
+@pytest.fixture(scope="module")
+def space():
+    return trained(120)
+
+
+def test_training_learns_the_room(space):
+    untrained, first = trained(0), trained(1)
+    assert first.status.psnr_db < 16  # about the spread of the room's colours round grey
+    assert space.status.psnr_db > 24
+    truth = box_room.perspective(CAMERA, 160, 90, 1.5).rgb
+    view = space.render(CAMERA, 160, 90, 1.5)
+    assert psnr_db(view.rgb, truth) > 23
+    assert psnr_db(untrained.render(CAMERA, 160, 90, 1.5).rgb, truth) < 16
+    assert (view.confidence > 0).mean() > 0.97
+
+
+def test_a_view_from_aside_has_the_rooms_depth(space):
+    pose = pose_matrix(x=0.9, y=-0.4, yaw=-0.2)
+    view, truth = space.render(pose, 160, 90, 1.5), box_room.perspective(pose, 160, 90, 1.5)
+    seen = view.confidence > 0
+    error = np.abs(view.depth_m / truth.depth_m - 1)[seen]
+    assert np.median(error) < 0.005
+    assert psnr_db(view.rgb[seen], truth.rgb[seen]) > 21
+
+
+def test_what_no_picture_has_seen_has_no_confidence(space):
+    # From beside the box one looks at the wall behind it, which the box hides from the keyframe: a point on the wall
+    # counts as hidden when the way to it from the keyframe's camera is shorter than the wall's distance.
+    pose = pose_matrix(x=2.0, y=-1.0, yaw=1.0)
+    width, height, fov = 160, 90, 1.5
+    view, truth = space.render(pose, width, height, fov), box_room.perspective(pose, width, height, fov)
+    rays = space._view_rays(pose, width, height, fov)
+    points = rays.origin + truth.depth_m.reshape(-1, 1) * rays.directions
+    away = points - CAMERA[:3, 3]
+    distance = np.linalg.norm(away, axis=1)
+    hidden = np.array(
+        [box_room._draw(_looking(d), np.array([[[1.0, 0, 0]]], np.float32)).depth_m[0, 0] for d in away[::37]]
+    )
+    hidden = hidden < distance[::37] - 0.1
+    confidence = view.confidence.reshape(-1)[::37]
+    assert hidden.sum() > 10
+    assert confidence[hidden].mean() < 0.2
+    assert confidence[~hidden].mean() > 0.9
+    assert np.all(view.rgb.reshape(-1, 3).std(axis=0) > 5)  # and is filled, not black
+
+
+def _looking(direction):
+    x, y, z = direction
+    pose = CAMERA.copy()
+    pose[:3, :3] = pose_matrix(yaw=math.atan2(y, x), pitch=-math.atan2(z, math.hypot(x, y)))[:3, :3]
+    return pose
+
+
+def test_training_stops_at_its_end_and_becomes_ready(space):
+    assert space.status.state == State.READY
+    assert space.status.converged
+    stats = space.train(budget_ms=1000)
+    assert stats.iterations == 0
+    assert stats.converged
+
+
+def test_the_same_seed_gives_the_same_bits():
+    first, second = (trained(8).render(CAMERA, 64, 36, 1.5) for _ in range(2))
+    assert np.array_equal(first.rgb, second.rgb)
+    assert np.array_equal(first.depth_m, second.depth_m)
+
+
+def test_a_budget_is_kept_to_one_iteration():
+    space = trained(0)
+    assert space.train(budget_ms=0.0).iterations == 1
+    assert space.status.iterations == 1
+
+
+def test_readiness_by_psnr_plateau_and_radius():
+    rule = ReadinessConfig(psnr_db=90, plateau_iterations=20, plateau_db=50, max_radius_m=9)
+    space = trained(20, VirtualSpaceConfig(device="cpu", field=CONFIG.field, train=CONFIG.train, readiness=rule), 0.05)
+    assert space.status.state == State.TRAINING
+    assert space.status.ready_radius_m == 0
+    space.train(iterations=5)  # the 21st value shows less than 50 dB gained over 20 iterations
+    assert space.status.ready_iterations == 21
+    # 0.035 rad · median depth / 5 %
+    median = space.keyframe.median_depth_m
+    assert space.status.ready_radius_m == pytest.approx(0.035 * median / 0.05)
+
+
+def test_a_second_keyframe_goes_on_from_the_first():
+    space = trained(60)
+    before = space.status.psnr_db
+    pose = pose_matrix(x=0.9, y=0.0, z=0.05, yaw=0.1)
+    picture = box_room.panorama(pose, 192)
+    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+    assert space.status.iterations == 0
+    assert space.status.state == State.TRAINING
+    space.train(iterations=3)
+    assert space.status.psnr_db > before - 8
+    assert trained(3).status.psnr_db < before - 8
+
+
+def test_another_scale_starts_anew():
+    space = trained(30)
+    picture = box_room.panorama(CAMERA, 192)
+    space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)
+    assert space.train(iterations=1).psnr_db < 16
+    cells = space._scene.lattice.cells_per_m
+    assert cells[0] == pytest.approx(trained(0)._scene.lattice.cells_per_m[0] / 5, rel=1e-3)
+
+
+def test_nothing_before_the_first_keyframe():
+    space = VirtualSpace(CONFIG)
+    assert space.status.state == State.EMPTY
+    with pytest.raises(NotReadyError):
+        space.train(10)
+    with pytest.raises(NotReadyError):
+        space.render(np.eye(4), 64, 36, 1.5)
+
+
+BAD = {
+    "black": ({"rgb": np.zeros((64, 128, 3), np.uint8)}, "one colour"),
+    "shape": ({"rgb": np.zeros((64, 100, 3), np.uint8)}, "twice as wide"),
+    "grey": ({"rgb": np.zeros((64, 128), np.uint8)}, "uint8"),
+    "nan depth": ({"depth": np.full((64, 128), np.nan, np.float32)}, "not finite"),
+    "empty depth": ({"depth": np.zeros((64, 128), np.float32)}, "known in 0%"),
+    "negative depth": ({"depth": np.full((64, 128), -1, np.float32)}, "negative"),
+    "face-shaped depth": ({"depth": np.ones((64, 64), np.float32)}, "depth must be"),
+    "nan pose": ({"pose": np.full((4, 4), np.nan)}, "pose"),
+    "no rotation": ({"pose": np.diag([2.0, 1, 1, 1])}, "rotation"),
+    "negative sigma": ({"sigma": -0.1}, "relative_sigma"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_keyframe_is_refused_and_changes_nothing(space, name):
+    changes, words = BAD[name]
+    picture = box_room.panorama(CAMERA, 64)
+    values = {"rgb": picture.rgb, "depth": picture.depth_m, "pose": CAMERA, "sigma": 0.02, **changes}
+    before = space.status
+    with pytest.raises(KeyframeError, match=words):
+        space.set_keyframe(values["rgb"], values["depth"], values["pose"], values["sigma"])
+    assert space.status == before
+
+
+@pytest.mark.parametrize(("width", "height", "fov"), [(8, 90, 1.5), (160, 5000, 1.5), (160, 90, 3.2), (160, 90, 0.0)])
+def test_a_view_that_cannot_be_drawn(space, width, height, fov):
+    with pytest.raises(ValueError, match=r"view must|hfov_rad"):
+        space.render(CAMERA, width, height, fov)
+
+
+@pytest.mark.parametrize(
+    ("make", "key"),
+    [
+        (lambda: FieldConfig(features=3), "features"),
+        (lambda: FieldConfig(levels=20), "levels"),
+        (lambda: TrainConfig(ray_rows=12), "ray_rows"),
+        (lambda: TrainConfig(table_lr=0), "table_lr"),
+        (lambda: GeometryConfig(band_max=0.01), "band_max"),
+        (lambda: ReadinessConfig(psnr_db=-1), "psnr_db"),
+        (lambda: VirtualSpaceConfig(device="tpu"), "device"),
+    ],
+)
+def test_parameters_name_what_is_wrong(make, key):
+    with pytest.raises(ValueError, match=key):
+        make()
+
+
+def test_cuda_without_a_gpu_says_so():
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(RuntimeError, match="CUDA"):
+        VirtualSpace(VirtualSpaceConfig(device="cuda"))
+
+
+def test_warm_up_leaves_nothing_to_compile():
+    from instant_ic.nerf import kernels, march
+
+    warm_up(CONFIG)
+    before = [len(f.signatures) for f in (kernels.gradient, kernels.query, kernels.adam_touched, march.trace)]
+    trained(1).render(CAMERA, 64, 36, 1.5)
+    assert [len(f.signatures) for f in (kernels.gradient, kernels.query, kernels.adam_touched, march.trace)] == before
+
+
+def test_torch_on_the_cpu_is_the_fallback():
+    small = VirtualSpaceConfig(
+        device="torch-cpu", field=FieldConfig(log2_table=12, levels=4), train=TrainConfig(ray_columns=32, ray_rows=16)
+    )
+    space = trained(30, small)
+    assert space.status.psnr_db > trained(1, small).status.psnr_db + 3
+    assert space.render(CAMERA, 32, 18, 1.5).confidence.mean() > 0.5
+
+
+# -- prior and occupancy -------------------------------------------------------------------------------
+
+
+def test_area_average_by_hand():
+    image = np.zeros((2, 6, 1), np.uint8)
+    image[0, :, 0] = [0, 30, 60, 90, 120, 150]
+    image[1, :, 0] = [20, 50, 80, 110, 140, 170]
+    assert area_average(image, 1, 3)[..., 0].tolist() == [[25, 85, 145]]
+    # 6 columns into 4: each takes 1.5; (0 + 0.5·30) / 1.5 = 10, (0.5·30 + 60) / 1.5 = 50, …; rows differ by 20.
+    assert area_average(image, 2, 4)[..., 0].tolist() == [[10, 50, 100, 140], [30, 70, 120, 160]]
+
+
+def test_holes_are_filled_from_around_and_prefer_weight():
+    values = np.ones((8, 8), np.float32)
+    values[:, 4:] = 3
+    valid = np.ones((8, 8), bool)
+    valid[:, 3:5] = False
+    filled = fill_holes(np.where(valid, values, 0).astype(np.float32), valid)
+    assert np.all((filled[:, 3:5] >= 1) & (filled[:, 3:5] <= 3))
+    assert np.array_equal(filled[valid], values[valid])
+    heavy = fill_holes(np.where(valid, values, 0).astype(np.float32), valid, np.where(values > 2, 100, 1).astype(np.float32))
+    assert heavy[:, 3:5].mean() > filled[:, 3:5].mean()
+
+
+def test_depth_edges_are_torn_and_leaning_planes_are_not():
+    # A level camera 1.2 m over an endless floor: radial depth 1.2 / sin(−elevation), far rows differ by far more than
+    # 10 %. An object at 2 m in columns 20 to 29 stands before it.
+    height, width = 64, 128
+    elevation = np.pi / 2 - (np.arange(height) + 0.5) * np.pi / height
+    inverse = np.where(elevation < 0, np.sin(-elevation) / 1.2, 1 / 30.0)
+    inverse = np.repeat(np.maximum(inverse, 1 / 30.0)[:, None], width, 1).astype(np.float32)
+    plain = torn_quads(inverse, 0.1)
+    assert plain[36:63].sum() == 0
+    inverse[30:40, 20:30] = 0.5
+    torn = torn_quads(inverse, 0.1)
+    assert torn[31:38, 19].all()
+    assert torn[31:38, 29].all()
+    assert not torn[31:38, 21:28].any()
+    assert not torn[41:, :].any()
+
+
+def test_occupancy_holds_every_surface_and_knows_distances():
+    picture = box_room.panorama(CAMERA, 128)
+    config = GeometryConfig()
+    prior = prepare(picture.rgb, picture.depth_m, CAMERA, 0.02, config, 2048)
+    grid = build_occupancy(prior, config)
+    cloud = surface_points(prior, 0.5)
+    index = ((cloud - grid.origin) / grid.cell_m).astype(int)
+    assert np.all(grid.distance[tuple(index.T)] == 0)
+    # The camera is in free space: walls 2.35 m and more away to the sides, floor and ceiling 1.25 m (31 cells of 4 cm,
+    # less the margin of two and the cell's own edge).
+    cell = tuple(((CAMERA[:3, 3] - grid.origin) / grid.cell_m).astype(int))
+    assert 24 <= int(grid.distance[cell]) <= 31
+    assert grid.occupied_share < 0.35
