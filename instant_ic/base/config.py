@@ -118,11 +118,11 @@ class RoboclawConfig:
     port: str = "/dev/ttyACM0"
     baud: int = 115200
     address: int = 0x80
-    reply_timeout_s: float = 0.05
+    reply_timeout_s: float = 0.1
     retries: int = 2
     watchdog_s: float = 0.5
     reconnect_min_s: float = 0.2
-    reconnect_max_s: float = 5.0
+    reconnect_max_s: float = 2.0
 
     def __post_init__(self) -> None:
         """Check the values."""

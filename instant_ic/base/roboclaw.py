@@ -226,8 +226,10 @@ class Roboclaw:
 
         def acknowledged(port: SerialPort, command: int) -> bytes:
             reply = port.read(1)
+            if not reply:
+                raise TimeoutError(f"command {command}: no acknowledgement")
             if reply != ACKNOWLEDGE:
-                raise ProtocolError(f"command {command}: no acknowledgement (got {reply.hex() or 'nothing'})")
+                raise ProtocolError(f"command {command}: acknowledged with 0x{reply.hex()} instead of 0xff")
             return reply
 
         self._transact(command, acknowledged, frame)

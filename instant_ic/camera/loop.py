@@ -17,7 +17,7 @@ class ReconnectConfig:
     """
 
     min_s: float = 0.5
-    max_s: float = 10.0
+    max_s: float = 5.0
 
     def __post_init__(self) -> None:
         """Check the values."""

@@ -284,7 +284,8 @@ class ThetaCamera(Camera):
         deadline = time.monotonic() + self.config.read_timeout_s
         while True:
             if time.monotonic() > deadline:
-                raise self._ended(f"no whole picture for {self.config.read_timeout_s} s ({self._parser.last_fault})")
+                fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""
+                raise self._ended(f"data came, but no whole picture for {self.config.read_timeout_s} s{fault}")
             try:
                 # read1: what is there now, instead of waiting until the buffer is full.
                 data = response.raw.read1(_CHUNK)

@@ -118,24 +118,28 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
 
     def on_state(self, state: BaseState) -> None:
         """Publish what a step of the controller gave."""
-        counters = self.controller.roboclaw.counters
         if state.link:
             self.diagnose("link", OK if state.connected else ERROR, state.link)
-            (self.log.info if state.connected else self.log.debug)("%s", state.link)
-        elif state.connected and counters.retries > self.retries_told:
-            self.retries_told = counters.retries
-            self.diagnose(
-                "link",
-                WARN,
-                f"{counters.retries} commands had to be repeated",
-                timeouts=counters.timeouts,
-                crc_errors=counters.crc_errors,
-                transactions=counters.transactions,
-            )
+        if state.health is not None:
+            self.tell_repeats()
         if state.odometry is not None:
             self.publish_odometry(state.odometry)
         if state.health is not None:
             self.publish_health(state.health)
+
+    def tell_repeats(self) -> None:
+        """Repeated commands since the last time; with each health."""
+        counters = self.controller.roboclaw.counters
+        repeated, self.retries_told = counters.retries - self.retries_told, counters.retries
+        self.diagnose(
+            "replies",
+            WARN if repeated else OK,
+            f"{repeated} commands had to be repeated" if repeated else "the controller replies",
+            repeated=counters.retries,
+            timeouts=counters.timeouts,
+            crc_errors=counters.crc_errors,
+            transactions=counters.transactions,
+        )
 
     def publish_odometry(self, estimate: OdometryEstimate) -> None:
         """Odometry message and transform."""

@@ -129,8 +129,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
     def on_event(self, connected: bool, text: str) -> None:
         """The connection came or went."""
         self.diagnose("camera", OK if connected else ERROR, text)
-        if connected:
-            self.log.info("%s", text)
 
     def check(self) -> None:
         """Tell of silence, and of the rate; each second."""

@@ -151,8 +151,11 @@ def test_repeats_are_told(bench: Bench) -> None:
     bench.run(0.2)
     damages = iter([True])
     bench.port.damage = lambda reply: b"\x00" * len(reply) if next(damages, False) else reply
-    bench.run(0.1)
-    assert bench.node.diagnoses()["link"][:2] == (WARN, "1 commands had to be repeated")
+    bench.run(1.1)
+    level, text, values = bench.node.diagnoses()["replies"]
+    assert (level, text, values["repeated"]) == (WARN, "1 commands had to be repeated", 1)
+    bench.run(1.1)
+    assert bench.level("replies") == OK
 
 
 def test_thread_stops_the_motors_when_its_work_fails() -> None:
