@@ -73,9 +73,10 @@ class CameraLoop(threading.Thread):
                         wait_s = self._reconnect.min_s
                         self.frames += 1
                         self._on_frame(frame)
-                except CameraError as error:
+                except Exception as error:  # noqa: BLE001 - nobody else hears what ends a thread
                     self.failures += 1
-                    self._on_event(False, f"{error}; trying again in {wait_s:.1f} s")
+                    text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
+                    self._on_event(False, f"{text}; trying again in {wait_s:.1f} s")
                     self._end.wait(wait_s)
                     wait_s = min(2.0 * wait_s, self._reconnect.max_s)
         finally:

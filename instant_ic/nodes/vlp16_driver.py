@@ -133,12 +133,16 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
 
     def receive(self) -> None:
         """Receive and decode until the node ends; the receiver's own thread."""
-        while not self.ending.is_set():
-            for stamp, payload, is_data in self.receiver.read(timeout_s=0.2):
-                if is_data:
-                    self.take(payload, stamp)
-                else:
-                    self.call_soon(self.on_position, payload)
+        try:
+            while not self.ending.is_set():
+                for stamp, payload, is_data in self.receiver.read(timeout_s=0.2):
+                    if is_data:
+                        self.take(payload, stamp)
+                    else:
+                        self.call_soon(self.on_position, payload)
+        except Exception as error:  # noqa: BLE001 - nobody else hears what ends a thread
+            self.call_soon(self.fault, "receiver", error)
+            self.call_soon(self.stop)
 
     def on_packets(self, message: Any) -> None:
         """Packets of a bag."""

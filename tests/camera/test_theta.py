@@ -7,7 +7,7 @@ from fake_theta import Behaviour, FakeTheta, jpeg, part
 
 from instant_ic.camera.config import ThetaConfig
 from instant_ic.camera.loop import CameraLoop, ReconnectConfig
-from instant_ic.camera.source import CameraError, Frame
+from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import NEVER, ThetaCamera, ThetaClient, ThetaError
 
 FRAMES = [jpeg(value) for value in (40, 80, 120, 160)]
@@ -172,6 +172,40 @@ def test_loop_ends_while_it_waits() -> None:
         loop.start()
         assert failed.wait(30.0)
         assert loop.end(30.0)
+
+
+class FlakyCamera(Camera):
+    """Fails in a way that no camera should, and then works."""
+
+    failures = 2
+
+    def connect(self) -> str:
+        self.failures -= 1
+        if self.failures >= 0:
+            raise RuntimeError("a bug")
+        return "works"
+
+    def read(self) -> Frame:
+        return Frame(FRAMES[0], 0, 64, 32)
+
+    def close(self) -> None:
+        pass
+
+
+def test_loop_outlives_and_tells_unexpected_exceptions() -> None:
+    events: list[str] = []
+    arrived = threading.Event()
+    loop = CameraLoop(
+        FlakyCamera(0.0),
+        lambda frame: arrived.set(),
+        lambda connected, text: events.append(text),
+        ReconnectConfig(min_s=0.01, max_s=0.01),
+    )
+    loop.start()
+    assert arrived.wait(30.0)
+    assert loop.end(30.0)
+    assert events[0].startswith("unexpected RuntimeError('a bug')")
+    assert events[2] == "works"
 
 
 @pytest.mark.parametrize(
