@@ -47,6 +47,7 @@ class Supervisor:
         run_dir: prepared run directory.
         output: where lines and events go.
         make_limit: the respawn limit of a node; for tests.
+        stop_schedule: signals of the end and the wait after each.
     """
 
     def __init__(
@@ -55,7 +56,9 @@ class Supervisor:
         run_dir: Path,
         output: Output,
         make_limit: Callable[[NodeSpec], RespawnLimit] = lambda spec: RespawnLimit(spec.respawn_delay_s),
+        stop_schedule: Sequence[tuple[signal.Signals, float]] = STOP_SCHEDULE,
     ) -> None:
+        self._stop_schedule = tuple(stop_schedule)
         self.processes = [ManagedProcess(node, run_dir, make_limit(node)) for node in nodes]
         self._output = output
         self._selector = selectors.DefaultSelector()
@@ -195,7 +198,7 @@ class Supervisor:
         running = [process for process in self.processes if process.state is State.RUNNING]
         if running:
             self._output.event(f"stopping {len(running)} node{'s' if len(running) > 1 else ''}")
-        for signum, wait_s in STOP_SCHEDULE:
+        for signum, wait_s in self._stop_schedule:
             if self._hurry and signum is not signal.SIGKILL:
                 continue
             left = [process for process in self.processes if process.state is State.RUNNING]

@@ -171,11 +171,11 @@ def test_topic_echo(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_topic_hz_and_bw(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = ic(capsys, "topic", "hz", "/scan", "--duration", "2.5")
+    status, out, _ = ic(capsys, "topic", "hz", "/scan", "--duration", "1.4")
     last = out.strip().splitlines()[-1]
     assert status == 0 and last.startswith("all: ") and last.endswith(" lost")
     assert 5 < float(last.split()[1]) < 60  # 50 Hz on an idle machine, less on a busy one, never more
-    status, out, _ = ic(capsys, "topic", "bw", "/scan", "--duration", "2.5")
+    status, out, _ = ic(capsys, "topic", "bw", "/scan", "--duration", "1.4")
     assert status == 0 and "MB/s" in out.splitlines()[-1]
     with BagReader(record_scan(capsys)) as reader:
         size = len(next(reader.messages({"/scan"})).payload)
@@ -184,7 +184,7 @@ def test_topic_hz_and_bw(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def record_scan(capsys: pytest.CaptureFixture[str]) -> Path:
-    words = ("bag", "record", "-o", "probe", "/scan", "/flag", "--duration", "1.5")
+    words = ("bag", "record", "-o", "probe", "/scan", "/flag", "--duration", "0.8")
     status, _, error = ic_process(*words)
     assert status == 0, error
     return Path("probe")
