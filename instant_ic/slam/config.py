@@ -35,7 +35,7 @@ class OdometryNoise:
 
     translation_floor_m: float = 0.01
     translation_per_m: float = 0.2
-    rotation_floor_rad: float = 0.01
+    rotation_floor_rad: float = 0.03
     rotation_per_rad: float = 0.2
     rotation_per_m: float = 0.1
 

@@ -15,6 +15,9 @@ from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.matcher import Match, Matcher, Window
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
+RECOVERY_MARGIN = 0.1
+"""By so much must the score of the wide search exceed that of the first one."""
+
 
 class TrackStatus(enum.StrEnum):
     """How a scan was placed."""
@@ -107,10 +110,12 @@ class FrontEnd:
 
         status = TrackStatus.TRACKED
         match = self._matcher.match(self._field, points, guess.pose, guess.sigma, guess.window)
-        if match.score < config.recovery_score:
+        if match.score < config.recovery_score or match.at_border:
             recovered = self._recover(points, guess)
-            # The wide search must be clearly better: a window this large always finds something a little better.
-            if recovered.score >= max(config.min_score, match.score + 0.1):
+            # Unless the first window was too small, the wide search must be clearly better: so large a window always
+            # finds something a little better.
+            margin = 0.0 if match.at_border else RECOVERY_MARGIN
+            if recovered.score >= config.min_score and recovered.score > match.score + margin:
                 match, status = recovered, TrackStatus.RECOVERED
         if match.score < config.min_score:
             return self._lost(scan, guess, match.score, stamp_ns)

@@ -124,11 +124,11 @@ class GridSlam:
             start = np.zeros(3) if odometry is None else odometry
             return self.front_end.guess_from_odometry(start, np.zeros(3))
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
-        if odometry is not None and self._odometry_stamp_ns is not None:
-            # Across a short gap the encoders have gone on counting; after a long one they may have been reset.
-            if (stamp_ns - self._odometry_stamp_ns) * 1e-9 <= max(MAX_ODOMETRY_GAP_S, 2 * elapsed_s):
-                step = relative2(self._odometry_pose, odometry)
-                return self.front_end.guess_from_odometry(compose2(self._pose_at_odometry, step), step)
+        # Across a short gap the encoders have gone on counting; after a long one they may have been reset.
+        gap_s = math.inf if self._odometry_stamp_ns is None else (stamp_ns - self._odometry_stamp_ns) * 1e-9
+        if odometry is not None and gap_s <= max(MAX_ODOMETRY_GAP_S, 2 * elapsed_s):
+            step = relative2(self._odometry_pose, odometry)
+            return self.front_end.guess_from_odometry(compose2(self._pose_at_odometry, step), step)
         pose = constant_velocity(self.map_from_base, self._step, self._step_s, elapsed_s)
         return self.front_end.guess_from_velocity(pose, elapsed_s)
 

@@ -78,11 +78,10 @@ def read_carmen(path: str | Path, range_max: float = 80.0) -> Iterator[LogEntry]
     scans = 0
     with open_log(path) as lines:
         for number, line in enumerate(lines, start=1):
-            kind, _, rest = line.partition(" ")
+            kind, *fields = line.split() or [""]
             if kind not in ("FLASER", "ROBOTLASER1"):
                 continue
             try:
-                fields = rest.split()
                 entry = _flaser(fields, range_max) if kind == "FLASER" else _robotlaser(fields)
             except (ValueError, IndexError, OverflowError) as error:
                 raise LogError(f"{path}:{number}: {kind}: {error}") from None
@@ -122,7 +121,7 @@ def _no_return(ranges: FloatArray, range_max: float) -> FloatArray:
 
 def _flaser(fields: list[str], range_max: float) -> LogEntry:
     if not fields:
-        raise ValueError("empty line")
+        raise ValueError("the line is empty")
     count = _count(fields[0], "readings")
     ranges = _numbers(fields[1:], "readings", count)
     tail = fields[1 + count :]

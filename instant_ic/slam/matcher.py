@@ -221,11 +221,19 @@ class Window:
 
 @dataclass(frozen=True)
 class Match:
-    """Where a scan fits: pose (3,) and covariance (3, 3) in the field's frame, score 0..1 (mean field value)."""
+    """Where a scan fits.
+
+    Attributes:
+        pose: field_from_base (3,).
+        covariance: (3, 3) in the field's frame.
+        score: 0..1, mean field value over the points.
+        at_border: the search ended at the edge of its window, so better may lie outside.
+    """
 
     pose: FloatArray
     covariance: FloatArray
     score: float
+    at_border: bool
 
 
 @dataclass(frozen=True)
@@ -269,6 +277,10 @@ class Matcher:
             field.values, field.origin, resolution, points, guess, cells, rotations,
             self.coarse_rotation_step_rad, guess, information, self.cutoff, gain,
         )  # fmt: skip
+        at_border = (
+            max(abs(x - guess[0]), abs(y - guess[1])) > (cells - 0.5) * resolution
+            or abs(yaw - guess[2]) > (rotations - 0.5) * self.coarse_rotation_step_rad
+        )
         finer = math.ceil(self.coarse_rotation_step_rad / self.fine_rotation_step_rad) - 1
         x, y, yaw, _ = correlate(
             field.values, field.origin, resolution, points, np.array([x, y, yaw]), 1, finer,
@@ -285,4 +297,4 @@ class Matcher:
         variance = max(squares / max(len(points) - 3, 1), 1e-3) * weight
         covariance = variance * np.linalg.inv(hessian)
         pose[2] = wrap_angle(float(pose[2]))
-        return Match(pose, 0.5 * (covariance + covariance.T), float(score))
+        return Match(pose, 0.5 * (covariance + covariance.T), float(score), bool(at_border))

@@ -85,7 +85,7 @@ def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArra
 def scan_points(scan: Scan, base_from_laser: FloatArray, join_gap_m: float, clear_m: float) -> ScanPoints:
     """Hits and free rays of ``scan``; a hit is what ``range_min <= r <= range_max`` (REP-117).
 
-    Neighbouring beams whose hits lie no more than ``join_gap_m`` apart, or in a line, are taken for one surface. Rays of +inf are
+    Neighbouring beams whose hits lie no more than ``join_gap_m`` apart, or in a line, are one surface. Rays of +inf are
     free for ``clear_m`` metres (0: nothing is known of them).
     """
     ranges = np.asarray(scan.ranges, dtype=np.float64)
