@@ -179,7 +179,8 @@ class SimulatorNode(Node[SimulatorConfig]):
                 text = f"{rate:.1f} of {wanted:.1f} pictures a second: the machine is too slow"
                 self.diagnose("camera", WARN, text, frames=self.camera.frames)
             else:
-                self.diagnose("camera", OK, f"{rate:.1f} pictures a second", frames=self.camera.frames)
+                text = f"{rate:.1f} pictures a second" if rate else "the preview begins"
+                self.diagnose("camera", OK, text, frames=self.camera.frames)
 
 
 if __name__ == "__main__":

@@ -112,9 +112,12 @@ class ThetaServer:
         source: what the camera sees; called from the camera's own thread.
         seed: of the noise.
 
+    Raises:
+        OSError: the port is taken.
+
     Attributes:
         port: where it listens.
-        rate_hz: frames a second made lately; 0 while nobody watches.
+        rate_hz: frames a second made lately; 0 while nobody watches and for the first four.
         frames: pictures made.
     """
 
@@ -123,7 +126,6 @@ class ThetaServer:
         self.source = source
         self.rate_hz = 0.0
         self.frames = 0
-        self.fault = ""
         self._format = next(f for f in PREVIEW_FORMATS if f[:2] == (config.width, config.height))
         self._options: dict[str, Any] = {"captureMode": "image", "sleepDelay": 180, "offDelay": 600}
         self._options_set_s = -1e9
@@ -140,7 +142,13 @@ class ThetaServer:
         class Handler(_Handler):
             camera = server
 
-        self._http = ThreadingHTTPServer((config.host, config.port), Handler)
+        try:
+            self._http = ThreadingHTTPServer((config.host, config.port), Handler)
+        except OSError as error:
+            raise OSError(
+                f"the camera's Web API cannot listen on {config.host}:{config.port} ({error.strerror}); is another "
+                "simulator running? camera.port chooses another port"
+            ) from error
         self._http.daemon_threads = True
         self.port = int(self._http.server_address[1])
         self._threads = [
@@ -172,10 +180,11 @@ class ThetaServer:
         import cv2
 
         due = time.monotonic()
+        made, period_s = 0, 0.0
         while True:
             with self._changed:
                 while self._viewers == 0 and not self._stopping:
-                    self.rate_hz = 0.0
+                    self.rate_hz, made = 0.0, 0
                     self._changed.wait(1.0)
                     due = time.monotonic()
                 if self._stopping:
@@ -202,7 +211,11 @@ class ThetaServer:
             due = max(due + period, time.monotonic())
             self._sleep(due)
             took = time.monotonic() - began
-            self.rate_hz = 1 / took if self.rate_hz == 0 else 0.8 * self.rate_hz + 0.2 / took
+            made += 1
+            period_s = took if made == 1 else 0.8 * period_s + 0.2 * took
+            # The first pictures come late for many reasons; a rate is told once it means something.
+            if made >= 5:
+                self.rate_hz = 1 / period_s
 
     def _sleep(self, until: float) -> None:
         with self._changed:

@@ -39,7 +39,7 @@ class Vlp16Config:
     position_port: int = 8308
     rpm: float = 600.0
     range_noise: float = 0.01
-    min_range: float = 0.4
+    min_range: float = 0.2
     max_range: float = 100.0
     burst: int = 8
     mount_xyz: tuple[float, float, float] = (0.0, 0.0, 0.60)

@@ -182,6 +182,11 @@ def test_digest_is_asked_for_and_checked() -> None:
         server.close()
 
 
+def test_a_taken_port_is_told(camera: ThetaServer) -> None:
+    with pytest.raises(OSError, match=rf"cannot listen on 127.0.0.1:{camera.port}.*camera.port"):
+        ThetaServer(ThetaConfig(port=camera.port), grey_ramp)
+
+
 def test_a_panorama_file_is_area_averaged(tmp_path: Path) -> None:
     # Columns of one pixel, black and white: averaged they are mid grey, point-sampled they would not be.
     image = np.zeros((1280, 2560, 3), np.uint8)

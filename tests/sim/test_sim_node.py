@@ -37,7 +37,8 @@ def test_process_starts_serves_and_ends(tmp_path: Path) -> None:
         process = subprocess.Popen(
             [sys.executable, "-m", "instant_ic.nodes.simulator",
              "--run-dir", str(tmp_path),
-             "--params-file", str(CONFIG), "-p", "world:=random:3", "-p", "camera.port:=0", "-p", "lidar.enabled:=false",
+             "--params-file", str(CONFIG), "-p", "world:=random:3", "-p", "camera.port:=0",
+             "-p", "lidar.enabled:=false",
              "-p", f"panorama:={panorama}"],
             stdout=output, stderr=subprocess.STDOUT, env={**os.environ, "INSTANT_IC_RUN_DIR": str(tmp_path)},
         )  # fmt: skip
