@@ -1,6 +1,7 @@
 """Drives the base at a fixed rate: newest command in, odometry and health out, stop when in doubt."""
 
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -208,9 +209,12 @@ class ControllerThread(threading.Thread):
     def run(self) -> None:
         """Step until `end`; the motors are stopped however it ends."""
         fault: BaseException | None = None
+        due_s = time.monotonic()
         try:
-            while not self._end.wait(self._period_s):
+            # By a grid of times, so that what a step takes does not slow the rate; steps missed are left out.
+            while not self._end.wait(max(0.0, due_s - time.monotonic())):
                 self._on_state(self._controller.step())
+                due_s = max(due_s + self._period_s, time.monotonic())
         except BaseException as error:  # noqa: BLE001 - handed to on_end; the motors must stop first
             fault = error
         self._on_end(fault, self._controller.close())

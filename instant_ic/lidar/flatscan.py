@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.motion import PlanarMotion
-from instant_ic.lidar.stream import Revolution
+from instant_ic.lidar.packets import BLOCKS, FIRINGS, LASERS, encode_data_packet
+from instant_ic.lidar.stream import PacketStream, Revolution
 
 _MOTION_SAMPLES = 65
 """Nodes of the motion over a revolution; within 1.6 ms the motion is straight enough (1 um at 1 rad/s)."""
@@ -100,6 +101,16 @@ def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion:
         axis=-1,
     )
     return np.asarray((moved - translation) @ rotation, np.float32)
+
+
+def warm_up() -> None:
+    """Compile decoder and projection now (seconds, the first time on a machine), not when packets wait."""
+    stream = PacketStream()
+    nothing = np.zeros((BLOCKS, FIRINGS, LASERS), np.int64)
+    stream.feed(encode_data_packet(np.zeros(BLOCKS, np.int64), nothing + 1000, nothing, 0), 0)
+    revolution = stream.finish()
+    assert revolution is not None
+    flat_scan(revolution, np.eye(4), FlatScanConfig())
 
 
 @njit(nogil=True, cache=True)

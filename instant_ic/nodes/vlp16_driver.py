@@ -14,7 +14,7 @@ from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
 from instant_ic.geometry.transforms import TransformError
 from instant_ic.lidar.capture import CaptureError, CaptureReader, Datagram
 from instant_ic.lidar.config import DecoderConfig, FlatScanConfig
-from instant_ic.lidar.flatscan import flat_scan
+from instant_ic.lidar.flatscan import flat_scan, warm_up
 from instant_ic.lidar.motion import MotionError, PlanarMotion
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, PacketError, decode_position_packet
 from instant_ic.lidar.receiver import PacketReceiver, ReceiverConfig, ReceiverError
@@ -98,6 +98,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     def setup(self) -> None:
         """Topics, mount, and the source of packets."""
         config = self.config
+        warm_up()
         self.ending = threading.Event()
         self.thread: threading.Thread | None = None
         self.stream = PacketStream(config.decoder)
