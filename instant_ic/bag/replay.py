@@ -27,9 +27,11 @@ BROADCASTS: Mapping[str, tuple[str, ...]] = {
     "theta_camera": ("camera",),
     "vlp16_driver": ("velodyne",),
 }
-"""Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed. Only these: what
-such a node broadcasts for a while in another's place (the SLAM without wheel odometry) stays the other's. Of other
-nodes every frame is left out from its first broadcast on."""
+"""Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed.
+
+Only these: what such a node broadcasts for a while in another's place (the SLAM without wheel odometry) stays the
+other's. Of other nodes every frame is left out from its first broadcast on.
+"""
 
 
 class ReplayError(RuntimeError):
