@@ -26,7 +26,7 @@ class ScalerConfig:
     """How depth is scaled.
 
     Attributes:
-        method: ``max_ratio`` (the paper's rule) or ``median_ratio`` (median of range over depth at the points).
+        method: ``median_ratio`` (median of range over depth at the points) or ``max_ratio`` (the paper's rule).
             Only for ``metric`` and ``scale_invariant`` depth; the others get a robust line.
         maxima: where ``max_ratio`` takes the depth's maximum: ``lidar``, over the directions that the LiDAR sees, or
             ``image``, over the whole picture by solid angle.
