@@ -122,10 +122,10 @@ class FrontEnd:
 
         self._lost_scans = 0
         self._covariance = match.covariance
-        keyframe = None
+        added: Keyframe | None = None
         if self._moved(match.pose):
-            keyframe = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
-        return Track(match.pose, match.covariance, match.score, status, keyframe)
+            added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
+        return Track(match.pose, match.covariance, match.score, status, added)
 
     def dead_reckon(self, guess: Guess) -> Track:
         """Believe the guess, for a scan that shows nothing."""

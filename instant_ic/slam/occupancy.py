@@ -155,7 +155,7 @@ class OccupancyMap:
     @property
     def origin(self) -> FloatArray:
         """Map coordinates (2,) of the lower left corner."""
-        corner: FloatArray = self._first * self.config.resolution_m
+        corner: FloatArray = self._first.astype(np.float64) * self.config.resolution_m
         return corner
 
     def insert(self, map_from_base: FloatArray, scan: ScanPoints) -> None:
@@ -203,4 +203,4 @@ class OccupancyMap:
             new = np.zeros((height, width), dtype=old.dtype)
             new[row : row + old_height, column : column + old_width] = old
             setattr(self, name, new)
-        self._first = low
+        self._first = np.asarray(low, dtype=np.int64)
