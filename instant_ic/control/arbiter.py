@@ -107,7 +107,7 @@ class TimeoutConfig:
     scan: float = 0.3
     odometry: float = 0.3
     pose: float = 1.0
-    camera: float = 0.6
+    camera: float = 1.0
     vbot: float = 0.3
     nav: float = 0.3
     command: float = 0.3

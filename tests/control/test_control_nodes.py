@@ -166,7 +166,7 @@ def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
         ("/scan", "LiDAR scan", 0.45),
         ("/wheel/odom", "wheel odometry", 0.35),
         ("/operator/cmd_vel", "you drive the robot", 0.35),
-        ("/camera/image/compressed", "camera picture", 0.7),
+        ("/camera/image/compressed", "camera picture", 1.1),
         ("/pose", "SLAM pose", 1.1),
     ],
 )
