@@ -160,18 +160,21 @@ async def drive_through_obstacle(
         StackError: something did not come about in time.
     """
     control = message_type("ControlState")
-    async with pump(stack) as until, ConsoleClient(console_url) as console:
+    async with pump(stack) as until:
         await until(lambda: recorder.mode == control.REAL and recorder.ready, 180, "virtual space that is fit to show")
-        await console.wait_for(lambda c: any(c.frame_counts.values()), 30)
-        await console.acquire()
-        console.drive(speed_mps, 0.0)
-        await until(lambda: recorder.mode == control.VIRTUAL, 90, "passage into the virtual space")
-        await until(
-            lambda: recorder.vbot_pose is not None and recorder.vbot_pose[0] > beyond_x_m, 90, "v-bot past the obstacle"
-        )
-        await console.stop()
-        await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
-        console.drive(speed_mps, 0.0)
-        await asyncio.sleep(1.5)
-        await console.stop()
-        await asyncio.sleep(1.0)
+        async with ConsoleClient(console_url) as console:
+            await console.wait_for(lambda c: any(c.frame_counts.values()), 30)
+            await console.acquire()
+            console.drive(speed_mps, 0.0)
+            await until(lambda: recorder.mode == control.VIRTUAL, 90, "passage into the virtual space")
+            await until(
+                lambda: recorder.vbot_pose is not None and recorder.vbot_pose[0] > beyond_x_m,
+                90,
+                "v-bot past the obstacle",
+            )
+            await console.stop()
+            await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
+            console.drive(speed_mps, 0.0)
+            await asyncio.sleep(1.5)
+            await console.stop()
+            await asyncio.sleep(1.0)
