@@ -23,7 +23,7 @@ def prior_inverse_depth(inverse, torn, u, v):  # type: ignore[no-untyped-def]
     """Inverse depth at index coordinates: bilinear on a surface, nearest at an edge."""
     height, width = inverse.shape
     v = min(max(v, np.float32(0)), np.float32(height - 1))
-    u0, v0 = int(math.floor(u)), int(math.floor(v))
+    u0, v0 = math.floor(u), math.floor(v)
     fu, fv = u - np.float32(u0), v - np.float32(v0)
     v1 = min(v0 + 1, height - 1)
     left, right = u0 % width, (u0 + 1) % width
@@ -61,7 +61,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
         fall = np.float32(0.5) - np.float32(math.asin(z)) / np.float32(math.pi)
         u, v = turn * np.float32(width) - np.float32(0.5), fall * np.float32(height) - np.float32(0.5)
         v = min(max(v, np.float32(0)), np.float32(height - 1))
-        u0, v0 = int(math.floor(u)), int(math.floor(v))
+        u0, v0 = math.floor(u), math.floor(v)
         fu, fv = u - np.float32(u0), v - np.float32(v0)
         v1 = min(v0 + 1, height - 1)
         left, right = u0 % width, (u0 + 1) % width
@@ -100,7 +100,7 @@ def prior_agrees(x, y, z, inverse, torn, known, tolerance):  # type: ignore[no-u
     u = (math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
     v = (math.pi / 2 - math.atan2(z, flat)) * (height / math.pi) - 0.5
     v = min(max(v, 0.0), height - 1.0)
-    u0, v0 = int(math.floor(u)), int(math.floor(v))
+    u0, v0 = math.floor(u), math.floor(v)
     v1 = min(v0 + 1, height - 1)
     left, right = u0 % width, (u0 + 1) % width
     seen = 1 + known[v1 if v - v0 >= 0.5 else v0, right if u - u0 >= 0.5 else left]
@@ -140,7 +140,7 @@ def next_occupied(origin, direction, t, leave, grid, low, cell):  # type: ignore
     x, y, z = ((origin[0] - low[0]) * per_cell, (origin[1] - low[1]) * per_cell, (origin[2] - low[2]) * per_cell)
     dx, dy, dz = direction[0] * per_cell, direction[1] * per_cell, direction[2] * per_cell
     while t < leave:
-        ix, iy, iz = int(math.floor(x + t * dx)), int(math.floor(y + t * dy)), int(math.floor(z + t * dz))
+        ix, iy, iz = math.floor(x + t * dx), math.floor(y + t * dy), math.floor(z + t * dz)
         ix, iy, iz = min(max(ix, 0), nx - 1), min(max(iy, 0), ny - 1), min(max(iz, 0), nz - 1)
         distance = grid[ix, iy, iz]
         if distance == 0:

@@ -95,7 +95,11 @@ class NumbaDevice:
         stride = self.first_stride // 2
         while stride >= 1:
             count = march.interpolate_depth(
-                depth.reshape(height, width), confidence.reshape(height, width), stride, np.float32(DEPTH_TOLERANCE), listed
+                depth.reshape(height, width),
+                confidence.reshape(height, width),
+                stride,
+                np.float32(DEPTH_TOLERANCE),
+                listed,
             )
             self._march(rays, listed[:count], depth, confidence)
             stride //= 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -96,5 +97,5 @@ def _spread(distance: NDArray[np.uint8]) -> None:
         lines = np.moveaxis(distance, axis, 0)
         for order in (1, -1):
             ordered = lines[::order]
-            for previous, current in zip(ordered[:-1], ordered[1:], strict=True):
+            for previous, current in itertools.pairwise(ordered):
                 np.minimum(current, previous + np.uint8(1), out=current)

@@ -171,9 +171,10 @@ def fill_holes(
     total, w = levels[-1]
     for finer_total, finer_w in reversed(levels[:-1]):
         known = finer_w > 0
-        total, w = _double(total, known.shape) / 4, _double(w, known.shape) / 4
+        total = np.float32(0.25) * _double(total, known.shape)
+        w = np.float32(0.25) * _double(w, known.shape)
         total[known], w[known] = finer_total[known], finer_w[known]
-    coarse = total / np.maximum(w, 1e-30)[..., None]
+    coarse = (total / np.maximum(w, np.float32(1e-30))[..., None]).astype(np.float32)
     coarse[valid] = channels[valid]
     return coarse if values.ndim == 3 else coarse[..., 0]
 

@@ -7,6 +7,7 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,8 +66,8 @@ class Status:
 @dataclass(frozen=True)
 class View:
     """A picture of the space: ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) radial, 0 where unknown; ``confidence``
-    (H, W): 1 where the keyframe has seen the place, 0.5 where it has but its depth was filled from around, 0 where it has
-    not (``rgb`` is continued from the surroundings there).
+    (H, W): 1 where the keyframe has seen the place, 0.5 where it has but its depth was filled from around, 0 where it
+    has not (``rgb`` is continued from the surroundings there).
     """
 
     rgb: NDArray[np.uint8]
@@ -251,7 +252,7 @@ def make_device(config: VirtualSpaceConfig) -> Device:
     Raises:
         RuntimeError: CUDA was asked for and torch finds none.
     """
-    if config.device in ("auto", "cuda"):
+    if config.device == "cuda" or (config.device == "auto" and _may_have_cuda()):
         import torch
 
         if torch.cuda.is_available():
@@ -271,6 +272,11 @@ def make_device(config: VirtualSpaceConfig) -> Device:
     from .torch_device import TorchDevice
 
     return TorchDevice(config.field, config.train, "cpu")
+
+
+def _may_have_cuda() -> bool:
+    """Whether the machine has an NVIDIA device at all: importing torch only to learn that it has not costs seconds."""
+    return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
 
 
 __all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace", "make_device"]

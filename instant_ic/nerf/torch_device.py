@@ -58,7 +58,9 @@ class TorchDevice:
         self._prior = torch_prior(scene, self._device)
         grid = scene.occupancy
         self._grid = TorchGrid(
-            torch.from_numpy(grid.distance).to(self._device), torch.from_numpy(grid.origin).to(self._device), grid.cell_m
+            torch.from_numpy(grid.distance).to(self._device),
+            torch.from_numpy(grid.origin).to(self._device),
+            grid.cell_m,
         )
         self._field.cells_per_m = torch.from_numpy(scene.lattice.cells_per_m).to(self._device)
         self._field.origin = torch.from_numpy(scene.lattice.origin).to(self._device)

@@ -34,7 +34,9 @@ class NerfConfig:
     """Parameters.
 
     Attributes:
-        train_slice_ms: training between two pictures; a request waits at most about this long.
+        train_slice_ms: training between two pictures, at least; a request waits about this long.
+        train_share: training's time between two pictures, against the last picture's, where that is more.
+        train_share_until_ready: the same before the space is fit to show: there is more need of training than pictures.
         lockstep_iterations: iterations at each tick of ``lockstep_period_s`` in tests and replay.
         lockstep_period_s: see ``lockstep_iterations``.
         max_view_pixels: larger requests are refused.
@@ -44,6 +46,8 @@ class NerfConfig:
     """
 
     train_slice_ms: float = 60.0
+    train_share: float = 0.5
+    train_share_until_ready: float = 2.0
     lockstep_iterations: int = 5
     lockstep_period_s: float = 0.1
     max_view_pixels: int = 1280 * 720
@@ -52,7 +56,8 @@ class NerfConfig:
     space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
 
     def __post_init__(self) -> None:
-        for key in ("train_slice_ms", "lockstep_iterations", "lockstep_period_s", "max_view_pixels", "status_period_s"):
+        positive = ("train_slice_ms", "lockstep_iterations", "lockstep_period_s", "max_view_pixels", "status_period_s")
+        for key in (*positive, "train_share", "train_share_until_ready"):
             if getattr(self, key) <= 0:
                 raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
         if not 1 <= self.jpeg_quality <= 100:
@@ -65,6 +70,7 @@ class Job:
 
     kind: str
     message: Any = None
+    budget_ms: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,13 @@ class NerfNode(Node[NerfConfig]):
             request, self.waiting_request = self.waiting_request, None
             self.draw(request)
         elif self.trains and not self.lockstep:
-            self.start_job(Job("train"))
+            self.start_job(Job("train", budget_ms=self.slice_ms()))
+
+    def slice_ms(self) -> float:
+        """On a busy machine a picture takes long: training must not starve beside it."""
+        share = self.config.train_share if self.ready_ns else self.config.train_share_until_ready
+        drew = self.render_ms if self.last_drew else 0.0
+        return max(self.config.train_slice_ms, share * drew)
 
     def train_in_lockstep(self) -> None:
         if self.job is None and self.trains:
@@ -185,7 +197,7 @@ class NerfNode(Node[NerfConfig]):
         elif job.kind == "train" and self.lockstep:
             self.space.train(iterations=self.config.lockstep_iterations)
         elif job.kind == "train":
-            self.space.train(budget_ms=self.config.train_slice_ms)
+            self.space.train(budget_ms=job.budget_ms)
         elif job.kind == "draw":
             request = job.message
             view = self.space.render(pose_matrix(request.pose), request.width, request.height, request.fov_rad)

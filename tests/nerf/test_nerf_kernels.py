@@ -8,7 +8,16 @@ import torch
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES
-from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room, kernels, march, reference
+from instant_ic.nerf import (
+    FieldConfig,
+    TrainConfig,
+    VirtualSpace,
+    VirtualSpaceConfig,
+    box_room,
+    kernels,
+    march,
+    reference,
+)
 from instant_ic.nerf.config import GeometryConfig
 from instant_ic.nerf.field import FieldParameters, Lattice, Rays, Scene
 from instant_ic.nerf.numba_device import NumbaDevice
@@ -34,7 +43,9 @@ def random_field(levels, features, hidden=16, log2_table=10, seed=3):
 
 def torch_field(p, lattice):
     tensors = [torch.from_numpy(a.copy()).requires_grad_() for a in (p.table, *p.network())]
-    return TorchField(*tensors, torch.from_numpy(lattice.cells_per_m), torch.from_numpy(lattice.origin), torch.from_numpy(FOCUS))
+    return TorchField(
+        *tensors, torch.from_numpy(lattice.cells_per_m), torch.from_numpy(lattice.origin), torch.from_numpy(FOCUS)
+    )
 
 
 def random_points(count, seed=5):
@@ -57,7 +68,9 @@ def test_encoding_by_hand():
     table = np.zeros((1, 16, 4), F)
     table[0, 0], table[0, 1] = 1.0, 10.0
     x = np.zeros((4, kernels.BLOCK), F)
-    kernels.encode_block(table, np.array([1.0], F), np.zeros(3, F), np.zeros(4, F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x)
+    kernels.encode_block(
+        table, np.array([1.0], F), np.zeros(3, F), np.zeros(4, F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x
+    )
     # A pixel of 0 rad leaves all levels whole. 0.75·0.5·1 + 0.25·0.5·10 + 0.75·0.5·10 + 0.25·0.5·1 = 5.5
     assert x[:, 0] == pytest.approx([5.5] * 4)
 
@@ -73,7 +86,8 @@ def test_gradient_agrees_with_autograd(levels, features, count):
     table_grad, touched = np.zeros_like(p.table), np.zeros(p.table.shape[:2], np.uint8)
     g1, gb1, g2, gb2 = (np.zeros_like(a) for a in p.network())
     errors = kernels.gradient(
-        p.table, *p.network(), lattice.cells_per_m, lattice.origin, FOCUS, points, target, colour_weight, distance_weight,
+        p.table, *p.network(), lattice.cells_per_m, lattice.origin, FOCUS, points, target,
+        colour_weight, distance_weight,
         table_grad, touched, g1, gb1, g2, gb2,
     )  # fmt: skip
     field = torch_field(p, lattice)
@@ -156,7 +170,8 @@ def test_sampled_rays_lie_on_the_room_and_are_even_by_solid_angle(scene):
     # A sixth of the rays goes into each of the six faces (equal solid angles).
     direction = (surface - pose[:3, 3]) @ pose[:3, :3]
     shares = [
-        np.mean(np.argmax(direction @ np.array(list(CUBE_FACES.values()))[:, :, 0].T, axis=1) == face) for face in range(6)
+        np.mean(np.argmax(direction @ np.array(list(CUBE_FACES.values()))[:, :, 0].T, axis=1) == face)
+        for face in range(6)
     ]
     assert shares == pytest.approx([1 / 6] * 6, abs=0.01)
 
@@ -235,8 +250,8 @@ def test_the_march_by_hand():
         device = NumbaDevice(config, TrainConfig())
         device.load(p)
         device.set_scene(scene)
-        # Behind the surface everywhere: met at the first place in the band. In front everywhere, so that the field shows
-        # no crossing: the place in the band that came nearest. Never outside of the band
+        # Behind the surface everywhere: met at the first place in the band. In front everywhere, so that there is no
+        # crossing: the place in the band that came nearest. Never outside of the band
         # (but for the interpolation between traced pixels, which takes the sphere for flat).
         colour, depth, _ = device.draw(rays)
         assert depth.min() > 1.88

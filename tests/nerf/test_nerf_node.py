@@ -154,7 +154,9 @@ def test_a_new_keyframe_replaces_the_old(bus):
     assert bus.last("/vspace/status").psnr_db > before.psnr_db - 1
 
 
-@pytest.mark.parametrize("request_", [request_message(3, 4000, 4000), request_message(3, fov=3.5), request_message(3, 4, 4)])
+@pytest.mark.parametrize(
+    "request_", [request_message(3, 4000, 4000), request_message(3, fov=3.5), request_message(3, 4, 4)]
+)
 def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.publish("/view/request", request_)

@@ -254,7 +254,9 @@ def test_holes_are_filled_from_around_and_prefer_weight():
     filled = fill_holes(np.where(valid, values, 0).astype(np.float32), valid)
     assert np.all((filled[:, 3:5] >= 1) & (filled[:, 3:5] <= 3))
     assert np.array_equal(filled[valid], values[valid])
-    heavy = fill_holes(np.where(valid, values, 0).astype(np.float32), valid, np.where(values > 2, 100, 1).astype(np.float32))
+    heavy = fill_holes(
+        np.where(valid, values, 0).astype(np.float32), valid, np.where(values > 2, 100, 1).astype(np.float32)
+    )
     assert heavy[:, 3:5].mean() > filled[:, 3:5].mean()
 
 
