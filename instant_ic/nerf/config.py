@@ -72,7 +72,7 @@ class GeometryConfig:
 
     band_min: float = 0.05
     """Half width of the band round the depth in which the signed distance is learnt, share of the depth."""
-    band_max: float = 0.15
+    band_max: float = 0.06
     band_sigmas: float = 2.0
     """Half width of the band in standard deviations of the depth, between the two limits."""
     torn_ratio: float = 0.10
