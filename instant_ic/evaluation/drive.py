@@ -149,6 +149,8 @@ async def drive_through_obstacle(
 ) -> None:
     """Drives straight ahead from the start until the v-bot is past the obstacle, stops there, waits for the r-bot.
 
+    When a late sensor stops the robot on the way, the operator lets go and drives on, as a person would.
+
     Args:
         stack: a running ``launch/sim.yaml`` whose world has an obstacle straight ahead.
         recorder: of the same stack.
@@ -161,15 +163,26 @@ async def drive_through_obstacle(
     """
     control = message_type("ControlState")
     async with pump(stack) as until:
-        await until(lambda: recorder.mode == control.REAL and recorder.ready, 180, "virtual space that is fit to show")
+        await until(lambda: recorder.mode == control.REAL and recorder.ready, 240, "virtual space that is fit to show")
         async with ConsoleClient(console_url) as console:
+
+            async def drive_until(condition: Callable[[], Any], timeout_s: float, what: str) -> None:
+                deadline = asyncio.get_running_loop().time() + timeout_s
+                while True:
+                    console.drive(speed_mps, 0.0)
+                    left = deadline - asyncio.get_running_loop().time()
+                    await until(lambda: condition() or recorder.mode == control.STOPPED, max(left, 0.0), what)
+                    if condition():
+                        return
+                    await console.stop()
+                    await until(lambda: recorder.mode != control.STOPPED, 60, "end of the stop")
+
             await console.wait_for(lambda c: any(c.frame_counts.values()), 30)
             await console.acquire()
-            console.drive(speed_mps, 0.0)
-            await until(lambda: recorder.mode == control.VIRTUAL, 90, "passage into the virtual space")
-            await until(
+            await drive_until(lambda: recorder.mode == control.VIRTUAL, 120, "passage into the virtual space")
+            await drive_until(
                 lambda: recorder.vbot_pose is not None and recorder.vbot_pose[0] > beyond_x_m,
-                90,
+                120,
                 "v-bot past the obstacle",
             )
             await console.stop()
