@@ -134,8 +134,8 @@ def render() -> str:
         "# Nodes, topics, parameters",
         "",
         "Made by `scripts/make_reference.py` from the code and `config/*.yaml`; a test holds it to them. Every node",
-        "also takes `use_sim_time` and gives `/heartbeat`, `/diagnostics`, `/rosout`. Our own message types stand in",
-        "`instant_ic/msg/definitions/`; the others are ROS 2's.",
+        "also takes `use_sim_time` and `nice` (0..19; a higher value leaves the CPU to others) and gives `/heartbeat`,",
+        "`/diagnostics` and `/rosout`. Our own types stand in `instant_ic/msg/definitions/`; the others are ROS 2's.",
         "",
     ]
     missing = []

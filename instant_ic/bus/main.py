@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import signal
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +47,28 @@ def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
     return parser
 
 
+@dataclass(frozen=True)
+class ProcessParameters:
+    """Parameters that every node has beside its own.
+
+    Attributes:
+        use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
+        nice: 0..19; a node of a higher value leaves the CPU to the others when there is not enough for all.
+    """
+
+    use_sim_time: bool = False
+    nice: int = 0
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not 0 <= self.nice <= 19:
+            raise ValueError(f"nice must lie in 0..19 (got {self.nice})")
+
+
 def load_config(
     node_class: type[Node[Any]], name: str, files: Sequence[Path], overrides: Sequence[str]
-) -> tuple[Any, bool]:
-    """Typed configuration of a node, and whether it uses simulated time.
+) -> tuple[Any, ProcessParameters]:
+    """Typed configuration of a node, and what holds for its process.
 
     Raises:
         ParameterError: something in the files or words is wrong; the message says where.
@@ -57,10 +77,8 @@ def load_config(
     for path in files:
         values.update(params.load_file(path, name))
     values.update(params.parse_override(word) for word in overrides)
-    sim_time = values.pop("use_sim_time", params.Value(False, ""))
-    if not isinstance(sim_time.value, bool):
-        raise params.ParameterError(f"{sim_time.where}: use_sim_time must be true or false")
-    return params.build(node_class.config_class(), values), sim_time.value
+    common: params.Values = {key: values.pop(key) for key in ("use_sim_time", "nice") if key in values}
+    return params.build(node_class.config_class(), values), params.build(ProcessParameters, common)
 
 
 def parse_remaps(words: Sequence[str]) -> dict[str, str]:
@@ -94,13 +112,13 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     )
     log = logging.getLogger(args.name)
     try:
-        config, use_sim_time = load_config(node_class, args.name, args.params_file, args.param)
+        config, process = load_config(node_class, args.name, args.params_file, args.param)
         remaps = parse_remaps(args.remap)
         registry.check_node_name(args.name)
     except (params.ParameterError, registry.RegistryError) as error:
         log.error("%s", error)
         return 2
-    clock: Clock = ManualClock() if use_sim_time else SystemClock()
+    clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
     run_dir = args.run_dir or paths.run_dir()
     try:
         transport = ZmqTransport(run_dir, args.name, clock.now_ns)
@@ -108,7 +126,8 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     except registry.RegistryError as error:
         log.error("%s", error)
         return 1
-    node = node_class(config, transport, clock, args.name, args.namespace, remaps, use_sim_time=use_sim_time)
+    node = node_class(config, transport, clock, args.name, args.namespace, remaps, use_sim_time=process.use_sim_time)
+    os.nice(process.nice)
     started_ns = time.time_ns()
     # Signals only set a flag: the loop sees it within half a second, and teardown runs on the node's own thread.
     for number in (signal.SIGINT, signal.SIGTERM):

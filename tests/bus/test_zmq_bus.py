@@ -205,3 +205,12 @@ def test_publish_checks_the_type(transport):
 class _Clock:
     def now_ns(self) -> int:
         return time.time_ns()
+
+
+def test_every_node_takes_nice_and_checks_it(talker, run_dir):
+    process = talker("-p", "nice:=3")
+    wait_for(lambda: registry.list_nodes(run_dir))
+    assert os.getpriority(os.PRIO_PROCESS, process.pid) == os.getpriority(os.PRIO_PROCESS, 0) + 3
+    refused = talker("--name", "other", "-p", "nice:=-5")
+    assert refused.wait(30) == 2
+    assert "-p nice:=-5: nice must lie in 0..19 (got -5)" in refused.stderr.read()
