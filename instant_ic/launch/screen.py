@@ -111,8 +111,14 @@ class Screen:
 
     def _table(self, processes: Sequence[ManagedProcess]) -> Table:
         table = Table(box=None, pad_edge=False, expand=False)
-        for name, justify in (("node", "left"), ("state", "left"), ("CPU %", "right"), ("MB", "right")):
-            table.add_column(name, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+        # Least widths, or a long message in the last column would squeeze the others away.
+        for name, justify, width in (
+            ("node", "left", self._width),
+            ("state", "left", 8),
+            ("CPU %", "right", 5),
+            ("MB", "right", 5),
+        ):
+            table.add_column(name, justify=justify, no_wrap=True, min_width=width)  # type: ignore[arg-type]
         table.add_column("sends, Hz", no_wrap=True, overflow="ellipsis")
         for process in processes:
             health = self.health.nodes.get(process.spec.name) if self.health is not None else None
