@@ -39,6 +39,7 @@ class FlatScanConfig:
         beams: directions over 360 degrees.
         range_min: what the scan says of its nearest range, metres.
         range_max: farther points are left out of the scan, metres.
+        min_coverage: a revolution that looked into a smaller share of the circle gives no scan, 0-1.
     """
 
     min_height: float = 0.10
@@ -46,6 +47,7 @@ class FlatScanConfig:
     beams: int = 720
     range_min: float = 0.4
     range_max: float = 100.0
+    min_coverage: float = 0.5
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -55,3 +57,5 @@ class FlatScanConfig:
             raise ValueError(f"beams must be in 4..7200 (got {self.beams})")
         if not 0.0 <= self.range_min < self.range_max:
             raise ValueError(f"range_min must be below range_max (got {self.range_min}, {self.range_max})")
+        if not 0.0 <= self.min_coverage <= 1.0:
+            raise ValueError(f"min_coverage must be in 0..1 (got {self.min_coverage})")

@@ -85,6 +85,15 @@ def flat_scan(
     )
 
 
+def coverage(revolution: Revolution) -> float:
+    """Share of the circle that a revolution looked into, by whole degrees, 0-1.
+
+    Less than all where it was cut short: after a start, at a jump of the sensor's clock, with packets missing.
+    """
+    degrees = np.floor(np.degrees(revolution.firing_azimuth)).astype(np.int64) % 360
+    return float(len(np.unique(degrees))) / 360.0
+
+
 def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion: PlanarMotion) -> NDArray[np.float32]:
     """Positions of all points as the sensor would see them from where it is at the revolution's end, (N, 3).
 

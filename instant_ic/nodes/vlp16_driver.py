@@ -14,7 +14,7 @@ from instant_ic.geometry.poses import pose2_from_matrix, pose_matrix
 from instant_ic.geometry.transforms import TransformError
 from instant_ic.lidar.capture import CaptureError, CaptureReader, Datagram
 from instant_ic.lidar.config import DecoderConfig, FlatScanConfig
-from instant_ic.lidar.flatscan import flat_scan, warm_up
+from instant_ic.lidar.flatscan import coverage, flat_scan, warm_up
 from instant_ic.lidar.motion import MotionError, PlanarMotion
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, PacketError, decode_position_packet
 from instant_ic.lidar.receiver import PacketReceiver, ReceiverConfig, ReceiverError
@@ -105,6 +105,8 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.raw: list[tuple[bytes, int]] = []
         self.waiting = 0
         self.skipped = 0
+        self.partial = 0
+        self.partial_told = 0
         self.told = (0, 0, 0)
         self.last_ns = self.clock.now_ns()
         self.base_from_lidar = pose_matrix(*config.mount_xyz, *np.radians(config.mount_rpy_deg))
@@ -231,6 +233,10 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                 )
             )
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
+        if coverage(revolution) < config.scan.min_coverage:
+            # Half blind: matched to a map it misleads, and nobody else could see that from the scan.
+            self.partial += 1
+            return
         motion = self.motion(revolution)
         try:
             scan = flat_scan(revolution, self.base_from_lidar, config.scan, motion)
@@ -293,6 +299,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             "bad": counters.bad,
             "clock_resets": counters.clock_resets + self.stream.clock.resets,
             "revolutions_skipped": self.skipped,
+            "revolutions_partial": self.partial,
         }
         if silent_s > self.config.silence_s:
             self.diagnose("packets", ERROR, self.silence(silent_s), **values)
@@ -302,7 +309,9 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             )
             self.diagnose("packets", WARN, text, **values)
         else:
-            self.diagnose("packets", OK, "packets come", **values)
+            partial, self.partial_told = self.partial - self.partial_told, self.partial
+            text = f"packets come; {partial} revolutions were cut short and gave no scan" if partial else "packets come"
+            self.diagnose("packets", OK, text, **values)
 
     def silence(self, silent_s: float) -> str:
         """What to look at when nothing comes."""

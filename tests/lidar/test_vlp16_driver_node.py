@@ -20,6 +20,7 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.params import build, load_file
 from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.geometry.poses import matrix_from_pose2
+from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.packets import PACKET_PERIOD_US, encode_position_packet
 from instant_ic.msg import (
     LaserScan,
@@ -60,7 +61,8 @@ def test_capture_gives_points_packets_scans_and_the_mount(capture: Path) -> None
     bus, node = played(capture)
     bus.advance(0.5)
     clouds, scans, packets = (bus.messages(t) for t in ("/lidar/points", "/scan", "/lidar/packets"))
-    assert len(clouds) == len(scans) == len(packets) == 5  # 0.4 s from just behind the cut on: 4 cuts and the rest
+    assert len(clouds) == len(packets) == 5  # 0.4 s from just behind the cut on: 4 cuts and the rest
+    assert len(scans) == 4  # the rest, 302 packets of 1.327 ms less 4 turns of 0.1 s, is 4 degrees: no scan
     assert sum(len(cloud_array(cloud)) for cloud in clouds) == 302 * 384
     assert sum(len(message.packets) for message in packets) == 302
     assert all(message.header.frame_id == "velodyne" for message in [*clouds, *scans])
@@ -75,13 +77,16 @@ def test_capture_gives_points_packets_scans_and_the_mount(capture: Path) -> None
     assert (mount.header.frame_id, mount.child_frame_id) == ("base_link", "velodyne")
     assert transform_matrix(mount)[:3, 3].tolist() == [0.0, 0.0, 0.6]
     assert node.diagnoses()["capture"][:2] == (WARN, "303 datagrams played; left out: 1 x not IP")
+    bus.advance(0.6)
+    text = "packets come; 1 revolutions were cut short and gave no scan"
+    assert node.diagnoses()["packets"][:2] == (OK, text)
     assert node.diagnoses()["position"][:2] == (OK, "pulse per second locked")
 
 
 def test_capture_at_twice_the_pace_takes_half_the_time_with_the_same_stamps(capture: Path) -> None:
     bus, _ = played(capture, rate=2.0)
     bus.advance(0.21)
-    assert len(bus.messages("/scan")) == 5
+    assert len(bus.messages("/scan")) == 4
     stamps = [stamp_ns(scan) for scan in bus.messages("/scan")]
     assert stamps[2] - stamps[1] == pytest.approx(0.1 * SECOND, rel=5e-3)
 
@@ -93,10 +98,27 @@ def test_packets_of_a_bag_give_the_same_again_bit_for_bit(capture: Path) -> None
     again.add(Vlp16DriverNode, Vlp16DriverConfig(source="topic"))
     for record in bus.records("/lidar/packets"):
         again.publish_bytes("/lidar/packets", record.type_name, record.payload, record.stamp_ns)
-    for topic in ("/lidar/points", "/scan"):
-        # The last, unfinished revolution ends with the capture, of which a bag of packets does not know.
-        expected = [record.payload for record in bus.records(topic)][:-1]
+    # The last, unfinished revolution ends with the capture, of which a bag of packets does not know; it gives no scan.
+    for topic, unfinished in (("/lidar/points", 1), ("/scan", 0)):
+        expected = [record.payload for record in bus.records(topic)]
+        expected = expected[: len(expected) - unfinished]
+        assert len(expected) == 4
         assert [record.payload for record in again.records(topic)] == expected
+
+
+@pytest.mark.parametrize(("min_coverage", "scans"), [(0.5, 4), (0.0, 5), (0.75, 3)])
+def test_revolutions_that_are_cut_short_give_no_scan(tmp_path: Path, min_coverage: float, scans: int) -> None:
+    # 287 packets of 1.327 ms are 3.81 turns at 600 rpm: a tenth up to the first cut, three whole ones, 0.71.
+    stamps = [RECORDED + round((index + 1) * PACKET_PERIOD_US * 1000.0) for index in range(287)]
+    stream = wall_stream(287, 5.0, azimuth_cdeg=14400)  # 36 degrees before the cut
+    path = tmp_path / "cut.pcap"
+    path.write_bytes(pcap([(s, udp_frame(p)) for s, p in zip(stamps, stream, strict=True)], nano=True))
+    config = FlatScanConfig(min_coverage=min_coverage)
+    bus, node = played(path, scan=config)
+    bus.advance(0.5)
+    clouds = len(bus.messages("/lidar/points"))
+    assert len(bus.messages("/scan")) == scans
+    assert node.partial == clouds - scans
 
 
 def test_scan_is_motion_compensated_by_odometry(capture: Path) -> None:
