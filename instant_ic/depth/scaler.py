@@ -12,7 +12,7 @@ from instant_ic.geometry.projections import equirect_directions, equirect_pixels
 
 Floats = NDArray[np.floating]
 MIN_VALUES = 20
-METHODS = ("max_ratio", "median_ratio")
+METHODS = ("max_ratio", "median_ratio", "as_estimated")
 MAXIMA = ("lidar", "image")
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
 
@@ -27,7 +27,8 @@ class ScalerConfig:
 
     Attributes:
         method: ``median_ratio`` (median of range over depth at the points) or ``max_ratio`` (the paper's rule).
-            Only for ``metric`` and ``scale_invariant`` depth; the others get a robust line.
+            Only for ``metric`` and ``scale_invariant`` depth; the others get a robust line. ``as_estimated`` takes
+            the metres of a ``metric`` model unseen, for pictures and LiDAR from different places; never for driving.
         maxima: where ``max_ratio`` takes the depth's maximum: ``lidar``, over the directions that the LiDAR sees, or
             ``image``, over the whole picture by solid angle.
         confidence: quantile that stands for the maximum (paper: 99.5 %).
@@ -39,6 +40,7 @@ class ScalerConfig:
         agreement: a point agrees when scaled depth and range differ by no more than this share of the range.
         min_quality: a smaller share of agreeing points makes the fit not ok.
         min_scale, max_scale: a scale outside makes the fit not ok (``metric`` and ``scale_invariant``).
+        assumed_sigma: relative standard deviation that is told of depth taken ``as_estimated``, which nobody measured.
     """
 
     method: str = "median_ratio"
@@ -53,6 +55,7 @@ class ScalerConfig:
     min_quality: float = 0.25
     min_scale: float = 0.05
     max_scale: float = 20.0
+    assumed_sigma: float = 0.2
 
     def __post_init__(self) -> None:
         for key, allowed in (("method", METHODS), ("maxima", MAXIMA), ("output_kind", OUTPUT_KINDS)):
@@ -70,6 +73,10 @@ class ScalerConfig:
             raise ValueError(f"agreement and min_quality must lie in 0..1 (got {self.agreement}, {self.min_quality})")
         if not 0 < self.min_scale < self.max_scale:
             raise ValueError(f"min_scale must be under max_scale, above 0 (got {self.min_scale}, {self.max_scale})")
+        if not 0 < self.assumed_sigma <= 1:
+            raise ValueError(f"assumed_sigma must lie in 0..1 (got {self.assumed_sigma})")
+        if self.method == "as_estimated" and self.output_kind != "metric":
+            raise ValueError(f"method as_estimated needs output_kind metric (got {self.output_kind!r})")
 
 
 @dataclass(frozen=True)
@@ -227,6 +234,8 @@ class DepthScaler:
         """
         if depth.ndim != 2 or points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"depth must be (H, W), points (N, 3) (got {depth.shape}, {points.shape})")
+        if self.config.method == "as_estimated":
+            return self.as_estimated(depth)
         try:
             return self._fit(depth, points)
         except ScaleError as error:
@@ -237,6 +246,11 @@ class DepthScaler:
         metric = self.config.output_kind == "metric"
         given = self._clean(depth) if metric else np.zeros(depth.shape, np.float32)
         return ScaleFit(False, 1.0, 0.0, given, 0.0, float("inf"), 0, message)
+
+    def as_estimated(self, depth: Floats) -> ScaleFit:
+        """Depth (H, W) in the metres of a ``metric`` model, compared with nothing: ok, and the message says so."""
+        message = "metres as estimated: the LiDAR was not asked (method as_estimated)"
+        return ScaleFit(True, 1.0, 0.0, self._clean(depth), 0.0, self.config.assumed_sigma, 0, message)
 
     def _fit(self, depth: Floats, points: Floats) -> ScaleFit:
         config = self.config

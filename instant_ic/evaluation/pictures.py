@@ -72,7 +72,10 @@ def save_map(
     """An occupancy grid (−1 unknown, 0..100) with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
     figure, axes = _figure(1, 1, (7.0, 7.0))
     axis = axes[0, 0]
-    shade = np.where(grid < 0, 0.75, 1.0 - grid / 100.0)
+    # Three tones by where the evidence points, a little by how strong it is: one look of a standing robot is weak
+    # evidence everywhere, and would be grey on grey.
+    shade = np.where(grid < 50, 1.0 - 0.15 * grid / 50.0, 0.35 * (100 - grid) / 50.0)
+    shade = np.where(grid < 0, 0.7, shade)
     height, width = grid.shape
     x0, y0 = origin_xy
     extent = (x0, x0 + width * resolution_m, y0, y0 + height * resolution_m)

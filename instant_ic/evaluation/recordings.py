@@ -1,7 +1,8 @@
 """Real recordings through the real nodes: a LiDAR capture to a map, a panorama photo to a virtual space.
 
 The simulated devices send the recordings over the devices' own protocols, so every driver and node runs as with the
-hardware. Photo and capture need not come from one place: then the depth's scale means nothing, but every step works.
+hardware. Photo and capture are taken to be from different places, so the photo's depth is taken in the model's own
+metres and the LiDAR is not asked (``trust_depth:=true`` of ``launch/sim.yaml``); the summary tells it.
 """
 
 from __future__ import annotations
@@ -34,11 +35,20 @@ def evaluate_recordings(
     out: Path,
     timeout_s: float = 240.0,
     tell: Callable[[str], None] = lambda text: None,
+    same_place: bool = False,
 ) -> dict[str, Any]:
     """Runs ``launch/sim.yaml`` on recordings and writes a bag, pictures and a summary into ``out``.
 
     Writes ``bag/`` (rosbag2 MCAP), ``view.png`` (trained view beside the photo's own crop), ``depth.png``,
     ``map.png``, ``launch.log`` and ``summary.json``, whose content is returned.
+
+    Args:
+        pcap: VLP-16 capture.
+        panorama: equirect photo.
+        out: folder for what is written.
+        timeout_s: for all of it.
+        tell: called with what is waited for.
+        same_place: photo and capture are of one place and moment: the depth is scaled by the LiDAR, as on the robot.
 
     Raises:
         FileNotFoundError: a recording is missing.
@@ -59,6 +69,7 @@ def evaluate_recordings(
         "panorama": panorama.resolve(),
         "record": (out / "bag").resolve(),
         "headless": True,
+        "trust_depth": not same_place,
     }
     try:
         with Stack("sim.yaml", run_dir, arguments, out / "launch.log") as stack:
@@ -69,6 +80,7 @@ def evaluate_recordings(
             raise StackError(f"the stack ended with status {status}; see {out}/launch.log")
     finally:
         shutil.rmtree(run_dir, ignore_errors=True)
+    summary["depth_from"] = "scaled by the LiDAR" if same_place else "as estimated, the LiDAR was not asked"
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     return summary
 
@@ -126,7 +138,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         rows.append((f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)", rendered, crop))
     save_view_strip(out / "view.png", rows)
     depth = image_array(keyframe.depth)
-    save_depth(out / "depth.png", photo, depth, f"depth, scale {keyframe.scale:.3f}, quality {keyframe.quality:.2f}")
+    save_depth(out / "depth.png", photo, depth, f"depth: {keyframe.message}")
     grid, resolution, origin = grid_array(maps[-1])
     robot = matrix_of_pose(poses[-1])
     save_map(out / "map.png", grid, resolution, origin, (robot[0, 3], robot[1, 3], yaw_of(robot)))

@@ -70,6 +70,8 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.last_ns: int | None = None
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
+        if self.config.scaler.method == "as_estimated":
+            self.log.warning("depth is taken as estimated, the LiDAR is not asked: for recordings, not for driving")
         self.transforms = self.tf  # subscribes now: the past must be known when the first depth comes
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_picture, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.clouds.append, qos=SENSOR)
@@ -99,6 +101,8 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def fit(self, depth: NDArray[np.float32], camera: str, stamp: int) -> ScaleFit:
         """Scales by the revolution nearest in time; what is missing is told by the fit's message."""
+        if self.config.scaler.method == "as_estimated":
+            return self.scaler.as_estimated(depth)
         try:
             points = self.points_in_camera(camera, stamp)
         except TransformError as error:

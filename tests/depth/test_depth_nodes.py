@@ -196,6 +196,19 @@ def test_no_lidar_is_told_and_no_keyframe_at_once() -> None:
         assert level(node, "scale") == (1, "no LiDAR revolution within 0.3 s")
 
 
+def test_depth_as_estimated_makes_keyframes_that_say_so() -> None:
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthScalerNode, DepthScalerConfig(scaler=ScalerConfig(method="as_estimated")))
+        drive(bus, 1.0, lidar=False)
+        scaled, (keyframe,) = bus.messages("/depth/scaled"), bus.messages("/keyframe")
+        assert level(node, "scale")[0] == 0
+    truth = room_depth(base_at(START + S // 5) @ BASE_FROM_CAMERA)
+    np.testing.assert_allclose(image_array(scaled[0]), truth / 2, rtol=1e-5)  # as it came, a factor of 2 too near
+    assert keyframe.fit and keyframe.scale == 1.0 and keyframe.quality == 0.0
+    assert keyframe.relative_sigma == pytest.approx(0.2)
+    assert "LiDAR was not asked" in keyframe.message
+
+
 def test_unfit_keyframe_goes_out_marked_after_waiting_and_a_fit_one_replaces_it() -> None:
     config = DepthScalerConfig(keyframes=KeyframeConfig(unfit_after_s=1.0))
     with LockstepBus(START) as bus:

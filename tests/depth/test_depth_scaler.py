@@ -103,6 +103,19 @@ def test_robust_line_ignores_outliers() -> None:
     assert offset == pytest.approx(1.0, abs=0.1)
 
 
+def test_depth_as_estimated_is_told_as_such_and_asks_no_points() -> None:
+    depth = room_depth() * 3.0  # far from what the points say
+    config = ScalerConfig(method="as_estimated", assumed_sigma=0.3)
+    fit = DepthScaler(config).fit(depth, room_points(noise=0.0))
+    assert (fit.ok, fit.scale, fit.points, fit.quality, fit.relative_sigma) == (True, 1.0, 0, 0.0, 0.3)
+    np.testing.assert_array_equal(fit.depth_m, np.minimum(depth, 16.0).astype(np.float32))
+    assert "LiDAR was not asked" in fit.message
+    assert ScalerConfig().method != "as_estimated"
+    assert not DepthScaler().fit(depth, np.zeros((0, 3))).ok
+    with pytest.raises(ValueError, match="as_estimated needs output_kind metric"):
+        ScalerConfig(method="as_estimated", output_kind="disparity")
+
+
 @pytest.mark.parametrize("method", ["max_ratio", "median_ratio"])
 @pytest.mark.parametrize("factor", [0.5, 1.7])
 def test_room_gets_its_scale_back(method: str, factor: float) -> None:

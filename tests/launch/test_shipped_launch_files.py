@@ -13,7 +13,7 @@ NAMES = sorted(file.stem for file in paths.share_dir("launch").glob("*.yaml"))
 NEEDED = {"replay": {"bag": "drive"}}
 EVERYTHING = {
     "replay": {"bag": "drive", "record": "again", "nerf": "true"},
-    "sim": {"panorama": "photo.jpg", "pcap": "drive.pcap", "record": "drive"},
+    "sim": {"panorama": "photo.jpg", "pcap": "drive.pcap", "record": "drive", "trust_depth": "true"},
     "robot": {"camera_url": "http://10.0.0.9", "lidar_port": "3000", "serial_port": "/dev/ttyUSB1", "record": "x"},
     "full": {"serial_port": "/dev/ttyUSB1", "console_port": "9000", "record": "x"},
     "station": {"console_port": "9000"},
@@ -69,6 +69,14 @@ def test_simulated_devices_and_drivers_meet() -> None:
     assert "server.port:=9004" in found["console"]
     link = yaml.safe_load(paths.shipped_file("config", "sim.yaml").read_text())["simulator"]["ros__parameters"]["base"]
     assert link["link"] == "roboclaw"
+
+
+def test_depth_is_taken_unchecked_only_where_it_is_asked_for() -> None:
+    assert "scaler.method:=as_estimated" in nodes("sim", trust_depth="true")["depth_scaler"]
+    assert "scaler.method:=as_estimated" in nodes("station", trust_depth="true")["depth_scaler"]
+    for name in NAMES:
+        assert "as_estimated" not in nodes(name).get("depth_scaler", "")
+    assert all("trust_depth" not in {a.name for a in read_arguments(find_launch_file(n))} for n in ("robot", "full"))
 
 
 def test_robot_leaves_to_the_configuration_what_is_not_given() -> None:

@@ -21,13 +21,15 @@ def add_parser(subparsers: Any) -> None:
         description=(
             "Sends a VLP-16 capture as UDP packets and a 360° photo by the Theta's web API through the whole stack. "
             "Writes a bag, the trained view beside the photo's own crop, the depth and the map as PNG, "
-            "and summary.json into the output folder."
+            "and summary.json into the output folder. Photo and capture are taken to be from different places: "
+            "the depth is then in the model's own metres. With --same-place the LiDAR scales it, as on the robot."
         ),
         epilog="example: ic evaluate recordings --pcap drive.pcap --panorama room.jpg -o runs/recordings",
     )
     recordings.add_argument("--pcap", type=Path, required=True, help="capture of VLP-16 data packets")
     recordings.add_argument("--panorama", type=Path, required=True, help="equirect photo (JPEG, 2:1)")
     recordings.add_argument("-o", "--out", type=Path, required=True, help="folder for what is written")
+    recordings.add_argument("--same-place", action="store_true", help="scale the photo's depth by the capture")
     recordings.add_argument("--timeout", type=float, default=240.0, metavar="S", help="in all (default: %(default)g s)")
     recordings.add_argument("--json", type=Path, metavar="OUT", help="also write the summary here")
     recordings.set_defaults(func=evaluate_recordings)
@@ -49,7 +51,7 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
                 if not console.is_terminal:
                     console.print(text)
 
-            summary = run(args.pcap, args.panorama, args.out, args.timeout, tell)
+            summary = run(args.pcap, args.panorama, args.out, args.timeout, tell, args.same_place)
     except (FileNotFoundError, FileExistsError, StackError) as error:
         console.print(f"ic evaluate recordings: {error}", style="red", markup=False)
         return 1
