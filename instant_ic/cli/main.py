@@ -10,8 +10,12 @@ import argparse
 import importlib
 import os
 import pkgutil
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from types import FrameType
 
 from instant_ic.cli import commands
 from instant_ic.cli.errors import UserError
@@ -42,6 +46,30 @@ def build_parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; returns the exit status."""
+    words = sys.argv[1:] if argv is None else argv
+    with _quiet_end() if words[:1] == ["launch"] else nullcontext():
+        return _main(argv)
+
+
+@contextmanager
+def _quiet_end() -> Iterator[None]:
+    """A signal before the stack is up ends ``ic launch`` as one after it does: cleanly, with status 0."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(signum: int, frame: FrameType | None) -> None:
+        raise SystemExit(0)
+
+    before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+def _main(argv: Sequence[str] | None) -> int:
     parser = build_parser()
     args = parser.parse_args(argv)
     function = getattr(args, "func", None)

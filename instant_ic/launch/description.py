@@ -321,7 +321,7 @@ class _Reader:
             value.problem(f"program {executable} does not exist beside the launch file")
             return None
         if executable.isidentifier() and importlib.util.find_spec(f"instant_ic.nodes.{executable}"):
-            return (sys.executable, "-m", f"instant_ic.nodes.{executable}")
+            return (sys.executable, "-m", "instant_ic.launch.node_main", f"instant_ic.nodes.{executable}")
         value.problem(f"unknown exec {executable!r} (nodes: {', '.join(known_nodes()) or 'none'})")
         return None
 

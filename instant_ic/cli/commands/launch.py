@@ -19,9 +19,7 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic launch sim console_port:=9000 record:=drive",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, replay"
-    )
+    parser.add_argument("file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, replay")
     parser.add_argument("arguments", nargs="*", metavar="KEY:=VALUE", help="arguments of the launch file")
     parser.add_argument("--show-args", action="store_true", help="list the file's arguments and end")
     parser.add_argument(

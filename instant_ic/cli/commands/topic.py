@@ -31,9 +31,7 @@ def add_parser(subparsers: Any) -> None:
     listing = verb("list", "names of the topics that have a publisher", list_topics, "ic topic list -v", topic=False)
     listing.add_argument("-v", "--verbose", action="store_true", help="with type, QoS and publishers")
     verb("info", "type, publishers and subscribers of a topic", info, "ic topic info /scan")
-    echo_parser = verb(
-        "echo", "prints messages as they come", echo, "ic topic echo /pose -n 1 --field pose.pose"
-    )
+    echo_parser = verb("echo", "prints messages as they come", echo, "ic topic echo /pose -n 1 --field pose.pose")
     echo_parser.add_argument("-n", type=_positive_int, default=0, metavar="COUNT", help="end after so many messages")
     echo_parser.add_argument("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
     echo_parser.add_argument("--full", action="store_true", help="long arrays and byte strings in full")
@@ -45,9 +43,7 @@ def add_parser(subparsers: Any) -> None:
         ("bw", "bytes a second of a topic, once a second", bandwidth),
     ):
         added = verb(name, words, function, f"ic topic {name} /scan")
-        added.add_argument(
-            "--duration", type=_positive, default=float("inf"), metavar="S", help="default: no end"
-        )
+        added.add_argument("--duration", type=_positive, default=float("inf"), metavar="S", help="default: no end")
 
 
 def _positive(text: str) -> float:

@@ -1,0 +1,83 @@
+"""How a node's process begins and ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from instant_ic.cli.main import main
+
+
+def run_module(folder: Path, code: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    (folder / "its_module.py").write_text(textwrap.dedent(code))
+    return subprocess.run(
+        [sys.executable, "-m", "instant_ic.launch.node_main", "its_module", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": str(folder)},
+    )
+
+
+@pytest.mark.parametrize(
+    ("end", "status", "told"),
+    [
+        ("pass", 0, ""),
+        ("sys.exit(0)", 0, ""),
+        ("sys.exit()", 0, ""),
+        ("sys.exit(2)", 2, ""),
+        ("sys.exit('no such port')", 1, "no such port"),
+        ("raise ValueError('broken')", 1, "ValueError: broken"),
+    ],
+)
+def test_exit_status_and_last_words_are_the_modules_own(tmp_path: Path, end: str, status: int, told: str) -> None:
+    done = run_module(tmp_path, f"import sys\nprint(sys.argv[1:], __name__)\n{end}\n", "--name", "x")
+    assert done.returncode == status
+    assert done.stdout == "['--name', 'x'] __main__\n"  # not lost, although the interpreter is not taken down
+    assert told in done.stderr
+    assert bool(told) == bool(done.stderr)
+
+
+def test_interpreter_is_not_taken_down(tmp_path: Path) -> None:
+    done = run_module(tmp_path, "import atexit\natexit.register(print, 'taken down')\nprint('done')\n")
+    assert (done.returncode, done.stdout) == (0, "done\n")
+
+
+def test_a_signal_while_a_node_is_still_imported_ends_it_quietly(tmp_path: Path) -> None:
+    (tmp_path / "its_module.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "instant_ic.launch.node_main", "its_module"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    try:
+        assert process.stdout is not None and process.stdout.readline() == "importing\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert process.stdout.read() == ""
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_before_the_stack_is_up_ends_the_launcher_with_0(
+    monkeypatch: pytest.MonkeyPatch, signum: signal.Signals
+) -> None:
+    def find(name: str) -> Path:
+        os.kill(os.getpid(), signum)
+        raise AssertionError("the signal did not end it")
+
+    monkeypatch.setattr("instant_ic.launch.find_launch_file", find)
+    before = signal.getsignal(signum)
+    with pytest.raises(SystemExit) as end:
+        main(["launch", "sim"])
+    assert end.value.code == 0
+    assert signal.getsignal(signum) is before
