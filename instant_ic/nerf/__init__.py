@@ -3,6 +3,7 @@
 from .config import (
     FieldConfig,
     GeometryConfig,
+    PictureConfig,
     ReadinessConfig,
     TrainConfig,
     VirtualSpaceConfig,
@@ -15,6 +16,7 @@ __all__ = [
     "GeometryConfig",
     "KeyframeError",
     "NotReadyError",
+    "PictureConfig",
     "ReadinessConfig",
     "State",
     "Status",

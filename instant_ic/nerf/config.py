@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 
@@ -47,6 +48,8 @@ class TrainConfig:
     table_lr: float = 0.04
     network_lr: float = 0.01
     final_lr_share: float = 0.03
+    fine_lr_share: float = 0.1
+    """Learning rate of the finest level against the coarsest's, between them by equal ratios: it keeps grain down."""
     refresh_lr_share: float = 0.5
     """Share of the learning rates when a keyframe refreshes a trained field."""
     distance_weight: float = 0.1
@@ -60,7 +63,7 @@ class TrainConfig:
             value = getattr(self, key)
             _require(8 <= value <= 1024 and value % 8 == 0, key, value, "a multiple of 8 from 8 to 1024")
         _require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
-        for key in ("table_lr", "network_lr", "final_lr_share", "refresh_lr_share"):
+        for key in ("table_lr", "network_lr", "final_lr_share", "fine_lr_share", "refresh_lr_share"):
             _require(0 < getattr(self, key) <= 1, key, getattr(self, key), "in (0, 1]")
         _require(0 <= self.band_colour_weight <= 1, "band_colour_weight", self.band_colour_weight, "in 0..1")
         _require(self.distance_weight > 0, "distance_weight", self.distance_weight, "above 0")
@@ -102,7 +105,7 @@ class ReadinessConfig:
     """When the space is fit to show, and how far from the keyframe."""
 
     psnr_db: float = 24.0
-    """PSNR of the training rays that is good enough."""
+    """PSNR of the training rays that is good enough, also to take over from the keyframe before."""
     plateau_iterations: int = 100
     plateau_db: float = 0.3
     """Less gain than this over ``plateau_iterations`` also counts as ready."""
@@ -113,6 +116,26 @@ class ReadinessConfig:
     def __post_init__(self) -> None:
         for key in ("psnr_db", "plateau_iterations", "plateau_db", "max_radius_m", "parallax_rad"):
             _require(getattr(self, key) > 0, key, getattr(self, key), "above 0")
+
+
+@dataclass(frozen=True)
+class PictureConfig:
+    """Where a drawn surface's colour comes from: the keyframe's panorama, then the field as it becomes better.
+
+    The share of the panorama falls linearly in the PSNR of the training rays.
+    """
+
+    panorama_until_db: float = 30.0
+    """The panorama alone up to this PSNR."""
+    field_from_db: float = 36.0
+    """The field alone from this PSNR on; at or under ``panorama_until_db`` the panorama is never used."""
+
+    def panorama_share(self, psnr_db: float) -> float:
+        """Share of the panorama's colour, 0..1; 1 where nothing is known yet (NaN)."""
+        span = self.field_from_db - self.panorama_until_db
+        if span <= 0:
+            return 0.0
+        return 1.0 if math.isnan(psnr_db) else min(max((self.field_from_db - psnr_db) / span, 0.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -127,6 +150,7 @@ class VirtualSpaceConfig:
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
     readiness: ReadinessConfig = dataclasses.field(default_factory=ReadinessConfig)
+    picture: PictureConfig = dataclasses.field(default_factory=PictureConfig)
 
     def __post_init__(self) -> None:
         devices = ("auto", "cpu", "cuda", "torch-cpu")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,8 +123,18 @@ class Device(Protocol):
             Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
         """
 
-    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
-        """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,)."""
+    def freeze(self) -> Any:
+        """The present scene and a copy of the parameters, for ``draw``; training does not change it."""
+
+    def draw(self, rays: Rays, panorama_share: float, frozen: Any = None) -> tuple[Floats, Floats, Floats]:
+        """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,).
+
+        Args:
+            rays: of the view.
+            panorama_share: of the keyframe's panorama in the colour of surfaces that it has seen; the rest is the
+                field's. With 1 the colour of surfaces without confidence is not worked out.
+            frozen: what ``freeze`` gave, or the present field.
+        """
 
     def parameters(self) -> FieldParameters:
         """A copy of the present parameters."""
@@ -161,6 +171,11 @@ def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
     colour = np.where(on_surface, 1.0, config.band_colour_weight) / (3 * rays)
     distance = np.full(2 * rays, config.distance_weight / (2 * rays))
     return colour.astype(np.float32), distance.astype(np.float32)
+
+
+def level_rates(config: TrainConfig, levels: int) -> Floats:
+    """Learning rate of each level against the coarsest's, (levels,)."""
+    return np.geomspace(1.0, config.fine_lr_share, levels).astype(np.float32)
 
 
 def adam_step_size(lr: float, step: int) -> float:

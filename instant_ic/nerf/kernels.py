@@ -247,12 +247,13 @@ def adam_touched(  # type: ignore[no-untyped-def]
 ):
     """One Adam step on the touched entries; clears their gradient and mark.
 
-    Untouched entries keep value and moments, as in ``torch.optim.SparseAdam``. ``step_size`` already holds the bias
-    correction of the step, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
+    Untouched entries keep value and moments, as in ``torch.optim.SparseAdam``. ``step_size`` (levels,) already holds
+    the bias correction of the step, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
     """
     levels, size, features = table.shape
     keep1, keep2 = np.float32(1) - beta1, np.float32(1) - beta2
     for level in range(levels):
+        step = step_size[level]
         for entry in range(size):
             if touched[level, entry]:
                 touched[level, entry] = 0
@@ -263,4 +264,4 @@ def adam_touched(  # type: ignore[no-untyped-def]
                     square = beta2 * v[level, entry, f] + keep2 * g * g
                     m[level, entry, f] = mean
                     v[level, entry, f] = square
-                    table[level, entry, f] -= step_size * mean / (math.sqrt(square) + epsilon)
+                    table[level, entry, f] -= step * mean / (math.sqrt(square) + epsilon)

@@ -251,6 +251,36 @@ def trace(  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
+def mix_panorama(rgb, camera_from_map, origin, directions, depth, confidence, share, colour):  # type: ignore[no-untyped-def]
+    """Mixes the panorama's colour into that of surfaces which the keyframe has seen.
+
+    Args:
+        rgb: panorama (H, W, 3) uint8.
+        depth, confidence: (P,), of ``trace``; nothing happens where either is 0.
+        share: of the panorama, 0..1.
+        colour: in and out, (P, 3) in 0..1.
+    """
+    height, width = rgb.shape[:2]
+    one = np.float32(1)
+    for n in range(depth.shape[0]):
+        if depth[n] <= 0 or confidence[n] <= 0:
+            continue
+        x, y, z = along(camera_from_map, origin, directions[n], depth[n])
+        u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
+        v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
+        v = min(max(v, np.float32(0)), np.float32(height - 1))
+        u0, v0 = math.floor(u), math.floor(v)
+        fu, fv = u - np.float32(u0), v - np.float32(v0)
+        v1 = min(v0 + 1, height - 1)
+        left, right = u0 % width, (u0 + 1) % width
+        for c in range(3):
+            top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
+            bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
+            seen = (top * (one - fv) + bottom * fv) * np.float32(1 / 255)
+            colour[n, c] += share * (seen - colour[n, c])
+
+
+@njit(**_OPTIONS)
 def interpolate_depth(depth, confidence, stride, tolerance, pixels):  # type: ignore[no-untyped-def]
     """Fills the pixels at multiples of ``stride`` from their traced neighbours at multiples of ``2·stride``.
 

@@ -2,16 +2,39 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 
 from . import kernels, march
 from .config import FieldConfig, TrainConfig
-from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size, sample_weights
+from .field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FieldParameters,
+    Floats,
+    Rays,
+    Scene,
+    adam_step_size,
+    level_rates,
+    sample_weights,
+)
 
 FIRST_STRIDE = 4
 """Every so many pixels the rays are traced, the rest only where those between differ; a power of two, 1 traces all."""
 DEPTH_TOLERANCE = 0.08
 """Neighbours further apart than this share are traced, not interpolated."""
+
+
+@dataclass(frozen=True)
+class DrawnField:
+    """What drawing needs: parameters and scene, with what follows from the scene."""
+
+    parameters: FieldParameters
+    scene: Scene
+    focus: Floats
+    camera_from_map: Floats
 
 
 class NumbaDevice:
@@ -26,6 +49,7 @@ class NumbaDevice:
         self._points = np.zeros((2 * self._rays, 3), np.float32)
         self._target = np.zeros((2 * self._rays, 4), np.float32)
         self._colour_weight, self._distance_weight = sample_weights(train)
+        self._level_rates = level_rates(train, field.levels)
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -42,7 +66,8 @@ class NumbaDevice:
         self._scene = scene
         self._focus = scene.focus
         self._map_from_camera = scene.prior.map_from_camera.astype(np.float32)
-        self._camera_from_map = np.linalg.inv(scene.prior.map_from_camera).astype(np.float32)
+        camera_from_map = np.linalg.inv(scene.prior.map_from_camera).astype(np.float32)
+        self._drawn = DrawnField(self._p, scene, self._focus, camera_from_map)
         for moments in (self._table_moments, *self._network_moments):
             for moment in moments:
                 moment[...] = 0
@@ -61,8 +86,8 @@ class NumbaDevice:
         )  # fmt: skip
         self._steps += 1
         betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
-        step_size = np.float32(adam_step_size(table_lr, self._steps))
-        kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_size, *betas)
+        step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, self._steps))
+        kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_sizes, *betas)
         step_size = np.float32(adam_step_size(network_lr, self._steps))
         for value, grad, (m, v) in zip(p.network(), self._network_grads, self._network_moments, strict=True):
             m += (1 - betas[0]) * (grad - m)
@@ -71,26 +96,45 @@ class NumbaDevice:
             grad[...] = 0
         return colour / (1 + self._train.band_colour_weight), distance / self._train.distance_weight
 
-    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+    def freeze(self) -> DrawnField:
+        return replace(self._drawn, parameters=self.parameters())
+
+    def draw(
+        self, rays: Rays, panorama_share: float, frozen: DrawnField | None = None
+    ) -> tuple[Floats, Floats, Floats]:
         height, width = rays.shape
-        axial_depth, confidence = self._trace(rays)
+        drawn = frozen or self._drawn
+        axial_depth, confidence = self._trace(drawn, rays)
         depth = axial_depth / rays.axial
+        colour = np.zeros((height * width, 3), np.float32)
+        if panorama_share < 1:
+            self._query(drawn, rays, depth, colour)
+        if panorama_share > 0:
+            march.mix_panorama(
+                drawn.scene.prior.rgb, drawn.camera_from_map, rays.origin, rays.directions, depth, confidence,
+                np.float32(panorama_share), colour,
+            )  # fmt: skip
+        return colour, depth, confidence
+
+    @staticmethod
+    def _query(drawn: DrawnField, rays: Rays, depth: Floats, colour: Floats) -> None:
+        """The field's colours where the rays meet something."""
         met = np.flatnonzero(depth)
         points = rays.origin + depth[met, None] * rays.directions[met]
         out = np.empty((met.size, 4), np.float32)
-        p, lattice = self._p, self._scene.lattice
-        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, self._focus, points, out)
-        colour = np.zeros((height * width, 3), np.float32)
+        p, lattice = drawn.parameters, drawn.scene.lattice
+        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, points, out)
         colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
-        return colour, depth, confidence
 
-    def _trace(self, rays: Rays) -> tuple[Floats, Floats]:
+    def _trace(self, drawn: DrawnField, rays: Rays) -> tuple[Floats, Floats]:
         """Depth along the view's axis and confidence: every 4th pixel first, then what cannot be interpolated."""
         height, width = rays.shape
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)
         index = np.arange(height * width, dtype=np.int32).reshape(height, width)
-        self._march(rays, index[:: self.first_stride, :: self.first_stride].reshape(-1).copy(), depth, confidence)
+        self._march(
+            drawn, rays, index[:: self.first_stride, :: self.first_stride].reshape(-1).copy(), depth, confidence
+        )
         listed = np.empty(height * width, np.int32)
         stride = self.first_stride // 2
         while stride >= 1:
@@ -101,17 +145,17 @@ class NumbaDevice:
                 np.float32(DEPTH_TOLERANCE),
                 listed,
             )
-            self._march(rays, listed[:count], depth, confidence)
+            self._march(drawn, rays, listed[:count], depth, confidence)
             stride //= 2
         return depth, confidence
 
-    def _march(self, rays: Rays, pixels: np.ndarray, depth: Floats, confidence: Floats) -> None:
-        scene, p = self._scene, self._p
+    def _march(self, drawn: DrawnField, rays: Rays, pixels: np.ndarray, depth: Floats, confidence: Floats) -> None:
+        scene, p = drawn.scene, drawn.parameters
         prior, grid = scene.prior, scene.occupancy
         march.trace(
-            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, self._focus,
+            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, drawn.focus,
             grid.distance, grid.origin, np.float32(grid.cell_m),
-            prior.inverse_depth, prior.torn, prior.known, self._camera_from_map, np.float32(prior.band),
+            prior.inverse_depth, prior.torn, prior.known, drawn.camera_from_map, np.float32(prior.band),
             rays.origin, rays.directions, pixels, depth, confidence,
         )  # fmt: skip
         depth[pixels] *= rays.axial[pixels]

@@ -106,9 +106,19 @@ def loss(output: Tensor, target: Tensor, colour_weight: Tensor, distance_weight:
 
 
 def adam_touched(
-    value: Tensor, grad: Tensor, m: Tensor, v: Tensor, step_size: float, beta1: float, beta2: float, epsilon: float
+    value: Tensor,
+    grad: Tensor,
+    m: Tensor,
+    v: Tensor,
+    step_size: float | Tensor,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
 ) -> None:
-    """One Adam step in place on the entries (last axis) with any gradient; the others keep value and moments."""
+    """One Adam step in place on the entries (last axis) with any gradient; the others keep value and moments.
+
+    ``step_size``: one for all, or a tensor that broadcasts to ``value``.
+    """
     touched = (grad != 0).any(dim=-1, keepdim=True)
     m.copy_(torch.where(touched, beta1 * m + (1 - beta1) * grad, m))
     v.copy_(torch.where(touched, beta2 * v + (1 - beta2) * grad * grad, v))
@@ -183,6 +193,26 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
     any_near = ((ratios > low) & (ratios < high)).any(dim=0)
     between = (ratios.amin(dim=0) < high) & (ratios.amax(dim=0) > low)
     return torch.where(torch.where(prior.torn[top, left], any_near, between), seen, torch.zeros_like(seen))
+
+
+@torch.no_grad()
+def mix_panorama(
+    prior: TorchPrior,
+    origin: Tensor,
+    directions: Tensor,
+    depth: Tensor,
+    confidence: Tensor,
+    share: float,
+    colour: Tensor,
+) -> None:
+    """Mixes the panorama's colour into ``colour`` (P, 3) in place; see ``march.mix_panorama``."""
+    at = torch.nonzero((depth > 0) & (confidence > 0))[:, 0]
+    points = origin + depth[at, None] * directions[at]
+    x, y, z = (points @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]).unbind(1)
+    height, width = prior.rgb.shape[:2]
+    u = (math.pi - torch.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
+    v = (math.pi / 2 - torch.atan2(z, torch.hypot(x, y))) * (height / math.pi) - 0.5
+    colour[at] += share * (_bilinear(prior.rgb, u, v) / 255 - colour[at])
 
 
 @torch.no_grad()

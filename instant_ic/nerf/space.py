@@ -8,6 +8,7 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,9 +48,14 @@ class TrainStats:
 
 @dataclass(frozen=True)
 class Status:
-    """What the space can show now; fields as in VspaceStatus.msg."""
+    """What the space can show now; fields as in VspaceStatus.msg.
+
+    Training figures are of the newest keyframe. While ``refreshing``, pictures show the keyframe before it, and
+    ``ready_radius_m`` counts from that one.
+    """
 
     state: State
+    refreshing: bool
     psnr_db: float
     iterations: int
     train_seconds: float
@@ -79,9 +85,19 @@ class NotReadyError(RuntimeError):
     """Asked for training or a picture before the first keyframe."""
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """The space of the keyframe before the newest, drawn until that is learnt well enough."""
+
+    prior: PanoramaPrior
+    frozen: Any
+    psnr_db: float
+
+
 class VirtualSpace:
     """A hash-grid radiance field that is trained from the newest keyframe and drawn between training steps.
 
+    A space that is fit to show stays so: a new keyframe is learnt behind it, and takes over once it is fit itself.
     One thread at a time. The same calls with the same seed give the same bits on the CPU, as long as training is asked
     for by iterations and not by time.
 
@@ -96,6 +112,7 @@ class VirtualSpace:
         self.config = config or VirtualSpaceConfig()
         self._device = make_device(self.config)
         self._scene: Scene | None = None
+        self._shown: _Shown | None = None
         self._rng = np.random.default_rng(self.config.train.seed)
         self._directions: dict[tuple[int, int, float], NDArray[np.float32]] = {}
         self._reset_run(refresh=False)
@@ -110,7 +127,9 @@ class VirtualSpace:
 
     @property
     def keyframe(self) -> PanoramaPrior | None:
-        """The keyframe that the space rests on."""
+        """The keyframe that pictures show."""
+        if self._shown is not None:
+            return self._shown.prior
         return None if self._scene is None else self._scene.prior
 
     def set_keyframe(
@@ -131,6 +150,8 @@ class VirtualSpace:
         prior = prepare(rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width)
         occupancy = build_occupancy(prior, config.geometry)
         lattice = Lattice.for_prior(prior, config.field)
+        if self._scene is not None and self._ready_iterations:
+            self._shown = _Shown(self._scene.prior, self._device.freeze(), self._psnr_db)
         refresh = self._scene is not None and self._scene.lattice.suits(lattice)
         if refresh:
             assert self._scene is not None
@@ -177,6 +198,7 @@ class VirtualSpace:
         good = self._psnr_db >= rule.psnr_db and self._schedule.iteration >= 5
         if not self._ready_iterations and (good or plateau or self._schedule.finished):
             self._ready_iterations = self._schedule.iteration
+            self._shown = None
 
     @property
     def status(self) -> Status:
@@ -185,9 +207,10 @@ class VirtualSpace:
         if self._scene is None:
             state = State.EMPTY
         else:
-            state = State.READY if self._ready_iterations else State.TRAINING
+            state = State.READY if self._ready_iterations or self._shown is not None else State.TRAINING
         return Status(
             state=state,
+            refreshing=self._shown is not None,
             psnr_db=self._psnr_db,
             iterations=iterations,
             train_seconds=self._train_seconds,
@@ -200,8 +223,8 @@ class VirtualSpace:
 
     def _ready_radius_m(self) -> float:
         """A surface at depth D, wrong by σ·D, seen from b aside is displaced by about b·σ/D radians."""
-        assert self._scene is not None
-        rule, prior = self.config.readiness, self._scene.prior
+        rule, prior = self.config.readiness, self.keyframe
+        assert prior is not None
         sigma = max(prior.relative_sigma, 1e-3)
         return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
 
@@ -220,7 +243,9 @@ class VirtualSpace:
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("pose of the view must be a finite 4x4 matrix")
         rays = self._view_rays(pose, width, height, fov_rad)
-        colour, depth, confidence = self._device.draw(rays)
+        psnr_db, frozen = (self._psnr_db, None) if self._shown is None else (self._shown.psnr_db, self._shown.frozen)
+        share = self.config.picture.panorama_share(psnr_db)
+        colour, depth, confidence = self._device.draw(rays, share, frozen)
         image = colour.reshape(height, width, 3)
         depth = depth.reshape(height, width)
         confidence = confidence.reshape(height, width)

@@ -10,7 +10,18 @@ from torch import Tensor
 
 from . import reference
 from .config import FieldConfig, TrainConfig
-from .field import BETA1, BETA2, EPSILON, FieldParameters, Floats, Rays, Scene, adam_step_size, sample_weights
+from .field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FieldParameters,
+    Floats,
+    Rays,
+    Scene,
+    adam_step_size,
+    level_rates,
+    sample_weights,
+)
 from .reference import TorchField, TorchGrid, TorchPrior
 
 RAYS_AT_ONCE = 1 << 18
@@ -43,6 +54,7 @@ class TorchDevice:
         self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
         weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
         self._colour_weight, self._distance_weight = weights
+        self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -78,26 +90,41 @@ class TorchDevice:
         with torch.no_grad():
             for index, (value, grad) in enumerate(zip(self._field.parameters(), grads, strict=True)):
                 lr = table_lr if index == 0 else network_lr
-                step_size = adam_step_size(lr, self._steps)
+                step_size: float | Tensor = adam_step_size(lr, self._steps)
+                if index == 0:
+                    step_size = step_size * self._level_rates
                 # A network's row is an entry like the table's: without a gradient it is left alone.
                 reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
         colour_error = float(colour.detach()) / (1 + self._train.band_colour_weight)
         return colour_error, float(distance.detach()) / self._train.distance_weight
 
+    def freeze(self) -> tuple[TorchField, TorchPrior, TorchGrid]:
+        field = self._field
+        table, w1, b1, w2, b2 = (p.detach().clone() for p in field.parameters())
+        copy = TorchField(table, w1, b1, w2, b2, field.cells_per_m, field.origin, field.focus)
+        return copy, self._prior, self._grid
+
     @torch.no_grad()
-    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+    def draw(
+        self, rays: Rays, panorama_share: float, frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None
+    ) -> tuple[Floats, Floats, Floats]:
+        drawn = frozen or (self._field, self._prior, self._grid)
         origin = torch.from_numpy(rays.origin).to(self._device)
         directions = torch.from_numpy(rays.directions).to(self._device)
-        parts = [self._draw(origin, part) for part in directions.split(RAYS_AT_ONCE)]
+        parts = [self._draw(*drawn, origin, part, panorama_share) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
-    def _draw(self, origin: Tensor, directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        depth, confidence = reference.trace(self._field, self._grid, self._prior, origin, directions)
+    @staticmethod
+    def _draw(
+        field: TorchField, prior: TorchPrior, grid: TorchGrid, origin: Tensor, directions: Tensor, share: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        depth, confidence = reference.trace(field, grid, prior, origin, directions)
         met = torch.nonzero(depth)[:, 0]
         colour = torch.zeros_like(directions)
         points = origin + depth[met, None] * directions[met]
-        colour[met] = (reference.query(self._field, points)[:, :3] + 0.5).clamp(0, 1)
+        colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
+        reference.mix_panorama(prior, origin, directions, depth, confidence, share, colour)
         return colour, depth, confidence
 
     def parameters(self) -> FieldParameters:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import sys
+import threading
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -37,6 +40,7 @@ class NerfConfig:
         train_slice_ms: training between two pictures, at least; a request waits about this long.
         train_share: training's time between two pictures, against the last picture's, where that is more.
         train_share_until_ready: the same before the space is fit to show: there is more need of training than pictures.
+        nice: of the thread that trains and draws: what steers the robot comes first on a busy machine; 0 to 19.
         lockstep_iterations: iterations at each tick of ``lockstep_period_s`` in tests and replay.
         lockstep_period_s: see ``lockstep_iterations``.
         max_view_pixels: larger requests are refused.
@@ -48,6 +52,7 @@ class NerfConfig:
     train_slice_ms: float = 60.0
     train_share: float = 0.5
     train_share_until_ready: float = 2.0
+    nice: int = 5
     lockstep_iterations: int = 5
     lockstep_period_s: float = 0.1
     max_view_pixels: int = 1280 * 720
@@ -60,6 +65,8 @@ class NerfConfig:
         for key in (*positive, "train_share", "train_share_until_ready"):
             if getattr(self, key) <= 0:
                 raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
+        if not 0 <= self.nice <= 19:
+            raise ValueError(f"nice must be 0 to 19 (got {self.nice})")
         if not 1 <= self.jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality must be 1 to 100 (got {self.jpeg_quality})")
 
@@ -93,7 +100,8 @@ class NerfNode(Node[NerfConfig]):
 
     def setup(self) -> None:
         self.space: VirtualSpace | None = None  # touched by the worker alone
-        self.keyframe: Any = None  # newest that the space rests on
+        self.keyframe: Any = None  # newest that the space has taken
+        self.shown: Any = None  # the one that pictures show: the one before while the newest is learnt
         self.status: Status | None = None
         self.waiting_keyframe: Any = None
         self.waiting_request: Any = None
@@ -101,6 +109,7 @@ class NerfNode(Node[NerfConfig]):
         self.last_drew = False
         self.failure = ""
         self.keyframe_ns = self.ready_ns = 0
+        self.shown_seconds = 0.0
         self.render_ms = 0.0
         self.drawn_ns: deque[int] = deque(maxlen=20)
         self.view_out = self.publisher("/vspace/view", RenderedView, qos=SENSOR)
@@ -129,7 +138,7 @@ class NerfNode(Node[NerfConfig]):
         """Gives the idle worker its next job; idle it stays when there is nothing to train, draw or take in."""
         if self.job is not None or self.space is None:
             return
-        if self.waiting_keyframe is not None:
+        if self.waiting_keyframe is not None and self.takes_keyframe:
             keyframe, self.waiting_keyframe = self.waiting_keyframe, None
             self.start_job(Job("keyframe", keyframe))
         elif self.waiting_request is not None and (self.lockstep or not (self.trains and self.last_drew)):
@@ -138,9 +147,14 @@ class NerfNode(Node[NerfConfig]):
         elif self.trains and not self.lockstep:
             self.start_job(Job("train", budget_ms=self.slice_ms()))
 
+    @property
+    def takes_keyframe(self) -> bool:
+        """Each keyframe is learnt until it is fit to show, however fast they come; of those that wait, the newest."""
+        return self.keyframe is None or self.ready_ns > 0 or not self.trains
+
     def slice_ms(self) -> float:
         """On a busy machine a picture takes long: training must not starve beside it."""
-        share = self.config.train_share if self.ready_ns else self.config.train_share_until_ready
+        share = self.config.train_share if self.state() == State.READY else self.config.train_share_until_ready
         drew = self.render_ms if self.last_drew else 0.0
         return max(self.config.train_slice_ms, share * drew)
 
@@ -188,6 +202,7 @@ class NerfNode(Node[NerfConfig]):
     def do(self, job: Job) -> Outcome:
         if job.kind == "warm_up":
             if not self.lockstep:
+                self.yield_to_others()
                 warm_up(self.config.space)
             self.space = VirtualSpace(self.config.space)
             return Outcome(job)
@@ -205,6 +220,11 @@ class NerfNode(Node[NerfConfig]):
             _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], quality)
             return Outcome(job, view=view, jpeg=jpeg.tobytes())
         return Outcome(job)
+
+    def yield_to_others(self) -> None:
+        """Lowers this thread's priority (Linux has one for each thread)."""
+        if self.config.nice and sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self.config.nice)
 
     @staticmethod
     def take_keyframe(space: VirtualSpace, keyframe: Any) -> None:
@@ -233,8 +253,10 @@ class NerfNode(Node[NerfConfig]):
             self.on_drawn(outcome)
         elif kind == "train":
             self.diagnose("vspace", OK, self.words(), iterations=self.status.iterations if self.status else 0)
-        if self.keyframe is not None and not self.ready_ns and self.state() == State.READY:
-            self.ready_ns = self.clock.now_ns()
+        learnt = self.state() == State.READY and not (self.status is not None and self.status.refreshing)
+        if self.keyframe is not None and not self.ready_ns and learnt:
+            self.ready_ns, self.shown = self.clock.now_ns(), self.keyframe
+            self.shown_seconds = (self.ready_ns - self.keyframe_ns) / 1e9
             self.publish_status()
         self.next_job()
 
@@ -256,6 +278,8 @@ class NerfNode(Node[NerfConfig]):
             return
         self.keyframe, self.failure = keyframe, ""
         self.keyframe_ns, self.ready_ns = self.clock.now_ns(), 0
+        if self.status is None or not self.status.refreshing:
+            self.shown = keyframe
         self.diagnose("keyframe", OK, f"keyframe {keyframe.id} in use", id=keyframe.id)
         self.publish_status()
 
@@ -274,7 +298,7 @@ class NerfNode(Node[NerfConfig]):
             RenderedView(
                 header=header("map", now),
                 request_id=request.id,
-                keyframe_id=self.keyframe.id,
+                keyframe_id=self.shown.id,
                 pose=request.pose,
                 fov_rad=request.fov_rad,
                 width=request.width,
@@ -302,7 +326,8 @@ class NerfNode(Node[NerfConfig]):
             return "waiting for the first keyframe"
         if self.status.converged:
             return f"trained, {self.status.psnr_db:.1f} dB; idle"
-        return f"training, {self.status.psnr_db:.1f} dB" if self.status.iterations else "training"
+        words = f"training, {self.status.psnr_db:.1f} dB" if self.status.iterations else "training"
+        return f"{words}; keyframe {self.keyframe.id} takes over soon" if self.status.refreshing else words
 
     def frames_per_second(self, now_ns: int) -> float:
         """Over the last 20 pictures; 0 when none was drawn for 2 s."""
@@ -312,7 +337,7 @@ class NerfNode(Node[NerfConfig]):
         return (len(self.drawn_ns) - 1) * 1e9 / span if span > 0 else 0.0
 
     def publish_status(self) -> None:
-        now, status, keyframe = self.clock.now_ns(), self.status, self.keyframe
+        now, status, keyframe = self.clock.now_ns(), self.status, self.shown
         message = VspaceStatus(
             header=header("map", now),
             state=int(self.state()),
@@ -337,7 +362,7 @@ class NerfNode(Node[NerfConfig]):
             message.ready_radius_m = status.ready_radius_m
             message.psnr_db = status.psnr_db if status.iterations else 0.0
             message.train_seconds = (now - self.keyframe_ns) / 1e9
-            message.ready_seconds = (self.ready_ns - self.keyframe_ns) / 1e9 if self.ready_ns else 0.0
+            message.ready_seconds = self.shown_seconds if message.state == State.READY else 0.0
             message.iterations = status.iterations
             message.ms_per_iteration = 0.0 if self.lockstep else status.ms_per_iteration
         self.status_out.publish(message)

@@ -1,5 +1,6 @@
 """The virtual space as a whole, and the making of a keyframe's prior."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from instant_ic.nerf import (
     FieldConfig,
     KeyframeError,
     NotReadyError,
+    PictureConfig,
     ReadinessConfig,
     State,
     TrainConfig,
@@ -27,6 +29,7 @@ CONFIG = VirtualSpaceConfig(
     field=FieldConfig(log2_table=14),
     train=TrainConfig(ray_columns=64, ray_rows=32, iterations=120),
 )
+FIELD_ONLY = dataclasses.replace(CONFIG, picture=PictureConfig(field_from_db=30))
 CAMERA = pose_matrix(x=0.4, y=0.1, z=0.05, yaw=-0.5)
 
 
@@ -49,7 +52,7 @@ def space():
 
 
 def test_training_learns_the_room(space):
-    untrained, first = trained(0), trained(1)
+    untrained, first = trained(0, FIELD_ONLY), trained(1)
     assert first.status.psnr_db < 16  # about the spread of the room's colours round grey
     assert space.status.psnr_db > 24
     truth = box_room.perspective(CAMERA, 160, 90, 1.5).rgb
@@ -128,17 +131,64 @@ def test_readiness_by_psnr_plateau_and_radius():
     assert space.status.ready_radius_m == pytest.approx(0.035 * median / 0.05)
 
 
+NEXT = pose_matrix(x=0.9, y=0.0, z=0.05, yaw=0.1)
+
+
+def refreshed(space):
+    picture = box_room.panorama(NEXT, 192)
+    space.set_keyframe(picture.rgb, picture.depth_m, NEXT, 0.02)
+    return space
+
+
 def test_a_second_keyframe_goes_on_from_the_first():
     space = trained(60)
     before = space.status.psnr_db
-    pose = pose_matrix(x=0.9, y=0.0, z=0.05, yaw=0.1)
-    picture = box_room.panorama(pose, 192)
-    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+    refreshed(space)
     assert space.status.iterations == 0
-    assert space.status.state == State.TRAINING
     space.train(iterations=3)
     assert space.status.psnr_db > before - 8
     assert trained(3).status.psnr_db < before - 8
+
+
+def test_a_space_that_is_fit_stays_so_and_its_picture_too_until_the_next_is():
+    space = trained(120)
+    assert space.status.state == State.READY
+    before = space.render(CAMERA, 80, 45, 1.5)
+    refreshed(space)
+    space.train(iterations=1)
+    status = space.status
+    assert (status.state, status.refreshing, status.ready_iterations) == (State.READY, True, 0)
+    assert np.array_equal(space.keyframe.map_from_camera, CAMERA)
+    assert np.array_equal(space.render(CAMERA, 80, 45, 1.5).rgb, before.rgb)
+    # Another one before this is fit: what is shown stays the last that was.
+    refreshed(space)
+    space.train(iterations=1)
+    assert np.array_equal(space.render(CAMERA, 80, 45, 1.5).rgb, before.rgb)
+    space.train(iterations=119)
+    status = space.status
+    assert (status.state, status.refreshing) == (State.READY, False)
+    assert 5 <= status.ready_iterations < 120
+    assert np.array_equal(space.keyframe.map_from_camera, NEXT)
+    truth = box_room.perspective(NEXT, 80, 45, 1.5).rgb
+    assert psnr_db(space.render(NEXT, 80, 45, 1.5).rgb, truth) > 23
+
+
+def test_a_keyframe_that_replaces_one_that_is_not_fit_is_shown_at_once():
+    space = refreshed(trained(2))
+    assert (space.status.state, space.status.refreshing) == (State.TRAINING, False)
+    assert np.array_equal(space.keyframe.map_from_camera, NEXT)
+
+
+def test_the_panorama_gives_way_to_the_field():
+    rule = PictureConfig(panorama_until_db=30, field_from_db=36)
+    shares = [rule.panorama_share(db) for db in (math.nan, 20.0, 30.0, 33.0, 36.0, 40.0)]
+    assert shares == [1, 1, 1, 0.5, 0, 0]
+    assert PictureConfig(panorama_until_db=30, field_from_db=30).panorama_share(math.nan) == 0
+    # A picture from the panorama through the field's geometry is nearer to the truth than the young field's own.
+    pose = pose_matrix(x=0.7, y=-0.1, yaw=-0.4)
+    truth = box_room.perspective(pose, 160, 90, 1.5).rgb
+    mixed, field_only = (psnr_db(trained(40, c).render(pose, 160, 90, 1.5).rgb, truth) for c in (CONFIG, FIELD_ONLY))
+    assert mixed > field_only + 2
 
 
 def test_another_scale_starts_anew():
