@@ -33,6 +33,13 @@ def psnr_db(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
     return float("inf") if error == 0 else 10 * float(np.log10(255.0**2 / error))
 
 
+def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    """Pearson's correlation of two pictures' values, −1..1; 0 where one of them is uniform."""
+    x, y = (picture.astype(np.float64).ravel() - float(picture.mean()) for picture in (a, b))
+    norm = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y) / norm if norm > 0 else 0.0
+
+
 def save_view_strip(path: Path, rows: Sequence[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
     """Rows of (label, rendered view, the photo's own crop), side by side."""
     figure, axes = _figure(len(rows), 2, (10.0, 2.95 * len(rows)))

@@ -22,7 +22,7 @@ from ..bus import LATCHED, SENSOR
 from ..geometry.poses import inverse, pose_matrix, yaw_of
 from ..msg import grid_array, image_array, message_type, pose_message, stamp_ns, to_time
 from ..msg import pose_matrix as matrix_of_pose
-from .pictures import perspective_crop, psnr_db, save_depth, save_map, save_view_strip
+from .pictures import correlation, perspective_crop, psnr_db, save_depth, save_map, save_view_strip
 from .stack import Stack, StackError, free_ports
 
 _YAWS_DEG = (0, 90, 180, -90)
@@ -96,7 +96,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     statuses = stack.collect("/vspace/status", message_type("VspaceStatus"), LATCHED)
     views = stack.collect("/vspace/view", message_type("RenderedView"))
     requests = stack.observer.publisher("/view/request", message_type("ViewRequest"), SENSOR)
-    ready = message_type("VspaceStatus").READY
+    ready, failed = message_type("VspaceStatus").READY, message_type("VspaceStatus").FAILED
 
     def wait(condition: Callable[[], Any], what: str) -> Any:
         tell(f"waiting for {what}")
@@ -105,7 +105,13 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     wait(lambda: len(scans) >= 5, "laser scans of the capture")
     wait(lambda: maps and poses, "a map")
     keyframe = wait(lambda: keyframes and keyframes[-1], "a keyframe of the photo")
-    wait(lambda: statuses and statuses[-1].state == ready, "a virtual space that is fit to show")
+
+    def is_ready() -> bool:
+        if statuses and statuses[-1].state == failed:
+            raise StackError(f"the virtual space failed: {statuses[-1].message}")
+        return bool(statuses) and statuses[-1].state == ready
+
+    wait(is_ready, "a virtual space that is fit to show")
     time_to_ready_s = float(statuses[-1].ready_seconds)
     # A little longer than fit to show: what an operator sees after the first moments.
     settled = time.monotonic() + 10.0
@@ -116,7 +122,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     photo = cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
     map_from_camera = matrix_of_pose(keyframe.pose)
     rows = []
-    scores = {}
+    scores, likeness = {}, {}
     for number, yaw_deg in enumerate(_YAWS_DEG, start=1):
         map_from_view = map_from_camera @ pose_matrix(yaw=math.radians(yaw_deg))
         request = _request(number, map_from_view)
@@ -135,6 +141,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         camera_from_view = (inverse(map_from_camera) @ map_from_view)[:3, :3]
         crop = perspective_crop(photo, camera_from_view, rendered.shape[1], rendered.shape[0], _FOV)
         scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
+        likeness[str(yaw_deg)] = round(correlation(rendered, crop), 3)
         rows.append((f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)", rendered, crop))
     save_view_strip(out / "view.png", rows)
     depth = image_array(keyframe.depth)
@@ -151,6 +158,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         "keyframe_to_ready_s": round(time_to_ready_s, 2),
         "training_psnr_db": round(float(statuses[-1].psnr_db), 2),
         "view_psnr_db": scores,
+        "view_correlation": likeness,
         "depth_scale": round(float(keyframe.scale), 4),
         "depth_quality": round(float(keyframe.quality), 3),
         "depth_fit": bool(keyframe.fit),
