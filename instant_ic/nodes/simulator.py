@@ -23,6 +23,8 @@ from instant_ic.sim.vlp16 import Vlp16Server
 
 _STEP_S = 0.01
 _TRUTH_S = 1.0 / 30.0
+#: How long the end waits for a step under way.
+_MOST_WAIT_S = 0.3
 #: Most simulated time made up for at once after a stall.
 _MOST_BEHIND_S = 0.25
 
@@ -76,7 +78,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         """Stops the world and closes the devices."""
         self._stopped.set()
         if self._thread is not None:
-            self._thread.join(3.0)
+            self._thread.join(_MOST_WAIT_S)
         for device in reversed(self._devices):
             device.close()
 

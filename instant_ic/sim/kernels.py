@@ -258,9 +258,12 @@ def shade(
     light_uv: F32,
     light_linear: F32,
     light: F32,
+    listed: I32,
     out: F32,
 ) -> None:
-    """Radiance (N, 3) of rays whose surface (N,) and range (N,) are known; ``pixel_rad`` is the angle of a pixel.
+    """Radiance of rays whose surface (N,) and range (N,) are known; ``pixel_rad`` is the angle of a pixel.
+
+    Written to ``out`` (N, 3) for the rays in ``listed`` alone.
 
     The texture is averaged over the pixel's footprint on the surface: two trilinear lookups along its long axis where
     the surface is seen aslant, one elsewhere.
@@ -277,7 +280,8 @@ def shade(
     columns = rows = np.int64(0)
     first = np.int64(0)
     t = np.int32(0)
-    for i in range(surface.shape[0]):
+    for k in range(listed.shape[0]):
+        i = listed[k]
         s = surface[i]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         if s < 0:
@@ -307,7 +311,7 @@ def shade(
         side = nx * dx + ny * dy + nz * dz
         minor = r * angle
         stretch = min(one / max(abs(side), np.float32(0.02)), np.float32(16.0))
-        if stretch < np.float32(1.5):
+        if stretch < np.float32(2.2):
             lod = _log2(minor * stretch * density)
             cr, cg, cb = _albedo(texels, level_offset, level_size, levels, clamps, t, u, v, lod)
         else:
@@ -379,6 +383,52 @@ def edges(surface: I32, range_m: F32, normal: F32, texture: I32, wraps: bool, ou
                 out[count] = row * width + column
                 count += 1
     return count
+
+
+@_jit
+def plain_pixels(strides: I32, edge: U8, out: I32) -> int:
+    """Lists (flat indices) the pixels at multiples of their row's stride that are no edges; returns their number."""
+    height, width = edge.shape
+    count = 0
+    for row in range(height):
+        for column in range(0, width, strides[row]):
+            if not edge[row, column]:
+                out[count] = row * width + column
+                count += 1
+    return count
+
+
+@_jit
+def anchored(listed: I32, strides: I32, width: int) -> int:
+    """Keeps of ``listed`` the pixels at multiples of their row's stride, in place; returns their number."""
+    count = 0
+    for k in range(listed.shape[0]):
+        row = listed[k] // width
+        if (listed[k] - row * width) % strides[row] == 0:
+            listed[count] = listed[k]
+            count += 1
+    return count
+
+
+@_jit
+def fill_rows(radiance: F32, strides: I32) -> None:
+    """Writes the pixels between multiples of their row's stride, linear between both neighbours; rows wrap."""
+    height, width = radiance.shape[:2]
+    for row in range(height):
+        stride = strides[row]
+        if stride == 1:
+            continue
+        part = np.float32(1) / np.float32(stride)
+        for left in range(0, width, stride):
+            right = left + stride
+            end = min(right, width)
+            if right >= width:
+                right = 0
+            for column in range(left + 1, end):
+                share = np.float32(column - left) * part
+                for c in range(3):
+                    a = radiance[row, left, c]
+                    radiance[row, column, c] = a + share * (radiance[row, right, c] - a)
 
 
 @_jit

@@ -83,6 +83,19 @@ class _Lens:
 
 
 @lru_cache(maxsize=8)
+def _strides(lens: _Lens) -> npt.NDArray[np.int32]:
+    """How many columns of each row share a shaded pixel: towards the poles of a panorama columns lie close together.
+
+    A stride is taken where it is no wider than a pixel on the horizon.
+    """
+    if lens.hfov_rad is not None:
+        return np.ones(lens.height, np.int32)
+    elevation = (np.arange(lens.height) + 0.5) / lens.height * math.pi - math.pi / 2
+    most = np.minimum(1 / np.cos(elevation), 16)
+    return np.asarray(2 ** np.floor(np.log2(most)), np.int32)
+
+
+@lru_cache(maxsize=8)
 def _all_rays(lens: _Lens) -> npt.NDArray[np.float32]:
     rows, columns = np.mgrid[0 : lens.height, 0 : lens.width].reshape(2, -1).astype(np.float64)
     return lens.rays(rows, columns)
@@ -92,7 +105,8 @@ class EquirectRenderer:
     """Renders a world from any pose.
 
     Rays are cast for every fourth pixel in each direction and wherever neighbours show different surfaces; between,
-    the range follows from the surface's plane. Pixels on edges are cast and shaded again at four points.
+    the range follows from the surface's plane. Pixels on edges are cast and shaded at four points. Near the poles of a
+    panorama every second, fourth... pixel of a row is shaded, and the colours between are interpolated.
     One renderer may be used by one thread at a time.
     """
 
@@ -153,25 +167,34 @@ class EquirectRenderer:
         surface, range_m = self._visible(directions, origin, lens)
         radiance = np.empty((height * width, 3), np.float32)
         footprint = _FOOTPRINT * lens.pixel_rad
-        self._shade(surface.ravel(), range_m.ravel(), directions, origin, footprint, radiance)
+        strides = _strides(lens)
 
         listed = np.empty(height * width, np.int32)
         world = self.world
         count = kernels.edges(surface, range_m, world.normal, world.texture, lens.hfov_rad is None, listed)
+        count = kernels.anchored(listed[:count], strides, width)
+        edge = np.zeros((height, width), np.uint8)
+        edge.reshape(-1)[listed[:count]] = 1
+        plain = np.empty(height * width, np.int32)
+        plain = plain[: kernels.plain_pixels(strides, edge, plain)]
+        self._shade(surface.ravel(), range_m.ravel(), directions, origin, footprint, plain, radiance)
         if count:
             at = listed[:count]
             rows, columns = np.divmod(at, width)
-            points = [lens.rays(rows + dr, columns + dc) for dr, dc in _SUBPIXELS]
+            points = [lens.rays(rows + dr, columns + dc * strides[rows]) for dr, dc in _SUBPIXELS]
             sub = np.concatenate(points)
             rays = np.empty_like(sub)
             kernels.rotate(sub, rotation, rays)
             sub_range, sub_surface = self._caster.cast(origin, rays)
             kernels.surfaces_of(sub_surface, world.face_surface)
             colour = np.empty((len(rays), 3), np.float32)
-            self._shade(sub_surface, sub_range, rays, origin, 0.6 * footprint, colour)
+            every = np.arange(len(rays), dtype=np.int32)
+            self._shade(sub_surface, sub_range, rays, origin, 0.6 * footprint, every, colour)
             radiance[at] = np.minimum(colour, 1.5).reshape(len(_SUBPIXELS), count, 3).mean(axis=0)
+        picture = radiance.reshape(height, width, 3)
+        kernels.fill_rows(picture, strides)
         depth = np.where(surface >= 0, range_m, 0.0).astype(np.float32)
-        return radiance.reshape(height, width, 3), depth
+        return picture, depth
 
     def _visible(
         self, directions: npt.NDArray[np.float32], origin: npt.NDArray[np.float32], lens: _Lens
@@ -207,11 +230,12 @@ class EquirectRenderer:
         directions: npt.NDArray[np.float32],
         origin: npt.NDArray[np.float32],
         footprint_rad: float,
+        listed: npt.NDArray[np.int32],
         out: npt.NDArray[np.float32],
     ) -> None:
         w, t = self.world, self.world.textures
         kernels.shade(
             surface, range_m, directions, origin, footprint_rad, w.normal, w.uv, w.texture, w.tint, w.emission,
             w.texel_per_m, t.texels, t.level_offset, t.level_size, t.levels, t.clamp, w.light_at, w.light_uv,
-            w.light_linear, w.light, out,
+            w.light_linear, w.light, listed, out,
         )  # fmt: skip

@@ -42,7 +42,7 @@ class RoboClawServer:
     def close(self) -> None:
         """Ends the thread, takes the link away and closes the terminal."""
         os.write(self._wake_write, b"x")
-        self._thread.join(2.0)
+        self._thread.join(1.0)
         if self.link is not None and self.link.is_symlink() and str(self.link.readlink()) == self.device:
             self.link.unlink()
         for descriptor in (self._master, self._slave, self._wake_read, self._wake_write):

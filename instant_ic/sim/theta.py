@@ -152,7 +152,7 @@ class ThetaServer:
         self._http.daemon_threads = True
         self.port = int(self._http.server_address[1])
         self._threads = [
-            threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.2}, name="theta-http"),
+            threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.05}, name="theta-http"),
             threading.Thread(target=self._make_frames, name="theta-camera"),
         ]
         for thread in self._threads:
@@ -172,7 +172,8 @@ class ThetaServer:
         self._http.shutdown()
         self._http.server_close()
         for thread in self._threads:
-            thread.join(3.0)
+            # A picture under way on a busy machine is not waited for: nobody gets it, and the thread is a daemon.
+            thread.join(0.3)
 
     # --- pictures -----------------------------------------------------------------------------------
 
