@@ -12,6 +12,7 @@ import numpy as np
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerConfig, ControllerThread, Health
 from instant_ic.base.odometry import OdometryEstimate
+from instant_ic.base.recent import RecentCount
 from instant_ic.base.roboclaw import SerialPort, open_serial
 from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.geometry.poses import matrix_from_pose2
@@ -42,6 +43,8 @@ class CrawlerBaseConfig(ControllerConfig):
         base_frame: the base's own frame.
         battery_full_v: main battery when full, volts.
         battery_empty_v: main battery when it has to be charged, volts; lower is a warning.
+        recent_s: repeats, dropped commands and impossible readings are a warning for this long.
+        connect_grace_s: a controller that is not there yet is an error only this long after the start.
     """
 
     rate_hz: float = 30.0
@@ -49,6 +52,8 @@ class CrawlerBaseConfig(ControllerConfig):
     base_frame: str = "base_link"
     battery_full_v: float = 25.2
     battery_empty_v: float = 21.0
+    recent_s: float = 10.0
+    connect_grace_s: float = 5.0
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -60,6 +65,10 @@ class CrawlerBaseConfig(ControllerConfig):
                 "battery_empty_v must be > 0 and below battery_full_v "
                 f"(got {self.battery_empty_v}, {self.battery_full_v})"
             )
+        if not self.recent_s > 0.0:
+            raise ValueError(f"recent_s must be > 0 (got {self.recent_s})")
+        if not self.connect_grace_s >= 0.0:
+            raise ValueError(f"connect_grace_s must be >= 0 (got {self.connect_grace_s})")
 
 
 class CrawlerBaseNode(Node[CrawlerBaseConfig]):
@@ -75,9 +84,12 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
         self.subscribe_raw("/cmd_vel", self.on_command, qos=SENSOR)
-        self.dropped = 0
-        self.retries_told = 0
-        self.diagnose("link", WARN, f"connecting to {self.config.roboclaw.port}")
+        self.started_ns = self.clock.now_ns()
+        self.linked = False  # since the start, once
+        self.dropped = self.retries_told = self.rejected_told = 0
+        self.drops, self.repeats, self.jumps = (RecentCount(self.config.recent_s) for _ in range(3))
+        self.diagnose("link", OK, f"connecting to {self.config.roboclaw.port}")
+        self.timer(1.0, self.tell_recent)
         if self.lockstep:
             self.timer(1.0 / self.config.rate_hz, lambda: self.on_state(self.controller.step()))
             return
@@ -109,37 +121,53 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             )
         else:
             self.controller.command(v, w, stamp)
-            self.diagnose("command", OK, "driving by /cmd_vel", dropped=self.dropped)
+            if not self.drops.count(now_ns):
+                self.diagnose("command", OK, "driving by /cmd_vel", dropped=self.dropped)
 
     def drop(self, reason: str) -> None:
         """Tell of a command that is not obeyed."""
         self.dropped += 1
+        self.drops.add(1, self.clock.now_ns())
         self.diagnose("command", WARN, f"dropped: {reason}", dropped=self.dropped)
 
     def on_state(self, state: BaseState) -> None:
         """Publish what a step of the controller gave."""
         if state.link:
-            self.diagnose("link", OK if state.connected else ERROR, state.link)
-        if state.health is not None:
-            self.tell_repeats()
+            self.tell_link(state.connected, state.link)
         if state.odometry is not None:
             self.publish_odometry(state.odometry)
         if state.health is not None:
             self.publish_health(state.health)
 
-    def tell_repeats(self) -> None:
-        """Repeated commands since the last time; with each health."""
-        counters = self.controller.roboclaw.counters
-        repeated, self.retries_told = counters.retries - self.retries_told, counters.retries
+    def tell_link(self, connected: bool, text: str) -> None:
+        """What happened on the line; at start, while the controller may still be coming, its absence is a warning."""
+        self.linked |= connected
+        starting = not self.linked and self.clock.now_ns() - self.started_ns < self.config.connect_grace_s * 1e9
+        self.diagnose("link", OK if connected else WARN if starting else ERROR, text)
+
+    def tell_recent(self) -> None:
+        """What happened in the last ``recent_s``: repeats, impossible readings, dropped commands."""
+        now_ns, counters, window = self.clock.now_ns(), self.controller.roboclaw.counters, f"{self.config.recent_s:g} s"
+        self.repeats.add(counters.retries - self.retries_told, now_ns)
+        self.retries_told = counters.retries
+        repeated = self.repeats.count(now_ns)
         self.diagnose(
             "replies",
             WARN if repeated else OK,
-            f"{repeated} commands had to be repeated" if repeated else "the controller replies",
+            f"{repeated} commands repeated in the last {window}" if repeated else "no command had to be repeated",
             repeated=counters.retries,
             timeouts=counters.timeouts,
             crc_errors=counters.crc_errors,
             transactions=counters.transactions,
         )
+        rejected = self.controller.odometry.rejected
+        self.jumps.add(rejected - self.rejected_told, now_ns)
+        self.rejected_told = rejected
+        jumps = self.jumps.count(now_ns)
+        text = f"{jumps} readings of the last {window} were impossible jumps and left out" if jumps else "plausible"
+        self.diagnose("encoders", WARN if jumps else OK, text, rejected=rejected)
+        if self.dropped and not self.drops.count(now_ns):
+            self.diagnose("command", OK, f"none dropped in the last {window}", dropped=self.dropped)
 
     def publish_odometry(self, estimate: OdometryEstimate) -> None:
         """Odometry message and transform."""
@@ -193,9 +221,6 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             ", ".join(faults + warnings) or "no faults",
             status=f"0x{health.status.value:0{2 * health.status.size}x}",
         )
-        rejected = self.controller.odometry.rejected
-        if rejected:
-            self.diagnose("encoders", WARN, f"{rejected} readings were impossible jumps and left out")
 
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
         """The serial thread has ended: tell why, and end the node unless it is ending anyway."""

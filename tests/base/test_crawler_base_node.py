@@ -12,6 +12,7 @@ from base_ports import EmulatorPort, opener
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.controller import BaseController, ControllerConfig, ControllerThread
 from instant_ic.base.emulator import RoboclawEmulator
+from instant_ic.base.recent import RecentCount
 from instant_ic.bus import ERROR, OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import Twist, Vector3, pose_matrix, stamp_ns, twist_stamped, twist_values
@@ -147,15 +148,50 @@ def test_low_battery_and_faults_are_told(bench: Bench) -> None:
     assert bench.bus.last("/battery").percentage == 0.0
 
 
-def test_repeats_are_told(bench: Bench) -> None:
+def test_recent_events_leave_the_window() -> None:
+    recent = RecentCount(10.0)
+    assert recent.count(0) == 0
+    recent.add(2, 0)
+    recent.add(0, 10**9)
+    recent.add(3, 4 * 10**9)
+    assert [recent.count(t * 10**9) for t in (5, 9, 10, 13, 14)] == [5, 5, 3, 3, 0]
+
+
+def test_repeats_are_told() -> None:
+    bench = Bench(recent_s=2.0)
     bench.run(0.2)
     damages = iter([True])
     bench.port.damage = lambda reply: b"\x00" * len(reply) if next(damages, False) else reply
     bench.run(1.1)
     level, text, values = bench.node.diagnoses()["replies"]
-    assert (level, text, values["repeated"]) == (WARN, "1 commands had to be repeated", 1)
+    assert (level, text, values["repeated"]) == (WARN, "1 commands repeated in the last 2 s", 1)
+    bench.run(1.0)
+    assert bench.level("replies") == WARN
     bench.run(1.1)
     assert bench.level("replies") == OK
+
+
+def test_a_warning_of_what_is_over_is_taken_back() -> None:
+    bench = Bench(recent_s=2.0)
+    bench.run(0.2)
+    bench.bus.publish("/cmd_vel", twist_stamped(0.5, 0.0, bench.bus.clock.now_ns() - 500 * MILLISECOND))
+    bench.emulator.encoder += 10_000_000.0  # 2.5 km in no time
+    bench.run(1.0, v=0.1)
+    assert bench.level("command") == bench.level("encoders") == WARN
+    bench.run(3.1)
+    assert bench.node.diagnoses()["command"][:2] == (OK, "none dropped in the last 2 s")
+    assert bench.level("encoders") == OK
+
+
+def test_a_controller_that_is_not_there_yet_is_an_error_only_after_a_while(bench: Bench) -> None:
+    bench.port.unplugged = True
+    bench.run(4.9)
+    assert bench.level("link") == WARN
+    bench.run(2.1)  # the longest wait between two tries
+    assert bench.level("link") == ERROR
+    bench.port.unplugged = False
+    bench.run(2.1)
+    assert bench.level("link") == OK
 
 
 def test_thread_stops_the_motors_when_its_work_fails() -> None:
