@@ -19,13 +19,16 @@ class DriveConfig:
     rate_hz: float = 20.0  # commands given on while driving
     watchdog_s: float = 0.25  # no command from the driver for this long: stop
     max_command_age_s: float = 0.3  # older commands (by the client's stamp) are dropped
-    stop_repeat_s: float = 0.3  # zeros are given on for this long after a stop, then silence
+    stop_repeat_s: float = 0.3  # zeros are given on at rate_hz for this long after a stop
+    keep_alive_hz: float = 10.0  # zeros of an idle driver whose page lives: the operator is there
+    beat_timeout_s: float = 0.4  # nothing heard from the driver's page for this long: no more zeros
     lease_timeout_s: float = 2.0  # a driver who is silent for this long loses the lease
 
     def __post_init__(self) -> None:
         for key in ("max_linear_mps", "max_angular_rps", "rate_hz", "watchdog_s", "max_command_age_s"):
             _positive(key, getattr(self, key))
-        _positive("lease_timeout_s", self.lease_timeout_s)
+        for key in ("keep_alive_hz", "beat_timeout_s", "lease_timeout_s"):
+            _positive(key, getattr(self, key))
         if not self.stop_repeat_s >= 0 or not math.isfinite(self.stop_repeat_s):
             raise ValueError(f"stop_repeat_s must be >= 0 (got {self.stop_repeat_s})")
         if self.watchdog_s * self.rate_hz < 2:
@@ -43,7 +46,11 @@ class Verdict(Enum):
 
 
 class DriveGate:
-    """One driver by lease; the newest command that still holds; zero whenever in doubt."""
+    """One driver by lease; the newest command that still holds; zero whenever in doubt.
+
+    Zeros mean "the operator is there and wants nothing"; silence means that nobody is there. So an idle driver's zeros
+    are given on only while the page is heard, and after its loss one zero goes out, then nothing.
+    """
 
     def __init__(self, config: DriveConfig) -> None:
         self.config = config
@@ -53,6 +60,7 @@ class DriveGate:
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
         self._driver_seen = -math.inf
+        self._driver_beat = -math.inf
         self._sequence: dict[int, int] = {}
         self._command = (0.0, 0.0)
         self._received = -math.inf
@@ -78,7 +86,7 @@ class DriveGate:
             return False
         self.stop(now)
         self.driver = client
-        self._driver_seen = now
+        self._driver_seen = self._driver_beat = now
         return True
 
     def leave(self, client: int, now: float) -> None:
@@ -92,10 +100,23 @@ class DriveGate:
         self.leave(client, now)
         self._sequence.pop(client, None)
 
-    def touch(self, client: int, now: float) -> None:
-        """Any sign of life of ``client``."""
-        if self.driver == client:
-            self._driver_seen = now
+    def touch(self, client: int, now: float, *, away: bool = False) -> bool:
+        """Any sign of life of ``client``; True when a driver is back who was away for ``beat_timeout_s``.
+
+        ``away``: its page is not looked at. It keeps the lease, but the operator does not count as there.
+        """
+        if self.driver != client:
+            return False
+        self._driver_seen = now
+        if away:
+            return False
+        back = not self.driver_alive(now)
+        self._driver_beat = now
+        return back
+
+    def driver_alive(self, now: float) -> bool:
+        """Whether somebody drives whose page was heard, and looked at, within ``beat_timeout_s``."""
+        return self.driver is not None and now - self._driver_beat < self.config.beat_timeout_s
 
     def receive(self, client: int, sequence: int, age_s: float, linear: float, angular: float, now: float) -> Verdict:
         """Takes a drive command (m/s, rad/s; clamped to the limits) and says what became of it."""
@@ -104,7 +125,7 @@ class DriveGate:
         if verdict is not Verdict.ACCEPTED:
             return verdict
         self._sequence[client] = sequence
-        self._driver_seen = now
+        self._driver_seen = self._driver_beat = now
         self.last_age_s = age_s
         limits = self.config
         command = (
@@ -153,14 +174,13 @@ class DriveGate:
             self.stop(now)
         if self.driver is not None and now - self._driver_seen >= self.config.lease_timeout_s:
             self.leave(self.driver, now)
-        silent = not self.moving and now - self._stopped_at > self.config.stop_repeat_s
-        # The one zero after a stop goes out even when stop_repeat_s is 0.
-        if silent and self._emitted_command in (None, (0.0, 0.0)):
+        # The one zero after a stop goes out even when nobody is there any more.
+        if not self.moving and not self.driver_alive(now) and self._emitted_command in (None, (0.0, 0.0)):
             self._emitted_command = None
             return None
         changed = self._command != self._emitted_command
         # 1 ms of slack: a timer that wakes a little early must not skip a whole period.
-        if not changed and now - self._emitted < 1.0 / self.config.rate_hz - 0.001:
+        if not changed and now - self._emitted < self._period_s(now) - 0.001:
             return None
         self._emitted = now
         self._emitted_command = self._command
@@ -170,12 +190,17 @@ class DriveGate:
         """When :meth:`take_due` should be called next; None when nothing is going on."""
         deadlines = []
         if self.moving:
-            deadlines += [self._received + self.config.watchdog_s, self._emitted + 1.0 / self.config.rate_hz]
-        elif self._emitted_command is not None:
-            deadlines.append(self._emitted + 1.0 / self.config.rate_hz)
+            deadlines += [self._received + self.config.watchdog_s, self._emitted + self._period_s(now)]
+        elif self.driver_alive(now) or self._emitted_command is not None:
+            deadlines.append(self._emitted + self._period_s(now))
         if self.driver is not None:
             deadlines.append(self._driver_seen + self.config.lease_timeout_s)
         return max(now, min(deadlines)) if deadlines else None
+
+    def _period_s(self, now: float) -> float:
+        """Time between two commands given on."""
+        repeating = now - self._stopped_at <= self.config.stop_repeat_s
+        return 1.0 / (self.config.rate_hz if self.moving or repeating else self.config.keep_alive_hz)
 
 
 def _clamp(value: float, limit: float) -> float:

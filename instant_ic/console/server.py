@@ -48,7 +48,7 @@ class Backend(Protocol):
     """What the operator's actions do. Called on the server's thread: return at once."""
 
     def on_drive(self, linear: float, angular: float) -> None:
-        """Command to give on now, m/s and rad/s: 20 Hz while driving, zeros after a stop."""
+        """Command to give on now, m/s and rad/s: 20 Hz while driving; zeros while the driver is there and idle."""
 
     def on_estop(self, stop: bool) -> None:
         """Emergency stop set (any client) or released (the driver)."""
@@ -305,7 +305,11 @@ class ConsoleServer:
         }.get(kind)
         if handler is None:
             raise ProtocolError(f"unknown message type {kind!r:.40}")
-        self.gate.touch(session.number, now)
+        away = message.get("away", False)
+        if not isinstance(away, bool):
+            raise ProtocolError(f"{kind}.away must be true or false (got {away!r:.40})")
+        if self.gate.touch(session.number, now, away=away):
+            self._emit_due()
         handler(session, message, now)
 
     def _on_ping(self, session: Session, message: dict[str, Any], now: float) -> None:

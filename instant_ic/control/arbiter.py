@@ -70,8 +70,8 @@ GUARDS: dict[str, str] = {
     "round for the r-bot",
     "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, and the operator's command is safe for "
     "the r-bot over a longer horizon than the one that switches in",
-    "may_resume": "the emergency stop is released, every source is fresh for recover_s, and the operator's command "
-    "is zero",
+    "may_resume": "the emergency stop is released, every source is fresh for recover_s, the operator's command is zero "
+    "(silence counts as zero), and the operator's link is back where its loss was the reason",
 }
 
 ACTIONS: dict[str, str] = {
@@ -88,7 +88,11 @@ class Source:
     key: str
     name: str
     modes: tuple[Mode, ...]
+    words: str = ""
+    """What the operator is told of its loss; empty: "no NAME for SECONDS"."""
 
+
+OPERATOR_LOST = "the operator's link is lost, the robot waits"
 
 SOURCES: tuple[Source, ...] = (
     Source("scan", "LiDAR scan", (Mode.REAL, Mode.VIRTUAL)),
@@ -97,6 +101,8 @@ SOURCES: tuple[Source, ...] = (
     Source("camera", "camera picture", (Mode.REAL,)),
     Source("vbot", "v-bot", (Mode.VIRTUAL,)),
     Source("nav", "path follower", (Mode.VIRTUAL,)),
+    # In REAL its silence is a zero command and no more; in VIRTUAL the r-bot would go on to the v-bot by itself.
+    Source("command", "operator's link", (Mode.VIRTUAL,), OPERATOR_LOST),
 )
 
 
@@ -134,6 +140,7 @@ class SwitchConfig:
     neutral_return_s: float = 5.0
     stop_margin_m: float = 0.15
     min_switch_speed_m_s: float = 0.03
+    ready_hold_s: float = 2.0
     require_camera: bool = True
 
     def __post_init__(self) -> None:
@@ -165,6 +172,7 @@ class Vspace:
     """What the virtual space says of itself (VspaceStatus)."""
 
     ready: bool = False
+    training: bool = False
     failed: bool = False
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     """(2,) of the newest keyframe in the map frame."""
@@ -220,6 +228,8 @@ class Decision:
     """(N, 3) predicted for the robot that is driven."""
     subgoal: Subgoal | None
     estop: bool
+    operator_command: Twist2
+    """As it counts: zero when it is old."""
 
 
 @dataclass
@@ -253,6 +263,8 @@ class Arbiter:
         self._driven: Twist2 = (0.0, 0.0)  # the last command that was not zero
         self._driven_ns: int | None = None
         self._stop_reason = "waiting for the sensors"
+        self._await_operator = False  # STOPPED because the operator's link was lost
+        self._ready: tuple[int, Vspace] | None = None  # when the v-space was ready last, and what it said then
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
         self._subgoal: Subgoal | None = None
         self._passage_found: tuple[int, Passage] | None = None
@@ -296,6 +308,7 @@ class Arbiter:
             trajectory=np.zeros((0, 3)) if prediction is None else prediction.poses,
             subgoal=self._subgoal,
             estop=inputs.estop,
+            operator_command=situation.command,
         )
 
     # -- what the step starts from
@@ -305,6 +318,8 @@ class Arbiter:
         command = clip_twist(*inputs.operator_command, self.config.limits) if fresh else (0.0, 0.0)
         if command != (0.0, 0.0):
             self._driven, self._driven_ns = command, now_ns
+        if inputs.vspace.ready:
+            self._ready = (now_ns, inputs.vspace)
         if self._lacking(inputs, Mode.REAL, now_ns):
             self._fresh_since_ns = None
         elif self._fresh_since_ns is None:
@@ -416,7 +431,7 @@ class Arbiter:
             return "there is no room to turn"
         if inputs.age("vspace") > self.config.timeouts.vspace:
             return "no virtual space is running"
-        vspace = inputs.vspace
+        vspace = self._shown_vspace(situation)
         if not vspace.ready:
             return "the virtual space is not ready" + (f" ({vspace.message})" if vspace.message else "")
         away = float(np.linalg.norm(vspace.position - inputs.robot_pose[:2]))
@@ -428,6 +443,14 @@ class Arbiter:
         if inputs.costmap is None:
             return "there is no costmap yet"
         return self._passage(situation, inputs.costmap).reason
+
+    def _shown_vspace(self, situation: _Situation) -> Vspace:
+        """The virtual space by its last keyframe that was ready, while it learns the next one for a moment."""
+        now = situation.inputs.vspace
+        if now.ready or not now.training or self._ready is None:
+            return now
+        since_ns, before = self._ready
+        return before if situation.now_ns - since_ns <= self.config.switch.ready_hold_s * 1e9 else now
 
     def _passage(self, situation: _Situation, costmap: Costmap) -> Passage:
         """Way round the obstacle ahead; planning takes milliseconds, so an answer holds for a costmap's period."""
@@ -469,15 +492,22 @@ class Arbiter:
         inputs = situation.inputs
         if inputs.estop or situation.command != (0.0, 0.0) or inputs.robot_pose is None:
             return ""
+        if self._operator_missed(situation):
+            return ""
         since = self._fresh_since_ns
         if since is None or situation.now_ns - since < self.config.timeouts.recover_s * 1e9:
             return ""
         return "you drive the robot"
 
+    def _operator_missed(self, situation: _Situation) -> bool:
+        """Whether the machine stopped because of the operator's silence, which goes on."""
+        return self._await_operator and situation.inputs.age("command") > self.config.timeouts.command
+
     # Actions
 
     def _stop(self, situation: _Situation, reason: str) -> None:
         self._stop_reason = reason
+        self._await_operator = OPERATOR_LOST in reason
 
     def _place_vbot(self, situation: _Situation, reason: str) -> None:
         assert situation.inputs.robot_pose is not None
@@ -500,11 +530,22 @@ class Arbiter:
             if situation.inputs.age("nav") > self._timeout("nav"):
                 wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
             sent = self.monitor.limit(wanted, self._close_points(situation))
+            reason = "you drive the virtual robot" + self._far_from_keyframe(situation)
             if self._subgoal is None:
-                return (0.0, 0.0), False, "you drive the virtual robot; no free place for the robot near it"
+                return (0.0, 0.0), False, reason + "; no free place for the robot near it"
             held = "" if sent.action == "free" else "; the robot slows down for something close"
-            return sent.command, False, "you drive the virtual robot" + held
+            return sent.command, False, reason + held
         return self._real_command(situation)
+
+    def _far_from_keyframe(self, situation: _Situation) -> str:
+        """Words for a v-bot that has left what the virtual space is fit to show; "" within."""
+        if self._ready is None:
+            return ""
+        vspace = self._ready[1]
+        away = float(np.linalg.norm(situation.vbot_pose[:2] - vspace.position))
+        return (
+            "" if away <= vspace.ready_radius_m else f"; the picture gets worse {away:.1f} m from where it was learnt"
+        )
 
     def _real_command(self, situation: _Situation) -> tuple[Twist2, bool, str]:
         command, prediction = situation.command, situation.prediction
@@ -541,7 +582,7 @@ class Arbiter:
         """Why nothing may move although the state would let it; "" when it may."""
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
         if lacking:
-            return _no_data(lacking)
+            return "stopped: " + _no_data(lacking)
         if situation.inputs.robot_pose is None:
             return "the robot's pose in the map is not known"
         if situation.inputs.costmap is None:
@@ -554,16 +595,16 @@ class Arbiter:
             return "emergency stop: release it to go on"
         lacking = self._lacking(inputs, Mode.REAL, situation.now_ns)
         if lacking:
-            return _no_data(lacking)
+            return "stopped: " + _no_data(lacking)
         if inputs.robot_pose is None:
-            return "the robot's pose in the map is not known"
+            return "stopped: the robot's pose in the map is not known"
         if situation.command != (0.0, 0.0):
-            return f"stopped ({self._stop_reason}): let go of the controls to go on"
-        return f"stopped ({self._stop_reason})"
+            return f"let go of the controls to go on (stopped: {self._stop_reason})"
+        return f"stopped: {self._stop_reason}"
 
 
 def _no_data(lacking: list[tuple[Source, float]]) -> str:
-    texts = [
-        f"no {source.name} yet" if math.isinf(age) else f"no {source.name} for {age:.1f} s" for source, age in lacking
-    ]
-    return "stopped: " + ", ".join(texts)
+    return ", ".join(
+        source.words or (f"no {source.name} yet" if math.isinf(age) else f"no {source.name} for {age:.1f} s")
+        for source, age in lacking
+    )

@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 from .costmap import StaticMap
 
 
+def occupied_cells(static: StaticMap, occupied_threshold: int) -> NDArray[np.bool_]:
+    """Mask (H, W) of the cells that may be part of a wall."""
+    return static.occupancy >= occupied_threshold
+
+
 class WallMap:
     """Distance to the nearest wall of a map.
 
@@ -22,7 +27,7 @@ class WallMap:
         import cv2
 
         self.static = static
-        occupied = (static.occupancy >= occupied_threshold).astype(np.uint8)
+        occupied = occupied_cells(static, occupied_threshold).astype(np.uint8)
         length = max(2, math.ceil(min_length_m / static.resolution))
         lines = cv2.HoughLinesP(occupied * 255, 1.0, math.pi / 180.0, length // 2, minLineLength=length, maxLineGap=3)
         drawn = np.zeros_like(occupied)
@@ -43,3 +48,34 @@ class WallMap:
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         found = self._distance[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
         return np.where(inside, found, np.inf)
+
+
+class WallFinder:
+    """Walls of a map that grows: looked for anew only where occupied cells have changed.
+
+    Finding walls in a large map takes tens of milliseconds, and a map comes each second; most say nothing new. Not
+    thread-safe: one caller at a time, on any thread.
+    """
+
+    def __init__(self, min_length_m: float = 1.5, occupied_threshold: int = 65) -> None:
+        self.min_length_m = min_length_m
+        self.occupied_threshold = occupied_threshold
+        self._found: WallMap | None = None
+
+    def find(self, static: StaticMap) -> WallMap:
+        """The walls of ``static``; the same object as before where nothing has changed."""
+        if self._found is None or not self._same(self._found.static, static):
+            self._found = WallMap(static, self.min_length_m, self.occupied_threshold)
+        return self._found
+
+    def _same(self, before: StaticMap, now: StaticMap) -> bool:
+        return (
+            before.resolution == now.resolution
+            and before.occupancy.shape == now.occupancy.shape
+            and bool(np.array_equal(before.origin, now.origin))
+            and bool(
+                np.array_equal(
+                    occupied_cells(before, self.occupied_threshold), occupied_cells(now, self.occupied_threshold)
+                )
+            )
+        )

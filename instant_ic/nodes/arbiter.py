@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
-from instant_ic.control.walls import WallMap
+from instant_ic.control.walls import WallFinder, WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import Matrix, matrix_from_pose2, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformError
@@ -47,12 +47,13 @@ class ArbiterNodeConfig(ArbiterConfig):
     rate_hz: float = 20.0
     costmap_rate_hz: float = 5.0
     wall_min_length_m: float = 1.5
+    wall_period_s: float = 2.0
     map_jump_m: float = 0.3
     map_jump_deg: float = 5.0
     costmap: CostmapConfig = field(default_factory=CostmapConfig)
 
     def __post_init__(self) -> None:
-        for key in ("rate_hz", "costmap_rate_hz", "wall_min_length_m", "map_jump_m", "map_jump_deg"):
+        for key in ("rate_hz", "costmap_rate_hz", "wall_min_length_m", "wall_period_s", "map_jump_m", "map_jump_deg"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
 
@@ -70,6 +71,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.costmap: Costmap | None = None
         self.static: StaticMap | None = None
         self.walls: WallMap | None = None
+        self.map_is_new = False
+        finder = WallFinder(self.config.wall_min_length_m, self.config.costmap.occupied_threshold)
+        self.wall_worker = self.background(finder.find, self.on_walls)
         self.map_from_odom: Matrix | None = None
         self.camera_ns: int | None = None
         self.estop = False
@@ -93,6 +97,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         # Only its age matters: the picture is never decoded here.
         self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
         _ = self.tf  # listens from now on
+        self.timer(self.config.wall_period_s, self.update_walls)
         self.timer(1.0 / self.config.costmap_rate_hz, self.update_costmap)
         self.timer(1.0 / self.config.rate_hz, self.tick)
 
@@ -107,7 +112,18 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if grid.size == 0:
             return
         self.static = StaticMap(grid, resolution, np.array(origin))
-        self.walls = WallMap(self.static, self.config.wall_min_length_m, self.config.costmap.occupied_threshold)
+        self.map_is_new = True
+        if self.walls is None:
+            self.update_walls()  # the first at once
+
+    def update_walls(self) -> None:
+        """Has walls looked for in the newest map, beside the node's thread."""
+        if self.map_is_new:
+            self.map_is_new = False
+            self.wall_worker.submit(self.static)
+
+    def on_walls(self, walls: WallMap) -> None:
+        self.walls = walls
 
     def on_estop(self, message: Bool) -> None:
         self.estop = bool(message.data)
@@ -138,10 +154,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def robot_pose(self) -> NDArray[np.float64] | None:
         try:
-            return pose2_from_matrix(self.tf.lookup("map", "base_link"))
+            pose = pose2_from_matrix(self.tf.lookup("map", "base_link"))
         except TransformError as error:
             self.diagnose("pose", WARN, str(error))
             return None
+        self.diagnose("pose", OK, "known")
+        return pose
 
     def scan_in_base(self) -> NDArray[np.float64] | None:
         """Hits (N, 2) of the newest scan in ``base_link`` now; by odometry, which does not jump."""
@@ -164,6 +182,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def update_costmap(self) -> None:
         pose, scan = self.robot_pose(), self.scan.message
         if pose is None or scan is None:
+            missing = "no pose" if pose is None else "no LiDAR scan"
+            self.diagnose("costmap", WARN if self.costmap is not None else OK, f"costmap stands still: {missing}")
             return
         try:
             map_from_lidar = self.tf.lookup("map", scan.header.frame_id, stamp_ns(scan))
@@ -243,7 +263,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 robot_pose=pose_message(matrix_from_pose2(pose)),
                 vbot_start=pose_message(matrix_from_pose2(decision.vbot_start)),
                 vbot_pose=pose_message(matrix_from_pose2(decision.vbot_pose)),
-                operator_command=twist_message(*inputs.operator_command),
+                operator_command=twist_message(*decision.operator_command),
                 applied_command=twist_message(*decision.command),
                 pose_gap_m=decision.pose_gap_m,
                 yaw_gap_rad=decision.yaw_gap_rad,
@@ -270,6 +290,7 @@ def _twist(latest: Latest) -> tuple[float, float]:
 def _vspace(status: VspaceStatus) -> Vspace:
     return Vspace(
         ready=status.state == VspaceStatus.READY,
+        training=status.state == VspaceStatus.TRAINING,
         failed=status.state == VspaceStatus.FAILED,
         position=pose_matrix(status.keyframe_pose)[:2, 3],
         ready_radius_m=float(status.ready_radius_m),

@@ -12,7 +12,7 @@ from instant_ic.control.costmap import StaticMap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.control.walls import WallMap
+from instant_ic.control.walls import WallFinder, WallMap
 from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
 from instant_ic.msg import (
     ControlState,
@@ -35,13 +35,14 @@ class VirtualRobotConfig:
     command_timeout_s: float = 0.3
     state_timeout_s: float = 0.5
     wall_min_length_m: float = 1.5
+    wall_period_s: float = 2.0
     walls_block: bool = True
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
 
     def __post_init__(self) -> None:
-        for key in ("rate_hz", "command_timeout_s", "state_timeout_s", "wall_min_length_m"):
+        for key in ("rate_hz", "command_timeout_s", "state_timeout_s", "wall_min_length_m", "wall_period_s"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
 
@@ -54,19 +55,35 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
         self.walls: WallMap | None = None
+        self.map: StaticMap | None = None
+        self.map_is_new = False
         self.transitions: int | None = None
         self.stepped_ns = self.clock.now_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
         self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
+            self.wall_worker = self.background(WallFinder(self.config.wall_min_length_m).find, self.on_walls)
             self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
+            self.timer(self.config.wall_period_s, self.update_walls)
         self.timer(1.0 / self.config.rate_hz, self.tick)
 
     def on_map(self, message: OccupancyGrid) -> None:
         grid, resolution, origin = grid_array(message)
-        if grid.size:
-            self.walls = WallMap(StaticMap(grid, resolution, np.array(origin)), self.config.wall_min_length_m)
+        if grid.size == 0:
+            return
+        self.map, self.map_is_new = StaticMap(grid, resolution, np.array(origin)), True
+        if self.walls is None:
+            self.update_walls()  # the first at once
+
+    def update_walls(self) -> None:
+        """Has walls looked for in the newest map, beside the node's thread."""
+        if self.map_is_new:
+            self.map_is_new = False
+            self.wall_worker.submit(self.map)
+
+    def on_walls(self, walls: WallMap) -> None:
+        self.walls = walls
 
     def tick(self) -> None:
         now_ns = self.clock.now_ns()

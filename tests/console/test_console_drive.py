@@ -40,9 +40,8 @@ def test_lost_link_stops_the_robot_by_the_watchdog():
     first_zero = next(time for time, command in given if command == (0.0, 0.0))
     assert first_zero == 0.25
     assert [t for t, c in given if c == (0.3, 0.1)] == [0.05, 0.1, 0.15, 0.2]
-    # Zeros for 0.3 s, then silence.
-    assert [t for t, c in given if c == (0.0, 0.0)][:6] == [0.25, 0.3, 0.35, 0.4, 0.45, 0.5]
-    assert given[-1][0] <= 0.55
+    # Zeros until nothing was heard for 0.4 s, then silence: the arbiter must see that nobody is there.
+    assert [t for t, c in given if c == (0.0, 0.0)] == [0.25, 0.3, 0.35]
 
 
 def test_watchdog_counts_and_lets_a_fresh_command_through():
@@ -66,6 +65,7 @@ def test_one_zero_goes_out_even_without_repetition():
     gate.take_due(0.0)
     gate.receive(1, 2, 0.0, 0.0, 0.0, 0.01)
     assert gate.take_due(0.02) == (0.0, 0.0)
+    gate.leave(1, 0.03)
     assert run(gate, 0.03, 0.5) == []
 
 
@@ -77,12 +77,48 @@ def test_idle_zeros_of_a_watcher_do_not_fight_the_drivers_commands():
     assert gate.counts[Verdict.NOT_DRIVER] == 2
 
 
-def test_an_idle_driver_gives_nothing_on():
+def beating(gate, start, end, *, away=False):
+    """What is given on while the driver's page beats at 10 Hz."""
+    given = []
+    for i in range(round((end - start) / 0.1)):
+        gate.touch(1, start + 0.1 * i, away=away)
+        given += run(gate, start + 0.1 * i, start + 0.1 * (i + 1))
+    return given
+
+
+def test_an_idle_driver_is_told_by_zeros_as_long_as_its_page_beats():
+    gate = DriveGate(CONFIG)
+    assert run(gate, 0.0, 0.5) == []  # nobody drives
+    gate.request(1, 1.0)
+    given = beating(gate, 1.0, 2.0)
+    assert {command for _, command in given} == {(0.0, 0.0)}
+    assert 10 <= len(given) <= 11  # keep_alive_hz
+    assert gate.next_deadline(1.99) == pytest.approx(given[-1][0] + 0.1, abs=0.011)
+    # The last beat was at 1.9: 0.4 s later it is over, long before the lease is.
+    given = run(gate, 2.0, 3.0)
+    assert 2.19 < given[-1][0] < 2.31
+    assert gate.driver == 1
+    assert gate.next_deadline(3.0) == pytest.approx(3.9)  # of the lease alone
+    assert gate.touch(1, 3.5)  # back
+    assert gate.take_due(3.5) == (0.0, 0.0)
+    assert not gate.touch(1, 3.6)
+
+
+def test_a_page_that_nobody_looks_at_keeps_the_lease_but_is_nobody():
     gate = DriveGate(CONFIG)
     gate.request(1, 0.0)
-    gate.receive(1, 1, 0.0, 0.0, 0.0, 0.0)
-    assert run(gate, 0.0, 0.5) == []
-    assert gate.next_deadline(0.1) == pytest.approx(2.0)  # of the lease alone
+    assert [t for t, _ in beating(gate, 0.0, 5.0, away=True) if t >= 0.4] == []
+    assert gate.driver == 1
+
+
+@pytest.mark.parametrize("leave", ["leave", "forget"])
+def test_an_idle_driver_that_goes_leaves_silence(leave):
+    gate = DriveGate(CONFIG)
+    gate.request(1, 0.0)
+    assert beating(gate, 0.0, 0.5)
+    getattr(gate, leave)(1, 0.5)
+    assert run(gate, 0.5, 2.0) == []
+    assert gate.next_deadline(2.0) is None
 
 
 def test_take_over_stops_the_robot_and_the_old_driver_no_longer_counts():
@@ -154,6 +190,8 @@ def test_deadlines():
         ("watchdog_s", float("nan")),
         ("stop_repeat_s", -1.0),
         ("lease_timeout_s", 0),
+        ("keep_alive_hz", 0),
+        ("beat_timeout_s", -0.4),
         ("rate_hz", 5),
     ],
 )

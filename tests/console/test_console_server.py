@@ -62,6 +62,11 @@ def frame_number(client, kind):
     return client.frames[kind].header["n"] if kind in client.frames else None
 
 
+def motion(backend):
+    """Commands other than the keep-alive's zeros."""
+    return [command for command in backend.commands if command != (0.0, 0.0)]
+
+
 def in_thread(function, *args):
     return asyncio.get_running_loop().run_in_executor(None, function, *args)
 
@@ -94,7 +99,7 @@ def test_first_client_drives_and_others_watch_until_they_take_over(serve):
             await second.send({"type": "lease", "take": False})
             await second.send_drive(0.2, 0.0)
             await second.wait_for(lambda c: c.refused == ["not_driver"] and c.session["driver"] == "other", WAIT_S)
-            assert backend.commands == []
+            assert motion(backend) == []
             await first.send_drive(0.3, 0.1)
             await in_thread(backend.wait, lambda b: (0.3, 0.1) in b.commands)
             await second.acquire(take=True)
@@ -138,6 +143,61 @@ def test_cut_connection_stops_the_robot(serve):
     asyncio.run(scenario())
 
 
+async def silent_for(backend, seconds, quiet_s=0.5):
+    """Waits until nothing was given on for ``quiet_s``."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        count = len(backend.commands)
+        await asyncio.sleep(quiet_s)
+        if len(backend.commands) == count:
+            return
+    raise AssertionError(f"commands go on: {len(backend.commands)}")
+
+
+def test_an_idle_driver_is_told_by_zeros_until_its_connection_is_cut(serve):
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as watcher:
+            client = ConsoleClient(server.url)
+            await client.connect()
+            await asyncio.sleep(0.3)
+            assert backend.commands == []  # nobody drives
+            await client.acquire()
+            await in_thread(backend.wait, lambda b: len(b.commands) >= 5)
+            client._socket._response.connection.transport.abort()  # no closing handshake
+            await watcher.wait_for(lambda c: c.session["driver"] == "none", WAIT_S)
+            count = len(backend.commands)
+            await asyncio.sleep(0.5)
+            assert len(backend.commands) == count
+            await client.close()
+
+    asyncio.run(scenario())
+    assert set(backend.commands) == {(0.0, 0.0)}
+
+
+def test_zeros_end_when_the_drivers_page_beats_no_more_and_come_back_with_it(serve):
+    """A dead path closes no socket for minutes: only the beats tell. PATIENT's lease lasts on."""
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await in_thread(backend.wait, lambda b: len(b.commands) >= 3)
+            client._tasks.pop().cancel()  # the beats
+            await silent_for(backend, WAIT_S)
+            assert client.session["driver"] == "you"
+            # A page that is hidden says so: it is no sign of an operator.
+            count = len(backend.commands)
+            await client.send({"type": "ping", "client_ms": 0, "away": True})
+            await asyncio.sleep(0.3)
+            assert len(backend.commands) == count
+            await client.send({"type": "ping", "client_ms": 0})
+            await in_thread(backend.wait, lambda b: len(b.commands) >= count + 2)
+
+    asyncio.run(scenario())
+
+
 def test_driving_client_repeats_its_command_and_stops(serve):
     server, backend = serve()
 
@@ -164,7 +224,7 @@ def test_old_command_is_dropped(serve):
             await client.wait_for(lambda c: c.refused == ["old", "old"], WAIT_S)
 
     asyncio.run(scenario())
-    assert backend.commands == []
+    assert motion(backend) == []
 
 
 def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(serve):
@@ -341,6 +401,7 @@ def test_look_of_the_driver_counts(serve):
         '{"type":"warp"}',
         '{"type":"drive","seq":1,"time_ms":0,"linear":NaN,"angular":0}',
         '{"type":"lease","take":1}',
+        '{"type":"ping","client_ms":0,"away":1}',
         '{"type":"ack","kind":9,"seq":1}',
         '{"type":"look","yaw":99,"pitch":0,"hfov":1,"vfov":1}',
     ],
@@ -359,7 +420,7 @@ def test_bad_message_is_answered_and_many_end_the_connection(serve, text):
                 await client.wait_for(lambda c: False, WAIT_S)
 
     asyncio.run(scenario())
-    assert backend.commands == []
+    assert motion(backend) == []
 
 
 def test_too_many_clients_are_refused(serve):

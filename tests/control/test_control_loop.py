@@ -209,6 +209,98 @@ def test_a_stale_command_stops_the_robot_and_the_vbot() -> None:
     assert made.vbot.velocity == NOTHING
 
 
+def test_a_lost_operator_makes_the_robot_wait_in_virtual_mode_and_then_stop() -> None:
+    made = loop()
+    drive(made, 5.5, FORWARD)
+    assert made.modes()[-1] == "VIRTUAL"
+    assert made.frames[-1].command != NOTHING
+    for age in (0.31, 1.5):
+        made.ages["command"] = age
+        frame = made.step(NOTHING)
+        assert (frame.decision.mode, frame.command) == (Mode.VIRTUAL, NOTHING)
+        assert frame.decision.reason == "stopped: the operator's link is lost, the robot waits"
+    # Back in time, hands off: the robot closes up again.
+    made.ages["command"] = 0.0
+    drive(made, 0.5, NOTHING)
+    assert made.frames[-1].command != NOTHING
+    made.ages["command"] = 1.51
+    assert made.step(NOTHING).decision.mode == Mode.STOPPED
+    drive(made, 5.0, NOTHING)  # nobody is there: it stays so
+    assert made.frames[-1].decision.mode == Mode.STOPPED
+    assert made.frames[-1].decision.reason == "stopped: the operator's link is lost, the robot waits"
+    made.ages["command"] = 0.0
+    drive(made, 0.5, FORWARD)
+    assert made.frames[-1].decision.mode == Mode.STOPPED  # back, but with a key held
+    drive(made, 0.1, NOTHING)
+    assert made.frames[-1].decision.mode == Mode.REAL
+
+
+def test_a_silent_operator_is_harmless_in_real_mode_and_counts_as_hands_off() -> None:
+    made = loop(None)
+    drive(made, 1.0, FORWARD)
+    made.ages["command"] = math.inf
+    drive(made, 5.0, FORWARD)
+    assert made.frames[-1].decision.mode == Mode.REAL
+    assert made.frames[-1].command == NOTHING
+    assert made.frames[-1].decision.operator_command == NOTHING
+    made.ages["scan"] = 1.6
+    assert made.step(FORWARD).decision.mode == Mode.STOPPED
+    made.ages["scan"] = 0.0
+    drive(made, 1.0, FORWARD)
+    assert made.frames[-1].decision.mode == Mode.REAL
+
+
+def test_the_reason_of_a_stop_is_told_once_and_what_to_do_first() -> None:
+    made = loop(None)
+    drive(made, 1.0, FORWARD)
+    made.ages["camera"] = 1.6
+    assert made.step(FORWARD).decision.reason == "stopped: no camera picture for 1.6 s"
+    made.ages["camera"] = 0.0
+    reason = made.step(FORWARD).decision.reason
+    assert reason == "let go of the controls to go on (stopped: no camera picture for 1.6 s)"
+    assert made.step(NOTHING).decision.reason == "stopped: no camera picture for 1.6 s"  # for recover_s
+
+
+@pytest.mark.parametrize(
+    ("training_s", "position", "training", "mode"),
+    [
+        (0.0, 0.0, True, "VIRTUAL"),
+        (1.0, 0.0, True, "VIRTUAL"),  # learns the next keyframe for a moment
+        (1.0, -4.0, True, "REAL"),  # but the robot has left the last one's radius
+        (3.0, 0.0, True, "REAL"),  # learns for longer than ready_hold_s
+        (1.0, 0.0, False, "REAL"),  # empty: its node was started anew
+    ],
+)
+def test_readiness_is_held_over_the_change_of_a_keyframe(
+    training_s: float, position: float, training: bool, mode: str
+) -> None:
+    made = loop((3.0, -0.25, 3.5, 0.25))
+    made.vspace = Vspace(ready=True, position=np.array([position, 0.0]), ready_radius_m=4.0)
+    other = Vspace(training=training, position=np.array([50.0, 0.0]), message="learning")
+    # By the time of the switch with a space that is ready all the time.
+    probe = loop((3.0, -0.25, 3.5, 0.25))
+    while probe.modes()[-1] != "VIRTUAL":
+        drive(probe, 0.05, FORWARD)
+    switch_s = len(probe.frames) * 0.05
+    drive(made, switch_s - len(made.frames) * 0.05 - training_s - 0.05, FORWARD)
+    if training_s:
+        made.vspace = other
+    drive(made, training_s + 0.1, FORWARD)
+    assert made.modes()[-1] == mode
+
+
+def test_a_vbot_beyond_what_the_space_can_show_is_told() -> None:
+    made = loop()
+    made.vspace = Vspace(ready=True, ready_radius_m=2.0)
+    drive(made, 4.0, FORWARD)
+    assert made.modes()[-1] == "VIRTUAL"
+    assert made.vbot.pose[0] < 2.0
+    assert "picture" not in made.frames[-1].decision.reason
+    while made.vbot.pose[0] <= 2.2:
+        drive(made, 0.05, FORWARD)
+    assert "the picture gets worse 2.2 m from where it was learnt" in made.step(FORWARD).decision.reason
+
+
 def test_a_failed_virtual_space_gives_the_real_view_back_by_way_of_a_stop() -> None:
     made = loop()
     drive(made, 6.0, FORWARD)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
 
-from instant_ic.bus import params
+from instant_ic.bus import OK, WARN, params
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
@@ -222,6 +222,69 @@ def test_the_robot_stands_when_the_navigator_or_the_vbot_dies() -> None:
         stack.drive(0.35, (0.4, 0.0))
         assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
         assert stack.drive(2.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED
+
+
+def test_a_lost_operator_stops_the_robot_in_virtual_mode_within_its_time() -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, None)
+    assert stack.drive(5.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+    # Hands off with the page open: zeros go on at the console's 10 Hz, and the robot closes up.
+    states = []
+    for _ in range(10):
+        states += [stack.step((0.0, 0.0)), stack.step(None)]
+    assert all("link" not in state.reason for state in states)
+    assert twist_values(states[-1].applied_command) != (0.0, 0.0)
+    states = stack.drive(0.35, None)  # the page is gone
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+    assert states[-1].mode == ControlState.VIRTUAL
+    assert "the operator's link is lost" in states[-1].reason
+    stood = stack.base.pose.copy()
+    stack.drive(0.5, (0.0, 0.0))  # back
+    assert twist_values(stack.bus.last("/cmd_vel")) != (0.0, 0.0)
+    assert np.abs(stack.base.pose - stood).max() > 0.01  # it may have to turn first
+    assert stack.drive(3.0, None)[-1].mode == ControlState.STOPPED
+    stood = stack.base.pose.copy()
+    assert "the operator's link is lost" in stack.drive(20.0, None)[-1].reason
+    np.testing.assert_array_equal(stack.base.pose, stood)
+    assert stack.drive(0.2, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+def test_diagnoses_of_the_start_are_cleared() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    arbiter = next(node for node in stack.bus.nodes if isinstance(node, ArbiterNode))
+    stack.silent.add("/tf")
+    stack.drive(0.5, None)
+    assert arbiter.diagnoses()["pose"][0] == WARN
+    stack.silent.clear()
+    stack.drive(2.0, None)
+    stack.drive(6.0, (0.4, 0.0))
+    for node in stack.bus.nodes:
+        assert {name: d for name, d in node.diagnoses().items() if d[0] != OK} == {}, node.name
+
+
+def test_walls_are_looked_for_when_the_map_has_changed_and_not_more_often_than_set() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    nodes = [node for node in stack.bus.nodes if isinstance(node, ArbiterNode | VirtualRobotNode)]
+    first = [node.walls for node in nodes]
+    assert all(walls is not None and walls.mask.any() for walls in first)
+    grid = first[0].static.occupancy.copy()
+    origin = tuple(first[0].static.origin)
+
+    def publish() -> None:
+        stack.bus.publish("/map", grid_message(grid, 0.05, origin, "map", stack.now), latched=True)
+
+    publish()  # the same map again
+    stack.drive(2.5, None)
+    assert [node.walls for node in nodes] == first
+    stack.drive(1.45, None)
+    column = grid.shape[1] // 2
+    grid[:, column] = 100  # a new wall across the corridor
+    publish()
+    assert [node.walls for node in nodes] == first  # 3.95 s: due at 4 s
+    stack.drive(0.1, None)
+    for node, before in zip(nodes, first, strict=True):
+        assert node.walls is not before
+        assert node.walls.mask[grid.shape[0] // 2, column]
 
 
 def test_pictures_are_not_decoded() -> None:

@@ -189,7 +189,9 @@ document.addEventListener("visibilitychange", () => { lastFrame = performance.no
 // ---- what is shown -------------------------------------------------------------------------------
 
 function showBanner() {
-  hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), session.driver);
+  // A stopped robot starts only with hands off; whoever still holds a key must be told.
+  const held = state?.mode === "stopped" && (state.command ?? []).some((value) => value !== 0);
+  hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), held, session.driver);
 }
 
 function fit(canvas, pixels = 1) {

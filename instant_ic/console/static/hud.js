@@ -103,19 +103,20 @@ export function showSession(session) {
   byId("yield").hidden = session.driver !== "you" || watchers === 0;
 }
 
-/** One banner at a time: a lost link first, then the emergency stop. */
-export function showBanner(connected, everConnected, estop, driver) {
+/** One banner at a time: a lost link first, then the emergency stop, then a key held through a stop. */
+export function showBanner(connected, everConnected, estop, held, driver) {
   document.body.dataset.link = connected ? "up" : everConnected ? "lost" : "connecting";
   document.body.dataset.estop = estop ? "set" : "free";
   const banner = byId("banner");
   const lost = !connected && everConnected;
-  banner.hidden = !lost && !estop;
+  banner.hidden = !lost && !estop && !held;
   if (banner.hidden) return;
-  write(byId("banner-title"), lost ? "LINK LOST" : "EMERGENCY STOP");
+  write(byId("banner-title"), lost ? "LINK LOST" : estop ? "EMERGENCY STOP" : "STOPPED");
   write(byId("banner-text"), lost
     ? "The robot was told to stop. Connecting again…"
+    : !estop ? "Let go of the controls to go on."
     : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
-  byId("release").hidden = lost || driver !== "you";
+  byId("release").hidden = lost || !estop || driver !== "you";
 }
 
 /** Sets a data attribute of the page, where styles and tests look; writes only what has changed. */

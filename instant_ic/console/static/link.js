@@ -1,6 +1,6 @@
 // The WebSocket: reconnects, measures round trip and clock offset, decodes binary frames.
 
-const PING_MS = 250;
+const PING_MS = 100; // the server takes a driver who is silent for beat_timeout_s (0.4 s) as gone
 const SILENCE_MS = 1000; // nothing heard for this long: the link counts as lost
 const PREFIX_BYTES = 12;
 const VERSION = 1;
@@ -94,7 +94,7 @@ export class Link extends EventTarget {
   }
 
   _ping() {
-    this.send({ type: "ping", client_ms: performance.now() });
+    this.send({ type: "ping", client_ms: performance.now(), away: document.hidden });
   }
 
   _receive(data) {
@@ -113,10 +113,10 @@ export class Link extends EventTarget {
     const now = performance.now();
     const roundTrip = now - message.client_ms;
     this._samples.push({ roundTrip, offset: message.server_ms + roundTrip / 2 - now });
-    if (this._samples.length > 20) this._samples.shift();
+    if (this._samples.length > 50) this._samples.shift();
     // The quickest answer was delayed least, so its offset is the truest.
     this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
-    const recent = this._samples.slice(-8).map((s) => s.roundTrip).sort((a, b) => a - b);
+    const recent = this._samples.slice(-20).map((s) => s.roundTrip).sort((a, b) => a - b);
     this.roundTripMs = recent[recent.length >> 1];
     this.commandAgeMs = message.command_age_ms;
     if (!this.connected) {
