@@ -298,7 +298,7 @@ def test_looking_round_by_drag_turns_the_picture_at_once_and_tells_the_robot(ope
     page.mouse.down()
     page.mouse.move(680, 300, steps=4)
     page.mouse.up()
-    wait_until(lambda: demo.look.yaw > 0.1, page, "the look direction arrives")
+    wait_until(lambda: demo.look.yaw > np.radians(19), page, "the look direction arrives")
     # The picture follows the pointer: 200 of 600 pixels of a 60° high picture are 20°, to the left.
     assert demo.look.yaw == pytest.approx(np.radians(20), abs=0.01)
     turned = picture_of(page)
