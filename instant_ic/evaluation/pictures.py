@@ -44,7 +44,7 @@ def save_view_strip(path: Path, rows: Sequence[tuple[str, NDArray[np.uint8], NDA
     """Rows of (label, rendered view, the photo's own crop), side by side."""
     figure, axes = _figure(len(rows), 2, (10.0, 2.95 * len(rows)))
     for (label, view, crop), (left, right) in zip(rows, axes, strict=True):
-        for axis, picture, title in ((left, view, f"virtual space, {label}"), (right, crop, f"photo, {label}")):
+        for axis, picture, title in ((left, view, f"virtual space, {label}"), (right, crop, "photo")):
             axis.imshow(picture)
             axis.set_title(title, fontsize=9)
             axis.set_axis_off()

@@ -26,6 +26,8 @@ from .pictures import correlation, perspective_crop, psnr_db, save_depth, save_m
 from .stack import Stack, StackError, free_ports
 
 _YAWS_DEG = (0, 90, 180, -90)
+_AHEAD_M = 0.4
+"""The last two views are taken from so far beside the photo's place: what the estimated depth makes of it."""
 _WIDTH, _HEIGHT, _FOV = 640, 360, math.radians(90)
 
 
@@ -123,8 +125,9 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     map_from_camera = matrix_of_pose(keyframe.pose)
     rows = []
     scores, likeness = {}, {}
-    for number, yaw_deg in enumerate(_YAWS_DEG, start=1):
-        map_from_view = map_from_camera @ pose_matrix(yaw=math.radians(yaw_deg))
+    places = [(yaw, 0.0) for yaw in _YAWS_DEG] + [(yaw, _AHEAD_M) for yaw in (0, -90)]
+    for number, (yaw_deg, ahead_m) in enumerate(places, start=1):
+        map_from_view = map_from_camera @ pose_matrix(yaw=math.radians(yaw_deg)) @ pose_matrix(x=ahead_m)
         request = _request(number, map_from_view)
         next_try = 0.0
 
@@ -140,6 +143,10 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         rendered = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
         camera_from_view = (inverse(map_from_camera) @ map_from_view)[:3, :3]
         crop = perspective_crop(photo, camera_from_view, rendered.shape[1], rendered.shape[0], _FOV)
+        if ahead_m:
+            # Nothing to compare with: the photo was taken elsewhere.
+            rows.append((f"{yaw_deg}°, {ahead_m} m ahead of the photo's place", rendered, crop))
+            continue
         scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)
         likeness[str(yaw_deg)] = round(correlation(rendered, crop), 3)
         rows.append((f"{yaw_deg}°  ({scores[str(yaw_deg)]} dB)", rendered, crop))

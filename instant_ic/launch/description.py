@@ -25,6 +25,8 @@ _CONDITION = ("if", "unless")
 _MAX_INCLUDE_DEPTH = 8
 _NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")  # what the bus accepts
 
+_NODE_MAIN = Path(__file__).with_name("node_main.py")
+
 
 @dataclass(frozen=True)
 class LaunchArgument:
@@ -321,7 +323,7 @@ class _Reader:
             value.problem(f"program {executable} does not exist beside the launch file")
             return None
         if executable.isidentifier() and importlib.util.find_spec(f"instant_ic.nodes.{executable}"):
-            return (sys.executable, "-m", "instant_ic.launch.node_main", f"instant_ic.nodes.{executable}")
+            return (sys.executable, str(_NODE_MAIN), f"instant_ic.nodes.{executable}")
         value.problem(f"unknown exec {executable!r} (nodes: {', '.join(known_nodes()) or 'none'})")
         return None
 

@@ -1,4 +1,6 @@
-"""Runs one node's module as a program and leaves at once when the node is done: ``python -m ... MODULE ARGUMENTS``.
+"""Runs a node's module as a program and leaves at once when the node is done: ``node_main.py MODULE ARGUMENTS``.
+
+Run as a script, never imported, so that nothing of the launcher is loaded into each node.
 
 An interpreter that has numba's compiler loaded takes 0.7 s of CPU to take itself down, six of them on two cores
 several seconds. A node has closed what matters (motors, bag, sockets, registry) before its ``main`` returns; the rest
@@ -8,18 +10,25 @@ Until the node has signal handlers of its own, a signal ends the process quietly
 
 from __future__ import annotations
 
-import logging
 import os
-import runpy
 import signal
 import sys
-import traceback
+
+for _number in (signal.SIGINT, signal.SIGTERM):  # before the other imports: they take their time
+    signal.signal(_number, lambda *_: os._exit(0))
+
+import logging  # noqa: E402
+import runpy  # noqa: E402
+import traceback  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+_here = Path(__file__).resolve().parent
+if sys.path and Path(sys.path[0]) == _here:  # beside this file lie modules that no node should find by accident
+    sys.path[0] = str(_here.parents[1])
 
 
 def main() -> None:
     """Runs the module named by the first argument; ends the process with its exit status."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(0))
     module = sys.argv[1]
     del sys.argv[1]
     status = 1

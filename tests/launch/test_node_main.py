@@ -9,13 +9,16 @@ from pathlib import Path
 
 import pytest
 
+from instant_ic import launch
 from instant_ic.cli.main import main
+
+NODE_MAIN = Path(launch.__file__).with_name("node_main.py")
 
 
 def run_module(folder: Path, code: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
     (folder / "its_module.py").write_text(textwrap.dedent(code))
     return subprocess.run(
-        [sys.executable, "-m", "instant_ic.launch.node_main", "its_module", *arguments],
+        [sys.executable, str(NODE_MAIN), "its_module", *arguments],
         capture_output=True,
         text=True,
         timeout=60,
@@ -50,7 +53,7 @@ def test_interpreter_is_not_taken_down(tmp_path: Path) -> None:
 def test_a_signal_while_a_node_is_still_imported_ends_it_quietly(tmp_path: Path) -> None:
     (tmp_path / "its_module.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
     process = subprocess.Popen(
-        [sys.executable, "-m", "instant_ic.launch.node_main", "its_module"],
+        [sys.executable, str(NODE_MAIN), "its_module"],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
