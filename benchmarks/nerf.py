@@ -18,11 +18,17 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import cv2
 import numpy as np
 from numba import njit
+from skimage.metrics import structural_similarity
 
+from instant_ic import paths
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room, kernels
+from instant_ic.geometry.projections import equirect_directions
+from instant_ic.nerf import PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room, kernels
+from instant_ic.nerf.prior import fill_holes
 from instant_ic.nerf.warm_up import warm_up
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
@@ -89,6 +95,51 @@ def psnr_db(a: Any, b: Any) -> float:
     return 10 * math.log10(255**2 / float(np.mean((a.astype(np.float64) - b) ** 2)))
 
 
+def point_warp(picture: Any, depth_m: Any, pose: Any, view_pose: Any, width: int, height: int) -> Any:
+    """The panorama's pixels as points, nearest first, in a view; holes are filled from around."""
+    directions = equirect_directions(*picture.shape[1::-1])
+    depth = cv2.resize(depth_m, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    points = (directions * depth[..., None]).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3] - view_pose[:3, 3]
+    x, y, z = (points @ view_pose[:3, :3]).T
+    focal = 0.5 * width / math.tan(FOV / 2)
+    ahead = x > 0.05
+    u = np.rint(0.5 * (width - 1) - focal * y[ahead] / x[ahead]).astype(int)
+    v = np.rint(0.5 * (height - 1) - focal * z[ahead] / x[ahead]).astype(int)
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    at, far = (v * width + u)[inside], x[ahead][inside]
+    order = np.argsort(-far, kind="stable")  # the nearest is written last
+    image, seen = np.zeros((height * width, 3), np.float32), np.zeros(height * width, bool)
+    image[at[order]] = picture.reshape(-1, 3)[ahead][inside][order]
+    seen[at] = True
+    return fill_holes(image.reshape(height, width, 3), seen.reshape(height, width)).astype(np.uint8)
+
+
+def against_warp(picture: Any, pose: Any, poses: list[Any], truth: list[Any], iterations: int) -> dict[str, Any]:
+    """PSNR (dB) and SSIM at the views after few iterations, by true depth and by the shipped model's."""
+    estimate = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1).estimate(picture.rgb)
+    true = cv2.resize(picture.depth_m, estimate.shape[::-1], interpolation=cv2.INTER_AREA)
+    known = (estimate > 0) & (true > 0)
+    estimate = (estimate * np.median(true[known] / estimate[known])).astype(np.float32)
+    error = float(np.mean(np.abs(estimate[known] / true[known] - 1)))
+    field_only = PictureConfig(panorama_until_db=30.0, field_from_db=30.0)
+    result: dict[str, Any] = {"iterations": iterations, "model_depth_error": round(error, 3)}
+    for name, depth, sigma in (("true_depth", picture.depth_m, 0.02), ("model_depth", estimate, 0.08)):
+        views: dict[str, list[Any]] = {
+            "point_warp": [point_warp(picture.rgb, depth, pose, p, *SIZES[0]) for p in poses]
+        }
+        for label, colour in (("ours", PictureConfig()), ("field_only", field_only)):
+            space = VirtualSpace(VirtualSpaceConfig(picture=colour))
+            space.set_keyframe(picture.rgb, depth, pose, sigma)
+            space.train(iterations=iterations)
+            views[label] = [space.render(p, *SIZES[0], FOV).rgb for p in poses]
+        for label, drawn in views.items():
+            result[f"{name}_{label}"] = [
+                (round(psnr_db(a, b), 2), round(float(structural_similarity(a, b, channel_axis=2)), 3))
+                for a, b in zip(drawn, truth, strict=True)
+            ]
+    return result
+
+
 def measure(world: str, seconds: float) -> dict[str, Any]:
     """Trains for about ``seconds`` of CPU and follows the pictures' PSNR on the way."""
     config = VirtualSpaceConfig(train=TrainConfig())
@@ -127,6 +178,7 @@ def measure(world: str, seconds: float) -> dict[str, Any]:
         "final_view_psnr_db": [round(v, 2) for v in curve[-1][4]],
         "final_training_psnr_db": round(curve[-1][2], 2),
         "frame_cpu_ms": frames,
+        "against_warp": against_warp(picture, pose, poses, truth, 60) if world == "corridor" else {},
     }
 
 

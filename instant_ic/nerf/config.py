@@ -144,7 +144,7 @@ class VirtualSpaceConfig:
 
     device: str = "auto"
     """``auto`` (CUDA where torch finds it, else numba on the CPU), ``cpu``, ``cuda``, or ``torch-cpu`` (slow)."""
-    panorama_width: int = 1024
+    panorama_width: int = 2048
     """Wider panoramas are area-averaged to this width."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
