@@ -69,7 +69,7 @@ GUARDS: dict[str, str] = {
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready here, and there is a way "
     "round for the r-bot",
     "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, and the operator's command is safe for "
-    "the r-bot over a longer horizon than the one that switches in",
+    "the r-bot over a longer and wider way than the one that switches in",
     "may_resume": "the emergency stop is released, every source is fresh for recover_s, the operator's command is zero "
     "(silence counts as zero), and the operator's link is back where its loss was the reason",
 }
@@ -137,6 +137,7 @@ class SwitchConfig:
     min_virtual_s: float = 1.0
     min_real_s: float = 1.0
     return_margin_m: float = 0.5
+    return_side_m: float = 0.12
     neutral_return_s: float = 5.0
     stop_margin_m: float = 0.15
     min_switch_speed_m_s: float = 0.03
@@ -144,7 +145,7 @@ class SwitchConfig:
     require_camera: bool = True
 
     def __post_init__(self) -> None:
-        for key in ("position_m", "yaw_deg", "return_margin_m"):
+        for key in ("position_m", "yaw_deg", "return_margin_m", "return_side_m"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"switch.{key} must be > 0 (got {getattr(self, key)})")
         for key, value in vars(self).items():
@@ -484,7 +485,12 @@ class Arbiter:
             if idle_ns < switch.neutral_return_s * 1e9:
                 command = self._driven
         ahead = self.predictor.predict(
-            inputs.robot_pose, inputs.robot_velocity, command, inputs.costmap, switch.return_margin_m
+            inputs.robot_pose,
+            inputs.robot_velocity,
+            command,
+            inputs.costmap,
+            extra_m=switch.return_margin_m,
+            side_m=switch.return_side_m,
         )
         return "you drive the robot" if ahead.hit_index is None else ""
 

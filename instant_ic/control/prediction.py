@@ -67,6 +67,7 @@ class Predictor:
     def __init__(self, config: PredictionConfig, limits: MotionLimits, footprint: Footprint) -> None:
         self.config = config
         self.limits = limits
+        self.footprint = footprint
         self.reach_m = footprint.circumscribed_radius_m
         self.body = footprint.points(0.045, config.padding_m)
 
@@ -86,10 +87,12 @@ class Predictor:
         command: tuple[float, float],
         costmap: Costmap | None,
         extra_m: float = 0.0,
+        side_m: float = 0.0,
     ) -> Prediction:
         """Trajectory from ``pose`` (x, y, yaw) at ``velocity`` under ``command`` (m/s, rad/s).
 
-        ``extra_m`` is added to the horizon. Without a costmap nothing is met.
+        ``extra_m`` is added to the horizon, ``side_m`` to every side of the footprint. Without a costmap nothing is
+        met.
         """
         step = self.config.step_s
         command = clip_twist(*command, self.limits)
@@ -109,7 +112,10 @@ class Predictor:
         times: NDArray[np.float64] = step * np.arange(len(path), dtype=np.float64)
         hit = None
         if costmap is not None:
-            overlap = costmap.lethal_overlap(path, self.body)
+            body = self.body
+            if side_m > 0:
+                body = self.footprint.points(0.045, self.config.padding_m + side_m)
+            overlap = costmap.lethal_overlap(path, body)
             # Standing on an obstacle already (a map that jumped) must not hold the robot there for good.
             worse = np.flatnonzero(overlap > overlap[0])
             hit = int(worse[0]) if worse.size else None

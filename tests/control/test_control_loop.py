@@ -22,6 +22,10 @@ from instant_ic.control.arbiter import (
     TimeoutConfig,
     Vspace,
 )
+from instant_ic.control.costmap import LETHAL, Costmap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.prediction import PredictionConfig, Predictor
 
 BOX = (2.5, -0.25, 3.0, 0.25)
 FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
@@ -347,6 +351,27 @@ def test_one_switch_each_way_with_noise(seed: int) -> None:
     made.start()
     drive(made, 26.0, FORWARD)
     assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+
+
+@pytest.mark.parametrize("edge_y", [0.18, 0.22, 0.26])
+def test_box_that_the_path_only_grazes_makes_one_switch_each_way(edge_y: float) -> None:
+    """The robot's half width is 0.25 m: with noise, a way along the box's edge is now free and now not."""
+    walls = corridor()
+    world = World(np.concatenate([walls, rectangle(2.5, edge_y, 3.0, edge_y + 0.5)]))
+    made = Loop(world, draw_map(walls, (-2, -1.2, 14, 1.2)), noise=np.random.default_rng(4))
+    made.start()
+    drive(made, 26.0, FORWARD)
+    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+
+
+def test_way_back_must_be_wider_than_the_robot() -> None:
+    costs = np.zeros((80, 80), np.uint8)
+    costs[46:50, 30:34] = LETHAL  # x 1.5..1.7, y 0.3..0.5: the robot's side passes 0.05 m from it
+    costmap = Costmap(costs, 0.05, np.array([0.0, -2.0]))
+    predictor = Predictor(PredictionConfig(padding_m=0.0), MotionLimits(), Footprint())
+    start, speed = np.array([0.5, 0.0, 0.0]), (0.4, 0.0)
+    assert predictor.predict(start, speed, speed, costmap, extra_m=1.0).hit_index is None
+    assert predictor.predict(start, speed, speed, costmap, extra_m=1.0, side_m=0.12).hit_index is not None
 
 
 def test_at_the_return_the_way_is_free_beyond_the_horizon_that_switches_in() -> None:
