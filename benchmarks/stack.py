@@ -17,13 +17,14 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from instant_ic.bus import RELIABLE
 from instant_ic.evaluation.drive import DriveRecorder
 from instant_ic.evaluation.stack import Stack, free_ports, processes_of
-from instant_ic.msg import message_type, stamp_ns, twist_values
+from instant_ic.msg import message_type, twist_values
 
 CHROMIUM_FLAGS = [
     "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -38,22 +39,17 @@ window.addEventListener('keydown', e => {
 
 
 class Probe:
-    """Collects heartbeats and commands."""
+    """Collects the rates that heartbeats tell."""
 
     def __init__(self, stack: Stack) -> None:
         self.rates: dict[str, list[float]] = defaultdict(list)
         self.collecting = False
-        self.commands: list[tuple[int, float]] = []
         stack.observer.subscribe("/heartbeat", message_type("NodeStatus"), self.on_status, RELIABLE)
-        stack.observer.subscribe("/cmd_vel", message_type("TwistStamped"), self.on_command, RELIABLE)
 
     def on_status(self, message: Any) -> None:
         if self.collecting:
             for topic, rate in zip(message.outputs, message.output_rates_hz, strict=True):
                 self.rates[f"{topic} ({message.node})"].append(float(rate))
-
-    def on_command(self, message: Any) -> None:
-        self.commands.append((stamp_ns(message), twist_values(message)[0]))
 
 
 def usage(run_dir: Path) -> dict[str, tuple[float, float]]:
@@ -75,6 +71,7 @@ def main() -> int:
     parser.add_argument("--screenshots", type=Path, metavar="DIR", help="pictures of the page in each mode")
     parser.add_argument("--width", type=int, default=1280)
     parser.add_argument("--height", type=int, default=720)
+    parser.add_argument("--full-quality", action="store_true", help="the page draws at full resolution (screenshots)")
     parser.add_argument("--log", type=Path, default=None, help="where the stack's output goes")
     args = parser.parse_args()
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
@@ -112,13 +109,24 @@ def measure(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace) -> 
         errors: list[str] = []
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.add_init_script(KEY_TIMES)
-        page.goto(url)
+        page.goto(url + "?quality=full" if args.full_quality else url)
         page.wait_for_timeout(3000)
         shot(page, args, "real")
-        latencies = [press_latency(stack, probe, page, "KeyA" if i % 2 else "KeyD") for i in range(6)]
+        latencies = [press_latency(stack, page, "KeyW" if i % 2 else "KeyS") for i in range(8)]
+
+        def hold(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+            """W until then; after a stop by a late sensor lets go and presses again, as an operator does."""
+            end = time.monotonic() + timeout_s
+            while not condition():
+                page.keyboard.down("KeyW")
+                left = max(1.0, end - time.monotonic())
+                wait(stack, page, lambda: condition() or recorder.mode == control.STOPPED, left, what)
+                if recorder.mode == control.STOPPED:
+                    page.keyboard.up("KeyW")
+                    wait(stack, page, lambda: recorder.mode != control.STOPPED, 30, "end of the stop")
+
         note("driving into the obstacle")
-        page.keyboard.down("KeyW")
-        wait(stack, page, lambda: recorder.mode == control.VIRTUAL, 90, "passage into the virtual space")
+        hold(lambda: recorder.mode == control.VIRTUAL, 90, "passage into the virtual space")
         before = usage(run_dir), time.monotonic()
         probe.rates.clear()
         probe.collecting = True
@@ -133,7 +141,7 @@ def measure(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace) -> 
                 shot(page, args, f"virtual{shots}")
             return bool(x > 5.6)
 
-        wait(stack, page, past, 90, "v-bot past the obstacle")
+        hold(past, 90, "v-bot past the obstacle")
         page.keyboard.up("KeyW")
         after = usage(run_dir), time.monotonic()
         probe.collecting = False
@@ -207,25 +215,25 @@ def wait(stack: Stack, page: Any, condition: Any, timeout_s: float, what: str) -
     stack.wait_for(both, timeout_s, what)
 
 
-def press_latency(stack: Stack, probe: Probe, page: Any, key: str) -> float:
-    """Milliseconds from a key's event in the page to the first /cmd_vel that turns the robot."""
-    turning: list[int] = []
+def press_latency(stack: Stack, page: Any, key: str) -> float:
+    """Milliseconds from a key's event in the page to the first /cmd_vel that moves the robot."""
+    moving: list[int] = []
 
     def on_command(message: Any) -> None:
-        if abs(twist_values(message)[1]) > 1e-3:
-            turning.append(time.time_ns())
+        if abs(twist_values(message)[0]) > 1e-3:
+            moving.append(time.time_ns())
 
     subscription = stack.observer.subscribe("/cmd_vel", message_type("TwistStamped"), on_command, RELIABLE)
     settle = time.monotonic() + 1.0
     stack.wait_for(lambda: time.monotonic() > settle, 5, "a still robot")
-    turning.clear()
+    moving.clear()
     page.keyboard.down(key)
-    stack.wait_for(lambda: turning, 10, f"/cmd_vel after {key}")
+    stack.wait_for(lambda: moving, 10, f"/cmd_vel after {key}")
     page.keyboard.up(key)
     pressed_ms = page.evaluate("window.__keys.at(-1)[1]")
     stack.observer.subscriptions.remove(subscription)
     subscription.close()
-    return turning[0] / 1e6 - float(pressed_ms)
+    return moving[0] / 1e6 - float(pressed_ms)
 
 
 def shot(page: Any, args: argparse.Namespace, name: str) -> None:

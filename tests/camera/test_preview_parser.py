@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from fake_theta import jpeg, part
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from instant_ic.camera.jpeg import JpegError, check_whole, jpeg_size
@@ -40,13 +40,15 @@ def test_size_of_the_pieces_does_not_matter(sizes: list[int]) -> None:
 
 @settings(max_examples=60)
 @given(st.integers(1, len(FRAMES[1]) - 1), st.lists(st.integers(1, 500), max_size=40), st.sampled_from([RICOH, RFC]))
+@example(len(FRAMES[1]) - 1, [], RFC)
 def test_cut_frame_costs_only_itself(kept: int, sizes: list[int], boundary: str) -> None:
     stream = part(FRAMES[0], boundary) + part(FRAMES[1][:kept], boundary, length=len(FRAMES[1]))
     stream += b"".join(part(frame, boundary) for frame in FRAMES[2:])
     found, parser = parse(stream, sizes)
     assert found == [FRAMES[0], *FRAMES[2:]]
     assert parser.bad_frames == 1
-    assert parser.last_fault.startswith("cut after")
+    # Cut by a few bytes only, the frame's announced end lies within the next boundary: told by the missing end marker.
+    assert "cut" in parser.last_fault
 
 
 def test_frame_without_its_end_marker_is_dropped() -> None:

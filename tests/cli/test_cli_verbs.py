@@ -280,7 +280,9 @@ def reader_count(path: Path) -> int:
         return reader.count
 
 
-def test_launch_in_a_process_ends_in_time_and_leaves_nothing(run_dir: Path, tmp_path: Path) -> None:
+def test_launch_in_a_process_ends_in_time_and_leaves_nothing(
+    run_dir: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     (tmp_path / "talker.py").write_text(TALKER)
     (tmp_path / "two.yaml").write_text(
         "launch:\n"
@@ -289,7 +291,7 @@ def test_launch_in_a_process_ends_in_time_and_leaves_nothing(run_dir: Path, tmp_
         " remap: [{from: /scan, to: /one}]}\n"
         "- node: {exec: talker.py, name: second, remap: [{from: /scan, to: /two}], namespace: side}\n"
     )
-    other = tmp_path / "r"
+    other = tmp_path_factory.mktemp("r")  # short: sockets are bound in it
     process = subprocess.Popen(
         [sys.executable, "-m", "instant_ic.cli.main", "launch", "two.yaml", "rate:=30", "--run-dir", str(other)],
         stdout=subprocess.PIPE,
