@@ -96,6 +96,8 @@ class Predictor:
         """
         step = self.config.step_s
         command = clip_twist(*command, self.limits)
+        # Encoders read late make a measured speed that the base cannot drive; it would look metres too far ahead.
+        velocity = clip_twist(*velocity, self.limits)
         faster = command if _speed(command, self.reach_m) >= _speed(velocity, self.reach_m) else velocity
         length = self.horizon(*faster)
         length += extra_m if length > 0 else 0.0

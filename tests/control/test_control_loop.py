@@ -374,6 +374,16 @@ def test_way_back_must_be_wider_than_the_robot() -> None:
     assert predictor.predict(start, speed, speed, costmap, extra_m=1.0, side_m=0.12).hit_index is not None
 
 
+def test_speed_that_the_base_cannot_drive_does_not_lengthen_the_look_ahead() -> None:
+    predictor = Predictor(PredictionConfig(), MotionLimits(), Footprint())
+    start, command = np.zeros(3), (0.28, 0.0)
+    fastest = predictor.predict(start, (MotionLimits().max_linear_m_s, 0.0), command, None)
+    spike = predictor.predict(start, (5.0, 0.0), command, None)
+    assert spike.poses == pytest.approx(fastest.poses)
+    # 0.5 m/s: 0.1 m of latency, 0.156 m of braking at 0.8 m/s², 0.6 m of margin.
+    assert spike.poses[-1, 0] == pytest.approx(0.856, abs=0.03)
+
+
 def test_at_the_return_the_way_is_free_beyond_the_horizon_that_switches_in() -> None:
     made = loop()
     drive(made, 20.0, FORWARD)

@@ -120,7 +120,7 @@ def test_live_replay_ends_with_the_bag(tmp_path: Path) -> None:
         left = list(Path(run_dir).glob("topics/*/*.sock"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stdout
-    assert left == []
+    assert left == [], done.stdout
     with AnyReader([record]) as reader:
         counts = {c.topic: c.msgcount for c in reader.connections}
     for topic in (*MADE, "/wheel/odom", "/camera/image/compressed", "/clock"):
