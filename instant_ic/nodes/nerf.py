@@ -49,8 +49,8 @@ class NerfConfig:
         space: the virtual space itself.
     """
 
-    train_slice_ms: float = 60.0
-    train_share: float = 0.5
+    train_slice_ms: float = 30.0
+    train_share: float = 0.3
     train_share_until_ready: float = 2.0
     nice: int = 5
     lockstep_iterations: int = 5
