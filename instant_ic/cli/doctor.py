@@ -306,7 +306,7 @@ def check_camera(expectation: Expectation) -> Iterator[Finding]:
         yield Finding(missing, f"camera {url}", _short(error), advice)
         return
     if reply.status_code != 200:
-        advice = "in client mode the camera wants its user and password: docs/camera.md"
+        advice = "in client mode the camera wants its user and password: docs/devices.md"
         yield Finding(missing, f"camera {url}", f"answers {reply.status_code}", advice)
         return
     model, firmware = info.get("model", "unknown model"), info.get("firmwareVersion", "?")
