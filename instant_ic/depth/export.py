@@ -108,6 +108,7 @@ def export_model(
     max_range_m: float,
     record: dict[str, Any] | None = None,
     half_weights: bool = False,
+    brightness: float = 0.0,
 ) -> ModelManifest:
     """Writes ``NAME.onnx``, its manifest ``NAME.yaml`` and, where given, the training record ``NAME.json``."""
     path = Path(path)
@@ -119,6 +120,7 @@ def export_model(
         licence=licence,
         input_height=model.config.height,
         input_width=model.config.width,
+        brightness=brightness,
         max_range_m=max_range_m,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
     )

@@ -28,6 +28,8 @@ class ModelManifest:
         input_height: rows the network takes.
         input_width: columns the network takes.
         channels: ``rgb`` or ``bgr``: order of the channels that the network takes.
+        brightness: mean byte of the pictures that the model was trained on; a picture is brought to it by one
+            factor, within 1/2.5 .. 2.5 (a real camera's exposure is not that of the training). 0 leaves it as it is.
         input_scale: the bytes are multiplied by it first.
         mean: then this is subtracted, a value a channel in the network's order.
         std: then divided by this.
@@ -47,6 +49,7 @@ class ModelManifest:
     input_height: int
     input_width: int
     channels: str = "rgb"
+    brightness: float = 0.0
     input_scale: float = 1.0 / 255.0
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     std: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -90,6 +93,8 @@ class ModelManifest:
             value = getattr(self, key)
             if not _is_number(value) or value <= 0:
                 raise ValueError(f"{key} must be a number above 0 (got {value!r})")
+        if not _is_number(self.brightness) or not 0 <= self.brightness < 255:
+            raise ValueError(f"brightness must be a number from 0 to under 255 (got {self.brightness!r})")
         if self.max_range_m <= self.min_range_m:
             raise ValueError(f"max_range_m must be above min_range_m (got {self.max_range_m}, {self.min_range_m})")
 

@@ -15,6 +15,8 @@ from instant_ic.geometry.projections import equirect_directions
 from .manifest import ManifestError, ModelManifest, load_manifest, manifest_path
 
 DEFAULT_MODEL = "slicenet_small.onnx"
+MAX_GAIN = 2.5
+"""A picture's brightness is changed by this factor at most, up or down."""
 
 
 class DepthModel:
@@ -127,6 +129,11 @@ class DepthModel:
         if (rgb.shape[1], rgb.shape[0]) != size:
             shrinks = rgb.shape[1] >= size[0] and rgb.shape[0] >= size[1]
             rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
+        if manifest.brightness:
+            gain = np.clip(manifest.brightness / max(float(rgb.mean()), 1.0), 1 / MAX_GAIN, MAX_GAIN)
+            rgb = cv2.convertScaleAbs(
+                np.ascontiguousarray(rgb), alpha=float(gain)
+            )  # saturates at 255, as a camera does
         picture = rgb[..., ::-1] if manifest.channels == "bgr" else rgb
         mean, std = np.array(manifest.mean, np.float32), np.array(manifest.std, np.float32)
         values = (picture.astype(np.float32) * np.float32(manifest.input_scale) - mean) / std

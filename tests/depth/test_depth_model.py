@@ -118,6 +118,16 @@ def test_normalisation_and_channel_order(exported: tuple[Path, SliceNet], tmp_pa
     np.testing.assert_allclose(model.prepare(picture)[0, :, 0, 0], [0.5, 0.0, 0.25])
 
 
+def test_exposure_is_brought_to_the_trainings(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
+    model = load_with(exported, tmp_path, brightness=120.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+    picture = np.full((64, 128, 3), 40, np.uint8)
+    picture[32:] = 80  # mean 60: everything is doubled
+    prepared = model.prepare(picture)[0, 0, :, 0] * 255
+    np.testing.assert_allclose(prepared[[0, -1]], [80, 160], atol=0.5)
+    np.testing.assert_allclose(model.prepare(np.full_like(picture, 10)) * 255, 25, atol=0.5)  # 2.5 times at most
+    np.testing.assert_allclose(model.prepare(np.full_like(picture, 240)) * 255, 120, atol=0.5)
+
+
 def test_scale_range_and_planar(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
     plain = load_with(exported, tmp_path, output_kind="relative").estimate(panorama(64))
     scaled = load_with(exported, tmp_path, output_kind="relative", output_scale=2.0).estimate(panorama(64))
@@ -155,6 +165,7 @@ def write_manifest(folder: Path, **changes: object) -> Path:
         ({"geometry": "flat"}, "geometry must be radial or planar"),
         ({"mean": [0.0, 1.0]}, "mean must be three numbers"),
         ({"std": [1.0, 0.0, 1.0]}, "std must be above 0"),
+        ({"brightness": 300}, "brightness must be a number from 0"),
         ({"max_range_m": -1}, "max_range_m must be a number above 0"),
         ({"max_range_m": 0.05}, "max_range_m must be above min_range_m"),
         ({"name": 7}, "name must be text"),

@@ -67,6 +67,7 @@ def _add_export(commands: Any) -> None:
     parser.add_argument("weights", type=Path, help="checkpoint file")
     parser.add_argument("--output", type=Path, required=True, help="ONNX file to write")
     parser.add_argument("--half", action="store_true", help="store the weights as float16")
+    parser.add_argument("--brightness", type=float, default=0.0, help="mean byte of the training pictures; 0: any")
     parser.add_argument("--max-range", type=float, default=16.0, help="metres (%(default)s)")
     parser.add_argument("--licence", default=LICENCE, help="of the weights, for the manifest (%(default)s)")
     parser.set_defaults(func=export)
@@ -129,7 +130,7 @@ def train(args: argparse.Namespace) -> int:
     if args.export:
         manifest = export_model(
             load_checkpoint(args.checkpoint), args.export, args.export.stem, LICENCE, config.max_range_m,
-            record=trainer.record(), half_weights=True,
+            record=trainer.record(), half_weights=True, brightness=data.brightness(),
         )  # fmt: skip
         print(f"wrote {args.export} ({args.export.stat().st_size / 1e6:.1f} MB, {manifest.sha256[:12]})", flush=True)
     return 0
@@ -149,7 +150,7 @@ def export(args: argparse.Namespace) -> int:
         return 1
     record = torch.load(args.weights, map_location="cpu", weights_only=True).get("record")
     manifest = export_model(
-        model, args.output, args.output.stem, args.licence, args.max_range, record=record, half_weights=args.half
+        model, args.output, args.output.stem, args.licence, args.max_range, record, args.half, args.brightness
     )
     print(f"wrote {args.output} ({args.output.stat().st_size / 1e6:.1f} MB), input "
           f"{manifest.input_width} x {manifest.input_height}")  # fmt: skip
