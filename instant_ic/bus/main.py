@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -96,6 +97,26 @@ def parse_remaps(words: Sequence[str]) -> dict[str, str]:
     return remaps
 
 
+def _stop_on_signals(node: Node[Any]) -> None:
+    """SIGINT and SIGTERM end the loop; teardown then runs on the node's own thread.
+
+    A handler runs between two steps of the main thread, which may hold the very lock that :meth:`Node.stop` needs: it
+    would wait for itself for ever. So the handler does nothing, and a thread that hears of the signal by a pipe stops
+    the node.
+    """
+    heard, written = os.pipe()
+    os.set_blocking(written, False)
+    signal.set_wakeup_fd(written, warn_on_full_buffer=False)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+
+    def wait_for_signal() -> None:
+        os.read(heard, 1)
+        node.stop()
+
+    threading.Thread(target=wait_for_signal, name="signals", daemon=True).start()
+
+
 def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None:
     """Runs a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters."""
     sys.exit(run(node_class, argv))
@@ -129,9 +150,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     node = node_class(config, transport, clock, args.name, args.namespace, remaps, use_sim_time=process.use_sim_time)
     os.nice(process.nice)
     started_ns = time.time_ns()
-    # Signals only set a flag: the loop sees it within half a second, and teardown runs on the node's own thread.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: node.stop())
+    _stop_on_signals(node)
     status = 0
     try:
         node.on_registry_change = lambda: claim.write({**node.describe(), "started_ns": started_ns})

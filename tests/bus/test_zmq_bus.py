@@ -16,6 +16,7 @@ from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.msg import String, deserialize, serialize
 
 TALKER = Path(__file__).with_name("talker_node.py")
+INTERRUPTED = Path(__file__).with_name("interrupted_node.py")
 
 
 @pytest.fixture
@@ -214,3 +215,11 @@ def test_every_node_takes_nice_and_checks_it(talker, run_dir):
     refused = talker("--name", "other", "-p", "nice:=-5")
     assert refused.wait(30) == 2
     assert "-p nice:=-5: nice must lie in 0..19 (got -5)" in refused.stderr.read()
+
+
+def test_signal_while_the_loop_holds_its_lock_does_not_hang(run_dir):
+    command = [sys.executable, str(INTERRUPTED), "--run-dir", str(run_dir)]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert "left in order" in done.stderr
+    assert list(run_dir.glob("topics/*/*.sock")) == []
