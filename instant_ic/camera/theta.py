@@ -240,7 +240,6 @@ class ThetaCamera(Camera):
         self._session: requests.Session | None = None
         self._response: requests.Response | None = None
         self._parser = PreviewParser()
-        self._pending: list[Frame] = []
 
     def connect(self) -> str:
         """Set the camera up and start its preview.

@@ -59,7 +59,6 @@ class Demo:
         self.plan: dict[str, Any] = {"trajectory": [], "path": [], "subgoal": None}
         self.costmap: GridImage | None = None
         self._command = (0.0, 0.0)
-        self._commanded = -math.inf
         self._transitions = 0
         self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
@@ -74,7 +73,6 @@ class Demo:
         """See Backend."""
         self.commands.append((linear, angular))
         self._command = (linear, angular)
-        self._commanded = time.monotonic()
 
     def on_estop(self, stop: bool) -> None:
         """See Backend."""

@@ -231,7 +231,7 @@ class ConsoleServer:
             raise web.HTTPServiceUnavailable(text=f"{self.config.max_clients} clients already\n")
         socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=1.0)
         await socket.prepare(request)
-        session = Session(self._next_number, socket, time.monotonic())
+        session = Session(self._next_number, socket)
         self._next_number += 1
         self._sessions[session.number] = session
         self._greet(session)
@@ -280,7 +280,6 @@ class ConsoleServer:
                     await session.socket.close(code=WSCloseCode.UNSUPPORTED_DATA)
                 return
             now = time.monotonic()
-            session.last_heard = now
             try:
                 self._handle(session, parse_text(message.data), now)
             except ProtocolError as error:

@@ -32,12 +32,10 @@ class Session:
     waits; the next frame of a kind goes when the last was acknowledged.
     """
 
-    def __init__(self, number: int, socket: web.WebSocketResponse, now: float) -> None:
+    def __init__(self, number: int, socket: web.WebSocketResponse) -> None:
         self.number = number
         self.socket = socket
-        self.last_heard = now
         self.bad_messages = 0
-        self.frames_replaced = 0
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}
@@ -60,7 +58,6 @@ class Session:
 
     def put_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
         """Queues a frame; replaces one of the same kind that still waits."""
-        self.frames_replaced += kind in self._frames
         self._frames[kind] = frame
         self._wake.set()
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_directions, equirect_pixels
+from instant_ic.geometry.projections import equirect_pixels
 
 Floats = NDArray[np.floating]
 MIN_VALUES = 20
@@ -342,10 +342,3 @@ class DepthScaler:
 
 def _is_known(depth: Floats) -> NDArray[np.bool_]:
     return np.isfinite(depth) & (depth > 0)
-
-
-def unproject(depth: Floats) -> Floats:
-    """Points (N, 3) in the camera's frame of the known pixels of a radial depth picture (H, W)."""
-    height, width = depth.shape
-    known = _is_known(depth)
-    return np.asarray(equirect_directions(width, height)[known] * depth[known][:, None])

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -73,9 +72,7 @@ class ManagedProcess:
         self.limit = limit or RespawnLimit(spec.respawn_delay_s)
         self.state = State.ENDED
         self.exit_status: int | None = None
-        self.started_s = 0.0
         self.start_again_s = 0.0
-        self.respawns = 0
         self.output_closed = False
         self.log_path = run_dir / "log" / (spec.name.strip("/").replace("/", ".") + ".log")
         self._run_dir = run_dir
@@ -114,7 +111,7 @@ class ManagedProcess:
         )
         assert self._popen.stdout is not None
         os.set_blocking(self._popen.stdout.fileno(), False)
-        self.state, self.exit_status, self.started_s = State.RUNNING, None, time.monotonic()
+        self.state, self.exit_status = State.RUNNING, None
         self.output_closed = False
 
     def send(self, signum: signal.Signals) -> None:

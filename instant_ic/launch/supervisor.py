@@ -139,7 +139,6 @@ class Supervisor:
             if process.has_ended():
                 self._reap(process)
             elif process.state is State.WAITING and not self._stop and time.monotonic() >= process.start_again_s:
-                process.respawns += 1
                 self._start(process)
         self._output.refresh(self.processes)
 
