@@ -11,13 +11,14 @@ import logging
 from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from ..msg import deserialize, serialize, type_name
 from .clock import ManualClock
 from .node import Node
 from .qos import LATCHED, QoS
-from .transport import Received, Stats
+from .transport import Payload, Received, Stats, joined
 
 NodeT = TypeVar("NodeT", bound=Node[Any])
 
@@ -45,9 +46,10 @@ class _Publisher:
     def subscriber_count(self) -> int:
         return len(self._bus.subscriptions.get(self.topic, ()))
 
-    def send(self, payload: bytes | memoryview) -> None:
-        self.stats.add(self._bus.clock.now_ns(), len(payload))
-        self._bus.route(self.topic, self.type_name, bytes(payload), self._node, self.qos)
+    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
+        data = bytes(joined(payload))
+        self.stats.add(self._bus.clock.now_ns(), len(data))
+        self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns)
 
     def close(self) -> None:
         pass
@@ -73,6 +75,8 @@ class _Subscription:
 
 
 class _Transport:
+    run_dir: Path | None = None
+
     def __init__(self, bus: LockstepBus, node: str) -> None:
         self._bus = bus
         self._node = node
@@ -187,9 +191,9 @@ class LockstepBus:
 
     # -- for publishers and subscriptions --------------------------------------------------------
 
-    def route(self, topic: str, name: str, payload: bytes, node: str, qos: QoS) -> None:
+    def route(self, topic: str, name: str, payload: bytes, node: str, qos: QoS, publish_ns: int | None = None) -> None:
         """Hands a message to every subscription of its topic."""
-        record = Record(topic, name, payload, self.clock.now_ns(), node, qos)
+        record = Record(topic, name, payload, self.clock.now_ns() if publish_ns is None else publish_ns, node, qos)
         if self._keep:
             self._records[topic].append(record)
         if qos.latched:

@@ -10,6 +10,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args
 
 from ..geometry.poses import Matrix
@@ -29,7 +30,7 @@ from ..msg import (
 from . import params
 from .clock import Clock, ManualClock
 from .qos import LATCHED, RELIABLE, SENSOR, QoS
-from .transport import RawPublisher, RawSubscription, Received, Transport
+from .transport import Payload, RawPublisher, RawSubscription, Received, Transport
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a diagnosis (diagnostic_msgs/DiagnosticStatus)."""
@@ -67,9 +68,14 @@ class Publisher:
             raise MessageError(f"{self.topic} carries {self.raw.type_name}, not {type_name(message)}")
         self.raw.send(serialize(message))
 
-    def publish_bytes(self, payload: bytes | memoryview) -> None:
-        """Sends CDR bytes as they are."""
-        self.raw.send(payload)
+    def publish_bytes(self, payload: Payload, publish_ns: int | None = None) -> None:
+        """Sends CDR bytes as they are: one buffer, or several that follow each other.
+
+        Args:
+            payload: must not be changed afterwards; it may still be on its way.
+            publish_ns: the publication time of a message that is only passed on; now, if not given.
+        """
+        self.raw.send(payload, publish_ns)
 
 
 class Subscription:
@@ -249,6 +255,11 @@ class Node(Generic[ConfigT]):
             if arguments and isinstance(arguments[0], type):
                 return arguments[0]
         raise TypeError(f"{cls.__name__} must derive from Node[ItsConfig]")
+
+    @property
+    def run_dir(self) -> Path | None:
+        """The run directory that the node's topics are in; None in lockstep."""
+        return self._transport.run_dir
 
     def resolve(self, topic: str) -> str:
         """A topic's name after remaps and namespace."""
@@ -508,6 +519,7 @@ class Node(Generic[ConfigT]):
         worst = max(self._diagnoses.values(), default=(OK, "", {}), key=lambda d: d[0])
         inputs = [s.raw for s in self.subscriptions]
         outputs = [p.raw for p in self.publishers]
+        losses = [(s.topic, node, count) for s in inputs for node, count in sorted(s.stats.lost_by.items())]
         process = _process()
         self._heartbeat.publish(
             status(
@@ -522,6 +534,9 @@ class Node(Generic[ConfigT]):
                 input_rates_hz=_f32(s.stats.rate_hz(now) for s in inputs),
                 input_ages_s=_f32(s.stats.age_s(now) for s in inputs),
                 input_lost=_u64(s.stats.lost for s in inputs),
+                lost_topics=[topic for topic, _, _ in losses],
+                lost_publishers=[node for _, node, _ in losses],
+                lost_counts=_u64(count for _, _, count in losses),
                 outputs=[p.topic for p in outputs],
                 output_rates_hz=_f32(p.stats.rate_hz(now) for p in outputs),
             )
@@ -552,6 +567,7 @@ class Node(Generic[ConfigT]):
                         values=_key_values(
                             {
                                 "lost": raw.stats.lost,
+                                **{f"lost from {node}": n for node, n in sorted(raw.stats.lost_by.items())},
                                 "refused": raw.stats.rejected,
                                 "rate_hz": round(raw.stats.rate_hz(now), 2),
                                 "age_s": round(raw.stats.age_s(now), 3),

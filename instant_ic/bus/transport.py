@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 from .qos import QoS
+
+Buffer = bytes | bytearray | memoryview
+
+Payload = Buffer | Sequence[Buffer]
+"""CDR bytes: one buffer, or several that follow each other on the wire."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +34,21 @@ class Stats:
 
     def __init__(self) -> None:
         self.count = 0
-        self.lost = 0
+        self.lost_by: dict[str, int] = {}
         self.rejected = 0
         self.bytes = 0
         self.newest_ns = 0
         self._arrivals: deque[int] = deque(maxlen=50)
+
+    @property
+    def lost(self) -> int:
+        """Messages that never came, of all publishers together."""
+        return sum(self.lost_by.values())
+
+    def lose(self, publisher: str, count: int) -> None:
+        """Counts messages that a publisher (the name of its node) sent and that did not come."""
+        if count > 0:
+            self.lost_by = {**self.lost_by, publisher: self.lost_by.get(publisher, 0) + count}
 
     def add(self, now_ns: int, size: int) -> None:
         """Counts one message."""
@@ -65,8 +81,18 @@ class RawPublisher(Protocol):
 
     @property
     def subscriber_count(self) -> int: ...
-    def send(self, payload: bytes | memoryview) -> None: ...
+    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
+        """Sends one message; ``publish_ns`` keeps the publication time of a message that is only passed on."""
+        ...
+
     def close(self) -> None: ...
+
+
+def joined(payload: Payload) -> bytes | memoryview:
+    """A payload as one piece; copied only where it comes in several."""
+    if isinstance(payload, (bytes, memoryview)):
+        return payload
+    return memoryview(payload) if isinstance(payload, bytearray) else b"".join(payload)
 
 
 class RawSubscription(Protocol):
@@ -86,6 +112,11 @@ class RawSubscription(Protocol):
 
 class Transport(Protocol):
     """Topics in and out of one node."""
+
+    @property
+    def run_dir(self) -> Path | None:
+        """Where the topics are found; None in lockstep."""
+        ...
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> RawPublisher: ...
     def subscribe(

@@ -20,7 +20,7 @@ import zmq
 from . import registry
 from .frame import FrameError, FrameHeader, type_digest
 from .qos import QoS
-from .transport import Received, Stats
+from .transport import Payload, Received, Stats, joined
 
 _LINGER_MS = 200  # a last zero command still goes out when a node ends
 _HOUSEKEEPING_S = 0.05
@@ -76,14 +76,15 @@ class ZmqPublisher:
         self.attend()
         return self._subscribers
 
-    def send(self, payload: bytes | memoryview) -> None:
+    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         """Sends one message; never waits."""
         now = self._now_ns()
+        payload = joined(payload)
         with self._lock:
             if self._closed:
                 return
             self._sequence += 1
-            head = FrameHeader(self._sequence, now, self._id, self._digest).pack()
+            head = FrameHeader(self._sequence, now if publish_ns is None else publish_ns, self._id, self._digest).pack()
             frames: list[bytes | memoryview] = [self._topic_bytes, head, payload]
             if self.qos.latched:
                 self._last = frames
@@ -137,6 +138,7 @@ class ZmqSubscription:
         self._on_ready = on_ready
         self._digest = type_digest(type_name) if type_name else None
         self._names: dict[bytes, str] = {}
+        self._nodes: dict[bytes, str] = {}
         self._sequences: dict[bytes, int] = {}
         self._told: set[bytes] = set()
         self._lock = threading.Lock()
@@ -170,6 +172,7 @@ class ZmqSubscription:
             del self._connected[path]
         for path, info in wanted.items():
             self._names[bytes.fromhex(info.id)] = info.type_name
+            self._nodes[bytes.fromhex(info.id)] = info.node
             if path not in self._connected:
                 self.socket.connect(f"ipc://{path}")
             self._connected[path] = info.id
@@ -205,7 +208,7 @@ class ZmqSubscription:
         if last is not None:
             if head.sequence <= last:  # a latched value sent again for someone else
                 return False
-            self.stats.lost += head.sequence - last - 1
+            self.stats.lose(self._node_of(head.publisher), head.sequence - last - 1)
         self._sequences[head.publisher] = head.sequence
         now = self._transport.now_ns()
         payload = frames[2].buffer
@@ -219,12 +222,15 @@ class ZmqSubscription:
             if self.qos.depth == 1:
                 self._newest[head.publisher] = message
             elif len(self._queue) >= self.qos.depth:
-                self.stats.lost += 1
+                self.stats.lose(self._node_of(head.publisher), 1)
                 self._queue.popleft()
                 self._queue.append(message)
             else:
                 self._queue.append(message)
         return True
+
+    def _node_of(self, publisher: bytes) -> str:
+        return self._nodes.get(publisher, publisher.hex())
 
     def _reject(self, publisher: bytes, why: str) -> None:
         self.stats.rejected += 1

@@ -113,6 +113,9 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
             input_rates_hz=empty,
             input_ages_s=empty,
             input_lost=np.zeros(0, np.uint64),
+            lost_topics=[],
+            lost_publishers=[],
+            lost_counts=np.zeros(0, np.uint64),
             outputs=["/pose"],
             output_rates_hz=np.array([10.0], np.float32),
         )
