@@ -539,6 +539,7 @@ class Node(Generic[ConfigT]):
                 lost_counts=_u64(count for _, _, count in losses),
                 outputs=[p.topic for p in outputs],
                 output_rates_hz=_f32(p.stats.rate_hz(now) for p in outputs),
+                output_ages_s=_f32(p.stats.age_s(now) for p in outputs),
             )
         )
 

@@ -299,7 +299,7 @@ def heartbeat(node, state):
         header=header("", 0), node=node, pid=1, state=state, message="", cpu_percent=0.0, rss_mb=0.0, inputs=[],
         input_rates_hz=np.zeros(0, np.float32), input_ages_s=np.zeros(0, np.float32),
         input_lost=np.zeros(0, np.uint64), lost_topics=[], lost_publishers=[], lost_counts=np.zeros(0, np.uint64),
-        outputs=[], output_rates_hz=np.zeros(0, np.float32),
+        outputs=[], output_rates_hz=np.zeros(0, np.float32), output_ages_s=np.zeros(0, np.float32),
     )  # fmt: skip
 
 

@@ -1,0 +1,106 @@
+"""Nominal rates of topics (``config/topics.yaml``), and what follows from them: alive, right rate."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from instant_ic import paths
+
+ALIVE_PERIODS = 10.0
+"""A topic whose newest message is older than this many periods has stopped."""
+
+FREQ_OK_SHARE = 0.9
+"""Share of the nominal rate from which on a rate is right."""
+
+
+class TopicTableError(ValueError):
+    """The table of rates cannot be used; the message says where and why."""
+
+
+@dataclass(frozen=True)
+class TopicRate:
+    """What is expected of a topic.
+
+    Attributes:
+        rate_hz: nominal rate, messages a second.
+        when: it flows only then (words); empty where it flows all the time.
+    """
+
+    rate_hz: float
+    when: str = ""
+
+    def alive(self, age_s: float) -> bool:
+        """Whether a newest message of this age is young enough (inf: there was none)."""
+        return age_s * self.rate_hz < ALIVE_PERIODS
+
+    def freq_ok(self, rate_hz: float) -> bool:
+        """Whether a measured rate comes near enough to the nominal one."""
+        return rate_hz > FREQ_OK_SHARE * self.rate_hz
+
+    def fault(self, rate_hz: float, age_s: float) -> str:
+        """What is wrong in words, with the numbers; empty where nothing is.
+
+        Args:
+            rate_hz: measured rate.
+            age_s: of the newest message; inf before the first.
+        """
+        if not self.alive(age_s):
+            if self.when:  # its absence means nothing
+                return ""
+            return "has not come yet" if math.isinf(age_s) else f"stopped {age_s:.1f} s ago"
+        if not self.freq_ok(rate_hz):
+            return f"{rate_hz:.1f} of {self.rate_hz:g} Hz"
+        return ""
+
+
+def read_topic_rates(file: Path) -> dict[str, TopicRate]:
+    """Topic → what is expected of it.
+
+    Raises:
+        TopicTableError: the file cannot be read, a key is unknown, a rate is no number > 0; with every mistake.
+    """
+    from instant_ic.launch.source import Problem, load
+
+    problems: list[Problem] = []
+    rates: dict[str, TopicRate] = {}
+    root = load(file, problems)
+    for topic, entry in root.fields().items() if root is not None else ():
+        fields = entry.fields(known=("rate_hz", "when"), required=("rate_hz",))
+        rate, when = fields.get("rate_hz"), fields.get("when")
+        number = rate.plain() if rate is not None else 1
+        if not isinstance(number, int | float) or isinstance(number, bool) or not 0 < number < math.inf:
+            entry.problem(f"{topic}: rate_hz must be a number > 0 (got {number!r})")
+        elif not topic.startswith("/"):
+            entry.problem(f"topic {topic!r} must begin with /")
+        else:
+            rates[topic] = TopicRate(float(number), (when.text() if when is not None else "") or "")
+    if problems:
+        raise TopicTableError("\n".join(map(str, problems)))
+    return rates
+
+
+@functools.cache
+def topic_rates() -> dict[str, TopicRate]:
+    """The shipped table, ``config/topics.yaml``; read once.
+
+    Raises:
+        TopicTableError: see :func:`read_topic_rates`.
+    """
+    return read_topic_rates(paths.shipped_file("config", "topics.yaml"))
+
+
+def nominal_rate(topic: str, namespace: str = "") -> TopicRate | None:
+    """What is expected of a topic, or None where nothing is known.
+
+    Args:
+        topic: full name, ``/left/scan``.
+        namespace: of the node that sends it, ``left``; the table knows topics without it.
+    """
+    rates = topic_rates()
+    prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else ""
+    if topic in rates:
+        return rates[topic]
+    return rates.get(topic[len(prefix) - 1 :]) if prefix and topic.startswith(prefix) else None

@@ -1,0 +1,58 @@
+"""The table of nominal rates and what is judged by it."""
+
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from instant_ic.launch.topics import TopicRate, TopicTableError, nominal_rate, read_topic_rates, topic_rates
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def test_alive_is_younger_than_ten_periods() -> None:
+    scan = TopicRate(10.0)
+    assert scan.alive(0.99) and not scan.alive(1.0) and not scan.alive(math.inf)
+    assert TopicRate(0.5).alive(19.9)  # a period of 2 s
+
+
+def test_rate_is_right_above_nine_tenths() -> None:
+    assert TopicRate(10.0).freq_ok(9.01) and not TopicRate(10.0).freq_ok(9.0)
+
+
+@pytest.mark.parametrize(
+    ("expected", "rate_hz", "age_s", "words"),
+    [
+        (TopicRate(10.0), 10.0, 0.1, ""),
+        (TopicRate(10.0), 7.25, 0.1, "7.2 of 10 Hz"),
+        (TopicRate(10.0), 3.0, 2.5, "stopped 2.5 s ago"),
+        (TopicRate(10.0), 0.0, math.inf, "has not come yet"),
+        (TopicRate(10.0, "driving"), 0.0, math.inf, ""),
+        (TopicRate(10.0, "driving"), 0.0, 60.0, ""),
+        (TopicRate(10.0, "driving"), 5.0, 0.2, "5.0 of 10 Hz"),
+    ],
+)
+def test_fault(expected: TopicRate, rate_hz: float, age_s: float, words: str) -> None:
+    assert expected.fault(rate_hz, age_s) == words
+
+
+def test_namespace_of_the_sender_is_left_out() -> None:
+    assert nominal_rate("/scan") == TopicRate(10.0) == nominal_rate("/left/scan", "left")
+    assert nominal_rate("/left/scan") is None and nominal_rate("/leftscan", "left") is None
+
+
+def test_mistakes_are_told_with_their_lines(tmp_path: Path) -> None:
+    file = tmp_path / "topics.yaml"
+    file.write_text("/a: {rate_hz: 0}\n/b: {rate: 3}\nc: {rate_hz: 1}\n/d: {rate_hz: yes}\n")
+    with pytest.raises(TopicTableError) as caught:
+        read_topic_rates(file)
+    lines = str(caught.value).splitlines()
+    assert [int(line.split(":")[1]) for line in lines] == [1, 2, 2, 3, 4]
+    assert "rate_hz must be a number > 0 (got 0)" in lines[0] and "unknown key 'rate'" in lines[1]
+
+
+def test_every_topic_of_the_table_is_one_that_a_node_gives() -> None:
+    reference = (ROOT / "docs" / "reference.md").read_text()
+    given = set(re.findall(r"`(/[\w/]+)`", " ".join(re.findall(r"^Gives: .*$", reference, re.MULTILINE))))
+    assert set(topic_rates()) - {"/heartbeat", "/diagnostics"} <= given
