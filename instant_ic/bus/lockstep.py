@@ -214,7 +214,9 @@ class LockstepBus:
         now = self.clock.now_ns()
         subscription.stats.add(now, len(record.payload))
         subscription.queue.append(
-            Received(record.topic, record.type_name, record.payload, record.stamp_ns, now, next(self._orders))
+            Received(
+                record.topic, record.type_name, record.payload, record.stamp_ns, now, next(self._orders), record.node
+            )
         )
 
     def _run(self) -> None:

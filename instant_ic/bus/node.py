@@ -298,6 +298,19 @@ class Node(Generic[ConfigT]):
 
         return self._subscribe(topic, None, forward, qos)
 
+    def subscribe_received(self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE) -> Subscription:
+        """As :meth:`subscribe_raw` with all that is known of a message, its publisher too; for bridges."""
+        return self._subscribe(topic, None, callback, qos)
+
+    def drop(self, item: Publisher | Subscription) -> None:
+        """Ends a publisher or a subscription while the node goes on, as a bridge does when a topic leaves."""
+        item.raw.close()
+        if isinstance(item, Publisher):
+            self.publishers.remove(item)
+        else:
+            self.subscriptions.remove(item)
+        self._registry_changed()
+
     def latest(self, topic: str, message_class: Any, max_age_s: float, qos: QoS = SENSOR) -> Latest:
         """Keeps the newest message of a topic at hand."""
         latest = Latest(self.clock, max_age_s)

@@ -27,6 +27,8 @@ class Received:
     received_ns: int
     order: int
     """Place in the order of arrival over all subscriptions of a node."""
+    publisher: str = ""
+    """Name of the node that published it; its id in hex digits where the name is not known yet."""
 
 
 class Stats:

@@ -216,7 +216,8 @@ class ZmqSubscription:
         if type_name is None:  # a raw reader that heard the publisher before it read its JSON
             self.discover()
             type_name = self._names.get(head.publisher, "")
-        message = Received(self.topic, type_name, payload, head.publish_ns, now, self._transport.next_order())
+        order, node = self._transport.next_order(), self._node_of(head.publisher)
+        message = Received(self.topic, type_name, payload, head.publish_ns, now, order, node)
         self.stats.add(now, len(payload))
         with self._lock:
             if self.qos.depth == 1:
