@@ -16,7 +16,7 @@ import numpy as np
 from instant_ic.evaluation.slam import evaluate_log, read_relations, read_stamps
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam, Scan
-from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.backend import warm_up
 from instant_ic.slam.logs import read_log
 
 

@@ -36,7 +36,7 @@ from instant_ic.slam import (
     SlamResult,
     SlamStatus,
 )
-from instant_ic.slam.grid_slam import warm_up
+from instant_ic.slam.backend import warm_up
 from instant_ic.slam.odometry import CorrectionLimiter, OdometryBuffer
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
@@ -47,6 +47,7 @@ ODOMETRY_QUEUE = QoS("sensor", depth=100)
 class GridSlamConfig:
     """Parameters; `config/slam.yaml` explains each."""
 
+    backend: str = "graph"
     map_frame: str = "map"
     odom_frame: str = "odom"
     base_frame: str = "base_link"
@@ -79,7 +80,7 @@ class GridSlamConfig:
     @property
     def slam(self) -> SlamConfig:
         """The library's part."""
-        return SlamConfig(self.odometry, self.field, self.match, self.keyframe, self.map)
+        return SlamConfig(self.backend, self.odometry, self.field, self.match, self.keyframe, self.map)
 
 
 @dataclass(frozen=True)

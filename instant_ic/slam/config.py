@@ -25,6 +25,9 @@ def _require_not_negative(config: Any, *keys: str) -> None:
         _require(config, key, math.isfinite(value) and value >= 0, ">= 0")
 
 
+BACKENDS = ("graph", "rbpf")
+
+
 @dataclass(frozen=True)
 class OdometryNoise:
     """One standard deviation of an odometry step of ``d`` metres and ``a`` radians.
@@ -151,10 +154,14 @@ class MapConfig:
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """Everything `GridSlam` needs."""
+    """Everything a SLAM method needs."""
 
+    backend: str = "graph"
     odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
     keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
+
+    def __post_init__(self) -> None:
+        _require(self, "backend", self.backend in BACKENDS, f"one of {', '.join(BACKENDS)}")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +44,14 @@ class SlamStatus(enum.StrEnum):
         return self in (SlamStatus.FIRST, SlamStatus.TRACKED, SlamStatus.RECOVERED)
 
 
+class Anchor(Protocol):
+    """A pose of the past that later corrections move."""
+
+    def pose(self) -> FloatArray:
+        """map_from_base (3,) as it is known now."""
+        ...
+
+
 @dataclass(frozen=True)
 class SlamResult:
     """Answer for one scan.
@@ -52,6 +62,7 @@ class SlamResult:
         score: 0..1, mean likelihood field value over the points.
         status: what became of the scan.
         keyframe_added: whether the map has changed.
+        anchor: what carries this scan when the map is corrected later; None before the first keyframe.
     """
 
     map_from_base: FloatArray
@@ -59,6 +70,7 @@ class SlamResult:
     score: float
     status: SlamStatus
     keyframe_added: bool
+    anchor: Anchor | None = None
 
 
 class GridSlam:
@@ -113,11 +125,26 @@ class GridSlam:
         if track.keyframe is not None:
             self.map.insert(track.keyframe.map_from_base, track.keyframe.scan)
         self._follow(track, odometry, scan.stamp_ns)
-        return SlamResult(track.pose, track.covariance, track.score, status, track.keyframe is not None)
+        anchor = self.front_end.trajectory.keyframes[-1]
+        return SlamResult(track.pose, track.covariance, track.score, status, track.keyframe is not None, anchor)
 
     def grid(self) -> OccupancyGrid:
         """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
         return self.map.grid()
+
+    def background_job(self) -> Callable[[], Any] | None:
+        """See `instant_ic.slam.backend.Slam`."""
+        return None
+
+    def take_over(self, outcome: Any) -> None:
+        """See `instant_ic.slam.backend.Slam`."""
+
+    def finish(self) -> None:
+        """See `instant_ic.slam.backend.Slam`."""
+
+    def figures(self) -> dict[str, object]:
+        """See `instant_ic.slam.backend.Slam`."""
+        return {"keyframes": len(self.front_end.trajectory)}
 
     def _guess(self, odometry: FloatArray | None, stamp_ns: int) -> Guess:
         if self._stamp_ns is None:
@@ -156,13 +183,3 @@ _STATUS = {
     TrackStatus.LOST: SlamStatus.LOST,
     TrackStatus.RESTARTED: SlamStatus.RESTARTED,
 }
-
-
-def warm_up(config: SlamConfig | None = None) -> None:
-    """Compile the kernels, or load them from their cache, so that the first scan is not held up by it."""
-    slam = GridSlam(config)
-    angles = np.linspace(-math.pi, math.pi, 181)[:-1]
-    ranges = np.minimum(2.0 / np.maximum(np.abs(np.cos(angles)), 1e-6), 3.0 / np.maximum(np.abs(np.sin(angles)), 1e-6))
-    for index in range(2):
-        slam.process(Scan(ranges, -math.pi, 2 * math.pi / 180, 0.1, 30.0, index + 1))
-    slam.grid()

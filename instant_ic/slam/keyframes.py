@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from instant_ic.geometry.poses import compose2
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 
@@ -19,6 +20,7 @@ class Keyframe:
         covariance: (3, 3) of the match that placed it, relative to the keyframes before.
         scan: its points in the base frame.
         dead_reckoned: whether the scan did not match and the pose is odometry's.
+        merged_into: the keyframe that stands for this one since it was taken out, and this one's pose there (3,).
     """
 
     stamp_ns: int
@@ -26,6 +28,14 @@ class Keyframe:
     covariance: FloatArray
     scan: ScanPoints
     dead_reckoned: bool
+    merged_into: tuple[Keyframe, FloatArray] | None = None
+
+    def pose(self) -> FloatArray:
+        """map_from_base as it is known now (3,); of a keyframe that was taken out, by the one it was merged into."""
+        if self.merged_into is None:
+            return self.map_from_base
+        other, other_from_this = self.merged_into
+        return compose2(other.pose(), other_from_this)
 
 
 class Trajectory:

@@ -9,6 +9,7 @@ import gzip
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import IO
 
@@ -28,13 +29,15 @@ class LogEntry:
 
     Attributes:
         scan: ranges by REP-117.
-        odom_pose: odom_from_base (3,).
+        odom_pose: odom_from_base (3,); None: the log has no odometry.
         base_from_laser: (3,).
+        logger_s: the logger's own time of the scan, where the log has a second time column, seconds.
     """
 
     scan: Scan
-    odom_pose: FloatArray
+    odom_pose: FloatArray | None
     base_from_laser: FloatArray
+    logger_s: float | None = None
 
 
 def open_log(path: str | Path) -> IO[str]:
@@ -61,34 +64,112 @@ def read_log(path: str | Path) -> Iterator[LogEntry]:
     yield from read_mines(path) if mines else read_carmen(path)
 
 
-def read_carmen(path: str | Path, range_max: float = 80.0) -> Iterator[LogEntry]:
+@dataclass(frozen=True)
+class _Survey:
+    """What only the whole CARMEN log tells about its lines.
+
+    Attributes:
+        range_max: FLASER readings at or above it mean that nothing was met, metres.
+        mount: base_from_laser (3,).
+        odometry: slice of the line's six pose values that holds the odometry; None: there is none.
+    """
+
+    range_max: float
+    mount: FloatArray
+    odometry: slice | None
+
+
+_LASER_POSE, _ROBOT_POSE = slice(0, 3), slice(3, 6)
+_SICK_RANGE_MAX_M = 80.0
+_SURVEYED_SCANS = 400
+
+
+def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[LogEntry]:
     """Scans of a CARMEN log.
 
-    ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``: 180° to the front,
-    right to left, 1° apart up to 181 beams and 0.5° above, from −90°. ``ROBOTLASER1`` lines carry angles and maximum
-    themselves. Other messages are passed over. The laser's place on the robot follows from the line's two poses.
+    ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, the
+    middle beam to the front. ``ROBOTLASER1`` lines carry angles and maximum themselves. Other messages are passed
+    over. The laser's place on the robot follows from the lines' two poses where these always differ by the same;
+    where they do not, the first is somebody's corrected pose, and the laser is taken to stand in the middle.
 
     Args:
         path: the log, gzip or not.
-        range_max: FLASER readings at or above it, in metres, mean that nothing was met.
+        range_max: FLASER readings at or above it, in metres, mean that nothing was met. None: the log's own
+            ``PARAM``, or the value that readings pile up at, or 80 m.
 
     Raises:
         LogError: a line that cannot be read, or no scan at all.
     """
+    survey = _survey(path, range_max)
     scans = 0
     with open_log(path) as lines:
         for number, line in enumerate(lines, start=1):
             kind, *fields = line.split() or [""]
-            if kind not in ("FLASER", "ROBOTLASER1"):
+            if kind not in _CARMEN_SCANS:
                 continue
             try:
-                entry = _flaser(fields, range_max) if kind == "FLASER" else _robotlaser(fields)
+                entry = _flaser(fields, survey) if kind == "FLASER" else _robotlaser(fields, survey)
             except (ValueError, IndexError, OverflowError) as error:
                 raise LogError(f"{path}:{number}: {kind}: {error}") from None
             scans += 1
             yield entry
     if scans == 0:
         raise LogError(f"{path}: no FLASER or ROBOTLASER1 line: is this a CARMEN log?")
+
+
+def _survey(path: str | Path, range_max: float | None) -> _Survey:
+    """Reads a CARMEN log through once; lines that cannot be read are left for the reader to name."""
+    poses: list[FloatArray] = []
+    readings: list[FloatArray] = []
+    with open_log(path) as lines:
+        for line in lines:
+            kind, *fields = line.split() or [""]
+            try:
+                if kind == "PARAM" and fields[0] in ("robot_front_laser_max", "robot_frontlaser_max"):
+                    range_max = float(fields[1]) if range_max is None else range_max
+                if kind not in _CARMEN_SCANS:
+                    continue
+                if kind == "FLASER":
+                    count = _count(fields[0], "readings")
+                    if len(readings) < _SURVEYED_SCANS and len(poses) % (1 if len(poses) < 100 else 10) == 0:
+                        readings.append(_numbers(fields[1:], "readings", count))
+                    tail = fields[1 + count :]
+                else:
+                    at = 8 + _count(fields[7], "readings")
+                    tail = fields[at + 1 + _count(fields[at], "remissions") :]
+                poses.append(_numbers(tail, "pose values", 6))
+            except (ValueError, IndexError, OverflowError):
+                continue
+    if range_max is None:
+        range_max = _pile(np.concatenate(readings)) if readings else _SICK_RANGE_MAX_M
+    if not poses:
+        return _Survey(range_max, np.zeros(3), _ROBOT_POSE)
+    both = np.array(poses)
+    moves = [len(both) == 1 or bool((both[:, part] != both[0, part]).any()) for part in (_LASER_POSE, _ROBOT_POSE)]
+    if not moves[1]:
+        return _Survey(range_max, np.zeros(3), _LASER_POSE if moves[0] else None)
+    offsets = np.array([relative2(pose[_ROBOT_POSE], pose[_LASER_POSE]) for pose in poses])
+    mount = np.median(offsets, axis=0)
+    constant = (np.abs(offsets - mount).max(axis=0) <= _MOUNT_WOBBLE).all() and math.hypot(mount[0], mount[1]) < 2.0
+    return _Survey(range_max, mount if constant else np.zeros(3), _ROBOT_POSE)
+
+
+_CARMEN_SCANS = ("FLASER", "ROBOTLASER1")
+_MOUNT_WOBBLE = np.array([0.05, 0.05, 0.05])
+
+
+def _pile(readings: FloatArray) -> float:
+    """The range that stands for "nothing met": where the largest readings pile up, or the SICK's 80 m.
+
+    A laser that writes its maximum for a beam without return (8.183 m, 50 m, ...) would else draw arcs of wall.
+    """
+    readings = readings[readings < _SICK_RANGE_MAX_M]
+    if len(readings) == 0:
+        return _SICK_RANGE_MAX_M
+    top = float(readings.max())
+    at_top = int((readings >= top - 0.02).sum())
+    below = int(((readings < top - 0.02) & (readings >= 0.9 * top)).sum())
+    return top - 0.02 if at_top >= max(50, 0.002 * len(readings)) and at_top > below else _SICK_RANGE_MAX_M
 
 
 def _numbers(fields: list[str], what: str, count: int) -> FloatArray:
@@ -109,17 +190,32 @@ def _count(text: str, what: str) -> int:
 
 def _stamp_ns(text: str) -> int:
     """Seconds in decimal, exactly: a float64 of an epoch time keeps only a tenth of a microsecond."""
-    whole, _, part = text.partition(".")
-    if not whole.isdigit() or (part and not part.isdigit()):
-        raise ValueError(f"time stamp {text!r} is not a decimal number")
-    return int(whole) * 1_000_000_000 + int((part + "000000000")[:9])
+    try:
+        return int(Decimal(text) * 1_000_000_000)
+    except (InvalidOperation, ValueError, OverflowError):
+        raise ValueError(f"time stamp {text!r} is not a decimal number") from None
+
+
+def _second_stamp(fields: list[str]) -> float | None:
+    """The logger's time, where the line has one."""
+    try:
+        return float(fields[0])
+    except (IndexError, ValueError):
+        return None
 
 
 def _no_return(ranges: FloatArray, range_max: float) -> FloatArray:
     return np.where(ranges >= range_max, np.inf, ranges)
 
 
-def _flaser(fields: list[str], range_max: float) -> LogEntry:
+_FLASER_INCREMENT_DEG = {
+    90: 2.0, 91: 2.0, 101: 1.0, 180: 1.0, 181: 1.0, 201: 0.5, 360: 0.5, 361: 0.5, 401: 0.25, 540: 0.5, 541: 0.5,
+    681: 0.36, 682: 0.36, 720: 0.25, 721: 0.25, 1081: 0.25,
+}  # fmt: skip
+"""Degrees between the beams of the usual planar lasers, by their number; of others, 180° is the field of view."""
+
+
+def _flaser(fields: list[str], survey: _Survey) -> LogEntry:
     if not fields:
         raise ValueError("the line is empty")
     count = _count(fields[0], "readings")
@@ -128,12 +224,14 @@ def _flaser(fields: list[str], range_max: float) -> LogEntry:
     if len(tail) < 7:
         raise ValueError(f"two poses and a time must follow the {count} readings, only {len(tail)} fields do")
     poses = _numbers(tail, "pose values", 6)
-    increment = math.radians(1.0 if count <= 181 else 0.5)
-    scan = Scan(_no_return(ranges, range_max), -math.pi / 2, increment, 0.02, range_max, _stamp_ns(tail[6]))
-    return LogEntry(scan, poses[3:], relative2(poses[3:], poses[:3]))
+    increment = math.radians(_FLASER_INCREMENT_DEG.get(count, 180.0 / max(count - 1, 1) if count > 181 else 1.0))
+    # 180 of 181 beams: the last one, at +90°, is missing. So with the other even numbers.
+    angle_min = -increment * (count // 2) if count in _FLASER_INCREMENT_DEG else -math.pi / 2
+    scan = Scan(_no_return(ranges, survey.range_max), angle_min, increment, 0.02, survey.range_max, _stamp_ns(tail[6]))
+    return _entry(scan, poses, survey, tail[8:])
 
 
-def _robotlaser(fields: list[str]) -> LogEntry:
+def _robotlaser(fields: list[str], survey: _Survey) -> LogEntry:
     _, start, _, increment, range_max = _numbers(fields, "header values", 5)
     at = 7
     count = _count(fields[at], "readings")
@@ -145,7 +243,12 @@ def _robotlaser(fields: list[str]) -> LogEntry:
         raise ValueError(f"poses, speeds and a time must follow the readings, only {len(tail)} fields do")
     poses = _numbers(tail, "pose values", 6)
     scan = Scan(_no_return(ranges, range_max), start, increment, 0.02, range_max, _stamp_ns(tail[11]))
-    return LogEntry(scan, poses[3:], relative2(poses[3:], poses[:3]))
+    return _entry(scan, poses, survey, tail[13:])
+
+
+def _entry(scan: Scan, poses: FloatArray, survey: _Survey, rest: list[str]) -> LogEntry:
+    odometry = None if survey.odometry is None else poses[survey.odometry]
+    return LogEntry(scan, odometry, survey.mount, _second_stamp(rest))
 
 
 _MINES_FIRST_RANGE = 24

@@ -1,18 +1,27 @@
-"""``ic evaluate``: runs the stack or a part of it on recordings and measures what comes out."""
+"""``ic evaluate``: runs the stack or a part of it on recordings and measures what comes out.
+
+Each module ``evaluate_*`` beside this one adds a kind by its ``add_kind(kinds)``.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
+import pkgutil
 import sys
 from pathlib import Path
 from typing import Any
+
+from instant_ic.cli import commands
 
 
 def add_parser(subparsers: Any) -> None:
     """Adds ``evaluate`` to the ``ic`` command."""
     parser = subparsers.add_parser(
-        "evaluate", help="measure the stack on recordings", description=__doc__.replace("``", "")
+        "evaluate",
+        help="measure the stack on recordings",
+        description="Runs the stack or a part of it on recordings and measures what comes out.",
     )
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
     recordings = kinds.add_parser(
@@ -33,6 +42,9 @@ def add_parser(subparsers: Any) -> None:
     recordings.add_argument("--timeout", type=float, default=240.0, metavar="S", help="in all (default: %(default)g s)")
     recordings.add_argument("--json", type=Path, metavar="OUT", help="also write the summary here")
     recordings.set_defaults(func=evaluate_recordings)
+    for info in sorted(pkgutil.iter_modules(commands.__path__), key=lambda info: info.name):
+        if info.name.startswith("evaluate_"):
+            importlib.import_module(f"{commands.__name__}.{info.name}").add_kind(kinds)
 
 
 def evaluate_recordings(args: argparse.Namespace) -> int:

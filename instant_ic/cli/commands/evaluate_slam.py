@@ -1,0 +1,123 @@
+"""``ic evaluate slam``: a laser log through SLAM; see `instant_ic.cli.commands.evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import UserError
+
+if TYPE_CHECKING:
+    from ...evaluation.slam import LogResult
+    from ...slam.logs import LogEntry
+
+
+def add_kind(kinds: Any) -> None:
+    """Adds ``slam`` to ``ic evaluate``."""
+    parser = kinds.add_parser(
+        "slam",
+        help="a 2D laser log through the grid SLAM",
+        description=(
+            "Runs a log through the grid SLAM as fast as it goes. LOG is a CARMEN log (FLASER or ROBOTLASER1 lines, "
+            "gzip or not), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes the final trajectory, 't x y yaw' "
+            "a line for every scan, and prints the figures as JSON; with relations also the error against them."
+        ),
+        epilog="example: ic evaluate slam intel.log.gz --relations intel.relations --stamps intel.exact_stamps",
+    )
+    parser.add_argument("log", type=Path, metavar="LOG")
+    parser.add_argument("--relations", type=Path, metavar="REL", help="checked relations: t1 t2 x y z roll pitch yaw")
+    parser.add_argument("--stamps", type=Path, metavar="FILE", help="only relations whose ends lie on these times")
+    parser.add_argument(
+        "--tolerance", type=float, default=0.006, metavar="S", help="... within so much (default: %(default)g s)"
+    )
+    parser.add_argument("--backend", choices=("graph", "rbpf"), help="SLAM method (default: slam.backend, graph)")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="picture of map and trajectory")
+    parser.add_argument(
+        "--trajectory", type=Path, metavar="FILE", help="trajectory file (default: LOG's name + .trajectory.txt, here)"
+    )
+    parser.add_argument("--scan-topic", metavar="TOPIC", help="of a bag with several LaserScan topics")
+    parser.add_argument("--params-file", type=Path, action="append", metavar="F", help="parameters of grid_slam")
+    parser.add_argument(
+        "-p", "--param", action="append", default=[], metavar="KEY:=VALUE", help="one parameter of grid_slam"
+    )
+    parser.add_argument("--no-odometry", action="store_true", help="leave the log's odometry out")
+    parser.add_argument("--perturb-odometry", type=int, metavar="SEED", help="worsen it: 5 %% noise, 2 %% scale")
+    parser.set_defaults(func=evaluate_slam)
+
+
+def evaluate_slam(args: argparse.Namespace) -> int:
+    """Runs ``ic evaluate slam``; returns the exit status."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from ...bag.replay import make_node
+    from ...evaluation.slam import evaluate_log, perturb_odometry, read_relations, read_stamps, write_trajectory
+    from ...evaluation.slam_bag import is_bag, read_bag
+    from ...slam.logs import LogError, read_log
+
+    if args.stamps and not args.relations:
+        raise UserError("--stamps chooses among relations: give --relations too", 2)
+    if not args.tolerance > 0:
+        raise UserError(f"--tolerance must be > 0 (got {args.tolerance:g})", 2)
+    words = [f"grid_slam.{word}" for word in args.param]
+    if args.backend:
+        words.append(f"grid_slam.backend:={args.backend}")
+    config = make_node("grid_slam", args.params_file or [], words).config.slam
+    trajectory_file = args.trajectory or Path(_stem(args.log) + ".trajectory.txt")
+    for file in (args.json, args.plot, trajectory_file):
+        if file is not None and not file.parent.is_dir():
+            raise UserError(f"{file}: there is no folder {file.parent}", 2)
+    console = Console(stderr=True)
+    try:
+        relations = read_relations(args.relations) if args.relations else None
+        if relations is not None and args.stamps:
+            relations = relations.at_stamps(read_stamps(args.stamps), args.tolerance)
+            if len(relations) == 0:
+                raise LogError(f"no relation of {args.relations} has both ends on a time of {args.stamps}")
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("scans"),
+            TimeElapsedColumn(),
+        )
+        with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+            task = progress.add_task(f"reading {args.log.name}", total=None)
+            read = read_bag(args.log, args.scan_topic) if is_bag(args.log) else read_log(args.log)
+            entries: list[LogEntry] = list(read)
+            progress.update(task, description=args.log.name, total=len(entries))
+            source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
+            report, run = evaluate_log(
+                source, relations, config, use_wheel_odom=not args.no_odometry, tolerance_s=args.tolerance,
+                on_scan=lambda done: progress.update(task, completed=done),
+            )  # fmt: skip
+    except (LogError, OSError, ValueError) as error:
+        raise UserError(f"evaluate slam: {error}") from None
+    write_trajectory(trajectory_file, run.trajectory)
+    report = {"log": args.log.name, "backend": config.backend, **report, "trajectory": str(trajectory_file)}
+    if args.plot:
+        _plot(args.plot, run)
+        report["plot"] = str(args.plot)
+    text = json.dumps(report, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+    return 0
+
+
+def _stem(log: Path) -> str:
+    return log.resolve().name.removesuffix(".gz").rsplit(".", 1)[0]
+
+
+def _plot(path: Path, run: LogResult) -> None:
+    from ...evaluation.pictures import save_map
+
+    grid = run.slam.grid()
+    save_map(
+        path, grid.values, grid.resolution, (float(grid.origin[0]), float(grid.origin[1])),
+        paths={"trajectory": run.trajectory[:, 1:]},
+    )  # fmt: skip

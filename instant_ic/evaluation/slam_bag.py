@@ -1,0 +1,97 @@
+"""Laser scans of a bag, with odometry and the laser's mount, as the log readers give them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from instant_ic.bag.files import BagError, BagReader
+from instant_ic.geometry.poses import Pose2, pose2_from_matrix
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.msg import deserialize, pose_matrix, stamp_ns, transform_matrix
+from instant_ic.slam import Scan
+from instant_ic.slam.logs import LogEntry, LogError
+from instant_ic.slam.odometry import OdometryBuffer
+
+_SCAN, _ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a path looks like a bag: a folder, or a file with a bag's ending."""
+    return path.is_dir() or path.suffix in (".mcap", ".db3")
+
+
+def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_link") -> Iterator[LogEntry]:
+    """Scans of a bag.
+
+    Odometry comes from the bag's Odometry topic (``/wheel/odom`` before ``/odom`` before any other), interpolated to
+    the scan's stamp; the mount from ``/tf_static``. A scan outside the time of the odometry has none.
+
+    Args:
+        path: bag folder or file.
+        scan_topic: of type LaserScan; None: ``/scan``, or the only one.
+        base_frame: the robot's frame; where no transform leads to it, the laser is taken to stand in its middle.
+
+    Raises:
+        LogError: no bag, no such topic, or a scan that cannot be read.
+    """
+    try:
+        with BagReader(path) as bag:
+            types = {summary.topic: summary.type_name for summary in bag.topics}
+            topic = _choose(path, types, _SCAN, scan_topic, ("/scan",))
+            if topic is None:
+                raise LogError(f"{path}: no topic of type LaserScan in this bag; it has {', '.join(types) or 'none'}")
+            odometry = OdometryBuffer(keep_s=1e9)
+            wheels = _choose(path, types, _ODOMETRY, None, ("/wheel/odom", "/odom"))
+            transforms = TransformBuffer()
+            wanted = [name for name in (wheels, "/tf_static", "/tf") if name in types]
+            for message in bag.messages(wanted):
+                value = deserialize(message.payload, message.type_name)
+                if message.topic == wheels:
+                    odometry.add(stamp_ns(value), pose2_from_matrix(pose_matrix(value)))
+                    continue
+                for transform in value.transforms:
+                    if message.topic == "/tf_static":
+                        transforms.set(
+                            transform.header.frame_id, transform.child_frame_id, 0, transform_matrix(transform), True
+                        )
+            scans = 0
+            for message in bag.messages([topic]):
+                value = deserialize(message.payload, message.type_name)
+                stamp = stamp_ns(value)
+                try:
+                    scan = Scan(
+                        np.asarray(value.ranges), float(value.angle_min), float(value.angle_increment),
+                        float(value.range_min), float(value.range_max), stamp,
+                    )  # fmt: skip
+                except ValueError as error:
+                    raise LogError(f"{path}: scan {scans + 1} on {topic}: {error}") from None
+                scans += 1
+                yield LogEntry(scan, odometry.at(stamp), _mount(transforms, base_frame, value.header.frame_id))
+            if scans == 0:
+                raise LogError(f"{path}: no scan on {topic}")
+    except BagError as error:
+        raise LogError(str(error)) from None
+
+
+def _choose(path: Path, types: dict[str, str], kind: str, wanted: str | None, usual: tuple[str, ...]) -> str | None:
+    found = sorted(topic for topic, type_name in types.items() if type_name == kind)
+    if wanted is not None:
+        if wanted not in found:
+            raise LogError(f"{path}: no LaserScan topic {wanted}; there is {', '.join(found) or 'none'}")
+        return wanted
+    for topic in usual:
+        if topic in found:
+            return topic
+    if len(found) > 1 and kind == _SCAN:
+        raise LogError(f"{path}: several LaserScan topics ({', '.join(found)}): choose one with --scan-topic")
+    return found[0] if found else None
+
+
+def _mount(transforms: TransformBuffer, base_frame: str, laser_frame: str) -> Pose2:
+    try:
+        return pose2_from_matrix(transforms.lookup(base_frame, laser_frame))
+    except TransformError:
+        return np.zeros(3)
