@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from .. import paths
 from ..msg import MessageError
 from . import params, registry
 from .clock import Clock, ManualClock, SystemClock
+from .control import ControlServer
 from .node import Node, NodeError
 from .zmq_transport import ZmqTransport
 
@@ -48,27 +48,9 @@ def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
     return parser
 
 
-@dataclass(frozen=True)
-class ProcessParameters:
-    """Parameters that every node has beside its own.
-
-    Attributes:
-        use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
-        nice: 0..19; a node of a higher value leaves the CPU to the others when there is not enough for all.
-    """
-
-    use_sim_time: bool = False
-    nice: int = 0
-
-    def __post_init__(self) -> None:
-        """Checks the values."""
-        if not 0 <= self.nice <= 19:
-            raise ValueError(f"nice must lie in 0..19 (got {self.nice})")
-
-
 def load_config(
     node_class: type[Node[Any]], name: str, files: Sequence[Path], overrides: Sequence[str]
-) -> tuple[Any, ProcessParameters]:
+) -> tuple[Any, params.ProcessParameters]:
     """Typed configuration of a node, and what holds for its process.
 
     Raises:
@@ -79,7 +61,7 @@ def load_config(
         values.update(params.load_file(path, name))
     values.update(params.parse_override(word) for word in overrides)
     common: params.Values = {key: values.pop(key) for key in ("use_sim_time", "nice") if key in values}
-    return params.build(node_class.config_class(), values), params.build(ProcessParameters, common)
+    return params.build(node_class.config_class(), values), params.build(params.ProcessParameters, common)
 
 
 def parse_remaps(words: Sequence[str]) -> dict[str, str]:
@@ -126,12 +108,14 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     """As :func:`main`, and returns the exit status."""
     args = argument_parser(node_class).parse_args(argv)
     logging.basicConfig(
-        level=args.log_level.upper(),
+        level=logging.INFO,  # other packages' debugging would flood the node's own
         format=f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s",
         datefmt="%H:%M:%S",
         stream=sys.stderr,
     )
     log = logging.getLogger(args.name)
+    for logger in (log, logging.getLogger("instant_ic")):
+        logger.setLevel(args.log_level.upper())
     try:
         config, process = load_config(node_class, args.name, args.params_file, args.param)
         remaps = parse_remaps(args.remap)
@@ -149,10 +133,13 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
         return 1
     node = node_class(config, transport, clock, args.name, args.namespace, remaps, use_sim_time=process.use_sim_time)
     os.nice(process.nice)
+    node.nice = process.nice
     started_ns = time.time_ns()
     _stop_on_signals(node)
     status = 0
+    control: ControlServer | None = None
     try:
+        control = ControlServer(node, run_dir / "nodes" / f"{args.name}.sock")
         node.on_registry_change = lambda: claim.write({**node.describe(), "started_ns": started_ns})
         node.start()
         claim.write({**node.describe(), "started_ns": started_ns})
@@ -166,6 +153,8 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
         log.exception("failed")
         status = 1
     finally:
+        if control is not None:
+            control.close()
         try:
             node.close()
         finally:

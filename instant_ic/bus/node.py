@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import heapq
 import itertools
 import logging
@@ -9,7 +10,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args
 
@@ -29,6 +30,9 @@ from ..msg import (
 )
 from . import params
 from .clock import Clock, ManualClock
+from .parameter_event import TOPIC as PARAMETER_EVENTS
+from .parameter_event import parameter_event
+from .parameter_info import ParameterInfo, is_live, parameter_infos, plain
 from .qos import LATCHED, RELIABLE, SENSOR, QoS
 from .transport import Payload, RawPublisher, RawSubscription, Received, Transport
 
@@ -201,6 +205,9 @@ class Node(Generic[ConfigT]):
     """
 
     name: ClassVar[str] = "node"
+    live_parameters: ClassVar[tuple[str, ...]] = ()
+    """Parameters, or whole groups, that can be changed while the node runs: those it reads from ``self.config`` at each
+    use, and those that its :meth:`reconfigure` hands on. ``"*"`` is all of them."""
 
     def __init__(
         self,
@@ -219,6 +226,7 @@ class Node(Generic[ConfigT]):
         self.namespace = namespace.strip("/")
         self.lockstep = lockstep
         self.use_sim_time = use_sim_time
+        self.nice = 0
         self.log = logging.getLogger(self.node_name)
         self.publishers: list[Publisher] = []
         self.subscriptions: list[Subscription] = []
@@ -237,6 +245,8 @@ class Node(Generic[ConfigT]):
         self._tf_static_out: Publisher | None = None
         self._tf_static: dict[str, Any] = {}
         self._state = "STARTING"
+        self._running: tuple[str, float] | None = None
+        self._parameter_events: Publisher | None = None
         self.on_registry_change: Callable[[], None] | None = None
 
     # -- for the node's author -------------------------------------------------------------------
@@ -246,6 +256,16 @@ class Node(Generic[ConfigT]):
 
     def teardown(self) -> None:
         """Leaves devices safe; called once, also after an error in ``setup``."""
+
+    def reconfigure(self, config: ConfigT) -> None:
+        """Takes other values of live parameters, on the node's thread, already checked by the dataclass.
+
+        A node that built something from its parameters overrides it: build the new thing first, then call this.
+
+        Raises:
+            ValueError, NodeError: the values cannot be used; nothing has been changed.
+        """
+        self.config = config
 
     @classmethod
     def config_class(cls) -> type[Any]:
@@ -362,6 +382,54 @@ class Node(Generic[ConfigT]):
         """Whether the loop is to end."""
         return self._stop.is_set()
 
+    # -- parameters and log level while it runs ---------------------------------------------------
+
+    def parameters(self) -> list[ParameterInfo]:
+        """Every parameter with its present value; may be called from any thread."""
+        infos = parameter_infos(type(self.config), self.config, self.live_parameters, type(self).name)
+        own = {info.name for info in infos}
+        process = params.ProcessParameters(self.use_sim_time, self.nice)
+        common = parameter_infos(params.ProcessParameters, process)
+        return infos + [info for info in common if info.name not in own]
+
+    def set_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Changes live parameters together, or none of them; on the node's thread. Returns what differs now.
+
+        Raises:
+            ParameterError: a value is refused, or its parameter takes effect only at the start.
+        """
+        own = {field.name for field in dataclasses.fields(type(self.config))}  # type: ignore[arg-type]
+        flat = params.flatten(values)
+        shared = ("use_sim_time", "nice")
+        common: dict[str, Any] = {key: flat.pop(key) for key in shared if key in flat and key not in own}
+        process = params.ProcessParameters(self.use_sim_time, self.nice)
+        params.change(process, common, lambda key: False, self.node_name)
+        config, different = params.change(
+            self.config, flat, lambda key: is_live(key, self.live_parameters), self.node_name
+        )
+        if not different:
+            return {}
+        try:
+            self.reconfigure(config)
+        except (ValueError, NodeError) as error:
+            raise params.ParameterError(f"{self.node_name}: {error}") from error
+        different = {key: plain(value) for key, value in different.items()}
+        self.log.info("parameters changed: %s", ", ".join(f"{key} = {value}" for key, value in different.items()))
+        if self._parameter_events is not None:
+            self._parameter_events.publish(parameter_event(self.node_name, different, self.clock.now_ns()))
+        self._registry_changed()
+        return different
+
+    def set_log_level(self, level: str) -> None:
+        """What is logged from now on, by this node and by the library: ``debug``, ``info``, ``warning``, ``error``."""
+        for name in _loggers(self):
+            logging.getLogger(name).setLevel(level.upper())
+
+    def activity(self) -> tuple[str, float]:
+        """The callback that the node's thread is in, and for how many seconds; ("", 0) between two."""
+        running = self._running
+        return ("", 0.0) if running is None else (running[0], time.monotonic() - running[1])
+
     # -- transforms ------------------------------------------------------------------------------
 
     @property
@@ -409,14 +477,17 @@ class Node(Generic[ConfigT]):
         """Runs ``setup``; called once by whoever drives the node."""
         if not self.lockstep:
             self._rosout = self.publisher("/rosout", message_type("Log"), RELIABLE)
-            handler = _RosoutHandler(self)
-            self.log.addHandler(handler)
+            for name in _loggers(self):
+                logging.getLogger(name).addHandler(_RosoutHandler(self))
+            self._parameter_events = self.publisher(PARAMETER_EVENTS, message_type("ParameterEvent"), RELIABLE)
             self._heartbeat = self.publisher("/heartbeat", message_type("NodeStatus"), RELIABLE)
             self._diagnostics = self.publisher("/diagnostics", message_type("DiagnosticArray"), RELIABLE)
             self._beat()
         if self.use_sim_time:
             self.subscribe("/clock", message_type("Clock"), self._on_clock, RELIABLE)
+        self._running = ("setup", time.monotonic())
         self.setup()
+        self._running = None
         self._state = "RUNNING"
 
     def _on_clock(self, message: Any) -> None:
@@ -484,6 +555,7 @@ class Node(Generic[ConfigT]):
         return self._timers[0][0] if self._timers else None
 
     def _guard(self, what: str, function: Callable[..., None], *args: Any) -> None:
+        self._running = (what, time.monotonic())
         try:
             function(*args)
         except NodeError as error:
@@ -491,6 +563,8 @@ class Node(Generic[ConfigT]):
             self.diagnose(what, ERROR, str(error))
         except Exception as error:  # noqa: BLE001 - one bad message must not end a node that moves a robot
             self.fault(what, error)
+        finally:
+            self._running = None
 
     def fault(self, what: str, error: Exception) -> None:
         """Tells an exception with its trace, and counts it."""
@@ -510,8 +584,9 @@ class Node(Generic[ConfigT]):
             for worker in self._workers:
                 worker.stop()
             if not self.lockstep:
-                for handler in [h for h in self.log.handlers if isinstance(h, _RosoutHandler)]:
-                    self.log.removeHandler(handler)
+                for logger in map(logging.getLogger, _loggers(self)):
+                    for handler in [h for h in logger.handlers if isinstance(h, _RosoutHandler) and h.node is self]:
+                        logger.removeHandler(handler)
             self._transport.close()
 
     # -- what every node tells -------------------------------------------------------------------
@@ -610,10 +685,15 @@ class Node(Generic[ConfigT]):
             "name": self.node_name,
             "module": f"instant_ic.nodes.{type(self).name}",
             "pid": os.getpid(),
-            "params": {"use_sim_time": self.use_sim_time, **params.to_dict(self.config)},
+            "params": {"use_sim_time": self.use_sim_time, "nice": self.nice, **params.to_dict(self.config)},
             "publishes": {p.topic: p.raw.type_name for p in self.publishers},
             "subscribes": {s.raw.topic: s.raw.type_name or "any" for s in self.subscriptions},
         }
+
+
+def _loggers(node: Node[Any]) -> tuple[str, str]:
+    """The node's own logger, and that of the library's modules, which know of no node."""
+    return node.node_name, "instant_ic"
 
 
 class _RosoutHandler(logging.Handler):
@@ -622,16 +702,16 @@ class _RosoutHandler(logging.Handler):
     _LEVELS: ClassVar = {logging.DEBUG: 10, logging.INFO: 20, logging.WARNING: 30, logging.ERROR: 40}
 
     def __init__(self, node: Node[Any]) -> None:
-        super().__init__(logging.INFO)
-        self._node = node
+        super().__init__()
+        self.node = node
         self._log_type = message_type("Log")
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._node._rosout.publish(
+        self.node._rosout.publish(
             self._log_type(
                 stamp=to_time(int(record.created * 1e9)),
                 level=self._LEVELS.get(record.levelno, 50),
-                name=self._node.node_name,
+                name=self.node.node_name,
                 msg=record.getMessage(),
                 file=record.pathname,
                 function=record.funcName or "",

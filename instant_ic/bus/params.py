@@ -14,13 +14,15 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
+
+from ..ranges import Range, check_ranges, range_of
 
 ConfigT = TypeVar("ConfigT")
 
@@ -39,6 +41,23 @@ class Value:
 
 Values = dict[str, Value]
 """Dotted key → value."""
+
+
+@dataclass(frozen=True)
+class ProcessParameters:
+    """Parameters that every node has beside its own.
+
+    Attributes:
+        use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
+        nice: a node of a higher value leaves the CPU to the others when there is not enough for all.
+    """
+
+    use_sim_time: bool = False
+    nice: Annotated[int, Range(0, 19)] = 0
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        check_ranges(self)
 
 
 def load_file(path: Path, node: str) -> Values:
@@ -118,17 +137,22 @@ def parse_override(word: str) -> tuple[str, Value]:
         raise ParameterError(f"-p {word}: the value is not YAML: {error}") from error
 
 
-def build(config_class: type[ConfigT], values: Mapping[str, Value]) -> ConfigT:
+def build(config_class: type[ConfigT], values: Mapping[str, Value], base: ConfigT | None = None) -> ConfigT:
     """Typed configuration from flat values; unknown keys and wrong types are errors that say where.
+
+    Args:
+        config_class: dataclass of the configuration.
+        values: what is given.
+        base: where the other values come from; None takes the defaults.
 
     Raises:
         ParameterError: see above, or ``__post_init__`` refused the values.
     """
-    return _build(config_class, dict(values), "")
+    return _build(config_class, dict(values), "", base)
 
 
-def _build(config_class: type[ConfigT], values: Values, prefix: str) -> ConfigT:
-    hints = get_type_hints(config_class)
+def _build(config_class: type[ConfigT], values: Values, prefix: str, base: ConfigT | None) -> ConfigT:
+    hints = get_type_hints(config_class, include_extras=True)
     fields = {f.name: f for f in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     arguments: dict[str, Any] = {}
     nested: dict[str, Values] = {}
@@ -148,9 +172,10 @@ def _build(config_class: type[ConfigT], values: Values, prefix: str) -> ConfigT:
         else:
             arguments[head] = _coerce(value.value, hints[head], full, value.where)
     for head, inner in nested.items():
-        arguments[head] = _build(hints[head], inner, f"{prefix}{head}.")
+        group = None if base is None else getattr(base, head)
+        arguments[head] = _build(hints[head], inner, f"{prefix}{head}.", group)
     try:
-        return config_class(**arguments)
+        return config_class(**arguments) if base is None else dataclasses.replace(base, **arguments)  # type: ignore[type-var]
     except ValueError as error:
         if isinstance(error, ParameterError):
             raise
@@ -161,6 +186,12 @@ def _build(config_class: type[ConfigT], values: Values, prefix: str) -> ConfigT:
 def _coerce(value: Any, hint: Any, key: str, where: str) -> Any:
     """The value as the type that a field is declared with."""
     origin = get_origin(hint)
+    if origin is Annotated:
+        plain = _coerce(value, get_args(hint)[0], key, where)
+        bounds = range_of(hint)
+        if bounds is not None and plain is not None and plain not in bounds:
+            raise ParameterError(f"{where}: {key} {bounds.words} (got {value})")
+        return plain
     if origin in (typing.Union, UnionType):
         options = get_args(hint)
         if value is None and NoneType in options:
@@ -201,3 +232,37 @@ def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], 
 def to_dict(config: Any) -> dict[str, Any]:
     """Nested plain values of a configuration, for ``ic param`` and the registry."""
     return {key: str(value) if isinstance(value, Path) else value for key, value in dataclasses.asdict(config).items()}
+
+
+def change(
+    config: ConfigT, values: Mapping[str, Any], is_live: Callable[[str], bool], where: str
+) -> tuple[ConfigT, dict[str, Any]]:
+    """A configuration with other values, checked as a whole, and what differs (flat).
+
+    Args:
+        config: what holds now.
+        values: flat or nested keys; those that are as now do no harm.
+        is_live: whether a key may be changed while the node runs.
+        where: stands in front of the errors.
+
+    Raises:
+        ParameterError: a value is wrong, or its parameter takes effect only at the start.
+    """
+    flat = {key: Value(value, where) for key, value in flatten(values).items()}
+    changed = build(type(config), flat, config)
+    before, after = flatten(to_dict(config)), flatten(to_dict(changed))
+    different = {key: value for key, value in after.items() if value != before[key]}
+    if fixed := sorted(key for key in different if not is_live(key)):
+        raise ParameterError(f"{where}: {', '.join(fixed)} takes effect at start: restart the node with the new value")
+    return changed, different
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested values with dotted keys."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            flat.update(flatten(value, f"{prefix}{key}."))
+        else:
+            flat[prefix + key] = value
+    return flat

@@ -161,6 +161,19 @@ class Claim:
             self._fd = -1
 
 
+def check_socket_path(path: Path) -> Path:
+    """The path itself, if a socket can be bound there.
+
+    Raises:
+        RegistryError: it is too long.
+    """
+    if len(os.fsencode(path)) > _MAX_IPC_PATH:
+        raise RegistryError(
+            f"socket path {path} is longer than {_MAX_IPC_PATH} bytes: set INSTANT_IC_RUN_DIR to a shorter folder"
+        )
+    return path
+
+
 def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
     """Claims a publisher's place; the socket path is free to bind.
 
@@ -168,11 +181,7 @@ def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
         RegistryError: the place is taken, or the path is too long for a socket.
     """
     stem = topic_dir(run_dir, topic) / check_node_name(node)
-    socket = stem.with_name(stem.name + ".sock")
-    if len(os.fsencode(socket)) > _MAX_IPC_PATH:
-        raise RegistryError(
-            f"socket path {socket} is longer than {_MAX_IPC_PATH} bytes: set INSTANT_IC_RUN_DIR to a shorter folder"
-        )
+    socket = check_socket_path(stem.with_name(stem.name + ".sock"))
     claim = Claim(stem, f"publisher of {topic} by node {node}")
     socket.unlink(missing_ok=True)
     return claim, socket

@@ -1,0 +1,333 @@
+"""The control channel of a node: its parameters and its log level, asked and changed while it runs.
+
+Each node process listens on ``RUN_DIR/nodes/<node>.sock`` (a Unix socket in a folder of mode 0700). A request is one
+line of JSON, ``{"op": "set", "values": {"rate_hz": 5.0}}``, and so is the answer: ``{"ok": true, ...}`` or ``{"ok":
+false, "error": "what is wrong", "kind": "parameter"}``. Its threads answer also while the node's own thread is in a
+long callback; only a change has to wait for that one, and is dropped when it waits too long.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import difflib
+import json
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from . import registry
+from .parameter_info import ParameterInfo, plain
+from .params import ParameterError
+
+if TYPE_CHECKING:
+    from .node import Node
+
+MAX_REQUEST_BYTES = 256 * 1024
+MAX_ANSWER_BYTES = 16 * 1024 * 1024
+MAX_CONNECTIONS = 8
+LEVELS = ("debug", "info", "warning", "error")
+
+_IDLE_S = 5.0  # a connection that says nothing for so long is closed
+_CHANGE_S = 2.0  # a change waits so long for the node's thread
+
+log = logging.getLogger(__name__)
+
+
+class ControlError(RuntimeError):
+    """The node does not run, does not answer, or refuses the request."""
+
+
+class NodeBusyError(ControlError):
+    """The node's own thread is in a long callback; nothing was changed."""
+
+
+class _RequestError(ControlError):
+    """A request that makes no sense."""
+
+
+class ControlServer:
+    """Answers requests for one node.
+
+    Args:
+        node: the node.
+        path: of the socket; what stands there is replaced, the caller holds the node's claim.
+
+    Raises:
+        RegistryError: the path is too long for a socket, or cannot be bound.
+    """
+
+    def __init__(self, node: Node[Any], path: Path) -> None:
+        self.path = path
+        self._node = node
+        self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        registry.check_socket_path(path)
+        try:
+            path.unlink(missing_ok=True)
+            self._listener.bind(str(path))
+            self._listener.listen(MAX_CONNECTIONS)
+        except OSError as error:
+            self._listener.close()
+            raise registry.RegistryError(f"control socket {path}: {error}") from error
+        self._thread = threading.Thread(target=self._run, name="control", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Takes no more requests."""
+        try:
+            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread out of accept()
+        except OSError as error:
+            log.debug("control socket %s: %s", self.path, error)
+        self._listener.close()
+        self.path.unlink(missing_ok=True)
+        self._thread.join(1.0)
+
+    def _run(self) -> None:
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:  # closed
+                return
+            if self._slots.acquire(blocking=False):
+                threading.Thread(target=self._serve, args=(connection,), name="control", daemon=True).start()
+                continue
+            with connection:
+                connection.settimeout(_IDLE_S)
+                _send(connection, _refusal(f"more than {MAX_CONNECTIONS} connections at once", "request"))
+
+    def _serve(self, connection: socket.socket) -> None:
+        try:
+            with connection:
+                connection.settimeout(_IDLE_S)
+                reader = _LineReader(connection, MAX_REQUEST_BYTES)
+                while (line := reader.line()) is not None:
+                    _send(connection, self.answer(line))
+        except _RequestError as error:
+            log.warning("control: %s", error)
+        except OSError as error:  # the other side left, or says nothing
+            log.debug("control: %s", error)
+        finally:
+            self._slots.release()
+
+    def answer(self, line: bytes) -> dict[str, Any]:
+        """The answer to one request."""
+        try:
+            request = _parse(line)
+            operation = self._operations().get(str(request.get("op")))
+            if operation is None:
+                known = ", ".join(self._operations())
+                raise _RequestError(f"unknown op {request.get('op')!r} (there are: {known})")
+            return {"ok": True, **operation(request)}
+        except _RequestError as error:
+            return _refusal(str(error), "request")
+        except ParameterError as error:
+            return _refusal(str(error), "parameter")
+        except NodeBusyError as error:
+            return _refusal(str(error), "busy")
+        except Exception as error:  # a bug here must be told to the one who asks, and must not end the node
+            log.exception("control")
+            return _refusal(f"{type(error).__name__}: {error}", "internal")
+
+    def _operations(self) -> dict[str, Callable[[dict[str, Any]], dict[str, Any]]]:
+        return {
+            "describe": self._describe,
+            "get": self._get,
+            "set": self._set,
+            "log_level": self._log_level,
+            "status": self._status,
+        }
+
+    def _describe(self, request: dict[str, Any]) -> dict[str, Any]:
+        return {"parameters": [asdict(info) for info in self._node.parameters()]}
+
+    def _get(self, request: dict[str, Any]) -> dict[str, Any]:
+        return {"values": {info.name: info.value for info in self._node.parameters()}}
+
+    def _set(self, request: dict[str, Any]) -> dict[str, Any]:
+        values = request.get("values")
+        if not isinstance(values, dict) or not values:
+            raise _RequestError('set needs "values": {key: value}')
+        return {"changed": self._on_node(lambda: self._node.set_parameters(values))}
+
+    def _log_level(self, request: dict[str, Any]) -> dict[str, Any]:
+        level = request.get("level")
+        if level is not None:
+            if level not in LEVELS:
+                raise _RequestError(f"level must be one of {', '.join(LEVELS)} (got {level!r})")
+            self._node.set_log_level(level)
+        return {"level": logging.getLevelName(self._node.log.getEffectiveLevel()).lower()}
+
+    def _status(self, request: dict[str, Any]) -> dict[str, Any]:
+        what, busy_s = self._node.activity()
+        return {"pid": os.getpid(), "threads": threading.active_count(), "busy": what, "busy_s": round(busy_s, 3)}
+
+    def _on_node(self, function: Callable[[], Any]) -> Any:
+        """Runs a function on the node's thread and gives its result.
+
+        Raises:
+            NodeBusyError: that thread had no time for it; it will not be run later.
+        """
+        future: concurrent.futures.Future[Any] = concurrent.futures.Future()
+
+        def run() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            try:
+                future.set_result(function())
+            except Exception as error:  # noqa: BLE001 - it belongs to the one who asks
+                future.set_exception(error)
+
+        self._node.call_soon(run)
+        try:
+            return future.result(_CHANGE_S)
+        except concurrent.futures.TimeoutError:
+            if not future.cancel():  # it has begun in this moment
+                return future.result(_CHANGE_S)
+            what, busy_s = self._node.activity()
+            doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop does not turn"
+            raise NodeBusyError(f"{self._node.node_name} is busy ({doing}); nothing was changed") from None
+
+
+class NodeControl:
+    """Asks one running node; each call is one request with a time-out.
+
+    Args:
+        run_dir: run directory of the stack.
+        node: name of the node.
+        timeout_s: for each answer.
+    """
+
+    def __init__(self, run_dir: Path, node: str, timeout_s: float = 5.0) -> None:
+        self.run_dir = run_dir
+        self.node = node.strip("/")
+        self.timeout_s = timeout_s
+
+    def describe(self) -> list[ParameterInfo]:
+        """Every parameter of the node.
+
+        Raises:
+            ControlError: the node does not run or does not answer.
+        """
+        return [ParameterInfo(**entry) for entry in self.request({"op": "describe"})["parameters"]]
+
+    def get(self) -> dict[str, Any]:
+        """Value of every parameter.
+
+        Raises:
+            ControlError: see :meth:`describe`.
+        """
+        values: dict[str, Any] = self.request({"op": "get"})["values"]
+        return values
+
+    def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Changes parameters together, or none of them; returns those that have another value now.
+
+        Raises:
+            ParameterError: a value is refused; the words say why.
+            ControlError: see :meth:`describe`; :class:`NodeBusyError` when the node has no time for it.
+        """
+        changed: dict[str, Any] = self.request({"op": "set", "values": {k: plain(v) for k, v in values.items()}})[
+            "changed"
+        ]
+        return changed
+
+    def log_level(self, level: str | None = None) -> str:
+        """The node's log level, after setting it where one is given.
+
+        Raises:
+            ControlError: see :meth:`describe`, or there is no such level.
+        """
+        return str(self.request({"op": "log_level", "level": level})["level"])
+
+    def status(self) -> dict[str, Any]:
+        """``pid``, ``threads``, ``busy`` (what its thread is doing, or empty) and ``busy_s`` (for how long).
+
+        Raises:
+            ControlError: see :meth:`describe`.
+        """
+        return self.request({"op": "status"})
+
+    def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Sends one request and gives the answer.
+
+        Raises:
+            ParameterError, ControlError: what the node refused, or why there is no answer.
+        """
+        path = self.run_dir / "nodes" / f"{self.node}.sock"
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+            connection.settimeout(self.timeout_s)
+            try:
+                connection.connect(str(path))
+                _send(connection, request)
+                line = _LineReader(connection, MAX_ANSWER_BYTES).line()
+            except TimeoutError:
+                raise ControlError(
+                    f"node {self.node} did not answer within {self.timeout_s:g} s: its process hangs or is stopped "
+                    f"(ic node list shows its pid)"
+                ) from None
+            except (FileNotFoundError, ConnectionRefusedError):
+                raise ControlError(self._not_there()) from None
+            except OSError as error:
+                raise ControlError(f"node {self.node}: {path}: {error}") from error
+        if line is None:
+            raise ControlError(f"node {self.node} ended while it was asked")
+        answer = _parse(line)
+        if answer.get("ok"):
+            return answer
+        kinds = {"parameter": ParameterError, "busy": NodeBusyError}
+        raise kinds.get(str(answer.get("kind")), ControlError)(str(answer.get("error", "refused without a reason")))
+
+    def _not_there(self) -> str:
+        running = [node.name for node in registry.list_nodes(self.run_dir)]
+        if self.node in running:
+            return (
+                f"node {self.node} runs but takes no requests: it is just starting or ending, or is of an old version"
+            )
+        close = difflib.get_close_matches(self.node, running, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else f"running: {', '.join(running) or 'none'}"
+        return f"node {self.node!r} does not run in {self.run_dir} ({hint})"
+
+
+class _LineReader:
+    """Lines of a socket, up to a length."""
+
+    def __init__(self, connection: socket.socket, max_bytes: int) -> None:
+        self._connection = connection
+        self._max_bytes = max_bytes
+        self._buffer = bytearray()
+
+    def line(self) -> bytes | None:
+        """The next line without its end; None when the other side has closed."""
+        while (end := self._buffer.find(b"\n")) < 0:
+            if len(self._buffer) > self._max_bytes:
+                raise _RequestError(f"a line of more than {self._max_bytes} bytes")
+            part = self._connection.recv(65536)
+            if not part:
+                return None
+            self._buffer += part
+        line = bytes(self._buffer[:end])
+        del self._buffer[: end + 1]
+        return line
+
+
+def _send(connection: socket.socket, content: Mapping[str, Any]) -> None:
+    connection.sendall(json.dumps(content, default=str).encode() + b"\n")
+
+
+def _parse(line: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise _RequestError(f"not JSON: {error}") from None
+    if not isinstance(content, dict):
+        raise _RequestError("expected a JSON object")
+    return content
+
+
+def _refusal(error: str, kind: str) -> dict[str, Any]:
+    return {"ok": False, "error": error, "kind": kind}

@@ -1,0 +1,109 @@
+"""Ranges of configuration values, declared where the field is: ``rate_hz: Positive = 20.0``.
+
+>>> from dataclasses import dataclass
+>>> @dataclass(frozen=True)
+... class Config:
+...     nice: Annotated[int, Range(0, 19)] = 0
+...     def __post_init__(self) -> None:
+...         check_ranges(self)
+>>> Config(nice=33)
+Traceback (most recent call last):
+    ...
+ValueError: nice must lie in 0..19 (got 33)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, TypeAlias, get_args, get_origin, get_type_hints
+
+
+@dataclass(frozen=True)
+class Range:
+    """Where a number may lie; it must be finite in any case.
+
+    Attributes:
+        low: the smallest value that is allowed.
+        high: the largest value that is allowed.
+        above: the value must be larger than this.
+        below: the value must be smaller than this.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    def __contains__(self, value: float) -> bool:
+        """Whether a value is allowed."""
+        return (
+            math.isfinite(value)
+            and (self.low is None or value >= self.low)
+            and (self.high is None or value <= self.high)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+        )
+
+    def __str__(self) -> str:
+        """As it is shown beside a value: ``0..19``, ``> 0``."""
+        if self.low is not None and self.high is not None:
+            return f"{self.low:g}..{self.high:g}"
+        bounds = ((">=", self.low), (">", self.above), ("<=", self.high), ("<", self.below))
+        return ", ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
+
+    @property
+    def words(self) -> str:
+        """What a value that is not allowed is told: ``must lie in 0..19``, ``must be > 0``."""
+        return f"must lie in {self}" if ".." in str(self) else f"must be {str(self).replace(', ', ' and ')}"
+
+
+Positive: TypeAlias = Annotated[float, Range(above=0)]
+NotNegative: TypeAlias = Annotated[float, Range(low=0)]
+PositiveInt: TypeAlias = Annotated[int, Range(low=1)]
+NotNegativeInt: TypeAlias = Annotated[int, Range(low=0)]
+Share: TypeAlias = Annotated[float, Range(0, 1)]
+Percent: TypeAlias = Annotated[int, Range(1, 100)]
+
+
+def range_of(hint: Any) -> Range | None:
+    """The range that a type is annotated with, also inside ``X | None``; None without one."""
+    if get_origin(hint) is Annotated:
+        return next((extra for extra in get_args(hint)[1:] if isinstance(extra, Range)), None)
+    found = (range_of(part) for part in get_args(hint) if get_origin(hint) is not tuple)
+    return next((inner for inner in found if inner is not None), None)
+
+
+@functools.cache
+def ranges(config_class: type[Any]) -> dict[str, Range]:
+    """Field → range of a dataclass's own fields (not of groups inside it)."""
+    hints = get_type_hints(config_class, include_extras=True)
+    return {f.name: bounds for f in dataclasses.fields(config_class) if (bounds := _element(hints[f.name])) is not None}
+
+
+def _element(hint: Any) -> Range | None:
+    """The range of a value, or that of every element of a sequence."""
+    return range_of(hint) or next((r for part in get_args(hint) if (r := range_of(part)) is not None), None)
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    if isinstance(value, (tuple, list)):
+        for part in value:
+            yield from _numbers(part)
+    elif value is not None:
+        yield value
+
+
+def check_ranges(config: Any) -> None:
+    """Refuses a dataclass with a value outside the range of its field; for ``__post_init__``.
+
+    Raises:
+        ValueError: names the field, its range and the value.
+    """
+    for name, bounds in ranges(type(config)).items():  # type: ignore[arg-type]
+        for value in _numbers(getattr(config, name)):
+            if value not in bounds:
+                raise ValueError(f"{name} {bounds.words} (got {value})")
