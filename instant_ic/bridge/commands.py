@@ -1,0 +1,89 @@
+"""The gate for commands that come from outside a run directory: fresh, sane, of one sender at a time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+
+class CommandRefused(ValueError):
+    """A command that must not reach the robot; the message says why."""
+
+
+@dataclass(frozen=True)
+class CommandLimits:
+    """What a command from outside must keep to.
+
+    Attributes:
+        max_age_s: s; an older command is refused. The clocks of both machines must agree better than that.
+        lease_s: s; while one sender's commands come, another's are refused until it has been silent for this long.
+        max_linear_mps: m/s; a faster command is refused. The arbiter limits what passes.
+        max_angular_rps: rad/s, the same.
+    """
+
+    max_age_s: float = 0.3
+    lease_s: float = 2.0
+    max_linear_mps: float = 2.0
+    max_angular_rps: float = 4.0
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        for name in ("max_age_s", "lease_s", "max_linear_mps", "max_angular_rps"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be > 0 (got {getattr(self, name)})")
+
+
+class CommandGate:
+    """Decides on each command; knows no bus and no clock.
+
+    Attributes:
+        refused: reason → how many.
+    """
+
+    def __init__(self, limits: CommandLimits) -> None:
+        self.limits = limits
+        self.refused: dict[str, int] = {}
+        self._driver: str | None = None
+        self._driver_ns = 0
+
+    def check_age(self, source_ns: int, now_ns: int) -> None:
+        """Refuses what is old, or from the future, which would hide its age.
+
+        Raises:
+            CommandRefused: see above.
+        """
+        age_s = (now_ns - source_ns) / 1e9
+        if age_s > self.limits.max_age_s:
+            raise self._refuse("old", f"{age_s:.2f} s old, at most {self.limits.max_age_s:g} s allowed")
+        if age_s < -self.limits.max_age_s:
+            raise self._refuse("future", f"stamped {-age_s:.2f} s ahead of this machine's clock: set both by NTP")
+
+    def check_drive(self, sender: str, v: float, w: float, now_ns: int) -> None:
+        """Refuses what no sane operator sends (m/s, rad/s), and a second driver.
+
+        Raises:
+            CommandRefused: see above.
+        """
+        if not (math.isfinite(v) and math.isfinite(w)):
+            raise self._refuse("not finite", f"v {v}, w {w}: not finite")
+        if abs(v) > self.limits.max_linear_mps or abs(w) > self.limits.max_angular_rps:
+            limits = f"{self.limits.max_linear_mps:g} m/s, {self.limits.max_angular_rps:g} rad/s"
+            raise self._refuse("too fast", f"{v:g} m/s, {w:g} rad/s: beyond {limits}")
+        if self._driver not in (None, sender) and now_ns - self._driver_ns <= self.limits.lease_s * 1e9:
+            raise self._refuse("second driver", f"{sender} may not drive while {self._driver} does")
+        self._driver, self._driver_ns = sender, now_ns
+
+    def release(self, sender: str) -> bool:
+        """Notes that a sender has left; true if it was the driver."""
+        if self._driver != sender:
+            return False
+        self._driver = None
+        return True
+
+    def refuse(self, reason: str, words: str) -> CommandRefused:
+        """Counts a refusal by its reason and gives the error to raise."""
+        return self._refuse(reason, words)
+
+    def _refuse(self, reason: str, words: str) -> CommandRefused:
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+        return CommandRefused(words)

@@ -1,0 +1,306 @@
+"""What waits to go out to one host, in which order, and how much of it may be on its way at a time.
+
+A slow or stalled link must never be filled with pictures that are old when they arrive, nor hold up a command: so only
+as much is handed to it as it carries in a few hundredths of a second, and what waits here is replaced by what is newer.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from .host_protocol import DATA_OVERHEAD, LANES, MAX_CHUNK, Announce, Data
+from .host_topics import TopicCounts, TopicRule
+
+QUEUE_DEPTH = 1000
+"""Messages of a reliable topic that wait for the link; then the oldest is dropped and counted."""
+
+_COMMAND_IN_FLIGHT = 4 * 1024  # some 20 commands: more would arrive only to be too old
+_STATE_EXTRA = 16 * 1024  # state may go beyond the window, which pictures have filled
+_LEAST_CHUNK = 4 * 1024
+_COMMAND, _STATE, _BULK = range(3)
+
+
+@dataclass(frozen=True)
+class Item:
+    """A message that waits.
+
+    Attributes:
+        payload: CDR bytes.
+        publish_ns: when it was published first.
+        admitted_ns: when the bridge got it, by its monotonic clock.
+        sequence: 0 takes the next number of its channel when it leaves.
+        wall_time: ``publish_ns`` is the machine's time.
+    """
+
+    payload: bytes = field(repr=False)
+    publish_ns: int
+    admitted_ns: int
+    sequence: int = 0
+    wall_time: bool = True
+
+
+@dataclass
+class Channel:
+    """One topic of one publisher, as the sending side knows it.
+
+    Attributes:
+        number: by which its messages name it.
+        rule: how it goes over the link.
+        origin: the node that publishes it.
+        type_name, digest, qos: of the topic, for the other side.
+        latched: the last value goes to every host that comes.
+        queued: every message counts; otherwise the newest.
+        sequence: number of the newest message of a queued channel.
+        last: newest message of a latched channel.
+    """
+
+    number: int
+    rule: TopicRule
+    origin: str
+    type_name: str
+    digest: str
+    qos: str
+    latched: bool
+    queued: bool
+    sequence: int = 0
+    last: Item | None = None
+
+    def announce(self) -> Announce:
+        """The words that introduce it."""
+        return Announce(self.number, self.rule.topic, self.origin, self.type_name, self.digest, self.qos)
+
+
+class Window:
+    """How many bytes may be on their way, so that the link is used and its queues stay short.
+
+    Delay-based as LEDBAT (RFC 6817): more while the round trip is close to the shortest known, less when it shows that a
+    queue has formed.
+
+    Args:
+        target_s: time that a chunk may wait in queues.
+        least, most, start: bytes.
+    """
+
+    def __init__(
+        self, target_s: float = 0.05, least: int = 2 * _LEAST_CHUNK, most: int = 4 << 20, start: int = 64 << 10
+    ) -> None:
+        self.target_ns = int(target_s * 1e9)
+        self.least, self.most = least, most
+        self.size = float(start)
+        self.queue_ns = 0
+        self._base: deque[tuple[int, int]] = deque([(0, 1 << 62)], maxlen=4)
+        self._next_cut_ns = 0
+
+    @property
+    def base_ns(self) -> int:
+        """Shortest round trip of the last half minute or so."""
+        return min(rtt for _, rtt in self._base)
+
+    def observe(self, rtt_ns: int, now_ns: int) -> None:
+        """Takes a round trip of any kind."""
+        begun, least = self._base[-1]
+        if now_ns - begun > 10_000_000_000:  # the way may have become longer for good
+            self._base.append((now_ns, rtt_ns))
+        else:
+            self._base[-1] = (begun, min(least, rtt_ns))
+
+    def acked(self, taken: int, rtt_ns: int, in_flight: int, now_ns: int) -> None:
+        """Takes an answer: ``taken`` more bytes have arrived, of ``in_flight``."""
+        self.observe(rtt_ns, now_ns)
+        self.queue_ns = rtt_ns - self.base_ns
+        if self.queue_ns > self.target_ns:
+            if now_ns >= self._next_cut_ns:  # once a round trip: the next answers still tell of the same queue
+                self._next_cut_ns = now_ns + rtt_ns
+                self.size *= max(0.5, self.target_ns / self.queue_ns)
+        elif in_flight * 2 >= self.size:  # it was this window that held the sender back
+            if self.queue_ns * 2 < self.target_ns:
+                self.size += taken
+            else:
+                self.size += taken * _LEAST_CHUNK / self.size
+        self.size = min(max(self.size, self.least), self.most)
+
+    @property
+    def chunk(self) -> int:
+        """Bytes of a chunk: small on a slow link, where a command has to wait for its end."""
+        return int(min(max(self.size / 4, _LEAST_CHUNK), MAX_CHUNK))
+
+
+@dataclass
+class _Outgoing:
+    """A channel on its way to one host."""
+
+    channel: Channel
+    period_ns: int
+    waiting: deque[Item] = field(default_factory=deque)
+    due_ns: int = 0
+    turn: int = 0
+    announced: bool = False
+    refused: str = ""
+    sequence: int = 0
+
+
+class Outbox:
+    """Everything that waits for one host.
+
+    Args:
+        wants: topic → most messages a second that the other takes (0: all); others are not sent.
+        window: how much may be on its way.
+    """
+
+    def __init__(self, wants: dict[str, float], window: Window | None = None) -> None:
+        self.wants = wants
+        self.window = window or Window()
+        self.counts: dict[str, TopicCounts] = {}
+        self._channels: dict[int, _Outgoing] = {}
+        self._current: list[tuple[_Outgoing, Item, int] | None] = [None] * len(LANES)
+        self._turns = itertools.count(1)
+        self.sent = [0] * len(LANES)
+        self.taken = [0] * len(LANES)
+
+    # -- in ---------------------------------------------------------------------------------------
+
+    def offer(self, channel: Channel, item: Item, now_ns: int) -> None:
+        """Takes a message that the other host may want."""
+        out = self._outgoing(channel)
+        if out is None or out.refused:
+            return
+        counts = self.counts[channel.rule.topic]
+        if channel.queued:
+            if len(out.waiting) >= QUEUE_DEPTH:
+                out.waiting.popleft()
+                counts.overflowed += 1
+            out.waiting.append(item)
+            return
+        if out.period_ns and not channel.latched:
+            # On the grid of periods, with room for a source that comes a little early.
+            if now_ns < out.due_ns - out.period_ns // 4:
+                counts.thinned += 1
+                return
+            late = now_ns - out.due_ns
+            out.due_ns = out.due_ns + out.period_ns if late < out.period_ns else now_ns + out.period_ns
+        if out.waiting:
+            held = out.period_ns and now_ns < out.due_ns  # it waited for its turn, not for the link
+            counts.thinned += bool(held)
+            counts.superseded += not held
+            out.waiting.clear()
+        out.waiting.append(item)
+
+    def _outgoing(self, channel: Channel) -> _Outgoing | None:
+        topic = channel.rule.topic
+        if topic not in self.wants:
+            return None
+        out = self._channels.get(channel.number)
+        if out is None:
+            rates = [rate for rate in (channel.rule.rate_hz, self.wants[topic]) if rate > 0]
+            out = _Outgoing(channel, int(1e9 / min(rates)) if rates else 0)
+            self._channels[channel.number] = out
+            self.counts.setdefault(topic, TopicCounts())
+        return out
+
+    def refuse(self, number: int, reason: str) -> Channel | None:
+        """The other host does not take this channel; None if it was never announced."""
+        out = self._channels.get(number)
+        if out is None or not out.announced:
+            return None
+        out.refused = reason
+        out.waiting.clear()
+        return out.channel
+
+    def acked(self, taken: tuple[int, ...], rtt_ns: int, now_ns: int) -> bool:
+        """The other host tells what it has got; false if that cannot be."""
+        if any(not old <= new <= sent for old, new, sent in zip(self.taken, taken, self.sent, strict=True)):
+            return False
+        in_flight = self._in_flight(_STATE) + self._in_flight(_BULK)
+        more = sum(taken[1:]) - sum(self.taken[1:])
+        self.taken = list(taken)
+        if more:
+            self.window.acked(more, rtt_ns, in_flight, now_ns)
+        else:
+            self.window.observe(rtt_ns, now_ns)
+        return True
+
+    # -- out --------------------------------------------------------------------------------------
+
+    def next(self, now_ns: int) -> Data | Announce | None:
+        """What leaves next; None when nothing waits or the link has no room."""
+        for lane in range(len(LANES)):
+            if not self._room(lane):
+                continue
+            if self._current[lane] is None:
+                begun = self._begin(lane, now_ns)
+                if isinstance(begun, Announce):
+                    return begun
+                self._current[lane] = begun
+            current = self._current[lane]
+            if current is not None:
+                return self._chunk(lane, *current, now_ns)
+        return None
+
+    def next_due_ns(self) -> int | None:
+        """When a message that waits for its turn may leave."""
+        dues = [out.due_ns for out in self._channels.values() if out.waiting and out.period_ns and out.channel.latched]
+        return min(dues, default=None)
+
+    def _in_flight(self, lane: int) -> int:
+        return self.sent[lane] - self.taken[lane]
+
+    def _room(self, lane: int) -> bool:
+        if lane == _COMMAND:
+            return self._in_flight(_COMMAND) < _COMMAND_IN_FLIGHT
+        filled = self._in_flight(_STATE) + self._in_flight(_BULK)
+        return filled < self.window.size + (_STATE_EXTRA if lane == _STATE else 0)
+
+    def _begin(self, lane: int, now_ns: int) -> tuple[_Outgoing, Item, int] | Announce | None:
+        """The message of the lane that has waited for its turn the longest."""
+        name = LANES[lane]
+        for out in sorted(self._ready(name, now_ns), key=lambda out: out.turn):
+            rule = out.channel.rule
+            counts = self.counts[rule.topic]
+            while out.waiting and rule.max_age_s and now_ns - out.waiting[0].admitted_ns > rule.max_age_s * 1e9:
+                counts.expired += 1
+                out.waiting.popleft()
+            if not out.waiting:
+                continue
+            if not out.announced:
+                out.announced = True
+                return out.channel.announce()
+            item = out.waiting.popleft()
+            out.turn = next(self._turns)
+            if out.period_ns and out.channel.latched:
+                out.due_ns = now_ns + out.period_ns
+            out.sequence = item.sequence or out.sequence + 1
+            return out, item, 0
+        return None
+
+    def _ready(self, lane: str, now_ns: int) -> Iterable[_Outgoing]:
+        for out in self._channels.values():
+            if out.waiting and out.channel.rule.lane == lane:
+                if not (out.period_ns and out.channel.latched and now_ns < out.due_ns):
+                    yield out
+
+    def _chunk(self, lane: int, out: _Outgoing, item: Item, offset: int, now_ns: int) -> Data:
+        total = len(item.payload)
+        end = min(total, offset + self.window.chunk)
+        chunk = item.payload if end - offset == total else memoryview(item.payload)[offset:end]
+        self.sent[lane] += len(chunk) + DATA_OVERHEAD
+        if end == total:
+            self._current[lane] = None
+            counts = self.counts[out.channel.rule.topic]
+            counts.messages += 1
+            counts.bytes += total
+        else:
+            self._current[lane] = (out, item, end)
+        return Data(
+            out.channel.number,
+            out.sequence,
+            item.publish_ns,
+            item.admitted_ns,
+            now_ns,
+            total,
+            offset,
+            chunk,
+            item.wall_time,
+        )

@@ -1,0 +1,332 @@
+"""Keys of the link between two hosts: this host's own, and the list of those that are allowed.
+
+A folder (default ``$XDG_CONFIG_HOME/instant_ic/keys``) holds two files of plain text::
+
+    identity    name and secret key of this host, mode 0600
+    allowed     one host a line: NAME ROLE KEY
+
+A key is written as one word, ``ick_`` and 48 letters, with a check sum in it: a slip in copying is found at once.
+"""
+
+from __future__ import annotations
+
+import base64
+import fcntl
+import hashlib
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+ROLES = ("driver", "viewer")
+"""What an allowed host may do: a driver's topics are taken in, a viewer only watches."""
+
+_PREFIX = "ick_"
+_KEY_SIZE = 32
+_CHECK_SIZE = 4
+_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,62}\Z")
+
+
+class KeyFileError(RuntimeError):
+    """A key, or a file of keys, that cannot be used; the message says where and what to do."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A host of the allow-list.
+
+    Attributes:
+        name: what it is called here.
+        role: one of :data:`ROLES`.
+        public_key: 32 bytes (Curve25519).
+    """
+
+    name: str
+    role: str
+    public_key: bytes
+
+    @property
+    def fingerprint(self) -> str:
+        """See :func:`fingerprint`."""
+        return fingerprint(self.public_key)
+
+
+@dataclass(frozen=True)
+class Identity:
+    """This host's own key pair; 32 bytes each."""
+
+    name: str
+    public_key: bytes
+    secret_key: bytes
+
+
+def key_dir() -> Path:
+    """The folder of keys: ``$XDG_CONFIG_HOME/instant_ic/keys``, else ``~/.config/instant_ic/keys``."""
+    base = os.environ.get("XDG_CONFIG_HOME")
+    return (Path(base) if base else Path.home() / ".config") / "instant_ic" / "keys"
+
+
+def fingerprint(public_key: bytes) -> str:
+    """Short name of a key for logs and for reading aloud: 64 bits of its SHA-256, ``1f3a-9c02-77be-d410``."""
+    digits = hashlib.sha256(public_key).hexdigest()[:16]
+    return "-".join(digits[i : i + 4] for i in range(0, 16, 4))
+
+
+def key_text(public_key: bytes) -> str:
+    """A public key as one word."""
+    check = hashlib.sha256(public_key).digest()[-_CHECK_SIZE:]
+    return _PREFIX + base64.urlsafe_b64encode(public_key + check).decode()
+
+
+def parse_key(text: str) -> bytes:
+    """The 32 bytes of a public key.
+
+    Raises:
+        KeyFileError: it is no key, or not all of it, or a letter is wrong.
+    """
+    word = text.strip()
+    try:
+        raw = base64.b64decode(word.removeprefix(_PREFIX).encode(), altchars=b"-_", validate=True)
+    except ValueError:
+        raw = b""
+    if not word.startswith(_PREFIX) or len(raw) != _KEY_SIZE + _CHECK_SIZE:
+        raise KeyFileError(f"{word[:60]!r} is no key: it must be {_PREFIX} and 48 letters, as `ic keys list` shows it")
+    key = raw[:_KEY_SIZE]
+    if hashlib.sha256(key).digest()[-_CHECK_SIZE:] != raw[_KEY_SIZE:]:
+        raise KeyFileError(f"key {word} has a wrong letter (its check sum does not fit): copy it again")
+    return key
+
+
+def check_name(name: str) -> str:
+    """A host's name, if it is legal.
+
+    Raises:
+        KeyFileError: otherwise.
+    """
+    if not _NAME.match(name):
+        raise KeyFileError(f"name {name!r} is not legal: letters, digits, _ and - only, a letter first")
+    return name
+
+
+class KeyStore:
+    """The files of one folder.
+
+    Args:
+        folder: where they are; None takes :func:`key_dir`.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        self.folder = folder if folder is not None else key_dir()
+        self.identity_path = self.folder / "identity"
+        self.allowed_path = self.folder / "allowed"
+
+    # -- this host -------------------------------------------------------------------------------
+
+    def identity(self) -> Identity:
+        """This host's key pair.
+
+        Raises:
+            KeyFileError: there is none yet, others can read it, or it is damaged.
+        """
+        path = self.identity_path
+        try:
+            with path.open() as file:
+                mode = os.fstat(file.fileno()).st_mode
+                words = file.read().split()
+        except FileNotFoundError:
+            raise KeyFileError(f"{path} is not there: make this host's key with `ic keys new`") from None
+        except OSError as error:
+            raise KeyFileError(f"{path} cannot be read: {error.strerror}") from error
+        if mode & 0o077:
+            raise KeyFileError(f"{path} can be read by others (mode {mode & 0o777:04o}): chmod 600 {path}")
+        try:
+            name, public, secret = words
+            return Identity(check_name(name), parse_key(public), parse_key(secret))
+        except (ValueError, KeyFileError):
+            raise KeyFileError(f"{path} is damaged: make a new key with `ic keys new --force`") from None
+
+    def create(self, name: str, force: bool = False) -> Identity:
+        """Makes this host's key pair.
+
+        Raises:
+            KeyFileError: there is one already (and not ``force``), or the folder cannot be written.
+        """
+        import zmq
+        from zmq.utils import z85
+
+        check_name(name)
+        if self.identity_path.exists() and not force:
+            raise KeyFileError(
+                f"{self.identity_path} is there already; --force makes a new key, which the other hosts must then allow"
+            )
+        public, secret = (z85.decode(key) for key in zmq.curve_keypair())
+        self._write(self.identity_path, f"{name}\n{key_text(public)}\n{key_text(secret)}\n")
+        return Identity(name, public, secret)
+
+    # -- the others ------------------------------------------------------------------------------
+
+    def peers(self) -> list[Peer]:
+        """The allowed hosts; none when the file is not there.
+
+        Raises:
+            KeyFileError: the file cannot be read, or a line of it is wrong.
+        """
+        path = self.allowed_path
+        try:
+            lines = path.read_text().splitlines()
+        except FileNotFoundError:
+            return []
+        except (OSError, UnicodeDecodeError) as error:
+            raise KeyFileError(f"{path} cannot be read: {error}") from error
+        peers: list[Peer] = []
+        for number, line in enumerate(lines, 1):
+            words = line.partition("#")[0].split()
+            if not words:
+                continue
+            try:
+                if len(words) != 3 or words[1] not in ROLES:
+                    raise KeyFileError(f"expected NAME, {' or '.join(ROLES)}, KEY")
+                peer = Peer(check_name(words[0]), words[1], parse_key(words[2]))
+                for other in peers:
+                    if other.name == peer.name or other.public_key == peer.public_key:
+                        raise KeyFileError(f"{peer.name} stands twice, by name or by key (also as {other.name})")
+            except KeyFileError as error:
+                raise KeyFileError(f"{path}:{number}: {error}") from None
+            peers.append(peer)
+        return peers
+
+    def peer(self, name: str = "") -> Peer:
+        """The allowed host of a name, or the only one there is.
+
+        Raises:
+            KeyFileError: there is no such host, or no name was given and there are several.
+        """
+        peers = self.peers()
+        found = [peer for peer in peers if not name or peer.name == name]
+        if len(found) == 1:
+            return found[0]
+        known = ", ".join(peer.name for peer in peers) or "none"
+        if found:
+            raise KeyFileError(f"several hosts are allowed ({known}): say which is meant")
+        raise KeyFileError(
+            f"{self.allowed_path} has no host {name!r}".replace(" ''", "")
+            + f" (allowed: {known}): run `ic keys list` there, and `ic keys allow NAME KEY` here"
+        )
+
+    def allow(self, peer: Peer) -> str:
+        """Puts a host on the list; one of the same name is replaced. Returns what was done.
+
+        Raises:
+            KeyFileError: the name is not legal, or the key is there under another name.
+        """
+        check_name(peer.name)
+        with self._locked():
+            others = [other for other in self.peers() if other.name != peer.name]
+            for other in others:
+                if other.public_key == peer.public_key:
+                    raise KeyFileError(f"this key is allowed already, as {other.name}: `ic keys revoke {other.name}`")
+            before = next((other for other in self.peers() if other.name == peer.name), None)
+            if peer == before:
+                return "as before"
+            self._write_peers([*others, peer])
+            return "added" if before is None else "replaced"
+
+    def revoke(self, name: str) -> Peer:
+        """Takes a host off the list; a running bridge cuts it off at once.
+
+        Raises:
+            KeyFileError: there is none of this name.
+        """
+        with self._locked():
+            peer = self.peer(name)
+            self._write_peers([other for other in self.peers() if other.name != name])
+            return peer
+
+    def _write_peers(self, peers: list[Peer]) -> None:
+        lines = [f"{peer.name} {peer.role} {key_text(peer.public_key)}" for peer in peers]
+        head = "# Hosts that may connect: NAME ROLE KEY; `ic keys` writes this file, the bridge reads it as it changes."
+        self._write(self.allowed_path, "\n".join([head, *lines]) + "\n")
+
+    def _write(self, path: Path, text: str) -> None:
+        """Replaces a file in one step, readable by its owner alone from its first byte on."""
+        self._make_folder()
+        scratch = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            scratch.unlink(missing_ok=True)
+            with open(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            scratch.replace(path)
+        except OSError as error:
+            self._cannot_write(path, error)
+        finally:
+            scratch.unlink(missing_ok=True)
+
+    def _make_folder(self) -> None:
+        try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            self._cannot_write(self.folder, error)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Two commands at a time must not lose each other's line."""
+        self._make_folder()
+        try:
+            fd = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            self._cannot_write(self.folder, error)
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(fd)
+
+    def _cannot_write(self, path: Path, error: OSError) -> NoReturn:
+        raise KeyFileError(f"{path} cannot be written: {error.strerror}; give another folder with --dir") from error
+
+
+class AllowList:
+    """The allow-list as it stands now: read again when the file has changed.
+
+    A file that is gone allows nobody. One that cannot be understood leaves the list as it was, and ``problem`` tells.
+    """
+
+    def __init__(self, store: KeyStore) -> None:
+        self._store = store
+        self._seen: tuple[int, int, int] | None = None
+        self._peers: dict[bytes, Peer] = {}
+        self.problem = ""
+        self._read = False
+
+    def refresh(self) -> bool:
+        """Looks whether the file has changed; true if the list is another one now."""
+        try:
+            stat = self._store.allowed_path.stat()
+            seen = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
+        except OSError:
+            seen = None
+        if self._read and seen == self._seen:
+            return False
+        self._read, self._seen = True, seen
+        try:
+            peers = {peer.public_key: peer for peer in self._store.peers()}
+        except KeyFileError as error:
+            self.problem = str(error)
+            return False
+        self.problem = ""
+        changed = peers != self._peers
+        self._peers = peers
+        return changed
+
+    def get(self, public_key: bytes) -> Peer | None:
+        """The allowed host with this key."""
+        return self._peers.get(public_key)
+
+    def __len__(self) -> int:
+        """How many hosts are allowed."""
+        return len(self._peers)

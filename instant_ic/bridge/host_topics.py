@@ -1,0 +1,121 @@
+"""Which topics go over the link, at which rate and rank; what is counted of them."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field, fields
+
+from .host_protocol import LANES
+
+_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
+
+
+@dataclass(frozen=True)
+class TopicRule:
+    """How one topic goes over the link; written as ``/scan rate_hz=5 lane=state``.
+
+    Attributes:
+        topic: its name, without namespace.
+        rate_hz: most messages a second, newest first; 0 sends all.
+        lane: rank, one of :data:`~.host_protocol.LANES`.
+        max_age_s: older than this it is dropped, on either side, and counted; 0 keeps it.
+        shared: taken from every driver's host, not only from the one that drives.
+    """
+
+    topic: str
+    rate_hz: float = 0.0
+    lane: str = "state"
+    max_age_s: float = 0.0
+    shared: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not _TOPIC.match(self.topic):
+            raise ValueError(f"{self.topic!r} is no topic: it must look like /camera/image")
+        if self.lane not in LANES:
+            raise ValueError(f"{self.topic}: lane must be {', '.join(LANES)} (got {self.lane!r})")
+        for key in ("rate_hz", "max_age_s"):
+            value = getattr(self, key)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{self.topic}: {key} must be >= 0 (got {value})")
+
+    @classmethod
+    def parse(cls, text: str) -> TopicRule:
+        """The rule of a line.
+
+        Raises:
+            ValueError: with what is wrong in it.
+        """
+        words = text.split()
+        if not words:
+            raise ValueError("an empty line is no topic")
+        kinds = {f.name: f.type for f in fields(cls) if f.name != "topic"}
+        values: dict[str, object] = {}
+        for word in words[1:]:
+            key, separator, value = word.partition("=")
+            if not separator or key not in kinds or key in values:
+                raise ValueError(f"{words[0]}: {word!r} is not one of {', '.join(f'{k}=' for k in kinds)}, once each")
+            try:
+                values[key] = {"float": float, "str": str, "bool": _bool}[str(kinds[key])](value)
+            except ValueError:
+                raise ValueError(f"{words[0]}: {key} must be {kinds[key]} (got {value!r})") from None
+        return cls(words[0], **values)  # type: ignore[arg-type]
+
+
+def _bool(text: str) -> bool:
+    if text not in ("true", "false"):
+        raise ValueError(text)
+    return text == "true"
+
+
+def parse_rules(lines: tuple[str, ...]) -> dict[str, TopicRule]:
+    """Rules by topic.
+
+    Raises:
+        ValueError: a line is wrong, or a topic stands twice.
+    """
+    rules: dict[str, TopicRule] = {}
+    for line in lines:
+        rule = TopicRule.parse(line)
+        if rule.topic in rules:
+            raise ValueError(f"{rule.topic} stands twice")
+        rules[rule.topic] = rule
+    return rules
+
+
+@dataclass
+class TopicCounts:
+    """What became of a topic's messages in one direction of one link.
+
+    Attributes:
+        messages, bytes: that went out, or came in and were passed on.
+        thinned: left out for the rate limit, as asked.
+        superseded: a newer one took its place before the link had room: the link is too slow for the rate.
+        expired: older than ``max_age_s``.
+        overflowed: a full queue of a reliable topic.
+        lost: gaps in the sequence, on the receiving side.
+        not_driving: from a host that does not drive now.
+        newest_age_ns: age of the newest message when it came.
+    """
+
+    messages: int = 0
+    bytes: int = 0
+    thinned: int = 0
+    superseded: int = 0
+    expired: int = 0
+    overflowed: int = 0
+    lost: int = 0
+    not_driving: int = 0
+    newest_age_ns: int = field(default=0, compare=False)
+
+    @property
+    def bad(self) -> int:
+        """Messages that somebody may miss; thinning was asked for, and a newer picture is no loss."""
+        return self.expired + self.overflowed + self.lost
+
+    def add(self, other: TopicCounts) -> None:
+        """Adds another's numbers."""
+        for name in ("messages", "bytes", "thinned", "superseded", "expired", "overflowed", "lost", "not_driving"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.newest_age_ns = other.newest_age_ns or self.newest_age_ns

@@ -1,0 +1,337 @@
+"""A Zenoh session in which our topics are topics of ROS 2: nodes, publishers and subscriptions as rmw_zenoh makes them.
+
+Knows nothing of our bus: bytes in, bytes out. Zenoh is an extra, imported when a session is opened.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import logging
+import os
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from .zenoh_format import ADMIN_SPACE, GID_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
+
+DEFAULT_ROUTER = "tcp/localhost:7447"
+_HEARTBEAT_S = 0.5  # by which a late or unlucky reader of a latched topic finds what it missed, as in rmw_zenoh
+
+SESSION_DEFAULTS = {
+    "mode": '"peer"',
+    "connect/endpoints": f'["{DEFAULT_ROUTER}"]',
+    "listen/endpoints": '["tcp/localhost:0"]',
+    "scouting/multicast/enabled": "false",
+    "scouting/gossip/enabled": "true",
+    # The cache of a latched topic orders by time.
+    "timestamping/enabled": "{router: true, peer: true, client: true}",
+}
+"""What rmw_zenoh's sessions have: peers of one router, which tells them of each other; no multicast."""
+
+ROUTER_DEFAULTS = {
+    **SESSION_DEFAULTS,
+    "mode": '"router"',
+    "connect/endpoints": "[]",
+    "listen/endpoints": f'["{DEFAULT_ROUTER}"]',
+}
+
+log = logging.getLogger(__name__)
+
+
+class ZenohError(RuntimeError):
+    """Zenoh is not installed, or refuses its configuration; the message says what to do."""
+
+
+def zenoh() -> Any:
+    """The zenoh package.
+
+    Raises:
+        ZenohError: the extra is not installed.
+    """
+    try:
+        import zenoh
+        import zenoh.ext
+    except ImportError as error:
+        raise ZenohError(f"Zenoh is not installed ({error}): pip install 'instant-ic[zenoh]'") from None
+    return zenoh
+
+
+def load_config(
+    path: Path | None, connect: Sequence[str] = (), listen: Sequence[str] = (), defaults: dict[str, str] | None = None
+) -> Any:
+    """A Zenoh configuration.
+
+    Args:
+        path: a Zenoh JSON5 file, taken as it is; None takes ``defaults``.
+        connect: endpoints (``tcp/10.0.0.1:7447``) instead of the file's.
+        listen: the same for listening.
+        defaults: :data:`SESSION_DEFAULTS` if not given.
+
+    Raises:
+        ZenohError: the file cannot be read, is no Zenoh configuration, or an endpoint is none.
+    """
+    package = zenoh()
+    try:
+        if path is not None:
+            config = package.Config.from_json5(path.read_text())
+        else:
+            config = package.Config()
+            for key, value in (SESSION_DEFAULTS if defaults is None else defaults).items():
+                config.insert_json5(key, value)
+    except OSError as error:
+        raise ZenohError(f"{path}: cannot be read: {error.strerror}") from None
+    except package.ZError as error:
+        raise ZenohError(f"{path or 'defaults'}: not a Zenoh configuration: {error}") from None
+    for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
+        if endpoints:
+            try:
+                config.insert_json5(key, json.dumps(list(endpoints)))
+            except package.ZError as error:
+                raise ZenohError(f"{key} {list(endpoints)}: {error}") from None
+    return config
+
+
+def open_zenoh(config: Any) -> Any:
+    """A Zenoh session; where the router is not there yet it is looked for in the background.
+
+    Raises:
+        ZenohError: an endpoint cannot be listened on, certificates cannot be read, and the like.
+    """
+    package = zenoh()
+    package.init_log_from_env_or("error")
+    try:
+        return package.open(config)
+    except package.ZError as error:
+        raise ZenohError(f"Zenoh session: {error}") from None
+
+
+class RosSession:
+    """Nodes of the ROS graph in one Zenoh session. A context manager.
+
+    Args:
+        config: see :func:`load_config`.
+        domain: ROS domain.
+
+    Raises:
+        ZenohError: see :func:`open_zenoh`.
+    """
+
+    def __init__(self, config: Any, domain: int = 0) -> None:
+        self.domain = domain
+        self.zenoh = open_zenoh(config)
+        self.id = str(self.zenoh.info.zid())
+        self._ids = itertools.count()
+        self._watch: Any = None
+
+    def __enter__(self) -> Self:
+        """The session itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Closes the session."""
+        self.close()
+
+    def close(self) -> None:
+        """Takes every token, publisher and subscription away."""
+        if not self.zenoh.is_closed():
+            self.zenoh.close()
+
+    def routers(self) -> list[str]:
+        """Ids of the routers that the session is connected to."""
+        return [str(zid) for zid in self.zenoh.info.routers_zid()]
+
+    def peers(self) -> list[str]:
+        """Ids of the peers that the session is connected to."""
+        return [str(zid) for zid in self.zenoh.info.peers_zid()]
+
+    def token(self, kind: Kind, node: RosNode | None, namespace: str, name: str, *endpoint: Any) -> tuple[Token, Any]:
+        """A token of a new entity, and its declaration."""
+        entity = next(self._ids)
+        token = Token(
+            kind, self.domain, self.id, entity if node is None else node.id, entity, namespace, name, *endpoint
+        )
+        return token, self.zenoh.liveliness().declare_token(token.key())
+
+    def watch(self, on_token: Callable[[Token, bool], None]) -> None:
+        """Calls ``on_token(token, alive)`` for what others have and will have, on a thread of Zenoh."""
+        put = zenoh().SampleKind.PUT
+
+        def heard(sample: Any) -> None:
+            try:
+                token = Token.parse(str(sample.key_expr))
+            except FormatError as error:
+                log.warning("%s", error)
+                return
+            if token is not None and token.session != self.id:
+                on_token(token, sample.kind == put)
+
+        self._watch = self.zenoh.liveliness().declare_subscriber(
+            f"{ADMIN_SPACE}/{self.domain}/**", heard, history=True
+        )
+
+
+class RosNode:
+    """A node of the ROS graph, as ``ros2 node list`` shows it.
+
+    Args:
+        session: whose.
+        namespace: ``/robot1``, or ``/``.
+        name: the node's name.
+    """
+
+    def __init__(self, session: RosSession, namespace: str, name: str) -> None:
+        self.session = session
+        self.namespace = namespace
+        self.name = name
+        token, self._declaration = session.token("NN", None, namespace, name)
+        self.id = token.node_id
+
+    def endpoint(self, kind: Kind, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> Any:
+        """Declares a token of one of the node's publishers or subscriptions."""
+        return self.session.token(kind, self, self.namespace, self.name, topic, type_name, type_hash, qos)[1]
+
+    def close(self) -> None:
+        """Takes the node out of the graph."""
+        self._declaration.undeclare()
+
+
+class RosPublisher:
+    """A publisher of the ROS graph; :meth:`put` may be called from any thread.
+
+    Args:
+        node: whose.
+        topic: full name, with the namespace.
+        type_name: ``std_msgs/msg/String``.
+        type_hash: its RIHS01 hash.
+        qos: latched topics keep their last ``depth`` messages for late joiners.
+    """
+
+    def __init__(self, node: RosNode, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> None:
+        package = zenoh()
+        session = node.session
+        key = data_key(session.domain, topic, type_name, type_hash)
+        reliability = package.Reliability.RELIABLE if qos.reliable else package.Reliability.BEST_EFFORT
+        # As rmw_zenoh: a link that cannot keep up loses messages, which the reader counts; it never holds the sender up.
+        options = {"congestion_control": package.CongestionControl.DROP, "reliability": reliability}
+        if qos.latched:
+            self._publisher = package.ext.declare_advanced_publisher(
+                session.zenoh,
+                key,
+                cache=package.ext.CacheConfig(max_samples=qos.depth or 1),
+                publisher_detection=True,
+                sample_miss_detection=package.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+                **options,
+            )
+        else:
+            self._publisher = session.zenoh.declare_publisher(key, **options)
+        self._token = node.endpoint("MP", topic, type_name, type_hash, qos)
+        self._lock = threading.Lock()
+        self.gid = os.urandom(GID_SIZE)
+        self.count = 0
+
+    def put(self, payload: bytes | memoryview, source_ns: int) -> None:
+        """Sends CDR bytes as they are, with their time of publication.
+
+        Raises:
+            ZenohError: the session is closed.
+        """
+        with self._lock:
+            self.count += 1
+            attachment = Attachment(self.count, source_ns, self.gid).pack()
+            try:
+                self._publisher.put(bytes(payload), attachment=attachment)
+            except zenoh().ZError as error:
+                raise ZenohError(f"Zenoh: {error}") from None
+
+    def close(self) -> None:
+        """Takes the publisher out of the graph."""
+        self._token.undeclare()
+        self._publisher.undeclare()
+
+
+class RosSubscription:
+    """A subscription of the ROS graph; hears others' sessions only, so nothing of ours comes back.
+
+    Args:
+        node: whose.
+        topic: full name, with the namespace.
+        type_name: ``std_msgs/msg/String``.
+        type_hash: its RIHS01 hash; messages of another definition have another key and never come.
+        qos: latched subscriptions ask publishers for what was sent before.
+        on_message: ``(payload, attachment)``, in order for each publisher, on a thread of Zenoh.
+
+    Attributes:
+        count: messages handed on.
+        lost_by: publisher's id (hex digits) → messages of it that never came.
+        malformed: messages without a readable attachment; refused.
+    """
+
+    def __init__(
+        self,
+        node: RosNode,
+        topic: str,
+        type_name: str,
+        type_hash: str,
+        qos: TopicQoS,
+        on_message: Callable[[bytes, Attachment], None],
+    ) -> None:
+        package = zenoh()
+        session = node.session
+        self.topic = topic
+        self.count = 0
+        self.lost_by: dict[str, int] = {}
+        self.malformed = 0
+        self._sequences: dict[bytes, int] = {}
+        self._on_message = on_message
+        key = data_key(session.domain, topic, type_name, type_hash)
+        remote = package.Locality.REMOTE
+        if qos.latched:
+            self._subscriber = package.ext.declare_advanced_subscriber(
+                session.zenoh,
+                key,
+                self._heard,
+                allowed_origin=remote,
+                history=package.ext.HistoryConfig(detect_late_publishers=True, max_samples=qos.depth or 1),
+                recovery=package.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                subscriber_detection=True,
+            )
+        else:
+            self._subscriber = session.zenoh.declare_subscriber(key, self._heard, allowed_origin=remote)
+        self._token = node.endpoint("MS", topic, type_name, type_hash, qos)
+
+    @property
+    def lost(self) -> int:
+        """Messages that never came, of all publishers together."""
+        return sum(self.lost_by.values())
+
+    def _heard(self, sample: Any) -> None:
+        try:
+            if sample.attachment is None:
+                raise FormatError("no attachment")
+            attachment = Attachment.unpack(sample.attachment.to_bytes())
+        except FormatError as error:
+            self.malformed += 1
+            if self.malformed == 1:
+                log.error("%s: a message that rmw_zenoh did not make is refused: %s", self.topic, error)
+            return
+        last = self._sequences.get(attachment.gid)
+        if last is not None:
+            if attachment.sequence <= last:  # sent again
+                return
+            missing = attachment.sequence - last - 1
+            if missing:
+                gid = attachment.gid.hex()
+                self.lost_by = {**self.lost_by, gid: self.lost_by.get(gid, 0) + missing}
+        self._sequences[attachment.gid] = attachment.sequence
+        self.count += 1
+        self._on_message(sample.payload.to_bytes(), attachment)
+
+    def close(self) -> None:
+        """Takes the subscription out of the graph."""
+        self._token.undeclare()
+        self._subscriber.undeclare()
