@@ -1,5 +1,8 @@
 """Bags: rosbag2 folders (MCAP) written and read as bytes, replayed in lockstep, compared (docs/bags.md)."""
 
-from instant_ic.bag.files import BagError, BagMessage, BagReader, BagWriter, TopicSummary
+from instant_ic.bag.errors import BagError, DiskFullError
+from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
+from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.writer import BagWriter
 
-__all__ = ["BagError", "BagMessage", "BagReader", "BagWriter", "TopicSummary"]
+__all__ = ["BagError", "BagMessage", "BagReader", "BagWriter", "DiskFullError", "Schema", "TopicSummary"]

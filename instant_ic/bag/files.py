@@ -1,46 +1,26 @@
-"""rosbag2 folders: serialized messages in and out, never decoded.
-
-The format is the work of `rosbags`; here are our QoS presets, words for what can go wrong, and a writer that loses at
-most a second when its process is killed.
-"""
+"""Reads bags as bytes: rosbag2 folders (MCAP and SQLite), bare ``.mcap`` and ``.db3`` files, ROS 1 ``.bag`` files."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from contextlib import suppress
-from dataclasses import dataclass
+import heapq
+import json
+import struct
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rosbags.interfaces import (
-    Connection,
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
-from rosbags.rosbag2 import (
-    CompressionFormat,
-    CompressionMode,
-    Reader,
-    ReaderError,
-    StoragePlugin,
-    Writer,
-    WriterError,
-)
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader, ReaderError
 
-from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
-from instant_ic.msg import MessageError, message_type, typestore
-
-# What DDS writes for "no limit".
-_FOREVER = QosTime(2147483647, 4294967295)
-
-
-class BagError(RuntimeError):
-    """A bag that cannot be written or read; the message says why and what to do."""
+from instant_ic.bag.errors import BagError
+from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
+from instant_ic.bus.qos import QoS
+from instant_ic.msg import deserialize
 
 
 @dataclass(frozen=True)
@@ -70,117 +50,26 @@ class TopicSummary:
     type_name: str
     count: int
     qos: QoS
+    schema: Schema = field(repr=False)
 
 
-class BagWriter:
-    """Writes a bag folder; a context manager.
+@dataclass(frozen=True)
+class PartSummary:
+    """One file of a bag: its path, first and last stamp, messages."""
 
-    Args:
-        path: the folder, which must not exist yet.
-        compressed: chunks are compressed by zstd, for bags to keep or send: half the size for point packets.
-
-    Raises:
-        BagError: it exists, or cannot be made.
-    """
-
-    def __init__(self, path: Path, compressed: bool = False) -> None:
-        self.path = path
-        self.count = 0
-        self.bytes = 0
-        self._connections: dict[tuple[str, str], Connection] = {}
-        try:
-            self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-            if compressed:
-                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-            self._writer.open()
-        except (WriterError, OSError) as error:
-            raise BagError(f"bag {path} cannot be made: {error}") from None
-
-    def __enter__(self) -> BagWriter:
-        """The writer itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Closes the bag properly, also when something else went wrong: half a recording is worth having."""
-        self.close()
-
-    def write(self, topic: str, type_name: str, payload: bytes | memoryview, stamp_ns: int, qos: QoS = SENSOR) -> None:
-        """Appends one message.
-
-        Args:
-            topic: its topic.
-            type_name: its type; known to ROS 2 Jazzy or one of ours.
-            payload: CDR bytes.
-            stamp_ns: nanoseconds since the epoch.
-            qos: told with the topic, the first time that it comes.
-
-        Raises:
-            BagError: unknown type, or the disk is full.
-        """
-        try:
-            connection = self._connections.get((topic, type_name)) or self._connect(topic, type_name, qos)
-            self._writer.write(connection, stamp_ns, payload)
-        except (WriterError, OSError) as error:
-            raise BagError(f"bag {self.path}, topic {topic}: {error}") from error
-        self.count += 1
-        self.bytes += len(payload)
-
-    def add_topic(self, topic: str, type_name: str, qos: QoS) -> None:
-        """Notes a topic that may never carry a message.
-
-        Raises:
-            BagError: unknown type.
-        """
-        if (topic, type_name) not in self._connections:
-            self._connect(topic, type_name, qos)
-
-    def set_custom(self, key: str, value: str) -> None:
-        """Puts text into the metadata (``custom_data``)."""
-        self._writer.set_custom_data(key, value)
-
-    def flush(self) -> None:
-        """Hands to the system what has come so far: from here on it survives the end of this process."""
-        storage: Any = self._writer.storage
-        if storage is None:
-            return
-        if storage.chunk.msgs:
-            storage.close_chunk()
-        storage.bio.flush()
-
-    def close(self) -> None:
-        """Writes index and metadata; twice does no harm.
-
-        Raises:
-            BagError: the disk is full.
-        """
-        if self._writer.storage is None:
-            return
-        try:
-            self._writer.close()
-        except OSError as error:
-            with suppress(OSError):
-                self._writer.abort()
-            raise BagError(f"bag {self.path} cannot be completed: {error}; try ic bag recover") from error
-
-    def _connect(self, topic: str, type_name: str, qos: QoS) -> Connection:
-        try:
-            message_type(type_name)
-        except MessageError as error:
-            raise BagError(f"bag {self.path}, topic {topic}: {error}") from None
-        connection = self._writer.add_connection(
-            topic, type_name, typestore=typestore(), offered_qos_profiles=[ros_qos(qos)]
-        )
-        self._connections[topic, type_name] = connection
-        return connection
+    path: Path
+    start_ns: int
+    end_ns: int
+    count: int
 
 
 class BagReader:
-    """Reads a bag folder, or a bare ``.mcap`` file; a context manager.
+    """Reads a bag; a context manager.
+
+    The latched values that a recorder repeats at the beginning of each file count once, and are read once.
 
     Args:
-        path: folder or file.
+        path: rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
 
     Raises:
         BagError: no bag there, or one that was cut short.
@@ -190,14 +79,30 @@ class BagReader:
         self.path = path
         if not path.exists():
             raise BagError(f"bag {path} does not exist")
+        self._reader: Any
+        self._ros1: Any = None
         try:
-            self._reader = Reader(path)
+            if path.suffix == ".bag" and path.is_file():
+                from instant_ic.bag.ros1 import Ros1Source
+
+                self._ros1 = self._reader = Ros1Source(path)
+            else:
+                self._reader = Reader(path)
             self._reader.open()
         except FileNotFoundError:
-            hint = f": ic bag recover {path}" if any(path.glob("*.mcap")) else ""
-            raise BagError(f"{path} has no metadata.yaml, so it is no bag or was cut short{hint}") from None
+            raise BagError(self._why_no_metadata()) from None
+        except BagError:
+            raise
         except (ReaderError, OSError) as error:
             raise BagError(f"bag {path} cannot be read: {error}; if it was cut: ic bag recover {path}") from None
+        except (struct.error, LookupError, TypeError, ValueError, AssertionError, EOFError) as error:
+            # A parser on bytes that are no bag.
+            raise BagError(
+                f"bag {path} cannot be read: {type(error).__name__}: {error}; if it was cut: ic bag recover {path}"
+            ) from None
+        told = json.loads(self.custom.get(REPEATED, "{}"))
+        self._repeated: dict[str, Counter[str]] = {file: Counter(entry["topics"]) for file, entry in told.items()}
+        self._repeated_ns: dict[str, int] = {file: int(entry["stamp_ns"]) for file, entry in told.items()}
 
     def __enter__(self) -> BagReader:
         """The reader itself."""
@@ -227,23 +132,57 @@ class BagReader:
     @property
     def count(self) -> int:
         """Messages in the bag."""
-        return int(self._reader.message_count)
+        return int(self._reader.message_count) - sum(topics.total() for topics in self._repeated.values())
 
     @property
     def custom(self) -> dict[str, str]:
         """Text that the recorder put into the metadata."""
-        return dict(self._reader.storage.metadata.custom or {})
+        metadata = getattr(self._reader.storage, "metadata", None)
+        return dict(getattr(metadata, "custom", None) or {})
 
     @property
     def topics(self) -> list[TopicSummary]:
         """Its topics, by name."""
-        return sorted(
-            (
-                TopicSummary(c.topic, c.msgtype, int(c.msgcount), preset_of(c.ext.offered_qos_profiles))  # type: ignore[union-attr]
-                for c in self._reader.connections
-            ),
-            key=lambda summary: (summary.topic, summary.type_name),
-        )
+        counts: Counter[tuple[str, str]] = Counter()
+        first: dict[tuple[str, str], Connection] = {}
+        for connection in self._reader.connections:
+            key = (connection.topic, connection.msgtype)
+            first.setdefault(key, connection)
+            counts[key] += int(connection.msgcount)
+        for topics in self._repeated.values():
+            for key in counts:
+                counts[key] -= topics[key[0]]
+        return [
+            TopicSummary(*key, max(0, counts[key]), _qos(first[key]), schema_of(first[key])) for key in sorted(counts)
+        ]
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that hold the messages, in their order."""
+        if self.path.is_file():
+            return [self.path]
+        return [Path(storage.path) for storage in self._storages]
+
+    @property
+    def parts(self) -> list[PartSummary]:
+        """The files with their spans."""
+        if self.path.is_file():
+            return [PartSummary(self.path, self.start_ns, self.end_ns, self.count)]
+        found = []
+        for storage in self._storages:
+            told, path = storage.metadata, Path(storage.path)
+            count = int(told.message_count) - self._repeated.get(path.name, Counter()).total()
+            span = (int(told.start_time), int(told.end_time) - 1) if told.message_count else (0, 0)
+            found.append(PartSummary(path, *span, count))
+        return found
+
+    @property
+    def unlisted(self) -> list[Path]:
+        """Files in the folder that ``metadata.yaml`` does not tell: what a killed recorder was writing."""
+        if self.path.is_file():
+            return []
+        listed = {file.name for file in self.files}
+        return sorted(file for file in self.path.glob("*.mcap") if file.name not in listed)
 
     def messages(
         self,
@@ -264,34 +203,78 @@ class BagReader:
         connections = [c for c in self._reader.connections if topics is None or c.topic in topics]
         if not connections:
             return
-        presets = {c.id: preset_of(c.ext.offered_qos_profiles) for c in connections}  # type: ignore[union-attr]
+        presets = {(c.topic, c.msgtype): _qos(c) for c in connections}
         try:
-            for connection, stamp_ns, payload in self._reader.messages(connections, start_ns, stop_ns):
-                yield BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, presets[connection.id])
+            with closing(self._raw(connections, start_ns, stop_ns)) as raw:
+                for connection, stamp_ns, payload in raw:
+                    qos = presets[connection.topic, connection.msgtype]
+                    yield BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, qos)
         except ReaderError as error:
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
 
+    def decoder(self, topic: TopicSummary) -> Callable[[bytes], Any]:
+        """Turns the bytes of a topic into messages: by our types, or by the bag's own definition where it differs.
 
-def ros_qos(qos: QoS) -> Qos:
-    """ROS 2's profile for one of our presets."""
-    return Qos(
-        QosHistory.KEEP_LAST,
-        qos.depth,
-        QosReliability.RELIABLE if qos.reliable else QosReliability.BEST_EFFORT,
-        QosDurability.TRANSIENT_LOCAL if qos.latched else QosDurability.VOLATILE,
-        _FOREVER,
-        _FOREVER,
-        QosLiveliness.AUTOMATIC,
-        _FOREVER,
-        False,
-    )
+        Raises:
+            BagError: nobody knows the type.
+        """
+        own = schema_or_unknown(topic.type_name)
+        if own.encoding and topic.schema.type_hash in ("", own.type_hash):
+            return lambda payload: deserialize(payload, topic.type_name)
+        if topic.schema.encoding != "ros2msg":
+            raise BagError(f"bag {self.path}, topic {topic.topic}: its type {topic.type_name} is not known")
+        store = store_of(topic.schema)
+        return lambda payload: store.deserialize_cdr(payload, topic.type_name)
+
+    def differing_types(self) -> list[str]:
+        """Types whose definition in the bag is another than ours: their messages do not fit our nodes."""
+        found = set()
+        for topic in self.topics:
+            own = schema_or_unknown(topic.type_name)
+            if own.encoding and topic.schema.type_hash and topic.schema.type_hash != own.type_hash:
+                found.add(topic.type_name)
+        return sorted(found)
+
+    # -- internals -------------------------------------------------------------------------------
+
+    @property
+    def _storages(self) -> list[Any]:
+        return list(getattr(self._reader.storage, "storages", [self._reader.storage]))
+
+    def _raw(
+        self, connections: list[Connection], start_ns: int | None, stop_ns: int | None
+    ) -> Generator[tuple[Connection, int, bytes], None, None]:
+        if self._ros1 is not None or self._reader.compression_mode == "message":
+            yield from self._reader.messages(connections, start_ns, stop_ns)
+            return
+        # Merged by stamp: where a clock was set back, or files overlap, one file after the other is not the order.
+        streams = [self._of_part(storage, connections, start_ns, stop_ns) for storage in self._storages]
+        yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry[1])
+
+    def _of_part(
+        self, storage: Any, connections: list[Connection], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        wanted = {(c.topic, c.msgtype) for c in connections}
+        chosen = [c for c in storage.connections if (c.topic, c.msgtype) in wanted]
+        if not chosen:
+            return
+        name = Path(storage.path).name
+        repeated, repeated_ns = Counter(self._repeated.get(name, {})), self._repeated_ns.get(name)
+        # What is repeated stands first in its file, before other messages of the same stamp.
+        for connection, stamp_ns, payload in storage.messages(chosen, start_ns, stop_ns):
+            if stamp_ns == repeated_ns and repeated[connection.topic] > 0:
+                repeated[connection.topic] -= 1
+                continue
+            yield connection, stamp_ns, payload
+
+    def _why_no_metadata(self) -> str:
+        if any(self.path.glob("*.mcap")):
+            return (
+                f"{self.path} has no metadata.yaml: its recording was cut short, or the file was lost: "
+                f"ic bag recover {self.path}, or ic bag reindex {self.path} when its files are whole"
+            )
+        return f"{self.path} has no metadata.yaml, so it is no bag"
 
 
-def preset_of(profiles: Collection[Qos]) -> QoS:
-    """Our preset that comes closest to what a bag's topic was offered with; ``reliable`` where it does not say."""
-    profile = next(iter(profiles), None)
-    if profile is None:
-        return RELIABLE
-    if profile.durability is QosDurability.TRANSIENT_LOCAL:
-        return LATCHED
-    return SENSOR if profile.reliability is QosReliability.BEST_EFFORT else RELIABLE
+def _qos(connection: Connection) -> QoS:
+    return preset_of(connection.ext.offered_qos_profiles)  # type: ignore[union-attr]

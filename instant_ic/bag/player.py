@@ -8,7 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from instant_ic.bag.files import BagError, BagMessage, BagReader
+from instant_ic.bag.errors import BagError
+from instant_ic.bag.files import BagMessage, BagReader
 from instant_ic.bag.recorder import EVERYTHING, TopicChoice
 
 NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics")

@@ -13,9 +13,11 @@ from typing import Any
 import yaml
 
 from instant_ic import paths
-from instant_ic.bag.files import BagError, BagMessage, BagReader, BagWriter
+from instant_ic.bag.errors import BagError
+from instant_ic.bag.files import BagMessage, BagReader
 from instant_ic.bag.player import NEVER_PLAYED
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
+from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.bus.main import load_config
 from instant_ic.bus.node import Node

@@ -1,0 +1,201 @@
+"""Reads an MCAP file from its beginning, without its index, as far as it can be read: cut, damaged or whole."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from instant_ic.bag.errors import BagError
+from instant_ic.bag.mcap_writer import CHANNEL, CHUNK, DATA_END, HEADER, MAGIC, MESSAGE, METADATA, SCHEMA, Schema
+
+OWN_LIBRARY = "instant_ic"
+_KNOWN_OPCODES = range(0x01, 0x10)  # and from 0x80 on private ones
+_UNREADABLE = (struct.error, IndexError, ValueError)  # UnicodeDecodeError is a ValueError
+
+
+@dataclass(frozen=True)
+class ScannedMessage:
+    """A message as it stands in a file.
+
+    Attributes:
+        topic: its topic.
+        schema: definition of its type.
+        encoding: of the payload; ``cdr`` in bags of ROS 2.
+        metadata: of its topic; rosbag2 notes the QoS there.
+        stamp_ns: log time.
+        payload: its bytes.
+        repeated: a latched value that an earlier file of the bag holds.
+    """
+
+    topic: str
+    schema: Schema
+    encoding: str
+    metadata: dict[str, str]
+    stamp_ns: int
+    payload: bytes
+    repeated: bool
+
+
+class McapScan:
+    """One pass over a file; the attributes tell what was found once :meth:`messages` has come to its end.
+
+    Args:
+        path: the file.
+
+    Raises:
+        BagError: it cannot be opened, or is no MCAP file at all.
+
+    Attributes:
+        whole: the file has its end.
+        stopped_by: in words, where reading ended before the end of the file; empty when it did not.
+        damaged: in words, chunks inside the file that were left out.
+        metadata: metadata records, name → values; the last of each name.
+        library: who wrote the file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.whole = False
+        self.stopped_by = ""
+        self.damaged: list[str] = []
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.library = ""
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, tuple[str, int, str, dict[str, str]]] = {}
+        try:
+            with path.open("rb") as file:
+                size = path.stat().st_size
+                # An empty file cannot be mapped.
+                self._data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b"")
+        except OSError as error:
+            raise BagError(f"{path} cannot be read: {error.strerror}") from None
+        if bytes(self._data[: len(MAGIC)]) != MAGIC[: len(self._data)]:
+            raise BagError(f"{path} is no MCAP file")
+
+    def messages(self) -> Iterator[ScannedMessage]:
+        """Every message that can be read, in the order of the file."""
+        data, at = self._data, len(MAGIC)
+        while at < len(data):
+            if len(data) - at < 9:
+                self._stop(at, "the file ends in a record's head")
+                return
+            opcode, length = struct.unpack_from("<BQ", data, at)
+            body, end = at + 9, at + 9 + length
+            if opcode not in _KNOWN_OPCODES and opcode < 0x80:
+                self._stop(at, f"no record can begin with {opcode:#04x}")
+                return
+            if opcode == CHUNK:
+                yield from self._chunk(data[body : min(end, len(data))], at, end <= len(data))
+            elif opcode == DATA_END:
+                self.whole = end <= len(data) and bytes(data[-len(MAGIC) :]) == MAGIC
+                if not self.whole:
+                    self._stop(at, "the index after the messages is cut")
+                return
+            elif end <= len(data):
+                try:
+                    yield from self._record(opcode, data[body:end])
+                except _UNREADABLE as error:
+                    self.damaged.append(f"record at byte {at}: {error}")
+            if end > len(data):
+                self._stop(at, "the file ends inside a record")
+                return
+            at = end
+        self._stop(at, "the file ends without its index")
+
+    def _stop(self, at: int, why: str) -> None:
+        self.stopped_by = f"{self.path.name}, byte {at}: {why}"
+
+    def _chunk(self, body: memoryview, at: int, complete: bool) -> Iterator[ScannedMessage]:
+        try:
+            _, _, size, crc = struct.unpack_from("<QQQI", body, 0)
+            compression, offset = _string(body, 28)
+            (stored_size,) = struct.unpack_from("<Q", body, offset)
+            stored = body[offset + 8 : offset + 8 + stored_size]
+            records = _decompress(stored, compression)
+        except _UNREADABLE as error:
+            if complete:
+                self.damaged.append(f"chunk at byte {at}: {error}")
+            return
+        if complete and (len(records) != size or (crc and zlib.crc32(records) != crc)):
+            self.damaged.append(f"chunk at byte {at}: its check sum is wrong")
+            return
+        inner = 0
+        while len(records) - inner >= 9:
+            opcode, length = struct.unpack_from("<BQ", records, inner)
+            end = inner + 9 + length
+            if end > len(records) or (opcode not in _KNOWN_OPCODES and opcode < 0x80):
+                return
+            try:
+                yield from self._record(opcode, records[inner + 9 : end])
+            except _UNREADABLE as error:
+                self.damaged.append(f"record in the chunk at byte {at}: {error}")
+            inner = end
+
+    def _record(self, opcode: int, body: memoryview) -> Iterator[ScannedMessage]:
+        if opcode == MESSAGE:
+            number, _, stamp_ns, publish_ns = struct.unpack_from("<HIQQ", body, 0)
+            if number not in self._channels:
+                raise ValueError(f"a message of channel {number}, which is not known (its definition was damaged)")
+            topic, schema, encoding, metadata = self._channels[number]
+            repeated = self.library == OWN_LIBRARY and publish_ns != stamp_ns
+            known = self._schemas.get(schema, Schema("", "", "", ""))
+            yield ScannedMessage(topic, known, encoding, metadata, stamp_ns, bytes(body[22:]), repeated)
+        elif opcode == SCHEMA:
+            name, at = _string(body, 2)
+            encoding, at = _string(body, at)
+            text, at = _string(body, at)
+            self._schemas[struct.unpack_from("<H", body)[0]] = Schema(name, encoding, text, "")
+        elif opcode == CHANNEL:
+            number, schema = struct.unpack_from("<HH", body)
+            topic, at = _string(body, 4)
+            encoding, at = _string(body, at)
+            self._channels[number] = (topic, schema, encoding, _string_map(body, at)[0])
+        elif opcode == METADATA:
+            name, at = _string(body, 0)
+            self.metadata[name] = _string_map(body, at)[0]
+        elif opcode == HEADER:
+            _, at = _string(body, 0)
+            self.library = _string(body, at)[0]
+
+
+def _string(data: memoryview, at: int) -> tuple[str, int]:
+    (length,) = struct.unpack_from("<I", data, at)
+    end = at + 4 + length
+    if end > len(data):
+        raise ValueError("a text is longer than its record")
+    return str(data[at + 4 : end], "utf-8"), end
+
+
+def _string_map(data: memoryview, at: int) -> tuple[dict[str, str], int]:
+    (length,) = struct.unpack_from("<I", data, at)
+    at, end = at + 4, at + 4 + length
+    values = {}
+    while at < end:
+        key, at = _string(data, at)
+        values[key], at = _string(data, at)
+    return values, at
+
+
+def _decompress(data: memoryview, compression: str) -> memoryview:
+    """The records of a chunk; of a cut one what its whole blocks hold."""
+    if compression == "":
+        return data
+    if compression == "zstd":
+        import zstandard
+
+        try:
+            return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(bytes(data)))
+        except zstandard.ZstdError as error:
+            raise ValueError(str(error)) from None
+    if compression == "lz4":
+        import lz4.frame
+
+        try:
+            return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(bytes(data)))
+        except RuntimeError as error:
+            raise ValueError(str(error)) from None
+    raise ValueError(f"compression {compression!r} is not known")

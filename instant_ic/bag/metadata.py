@@ -1,0 +1,207 @@
+"""What stands beside the messages of a bag: ``metadata.yaml``, QoS profiles, definitions of types."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rosbags.interfaces import (
+    Connection,
+    MessageDefinitionFormat,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2.metadata import dump_qos_v9
+
+from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
+from instant_ic.msg import MessageError, message_type, type_hash, typestore
+
+METADATA_FILE = "metadata.yaml"
+REPEATED = "instant_ic.repeated"
+"""Key of ``custom_data``: JSON, file → its latched messages that only repeat what an earlier file holds:
+``{"stamp_ns": their stamp, "topics": {topic: how many}}``."""
+
+# What DDS writes for "no limit", and rosbag2 for the start of an empty bag.
+_FOREVER = QosTime(2147483647, 4294967295)
+_NO_START = (1 << 63) - 1
+
+Topic = tuple[str, str]
+"""Name and type."""
+
+
+@dataclass
+class PartInfo:
+    """One file of a bag.
+
+    Attributes:
+        path: its name in the bag's folder.
+        start_ns: first stamp.
+        end_ns: last stamp.
+        counts: messages by topic, repeated ones too.
+        repeated: latched messages at its beginning that an earlier file has, by topic.
+        repeated_ns: the stamp that they have here.
+    """
+
+    path: str
+    start_ns: int = 0
+    end_ns: int = 0
+    counts: dict[Topic, int] = field(default_factory=dict)
+    repeated: dict[str, int] = field(default_factory=dict)
+    repeated_ns: int = 0
+
+    @property
+    def count(self) -> int:
+        """Messages in the file."""
+        return sum(self.counts.values())
+
+
+def write_metadata(
+    folder: Path,
+    parts: Sequence[PartInfo],
+    topics: dict[Topic, tuple[QoS, Schema]],
+    custom: dict[str, str],
+) -> None:
+    """Writes ``metadata.yaml`` (rosbag2, version 9) in one step: there is always a whole one, the old or the new.
+
+    Args:
+        folder: the bag.
+        parts: its files in their order.
+        topics: what its topics were offered with.
+        custom: ``custom_data``.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    repeated = {part.path: {"stamp_ns": part.repeated_ns, "topics": part.repeated} for part in parts if part.repeated}
+    custom = {**custom, **({REPEATED: json.dumps(repeated)} if repeated else {})}
+    information = {
+        "version": 9,
+        "storage_identifier": "mcap",
+        "relative_file_paths": [part.path for part in parts],
+        **_span(parts),
+        "message_count": sum(part.count for part in parts),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": {
+                    "name": topic,
+                    "type": type_name,
+                    "serialization_format": "cdr",
+                    "offered_qos_profiles": dump_qos_v9([ros_qos(qos)]),
+                    "type_description_hash": schema.type_hash,
+                },
+                "message_count": sum(part.counts.get((topic, type_name), 0) for part in parts),
+            }
+            for (topic, type_name), (qos, schema) in topics.items()
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "files": [{"path": part.path, **_span([part]), "message_count": part.count} for part in parts],
+        "custom_data": custom or None,
+        "ros_distro": "jazzy",
+    }
+    text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False, width=1000)
+    scratch = folder / f"{METADATA_FILE}.tmp"
+    try:
+        scratch.write_text(text)
+        scratch.replace(folder / METADATA_FILE)
+    except OSError:
+        scratch.unlink(missing_ok=True)
+        raise
+
+
+def _span(parts: Sequence[PartInfo]) -> dict[str, Any]:
+    filled = [part for part in parts if part.count]
+    start_ns = min((part.start_ns for part in filled), default=_NO_START)
+    end_ns = max((part.end_ns for part in filled), default=_NO_START)
+    return {
+        "duration": {"nanoseconds": end_ns - start_ns},
+        "starting_time": {"nanoseconds_since_epoch": start_ns},
+    }
+
+
+@functools.cache
+def own_schema(type_name: str) -> Schema:
+    """Definition of a type that this project knows.
+
+    Raises:
+        MessageError: it does not.
+    """
+    message_type(type_name)
+    text, _ = typestore().generate_msgdef(type_name, ros_version=2)
+    return Schema(type_name, "ros2msg", text, type_hash(type_name))
+
+
+def schema_or_unknown(type_name: str) -> Schema:
+    """As :func:`own_schema`; without definition where the type is not known, as rosbag2 does."""
+    try:
+        return own_schema(type_name)
+    except MessageError:
+        return Schema(type_name, "", "", "")
+
+
+@functools.lru_cache(maxsize=200)
+def store_of(schema: Schema) -> Any:
+    """Type store with the types of a definition that a bag carries."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.text, schema.name))
+    return store
+
+
+@functools.lru_cache(maxsize=200)
+def with_hash(schema: Schema) -> Schema:
+    """The same with its RIHS01 hash, where the definition gives it; ours where there is no definition."""
+    if not schema.encoding or not schema.text:  # old SQLite bags hold none
+        return schema_or_unknown(schema.name)
+    if schema.type_hash or schema.encoding != "ros2msg":
+        return schema
+    return dataclasses.replace(schema, type_hash=store_of(schema).hash_rihs01(schema.name))
+
+
+def schema_of(connection: Connection) -> Schema:
+    """Definition of a topic's type as `rosbags` read it."""
+    encodings = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+    encoding = encodings.get(connection.msgdef.format, "")
+    return with_hash(Schema(connection.msgtype, encoding, connection.msgdef.data, connection.digest))
+
+
+def channel_metadata(qos: QoS) -> dict[str, str]:
+    """What rosbag2 notes with a topic inside an MCAP file."""
+    return {"offered_qos_profiles": yaml.safe_dump(dump_qos_v9([ros_qos(qos)]), sort_keys=False).strip()}
+
+
+def ros_qos(qos: QoS) -> Qos:
+    """ROS 2's profile for one of our presets."""
+    return Qos(
+        QosHistory.KEEP_LAST,
+        qos.depth,
+        QosReliability.RELIABLE if qos.reliable else QosReliability.BEST_EFFORT,
+        QosDurability.TRANSIENT_LOCAL if qos.latched else QosDurability.VOLATILE,
+        _FOREVER,
+        _FOREVER,
+        QosLiveliness.AUTOMATIC,
+        _FOREVER,
+        False,
+    )
+
+
+def preset_of(profiles: Collection[Qos]) -> QoS:
+    """Our preset that comes closest to what a bag's topic was offered with; ``reliable`` where it does not say."""
+    profile = next(iter(profiles), None)
+    if profile is None:
+        return RELIABLE
+    if profile.durability is QosDurability.TRANSIENT_LOCAL:
+        return LATCHED
+    return SENSOR if profile.reliability is QosReliability.BEST_EFFORT else RELIABLE

@@ -1,0 +1,297 @@
+"""Writes rosbag2 folders: one MCAP file or several, each whole by itself, with the latched values at its beginning."""
+
+from __future__ import annotations
+
+import errno
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+
+from instant_ic.bag.errors import BagError, DiskFullError
+from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
+from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
+from instant_ic.bus.qos import SENSOR, QoS
+
+CUSTOM_RECORD = "instant_ic"
+"""Name of the metadata record in which a file keeps ``custom_data`` while the bag is being written."""
+
+
+@dataclass
+class _Part:
+    """The file being written."""
+
+    file: McapWriter
+    info: PartInfo
+    schemas: dict[str, int] = field(default_factory=dict)
+    channels: dict[Topic, int] = field(default_factory=dict)
+    first_ns: int | None = None
+    given: int = 0
+    repeats: int = 0
+
+
+class BagWriter:
+    """Writes a bag folder; a context manager; not for several threads at once.
+
+    Each file that is complete is in ``metadata.yaml`` at once: who dies while recording leaves a bag that opens, and
+    one file to recover.
+
+    Args:
+        path: the folder, which must not exist yet.
+        compressed: chunks are compressed by zstd, for bags to keep or send: half the size for point packets.
+        max_bytes: a file that has grown so large is followed by the next; 0 does not look at the size.
+        max_duration_s: the same by the stamps of its messages.
+
+    Raises:
+        BagError: it exists, or cannot be made.
+    """
+
+    def __init__(self, path: Path, compressed: bool = False, max_bytes: int = 0, max_duration_s: float = 0.0) -> None:
+        self.path = path
+        self.compressed = compressed
+        self.max_bytes = max_bytes
+        self.max_duration_ns = int(max_duration_s * 1e9)
+        self.bytes = 0
+        self.not_written = 0
+        """Messages given to it that a full disk left no place for."""
+        self.unknown_types: dict[str, str] = {}
+        """Type → topic of what is recorded without its definition, which nobody here knows."""
+        self._topics: dict[Topic, tuple[QoS, Schema]] = {}
+        self._latched = LatchedValues()
+        self._custom: dict[str, str] = {}
+        self._done: list[PartInfo] = []
+        self._part: _Part | None = None
+        self._closed = False
+        try:
+            path.mkdir(mode=0o755, parents=True)
+        except FileExistsError:
+            raise BagError(f"bag {path} cannot be made: {path} exists already, not overwriting") from None
+        except OSError as error:
+            raise BagError(f"bag {path} cannot be made: {error.strerror or error}") from None
+        self._open_part()
+
+    def __enter__(self) -> BagWriter:
+        """The writer itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Closes the bag properly, also when something else went wrong: half a recording is worth having."""
+        self.close()
+
+    @property
+    def count(self) -> int:
+        """Messages so far, without those that a file only repeats."""
+        done = sum(part.count - sum(part.repeated.values()) for part in self._done)
+        return done + (self._part.given - self._part.repeats if self._part is not None else 0)
+
+    @property
+    def parts(self) -> int:
+        """Files so far."""
+        return len(self._done) + (self._part is not None)
+
+    @property
+    def folder_bytes(self) -> int:
+        """What has come onto the disk."""
+        return sum(file.stat().st_size for file in self.path.glob("*.mcap"))
+
+    def write(
+        self,
+        topic: str,
+        type_name: str,
+        payload: Buffer,
+        stamp_ns: int,
+        qos: QoS = SENSOR,
+        schema: Schema | None = None,
+        publisher: str = "",
+    ) -> None:
+        """Appends one message.
+
+        Args:
+            topic: its topic.
+            type_name: its type.
+            payload: CDR bytes, which must not change until they are on the disk.
+            stamp_ns: nanoseconds since the epoch.
+            qos: told with the topic, the first time that it comes.
+            schema: definition of the type; default ours. Where there is none, the bytes are kept all the same.
+            publisher: who sent it: each publisher of a latched topic has its own present value.
+
+        Raises:
+            DiskFullError: what did not fit is counted; the bag can be ended, or written on when there is room.
+            BagError: the file cannot be written.
+        """
+        if self._closed:
+            raise BagError(f"bag {self.path} is closed")
+        stamp = max(0, stamp_ns)
+        if self._part is not None and self._is_full(self._part, stamp):
+            self.end_part()
+        if (topic, type_name) not in self._topics:
+            self.add_topic(topic, type_name, qos, schema)
+        value = LatchedValue(topic, type_name, payload, stamp) if self._topics[topic, type_name][0].latched else None
+        if self._part is None:
+            self._open_part()
+        assert self._part is not None
+        try:
+            if self._part.first_ns is None:
+                self._part.first_ns = stamp
+                self._repeat(stamp, value, publisher)
+            self._put(topic, type_name, payload, stamp, stamp)
+        except OSError as error:
+            raise self._failed(error, topic) from error
+        if value is not None:
+            self._latched.put(value, publisher)
+        self.bytes += len(payload)
+
+    def add_topic(self, topic: str, type_name: str, qos: QoS, schema: Schema | None = None) -> None:
+        """Notes a topic that may never carry a message."""
+        if (topic, type_name) in self._topics:
+            return
+        schema = schema or schema_or_unknown(type_name)
+        if not schema.encoding:
+            self.unknown_types[type_name] = topic
+        self._topics[topic, type_name] = (qos, schema)
+        if self._part is not None:
+            self._channel(self._part, (topic, type_name))
+
+    def set_custom(self, key: str, value: str) -> None:
+        """Puts text into the metadata (``custom_data``)."""
+        self._custom[key] = value
+
+    def keep_custom(self) -> None:
+        """Writes the present ``custom_data`` into the file itself, from where a recovery takes it.
+
+        Raises:
+            BagError: the disk is full.
+        """
+        if self._part is not None and self._part.given:
+            try:
+                self._part.file.add_metadata(CUSTOM_RECORD, self._custom)
+            except OSError as error:
+                raise self._failed(error, "metadata") from error
+
+    def flush(self) -> None:
+        """Hands to the system what has come so far: from here on it survives the end of this process.
+
+        Raises:
+            BagError: the disk is full.
+        """
+        if self._part is not None:
+            try:
+                self._part.file.flush()
+            except OSError as error:
+                raise self._failed(error, "flush") from error
+
+    def end_part(self) -> None:
+        """Completes the present file and tells it in ``metadata.yaml``; the next message begins another.
+
+        Raises:
+            BagError: the disk does not take it.
+        """
+        part, self._part = self._part, None
+        if part is not None:
+            try:
+                with suppress(OSError):  # no room: finish() finds some, and metadata.yaml tells the same
+                    part.file.add_metadata(CUSTOM_RECORD, self._custom)
+                full = part.file.finish()
+            except OSError as error:
+                raise BagError(
+                    f"bag {self.path} cannot be completed: {error.strerror}; try ic bag recover {self.path}"
+                ) from error
+            self._note(part)
+            if full is not None:
+                self._write_metadata()
+                raise DiskFullError(f"bag {self.path}: {full.strerror}; it is complete up to here")
+        self._write_metadata()
+
+    def close(self) -> None:
+        """Writes index and metadata; twice does no harm.
+
+        Raises:
+            DiskFullError: the last messages did not fit; the bag is whole without them.
+            BagError: the disk does not take it.
+        """
+        if not self._closed:
+            self._closed = True
+            self.end_part()
+
+    # -- internals -------------------------------------------------------------------------------
+
+    def _is_full(self, part: _Part, stamp_ns: int) -> bool:
+        if part.first_ns is None:
+            return False
+        if self.max_bytes and part.file.size >= self.max_bytes:
+            return True
+        # A clock that was set back ends a file as one that ran on.
+        return 0 < self.max_duration_ns <= abs(stamp_ns - part.first_ns)
+
+    def _open_part(self) -> None:
+        number = len(self._done)
+        numbered = number > 0 or self.max_bytes > 0 or self.max_duration_ns > 0
+        name = f"{self.path.name}_{number}.mcap" if numbered else f"{self.path.name}.mcap"
+        try:
+            file = McapWriter(self.path / name, self.compressed)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise DiskFullError(f"bag {self.path}: {error.strerror}") from error
+            raise BagError(f"bag {self.path} cannot be made: {error.strerror or error}") from None
+        self._part = _Part(file, PartInfo(name))
+
+    def _repeat(self, stamp_ns: int, but: LatchedValue | None, publisher: str) -> None:
+        if not self._done:
+            return
+        assert self._part is not None
+        for value in self._latched.values(but, publisher):
+            self._put(value.topic, value.type_name, value.payload, stamp_ns, value.publish_ns)
+            repeated, self._part.info.repeated_ns = self._part.info.repeated, stamp_ns
+            repeated[value.topic] = repeated.get(value.topic, 0) + 1
+            self._part.repeats += 1
+
+    def _put(self, topic: str, type_name: str, payload: Buffer, stamp_ns: int, publish_ns: int) -> None:
+        assert self._part is not None
+        channel = self._channel(self._part, (topic, type_name))
+        self._part.given += 1
+        self._part.file.write(channel, stamp_ns, payload, publish_ns)
+
+    def _channel(self, part: _Part, topic: Topic) -> int:
+        if topic not in part.channels:
+            qos, schema = self._topics[topic]
+            if schema.name not in part.schemas:
+                part.schemas[schema.name] = part.file.add_schema(schema)
+            part.channels[topic] = part.file.add_channel(topic[0], part.schemas[schema.name], channel_metadata(qos))
+        return part.channels[topic]
+
+    def _failed(self, error: OSError, what: str) -> BagError:
+        """Ends the file at its last whole chunk, in words."""
+        words = f"bag {self.path}, {what}: {error.strerror}"
+        try:
+            self.end_part()
+        except DiskFullError:
+            pass
+        except BagError as worse:
+            words = str(worse)
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            return DiskFullError(f"{words}: the disk is full; the bag is complete up to here")
+        return BagError(words)
+
+    def _note(self, part: _Part) -> None:
+        counts = part.file.counts
+        part.info.counts = {topic: counts[channel] for topic, channel in part.channels.items()}
+        part.info.start_ns, part.info.end_ns = part.file.span_ns
+        if lost := part.given - part.info.count:
+            on_disk = {
+                topic: sum(n for t, n in part.info.counts.items() if t[0] == topic) for topic in part.info.repeated
+            }
+            part.info.repeated = {t: min(n, on_disk[t]) for t, n in part.info.repeated.items() if on_disk[t]}
+            self.not_written += lost - (part.repeats - sum(part.info.repeated.values()))
+        self._done.append(part.info)
+
+    def _write_metadata(self) -> None:
+        try:
+            write_metadata(self.path, self._done, self._topics, self._custom)
+        except OSError as error:
+            raise BagError(
+                f"bag {self.path}: metadata.yaml cannot be written: {error.strerror}; make room, then ic bag reindex "
+                f"{self.path}"
+            ) from error
