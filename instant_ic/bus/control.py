@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from . import registry
+from .node import NodeError
 from .parameter_info import ParameterInfo, plain
 from .params import ParameterError
 
@@ -140,6 +141,7 @@ class ControlServer:
             "set": self._set,
             "log_level": self._log_level,
             "status": self._status,
+            "call": self._call,
         }
 
     def _describe(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -165,6 +167,19 @@ class ControlServer:
     def _status(self, request: dict[str, Any]) -> dict[str, Any]:
         what, busy_s = self._node.activity()
         return {"pid": os.getpid(), "threads": threading.active_count(), "busy": what, "busy_s": round(busy_s, 3)}
+
+    def _call(self, request: dict[str, Any]) -> dict[str, Any]:
+        name, arguments = str(request.get("command")), request.get("arguments", {})
+        command = self._node.commands.get(name)
+        if command is None:
+            known = ", ".join(self._node.commands) or "none"
+            raise _RequestError(f"{self._node.node_name} has no command {name!r} (there are: {known})")
+        if not isinstance(arguments, dict):
+            raise _RequestError('call needs "arguments": {name: value}')
+        try:
+            return {"result": self._on_node(lambda: command(**arguments))}
+        except (ValueError, TypeError, NodeError) as error:
+            raise _RequestError(f"{name}: {error}") from error
 
     def _on_node(self, function: Callable[[], Any]) -> Any:
         """Runs a function on the node's thread and gives its result.
@@ -251,6 +266,14 @@ class NodeControl:
             ControlError: see :meth:`describe`.
         """
         return self.request({"op": "status"})
+
+    def call(self, command: str, **arguments: Any) -> Any:
+        """Has the node do one of its ``commands`` and gives the result.
+
+        Raises:
+            ControlError: see :meth:`describe`; or the node has no such command, or refuses it with a reason.
+        """
+        return self.request({"op": "call", "command": command, "arguments": arguments})["result"]
 
     def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Sends one request and gives the answer.

@@ -43,6 +43,8 @@ ConfigT = TypeVar("ConfigT")
 
 _HEARTBEAT_S = 0.5
 _DIAGNOSTICS_S = 1.0
+_WENT_BACK_NS = 100_000_000  # a simulated clock that goes back farther begins anew; less is jitter
+_NO_CLOCK_S = 5.0
 _IDLE_S = 0.5  # longest sleep of the loop, so that a stop flag set by a signal is seen
 
 
@@ -117,7 +119,9 @@ class Latest:
         """Seconds since it came; inf before the first."""
         if self._message is None:
             return float("inf")
-        return (self._clock.now_ns() - self._received_ns) / 1e9
+        age_ns = self._clock.now_ns() - self._received_ns
+        # From the future: a clock was set back since, as when a player begins again.
+        return age_ns / 1e9 if age_ns >= -_WENT_BACK_NS else float("inf")
 
 
 class Worker:
@@ -245,6 +249,11 @@ class Node(Generic[ConfigT]):
         self._tf_static_out: Publisher | None = None
         self._tf_static: dict[str, Any] = {}
         self._state = "STARTING"
+        self.commands: dict[str, Callable[..., Any]] = {}
+        """What the control channel's ``call`` can ask of this node: name → function with keyword arguments; its result
+        goes back as JSON, its ``ValueError`` or :class:`NodeError` as the reason of a refusal."""
+        self._clock_in: Subscription | None = None
+        self._began_s = time.monotonic()
         self._running: tuple[str, float] | None = None
         self._parameter_events: Publisher | None = None
         self.on_registry_change: Callable[[], None] | None = None
@@ -484,7 +493,7 @@ class Node(Generic[ConfigT]):
             self._diagnostics = self.publisher("/diagnostics", message_type("DiagnosticArray"), RELIABLE)
             self._beat()
         if self.use_sim_time:
-            self.subscribe("/clock", message_type("Clock"), self._on_clock, RELIABLE)
+            self._clock_in = self.subscribe("/clock", message_type("Clock"), self._on_clock, RELIABLE)
         self._running = ("setup", time.monotonic())
         self.setup()
         self._running = None
@@ -492,7 +501,26 @@ class Node(Generic[ConfigT]):
 
     def _on_clock(self, message: Any) -> None:
         assert isinstance(self.clock, ManualClock)
-        self.clock.set(stamp_ns(message.clock))
+        before_ns, now_ns = self.clock.now_ns(), stamp_ns(message.clock)
+        self.clock.set(now_ns)
+        if now_ns < before_ns - _WENT_BACK_NS:
+            self.log.warning("time went back %.1f s: timers and transforms begin anew", (before_ns - now_ns) / 1e9)
+            for entry in self._timers:
+                entry[2].due_ns = now_ns + entry[2].period_ns
+            self._timers = [(timer.due_ns, order, timer) for _, order, timer in self._timers]
+            heapq.heapify(self._timers)
+            if self._tf is not None:
+                self._tf.forget_moving()
+
+    def _inputs(self) -> list[Subscription]:
+        """Subscriptions to read now: none but ``/clock`` while simulated time has not begun, the others wait for it."""
+        if not self.use_sim_time or self._clock_in is None or self.clock.now_ns() > 0:
+            if self._diagnoses.get("simulated time", (OK,))[0] != OK:
+                self.diagnose("simulated time", OK, "comes")
+            return list(self.subscriptions)
+        if time.monotonic() > self._began_s + _NO_CLOCK_S:
+            self.diagnose("simulated time", WARN, f"use_sim_time is set, waiting for {self._clock_in.raw.topic}")
+        return [self._clock_in]
 
     def spin(self) -> None:
         """Runs callbacks until :meth:`stop`."""
@@ -524,7 +552,7 @@ class Node(Generic[ConfigT]):
             self._guard(getattr(function, "__qualname__", "callback"), function, *args)
             ran = True
         pending: list[tuple[int, Subscription, Received]] = []
-        for subscription in list(self.subscriptions):
+        for subscription in self._inputs():
             pending += [(received.order, subscription, received) for received in subscription.raw.take()]
         pending.sort(key=lambda entry: entry[0])
         for _, subscription, received in pending:

@@ -74,6 +74,11 @@ class TransformBuffer:
             if keep > 64:  # in blocks: deleting from the front of a list is linear
                 del edge.stamps_ns[:keep], edge.matrices[:keep]
 
+    def forget_moving(self) -> None:
+        """Drops the values of moving frames, as when time goes back; fixed ones stay."""
+        with self._lock:
+            self._edges = {child: edge for child, edge in self._edges.items() if edge.static}
+
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix:
         """``target_from_source`` at a time, interpolated; without a time, by each frame's newest value.
 

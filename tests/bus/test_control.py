@@ -211,7 +211,7 @@ def test_log_level(tuned):
         (b"\xff\xfe", "not JSON"),
         (b"[1]", "expected a JSON object"),
         (b"[" * 100_000, "not JSON"),
-        (b'{"op": "explode"}', "unknown op 'explode' (there are: describe, get, set, log_level, status)"),
+        (b'{"op": "explode"}', "unknown op 'explode' (there are: describe, get, set, log_level, status, call)"),
         (b"{}", "unknown op None"),
         (b'{"op": "set"}', 'set needs "values"'),
         (b'{"op": "set", "values": [1]}', 'set needs "values"'),
