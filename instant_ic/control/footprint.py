@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import Positive, check_ranges
+
 
 @dataclass(frozen=True)
 class Footprint:
     """Rectangle in metres, length along x, width along y."""
 
-    length_m: float = 0.60
-    width_m: float = 0.50
+    length_m: Positive = 0.60
+    width_m: Positive = 0.50
 
     def __post_init__(self) -> None:
-        for key, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"footprint.{key} must be > 0 (got {value})")
+        check_ranges(self)
 
     @property
     def inscribed_radius_m(self) -> float:

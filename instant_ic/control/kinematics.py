@@ -9,21 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.poses import wrap_angle
+from ..ranges import Positive, check_ranges
 
 
 @dataclass(frozen=True)
 class MotionLimits:
     """Speed and acceleration limits of the base (config/base.yaml holds the base's own copy)."""
 
-    max_linear_m_s: float = 0.5
-    max_angular_rad_s: float = 1.0
-    max_linear_accel_m_s2: float = 0.8
-    max_angular_accel_rad_s2: float = 2.0
+    max_linear_m_s: Positive = 0.5
+    max_angular_rad_s: Positive = 1.0
+    max_linear_accel_m_s2: Positive = 0.8
+    max_angular_accel_rad_s2: Positive = 2.0
 
     def __post_init__(self) -> None:
-        for key, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"limits.{key} must be > 0 (got {value})")
+        check_ranges(self)
 
 
 def clip_twist(linear: float, angular: float, limits: MotionLimits) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, Positive, check_ranges
 from .costmap import Costmap
 from .footprint import Footprint
 from .kinematics import MotionLimits, accelerate, clip_twist, move
@@ -17,20 +18,15 @@ from .kinematics import MotionLimits, accelerate, clip_twist, move
 class PredictionConfig:
     """How far to look ahead."""
 
-    latency_s: float = 0.2
-    margin_m: float = 0.6
-    yaw_margin_rad: float = 0.4
-    max_horizon_s: float = 8.0
-    step_s: float = 0.05
-    padding_m: float = 0.03
+    latency_s: NotNegative = 0.2
+    margin_m: NotNegative = 0.6
+    yaw_margin_rad: NotNegative = 0.4
+    max_horizon_s: Positive = 8.0
+    step_s: Positive = 0.05
+    padding_m: NotNegative = 0.03
 
     def __post_init__(self) -> None:
-        for key in ("latency_s", "margin_m", "yaw_margin_rad", "padding_m"):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"prediction.{key} must be >= 0 (got {getattr(self, key)})")
-        for key in ("max_horizon_s", "step_s"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"prediction.{key} must be > 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)

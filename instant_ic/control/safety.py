@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, Positive, PositiveInt, check_ranges
 from .footprint import Footprint
 
 
@@ -20,26 +21,17 @@ from .footprint import Footprint
 class CollisionMonitorConfig:
     """Time to collision at which the robot slows down and stops."""
 
-    time_before_collision: float = 1.2
-    stop_time_s: float = 0.1
-    simulation_time_step: float = 0.05
-    padding_m: float = 0.04
-    min_points: int = 2
-    blind_radius_m: float = 0.45
+    time_before_collision: Positive = 1.2
+    stop_time_s: NotNegative = 0.1
+    simulation_time_step: Positive = 0.05
+    padding_m: NotNegative = 0.04
+    min_points: PositiveInt = 2
+    blind_radius_m: NotNegative = 0.45
 
     def __post_init__(self) -> None:
-        for key in ("time_before_collision", "simulation_time_step"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"collision_monitor.{key} must be > 0 (got {getattr(self, key)})")
-        if not 0 <= self.stop_time_s < self.time_before_collision:
-            raise ValueError(
-                f"collision_monitor.stop_time_s must be in 0..time_before_collision (got {self.stop_time_s})"
-            )
-        for key in ("padding_m", "blind_radius_m"):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"collision_monitor.{key} must be >= 0 (got {getattr(self, key)})")
-        if self.min_points < 1:
-            raise ValueError(f"collision_monitor.min_points must be >= 1 (got {self.min_points})")
+        check_ranges(self)
+        if not self.stop_time_s < self.time_before_collision:
+            raise ValueError(f"stop_time_s must be below time_before_collision (got {self.stop_time_s})")
 
 
 @dataclass(frozen=True)

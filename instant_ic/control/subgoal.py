@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, Range, check_ranges
 from .costmap import LETHAL, UNKNOWN, Costmap
 from .prediction import Prediction
 from .walls import WallMap
@@ -17,18 +19,14 @@ from .walls import WallMap
 class SubgoalConfig:
     """What counts as a free place, and how far ahead one is looked for."""
 
-    max_cost: int = 150
-    extend_m: float = 3.0
-    search_radius_m: float = 1.5
+    max_cost: Annotated[int, Range(0, LETHAL - 2)] = 150
+    extend_m: NotNegative = 3.0
+    search_radius_m: NotNegative = 1.5
     anticipate: bool = True
-    wall_clearance_m: float = 0.25
+    wall_clearance_m: NotNegative = 0.25
 
     def __post_init__(self) -> None:
-        if not 0 <= self.max_cost < LETHAL - 1:
-            raise ValueError(f"subgoal.max_cost must be 0..252 (got {self.max_cost})")
-        for key in ("extend_m", "search_radius_m", "wall_clearance_m"):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"subgoal.{key} must be >= 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, Positive, check_ranges
 from .footprint import Footprint
 from .kinematics import MotionLimits, accelerate, clip_twist, move
 from .walls import WallMap
@@ -20,15 +21,14 @@ class VbotConfig:
     The wall clearance leaves room for the r-bot at the same place, or the two could never meet there.
     """
 
-    max_lead_m: float = 3.0
-    slow_lead_m: float = 1.0
-    wall_clearance_m: float = 0.12
+    max_lead_m: Positive = 3.0
+    slow_lead_m: NotNegative = 1.0
+    wall_clearance_m: NotNegative = 0.12
 
     def __post_init__(self) -> None:
-        if not 0 <= self.slow_lead_m < self.max_lead_m:
-            raise ValueError(f"vbot.slow_lead_m must be in 0..max_lead_m={self.max_lead_m} (got {self.slow_lead_m})")
-        if not self.wall_clearance_m >= 0:
-            raise ValueError(f"vbot.wall_clearance_m must be >= 0 (got {self.wall_clearance_m})")
+        check_ranges(self)
+        if not self.slow_lead_m < self.max_lead_m:
+            raise ValueError(f"slow_lead_m must be below max_lead_m = {self.max_lead_m} (got {self.slow_lead_m})")
 
 
 class VirtualRobot:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
+from instant_ic.ranges import Positive, Range, check_ranges
 
 MODES = {0: "real", 1: "virtual", 2: "stopped"}
 VSPACE_STATES = {0: "empty", 1: "training", 2: "ready", 3: "failed"}
@@ -52,25 +53,22 @@ class ConsoleConfig:
 
     server: ServerConfig = field(default_factory=ServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
-    state_rate_hz: float = 20.0
-    map_rate_hz: float = 2.0
-    dissolve_ms: float = 250.0
-    footprint_length_m: float = 0.6
-    footprint_width_m: float = 0.5
+    state_rate_hz: Positive = 20.0
+    map_rate_hz: Positive = 2.0
+    dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0
+    footprint_length_m: Positive = 0.6
+    footprint_width_m: Positive = 0.5
     camera_height_m: float = 1.2
 
     def __post_init__(self) -> None:
-        for key in ("state_rate_hz", "map_rate_hz", "footprint_length_m", "footprint_width_m"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
-        if not 0 <= self.dissolve_ms <= 5000:
-            raise ValueError(f"dissolve_ms must be in [0, 5000] (got {self.dissolve_ms})")
+        check_ranges(self)
 
 
 class ConsoleNode(Node[ConsoleConfig]):
     """Joins the topics to a :class:`ConsoleServer`, whose backend it is."""
 
     name = "console"
+    live_parameters = ("view",)
 
     def setup(self) -> None:
         config = self.config
@@ -115,6 +113,10 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.timer(0.2, self.send_plan)
         self.timer(1.0, self.send_health)
         self.timer(1.0 / config.map_rate_hz, self.send_grids)
+
+    def reconfigure(self, config: ConsoleConfig) -> None:
+        super().reconfigure(config)
+        self.views.config = config.view
 
     def teardown(self) -> None:
         if hasattr(self, "server"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from instant_ic.msg import (
     twist_values,
     type_name,
 )
+from instant_ic.ranges import NotNegative, Positive, Range, check_ranges
 
 _TWISTS = {type_name(Twist): False, type_name(TwistStamped): True}
 """Types that /cmd_vel may carry, and whether they have a stamp."""
@@ -47,34 +48,30 @@ class CrawlerBaseConfig(ControllerConfig):
         connect_grace_s: a controller that is not there yet is an error only this long after the start.
     """
 
-    rate_hz: float = 30.0
+    rate_hz: Annotated[float, Range(5, 200)] = 30.0
     odom_frame: str = "odom"
     base_frame: str = "base_link"
     battery_full_v: float = 25.2
     battery_empty_v: float = 21.0
-    recent_s: float = 10.0
-    connect_grace_s: float = 5.0
+    recent_s: Positive = 10.0
+    connect_grace_s: NotNegative = 5.0
 
     def __post_init__(self) -> None:
         """Check the values."""
         super().__post_init__()
-        if not 5.0 <= self.rate_hz <= 200.0:
-            raise ValueError(f"rate_hz must be in 5..200 (got {self.rate_hz})")
+        check_ranges(self)
         if not 0.0 < self.battery_empty_v < self.battery_full_v:
             raise ValueError(
                 "battery_empty_v must be > 0 and below battery_full_v "
                 f"(got {self.battery_empty_v}, {self.battery_full_v})"
             )
-        if not self.recent_s > 0.0:
-            raise ValueError(f"recent_s must be > 0 (got {self.recent_s})")
-        if not self.connect_grace_s >= 0.0:
-            raise ValueError(f"connect_grace_s must be >= 0 (got {self.connect_grace_s})")
 
 
 class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     """See the module."""
 
     name = "crawler_base"
+    live_parameters = ("battery_full_v", "battery_empty_v")
     open_port: Callable[[RoboclawConfig], SerialPort] = staticmethod(open_serial)
 
     def setup(self) -> None:

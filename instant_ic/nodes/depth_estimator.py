@@ -15,6 +15,7 @@ from instant_ic.depth.manifest import ManifestError
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.msg import CompressedImage, Image, image_message, stamp_ns
 from instant_ic.paths import shipped_file
+from instant_ic.ranges import Positive, PositiveInt, check_ranges
 
 
 @dataclass(frozen=True)
@@ -29,24 +30,21 @@ class DepthEstimatorConfig:
     """
 
     model: str = DEFAULT_MODEL
-    threads: int = 1
-    max_rate_hz: float = 2.0
-    max_age_s: float = 1.5
+    threads: PositiveInt = 1
+    max_rate_hz: Positive = 2.0
+    max_age_s: Positive = 1.5
 
     def __post_init__(self) -> None:
         if not self.model:
             raise ValueError("model must name a file")
-        if self.threads < 1:
-            raise ValueError(f"threads must be 1 or more (got {self.threads})")
-        for key in ("max_rate_hz", "max_age_s"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 class DepthEstimatorNode(Node[DepthEstimatorConfig]):
     """``/camera/image/compressed`` → ``/depth/raw``."""
 
     name = "depth_estimator"
+    live_parameters = ("max_rate_hz", "max_age_s")
 
     def setup(self) -> None:
         try:

@@ -28,6 +28,7 @@ from instant_ic.msg import (
     pose_message,
     stamp_ns,
 )
+from instant_ic.ranges import Positive, check_ranges
 
 # Pictures and clouds older than this against the newest depth are let go of.
 _KEEP_NS = 4_000_000_000
@@ -48,19 +49,19 @@ class DepthScalerConfig:
 
     scaler: ScalerConfig = field(default_factory=ScalerConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
-    max_cloud_age_s: float = 0.3
+    max_cloud_age_s: Positive = 0.3
     map_frame: str = "map"
     odom_frame: str = "odom"
 
     def __post_init__(self) -> None:
-        if self.max_cloud_age_s <= 0:
-            raise ValueError(f"max_cloud_age_s must be above 0 (got {self.max_cloud_age_s})")
+        check_ranges(self)
 
 
 class DepthScalerNode(Node[DepthScalerConfig]):
     """``/depth/raw``, ``/lidar/points``, ``/tf``, ``/camera/image/compressed`` → ``/depth/scaled``, ``/keyframe``."""
 
     name = "depth_scaler"
+    live_parameters = ("scaler", "keyframes", "max_cloud_age_s", "map_frame", "odom_frame")
 
     def setup(self) -> None:
         self.scaler = DepthScaler(self.config.scaler)
@@ -76,6 +77,10 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_picture, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.clouds.append, qos=SENSOR)
         self.subscribe("/depth/raw", Image, self.on_depth, qos=SENSOR)
+
+    def reconfigure(self, config: DepthScalerConfig) -> None:
+        super().reconfigure(config)
+        self.scaler.config, self.selector.config = config.scaler, config.keyframes
 
     def on_picture(self, message: Any) -> None:
         self.pictures[stamp_ns(message)] = message

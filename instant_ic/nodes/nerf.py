@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -30,6 +30,7 @@ from instant_ic.msg import (
 )
 from instant_ic.nerf import KeyframeError, State, Status, View, VirtualSpace, VirtualSpaceConfig
 from instant_ic.nerf.warm_up import warm_up
+from instant_ic.ranges import Percent, Positive, PositiveInt, Range, check_ranges
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class NerfConfig:
         train_slice_ms: training between two pictures, at least; a request waits about this long.
         train_share: training's time between two pictures, against the last picture's, where that is more.
         train_share_until_ready: the same before the space is fit to show: there is more need of training than pictures.
-        nice: of the thread that trains and draws: what steers the robot comes first on a busy machine; 0 to 19.
+        train_nice: of the thread that trains and draws: what steers the robot comes first on a busy machine; 0 to 19.
         lockstep_iterations: iterations at each tick of ``lockstep_period_s`` in tests and replay.
         lockstep_period_s: see ``lockstep_iterations``.
         max_view_pixels: larger requests are refused.
@@ -49,26 +50,19 @@ class NerfConfig:
         space: the virtual space itself.
     """
 
-    train_slice_ms: float = 30.0
-    train_share: float = 0.3
-    train_share_until_ready: float = 2.0
-    nice: int = 5
-    lockstep_iterations: int = 5
-    lockstep_period_s: float = 0.1
-    max_view_pixels: int = 1280 * 720
-    jpeg_quality: int = 85
-    status_period_s: float = 0.5
+    train_slice_ms: Positive = 30.0
+    train_share: Positive = 0.3
+    train_share_until_ready: Positive = 2.0
+    train_nice: Annotated[int, Range(0, 19)] = 5
+    lockstep_iterations: PositiveInt = 5
+    lockstep_period_s: Positive = 0.1
+    max_view_pixels: PositiveInt = 1280 * 720
+    jpeg_quality: Percent = 85
+    status_period_s: Positive = 0.5
     space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
 
     def __post_init__(self) -> None:
-        positive = ("train_slice_ms", "lockstep_iterations", "lockstep_period_s", "max_view_pixels", "status_period_s")
-        for key in (*positive, "train_share", "train_share_until_ready"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
-        if not 0 <= self.nice <= 19:
-            raise ValueError(f"nice must be 0 to 19 (got {self.nice})")
-        if not 1 <= self.jpeg_quality <= 100:
-            raise ValueError(f"jpeg_quality must be 1 to 100 (got {self.jpeg_quality})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -97,6 +91,10 @@ class NerfNode(Node[NerfConfig]):
     """Hands the worker one job at a time: a new keyframe first, then pictures and slices of training by turns."""
 
     name = "nerf"
+    live_parameters = (
+        *("train_slice_ms", "train_share", "train_share_until_ready"),
+        *("lockstep_iterations", "max_view_pixels", "jpeg_quality"),
+    )
 
     def setup(self) -> None:
         self.space: VirtualSpace | None = None  # touched by the worker alone
@@ -223,8 +221,8 @@ class NerfNode(Node[NerfConfig]):
 
     def yield_to_others(self) -> None:
         """Lowers this thread's priority (Linux has one for each thread)."""
-        if self.config.nice and sys.platform == "linux":
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self.config.nice)
+        if self.config.train_nice and sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self.config.train_nice)
 
     @staticmethod
     def take_keyframe(space: VirtualSpace, keyframe: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from instant_ic.camera.theta import ThetaCamera, ThetaClient, ThetaState
 from instant_ic.camera.video import VideoCamera
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import CompressedImage, compressed_image_message
+from instant_ic.ranges import Positive, Share, check_ranges
 
 USER_VARIABLE = "INSTANT_IC_THETA_USER"
 PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
@@ -42,14 +44,14 @@ class ThetaCameraConfig:
         reconnect: waits between attempts to connect.
     """
 
-    source: str = "theta"
+    source: Literal["theta", "video", "files"] = "theta"
     url: str = "http://192.168.1.1"
     frame_id: str = "camera"
     mount_xyz: tuple[float, float, float] = (0.0, 0.0, 1.2)
     mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    silence_s: float = 2.0
-    health_period_s: float = 10.0
-    battery_low: float = 0.2
+    silence_s: Positive = 2.0
+    health_period_s: Positive = 10.0
+    battery_low: Share = 0.2
     board_hot_c: float = 70.0
     theta: ThetaConfig = field(default_factory=ThetaConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
@@ -58,27 +60,23 @@ class ThetaCameraConfig:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.source not in ("theta", "video", "files"):
-            raise ValueError(f"source must be theta, video or files (got {self.source!r})")
+        check_ranges(self)
         if not self.url:
             raise ValueError("url must not be empty")
-        for key in ("silence_s", "health_period_s"):
-            if getattr(self, key) <= 0.0:
-                raise ValueError(f"{key} must be > 0 s (got {getattr(self, key)})")
 
 
 class ThetaCameraNode(Node[ThetaCameraConfig]):
     """See the module."""
 
     name = "theta_camera"
+    live_parameters = ("silence_s", "battery_low", "board_hot_c", "mount_xyz", "mount_rpy_deg")
 
     def setup(self) -> None:
         """Topics, mount, and the loop that reads the camera."""
         config = self.config
         self.loop: CameraLoop | None = None
         self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
-        mount = pose_matrix(*config.mount_xyz, *np.radians(config.mount_rpy_deg))
-        self.tf_broadcast_static("base_link", config.frame_id, mount)
+        self.tell_mount()
         self.last_ns = self.started_ns = self.clock.now_ns()
         self.published = self.published_told = 0
         self.camera = self.make_camera()
@@ -98,6 +96,15 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             client = self.camera.client
             self.timer(config.health_period_s, lambda: self.health.submit(client))
         self.loop.start()
+
+    def tell_mount(self) -> None:
+        """Where the camera is on the robot."""
+        mount = pose_matrix(*self.config.mount_xyz, *np.radians(self.config.mount_rpy_deg))
+        self.tf_broadcast_static("base_link", self.config.frame_id, mount)
+
+    def reconfigure(self, config: ThetaCameraConfig) -> None:
+        super().reconfigure(config)
+        self.tell_mount()
 
     def make_camera(self) -> Camera:
         """The camera that the parameters name."""

@@ -25,32 +25,32 @@ from instant_ic.msg import (
     stamp_ns,
     twist_values,
 )
+from instant_ic.ranges import Positive, check_ranges
 
 
 @dataclass(frozen=True)
 class VirtualRobotConfig:
     """Parameters of the node ``virtual_robot``."""
 
-    rate_hz: float = 20.0
-    command_timeout_s: float = 0.3
-    state_timeout_s: float = 0.5
-    wall_min_length_m: float = 1.5
-    wall_period_s: float = 2.0
+    rate_hz: Positive = 20.0
+    command_timeout_s: Positive = 0.3
+    state_timeout_s: Positive = 0.5
+    wall_min_length_m: Positive = 1.5
+    wall_period_s: Positive = 2.0
     walls_block: bool = True
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
     vbot: VbotConfig = field(default_factory=VbotConfig)
 
     def __post_init__(self) -> None:
-        for key in ("rate_hz", "command_timeout_s", "state_timeout_s", "wall_min_length_m", "wall_period_s"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 class VirtualRobotNode(Node[VirtualRobotConfig]):
     """Topics in and out of ``VirtualRobot``."""
 
     name = "virtual_robot"
+    live_parameters = ("vbot", "limits", "command_timeout_s", "state_timeout_s")
 
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
@@ -67,6 +67,11 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
             self.timer(self.config.wall_period_s, self.update_walls)
         self.timer(1.0 / self.config.rate_hz, self.tick)
+
+    def reconfigure(self, config: VirtualRobotConfig) -> None:
+        super().reconfigure(config)
+        self.robot.config, self.robot.limits = config.vbot, config.limits
+        self.command.max_age_s, self.state.max_age_s = config.command_timeout_s, config.state_timeout_s
 
     def on_map(self, message: OccupancyGrid) -> None:
         grid, resolution, origin = grid_array(message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from instant_ic.msg import (
     stamp_ns,
     to_time,
 )
+from instant_ic.ranges import Positive, check_ranges
 
 _PPS = ("absent", "synchronising", "locked", "error")
 _MAX_WAITING = 5
@@ -58,31 +59,26 @@ class Vlp16DriverConfig:
         scan: points to the flat scan.
     """
 
-    source: str = "udp"
+    source: Literal["udp", "pcap", "topic"] = "udp"
     host: str = "0.0.0.0"
     port: int = 2368
     position_port: int = 8308
     sensor: str = ""
     pcap: str = ""
-    rate: float = 1.0
+    rate: Positive = 1.0
     loop: bool = False
     frame_id: str = "velodyne"
     mount_xyz: tuple[float, float, float] = (0.0, 0.0, 0.6)
     mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    silence_s: float = 2.0
+    silence_s: Positive = 2.0
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     scan: FlatScanConfig = field(default_factory=FlatScanConfig)
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.source not in ("udp", "pcap", "topic"):
-            raise ValueError(f"source must be udp, pcap or topic (got {self.source!r})")
+        check_ranges(self)
         if self.source == "pcap" and not self.pcap:
             raise ValueError("pcap must name a capture file where source is pcap (got '')")
-        if self.rate <= 0.0:
-            raise ValueError(f"rate must be > 0 (got {self.rate})")
-        if self.silence_s <= 0.0:
-            raise ValueError(f"silence_s must be > 0 s (got {self.silence_s})")
         self.receiver()
 
     def receiver(self) -> ReceiverConfig:
@@ -94,6 +90,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     """See the module."""
 
     name = "vlp16_driver"
+    live_parameters = ("silence_s", "scan")
 
     def setup(self) -> None:
         """Topics, mount, and the source of packets."""

@@ -184,7 +184,7 @@ def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
 
 
 @pytest.mark.parametrize(
-    "values", [{"train_slice_ms": 0}, {"jpeg_quality": 101}, {"lockstep_iterations": -1}, {"nice": 20}]
+    "values", [{"train_slice_ms": 0}, {"jpeg_quality": 101}, {"lockstep_iterations": -1}, {"train_nice": 20}]
 )
 def test_parameters_are_checked(values):
     with pytest.raises(ValueError, match=next(iter(values))):
