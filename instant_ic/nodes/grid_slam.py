@@ -24,10 +24,12 @@ from instant_ic.msg import (
     pose_message,
     stamp_ns,
 )
+from instant_ic.ranges import NotNegative, Positive, check_ranges
 from instant_ic.slam import (
     FieldConfig,
     GridSlam,
     KeyframeConfig,
+    LoopConfig,
     MapConfig,
     MatchConfig,
     OdometryNoise,
@@ -52,35 +54,28 @@ class GridSlamConfig:
     odom_frame: str = "odom"
     base_frame: str = "base_link"
     use_wheel_odom: bool = True
-    odom_wait_s: float = 0.1
-    odom_startup_wait_s: float = 1.0
-    odom_extrapolate_s: float = 0.2
-    max_scan_age_s: float = 1.0
-    reset_on_time_jump_s: float = 1.0
-    map_period_s: float = 1.0
-    correction_speed_mps: float = 1.0
-    correction_yaw_rate_radps: float = 1.0
+    odom_wait_s: NotNegative = 0.1
+    odom_startup_wait_s: NotNegative = 1.0
+    odom_extrapolate_s: NotNegative = 0.2
+    max_scan_age_s: Positive = 1.0
+    reset_on_time_jump_s: Positive = 1.0
+    map_period_s: Positive = 1.0
+    correction_speed_mps: Positive = 1.0
+    correction_yaw_rate_radps: Positive = 1.0
     odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
     keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
+    loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
 
     def __post_init__(self) -> None:
-        for key in ("max_scan_age_s", "reset_on_time_jump_s", "map_period_s"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
-        for key in ("correction_speed_mps", "correction_yaw_rate_radps"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
-        for key in ("odom_wait_s", "odom_startup_wait_s", "odom_extrapolate_s"):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
     @property
     def slam(self) -> SlamConfig:
         """The library's part."""
-        return SlamConfig(self.backend, self.odometry, self.field, self.match, self.keyframe, self.map)
+        return SlamConfig(self.backend, self.odometry, self.field, self.match, self.keyframe, self.loop, self.map)
 
 
 @dataclass(frozen=True)
@@ -104,6 +99,10 @@ _LEVELS = {
 
 class GridSlamNode(Node[GridSlamConfig]):
     name = "grid_slam"
+    live_parameters = (
+        *("max_scan_age_s", "reset_on_time_jump_s", "odom_wait_s", "odom_startup_wait_s", "odom_extrapolate_s"),
+        *("correction_speed_mps", "correction_yaw_rate_radps"),
+    )
 
     def setup(self) -> None:
         warm_up(self.config.slam)
@@ -123,6 +122,11 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.subscribe("/scan", LaserScan, self.on_scan, qos=SENSOR)
         self.timer(self.config.map_period_s, self.publish_map)
         self.timer(1.0, self.watch)
+
+    def reconfigure(self, config: GridSlamConfig) -> None:
+        super().reconfigure(config)
+        self.limiter.speed_mps = config.correction_speed_mps
+        self.limiter.yaw_rate_radps = config.correction_yaw_rate_radps
 
     def _restart(self) -> None:
         self.slam = GridSlam(self.config.slam)

@@ -9,7 +9,15 @@ grid, resolution, origin = slam.grid()
 ```
 """
 
-from instant_ic.slam.config import FieldConfig, KeyframeConfig, MapConfig, MatchConfig, OdometryNoise, SlamConfig
+from instant_ic.slam.config import (
+    FieldConfig,
+    KeyframeConfig,
+    LoopConfig,
+    MapConfig,
+    MatchConfig,
+    OdometryNoise,
+    SlamConfig,
+)
 from instant_ic.slam.grid_slam import GridSlam, SlamResult, SlamStatus
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.scan import Scan
@@ -18,6 +26,7 @@ __all__ = [
     "FieldConfig",
     "GridSlam",
     "KeyframeConfig",
+    "LoopConfig",
     "MapConfig",
     "MatchConfig",
     "OccupancyGrid",

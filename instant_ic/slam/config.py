@@ -130,6 +130,45 @@ class KeyframeConfig:
 
 
 @dataclass(frozen=True)
+class LoopConfig:
+    """Closing of loops, and the pose graph that they bend."""
+
+    enabled: bool = True
+    spacing_m: float = 0.5
+    query_keyframes: int = 10
+    chain_keyframes: int = 20
+    min_chain_keyframes: int = 5
+    chains: int = 2
+    max_range_m: float = 20.0
+    max_points: int = 250
+    sigmas: float = 3.0
+    max_reach_m: float = 6.0
+    max_reach_rad: float = 0.8
+    min_score: float = 0.6
+    min_shape: float = 0.05
+    unique: float = 0.92
+    confirmations: int = 3
+    sure_m: float = 0.25
+    sure_rad: float = 0.06
+    step_sigma_m: float = 0.005
+    step_sigma_rad: float = 0.0015
+    loop_sigma_m: float = 0.03
+    loop_sigma_rad: float = 0.01
+
+    def __post_init__(self) -> None:
+        _require_positive(
+            self, "spacing_m", "max_range_m", "sigmas", "max_reach_m", "max_reach_rad", "sure_m", "sure_rad",
+            "step_sigma_m", "step_sigma_rad", "loop_sigma_m", "loop_sigma_rad",
+        )  # fmt: skip
+        for key in ("query_keyframes", "chain_keyframes", "min_chain_keyframes", "chains", "confirmations"):
+            _require(self, key, getattr(self, key) >= 1, ">= 1")
+        _require(self, "max_points", self.max_points >= 20, ">= 20")
+        for key in ("min_score", "unique"):
+            _require(self, key, 0 < getattr(self, key) < 1, "between 0 and 1")
+        _require(self, "min_shape", 0 <= self.min_shape < 1, "between 0 and 1")
+
+
+@dataclass(frozen=True)
 class MapConfig:
     """Occupancy grid drawn by ray casting from the keyframes."""
 
@@ -161,6 +200,7 @@ class SlamConfig:
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
     keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
+    loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import Keyframe, Trajectory
+from instant_ic.slam.keyframes import Keyframe, Trajectory, grown_drift
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.matcher import Match, Matcher, Window
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
@@ -167,10 +167,27 @@ class FrontEnd:
     def _add_keyframe(
         self, pose: FloatArray, covariance: FloatArray, scan: ScanPoints, stamp_ns: int, dead_reckoned: bool
     ) -> Keyframe:
-        keyframe = Keyframe(stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned)
+        step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
+        if len(self.trajectory):
+            last = self.trajectory.last
+            step = relative2(last.map_from_base, pose)
+            step_covariance = self._step_covariance(covariance, float(last.map_from_base[2]))
+            way = pose[:2] - last.map_from_base[:2]
+            drift = grown_drift(last.drift, way, float(last.map_from_base[2]), step_covariance)
+        keyframe = Keyframe(
+            stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned, step, step_covariance, drift
+        )  # fmt: skip
         self.trajectory.add(keyframe)
         self.redraw()
         return keyframe
+
+    def _step_covariance(self, covariance: FloatArray, yaw: float) -> FloatArray:
+        """The match's covariance in the frame of a pose with ``yaw``, and what scan matching errs beyond that."""
+        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
+        loop = self.config.loop
+        step: FloatArray = turn @ covariance @ turn.T
+        return step + np.diag(np.square([loop.step_sigma_m, loop.step_sigma_m, loop.step_sigma_rad]))
 
     def redraw(self) -> None:
         """Draw the local map anew from the recent keyframes, for instance after their poses were optimised."""

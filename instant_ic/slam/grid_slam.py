@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2
+from instant_ic.slam.back_end import BackEnd, correction
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, Track, TrackStatus, constant_velocity
+from instant_ic.slam.keyframes import grown_drift
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.scan import FloatArray, Scan, scan_points
 
@@ -58,7 +60,7 @@ class SlamResult:
 
     Attributes:
         map_from_base: (3,) at the scan's stamp.
-        covariance: (3, 3) x, y, yaw in the map frame; of this pose against the local map, so without drift.
+        covariance: (3, 3) x, y, yaw in the map frame: of the match, and the drift since the map was last met again.
         score: 0..1, mean likelihood field value over the points.
         status: what became of the scan.
         keyframe_added: whether the map has changed.
@@ -83,7 +85,10 @@ class GridSlam:
     def __init__(self, config: SlamConfig | None = None) -> None:
         self.config = config or SlamConfig()
         self.front_end = FrontEnd(self.config)
+        self.back_end = BackEnd(self.config)
         self.map = OccupancyMap(self.config.map)
+        self._handed_over = 0
+        self._busy = False
         self.map_from_base: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
         self.map_from_odom: FloatArray = np.zeros(3)
@@ -126,25 +131,66 @@ class GridSlam:
             self.map.insert(track.keyframe.map_from_base, track.keyframe.scan)
         self._follow(track, odometry, scan.stamp_ns)
         anchor = self.front_end.trajectory.keyframes[-1]
-        return SlamResult(track.pose, track.covariance, track.score, status, track.keyframe is not None, anchor)
+        covariance = track.covariance + anchor.drift
+        return SlamResult(track.pose, covariance, track.score, status, track.keyframe is not None, anchor)
 
     def grid(self) -> OccupancyGrid:
         """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
         return self.map.grid()
 
     def background_job(self) -> Callable[[], Any] | None:
-        """See `instant_ic.slam.backend.Slam`."""
-        return None
+        """Loop closing and optimisation over the keyframes since the last job; None: none are new, or one is out."""
+        new = self.front_end.trajectory.keyframes[self._handed_over :]
+        if self._busy or not new or not self.config.loop.enabled:
+            return None
+        self._busy, self._handed_over = True, self._handed_over + len(new)
+        return lambda: self.back_end.update(new)
 
     def take_over(self, outcome: Any) -> None:
-        """See `instant_ic.slam.backend.Slam`."""
+        """Take over what a background job found: corrected poses go into map_from_odom, never into odometry.
+
+        Args:
+            outcome: of the job; None: it failed, and nothing changes.
+        """
+        self._busy = False
+        if outcome is None:
+            return
+        keyframes = self.front_end.trajectory.keyframes
+        if outcome.poses is not None:
+            moved = correction(keyframes[outcome.count - 1].map_from_base, outcome.poses[-1])
+            for keyframe, pose in zip(keyframes, outcome.poses, strict=False):
+                keyframe.map_from_base = pose
+            for keyframe in keyframes[outcome.count :]:
+                keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
+            self.front_end.redraw()
+            self.map_from_base = compose2(moved, self.map_from_base)
+            self.map_from_odom = compose2(moved, self.map_from_odom)
+            self._pose_at_odometry = compose2(moved, self._pose_at_odometry)
+        if outcome.map is not None:
+            outcome.map.version = self.map.version + 1
+            self.map = outcome.map
+            for keyframe in keyframes[outcome.count :]:
+                self.map.insert(keyframe.map_from_base, keyframe.scan)
+        drift = outcome.drift
+        for before, keyframe in zip(keyframes[outcome.count - 1 :], keyframes[outcome.count :], strict=False):
+            way = keyframe.map_from_base[:2] - before.map_from_base[:2]
+            drift = grown_drift(drift, way, float(before.map_from_base[2]), keyframe.step_covariance)
+        keyframes[-1].drift = drift
 
     def finish(self) -> None:
-        """See `instant_ic.slam.backend.Slam`."""
+        """After the last scan: optimise with all loops, and draw the map from the outcome."""
+        new = self.front_end.trajectory.keyframes[self._handed_over :]
+        if self.config.loop.enabled and self.front_end.trajectory.keyframes:
+            self._handed_over += len(new)
+            self.take_over(self.back_end.update(new, last=True))
 
     def figures(self) -> dict[str, object]:
-        """See `instant_ic.slam.backend.Slam`."""
-        return {"keyframes": len(self.front_end.trajectory)}
+        """Keyframes, loops closed, loops taken back."""
+        return {
+            "keyframes": len(self.front_end.trajectory),
+            "loops": self.back_end.closed,
+            "loops_refused": self.back_end.refused,
+        }
 
     def _guess(self, odometry: FloatArray | None, stamp_ns: int) -> Guess:
         if self._stamp_ns is None:

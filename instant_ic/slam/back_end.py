@@ -1,0 +1,300 @@
+"""Back end: closes loops over the keyframes and keeps their poses in accord. Runs beside the scan thread.
+
+It owns its own poses; what goes to and fro are new keyframes in one direction and an `Outcome` in the other. Nothing
+in it depends on time, so that the same keyframes give the same answer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
+from instant_ic.slam.config import FieldConfig, SlamConfig
+from instant_ic.slam.keyframes import Keyframe, grown_drift
+from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.loop_search import Found, LoopSearch, spread
+from instant_ic.slam.occupancy import OccupancyMap
+from instant_ic.slam.pose_graph import Edge, optimise, residuals
+from instant_ic.slam.scan import FloatArray
+
+OVERLAP_M = 3.0
+"""An older keyframe this near, beyond the uncertainty of the place, is worth comparing with."""
+SETTLED_M, SETTLED_RAD = 0.02, 0.004
+"""Loops that the graph fits this well already need no optimisation of their own."""
+SETTLED_EDGES = 20
+"""... until there are so many of them."""
+PENDING_KEYFRAMES = 40
+"""A closed loop that is not confirmed within so many keyframes is forgotten."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the back end found.
+
+    Attributes:
+        count: keyframes that it knows.
+        poses: of these (count, 3); None: not changed.
+        drift: covariance of the last one in the map (3, 3).
+        map: drawn anew from all of them; None: not.
+    """
+
+    count: int
+    poses: FloatArray | None
+    drift: FloatArray
+    map: OccupancyMap | None
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A loop that passed all checks of its own, and waits for others that say the same."""
+
+    edge: Edge
+    travelled_m: float
+
+
+class BackEnd:
+    """Loop closing and pose graph.
+
+    Attributes:
+        edges: of the graph; node ids are positions in the list of keyframes.
+        closed: accepted loops so far.
+        refused: loops taken back after optimisation, because the rest of the graph contradicted them.
+    """
+
+    def __init__(self, config: SlamConfig) -> None:
+        self.config = config
+        self.edges: list[Edge] = []
+        self.closed = 0
+        self.refused = 0
+        loop = config.loop
+        self._keyframes: list[Keyframe] = []
+        self._poses: FloatArray = np.zeros((256, 3))
+        self._drifts: list[FloatArray] = []
+        self._travelled: list[float] = []
+        self._pending: list[_Candidate] = []
+        self._unsettled = 0
+        self._searched_at_m = 0.0
+        self._drawn: FloatArray = np.zeros((0, 3))
+        field = replace(config.field, max_range_m=loop.max_range_m)
+        self._field = LikelihoodField(FieldConfig(**vars(field)), loop.max_reach_m + OVERLAP_M)
+        self._search = LoopSearch(config.match.residual_sigma)
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    @property
+    def poses(self) -> FloatArray:
+        """Of every keyframe (n, 3)."""
+        return self._poses[: len(self._keyframes)]
+
+    def update(self, new: Sequence[Keyframe], last: bool = False) -> Outcome:
+        """Take in new keyframes, look for loops, optimise where there is something to gain.
+
+        Args:
+            new: those since the last call, in order.
+            last: nothing comes after: settle everything.
+        """
+        changed = False
+        for keyframe in new:
+            self._add(keyframe)
+            here = len(self._keyframes) - 1
+            if self.config.loop.enabled and self._travelled[here] - self._searched_at_m >= self.config.loop.spacing_m:
+                self._searched_at_m = self._travelled[here]
+                changed |= self._close(here)
+        if last and self._unsettled:
+            changed |= self._optimise(self.edges[len(self.edges) :])
+        drift = self._drifts[-1] if self._drifts else np.zeros((3, 3))
+        redrawn = self._redraw(last) if changed or last else None
+        return Outcome(len(self), self.poses.copy() if changed else None, drift, redrawn)
+
+    # -- keyframes --------------------------------------------------------------------------------
+
+    def _add(self, keyframe: Keyframe) -> None:
+        here = len(self._keyframes)
+        if here == len(self._poses):
+            self._poses = np.concatenate([self._poses, np.zeros_like(self._poses)])
+        if here == 0:
+            self._poses[0] = keyframe.map_from_base
+            self._drifts.append(keyframe.drift)
+            self._travelled.append(0.0)
+        else:
+            before = self._poses[here - 1]
+            pose = compose2(before, keyframe.step)
+            self._poses[here] = pose
+            self._drifts.append(
+                grown_drift(self._drifts[-1], pose[:2] - before[:2], float(before[2]), keyframe.step_covariance)
+            )
+            # Turning shows new things too: a radian counts as half a metre.
+            way = math.hypot(keyframe.step[0], keyframe.step[1]) + 0.5 * abs(float(keyframe.step[2]))
+            self._travelled.append(self._travelled[-1] + way)
+            self.edges.append(Edge(here - 1, here, keyframe.step, keyframe.step_covariance))
+        self._keyframes.append(keyframe)
+
+    # -- loops ------------------------------------------------------------------------------------
+
+    def _close(self, here: int) -> bool:
+        """Look for loops that end at keyframe ``here``; True when poses changed."""
+        loop = self.config.loop
+        first = max(0, here - loop.query_keyframes + 1)
+        old = first - self.config.field.keyframes
+        if old < loop.min_chain_keyframes:
+            return False
+        pose, drift = self._poses[here], self._drifts[here]
+        sigma_m = math.sqrt(max(np.linalg.eigvalsh(drift[:2, :2])[-1], 0.0))
+        sigma_rad = math.sqrt(max(drift[2, 2], 0.0))
+        reach_m = min(loop.sigmas * sigma_m + 0.3, loop.max_reach_m)
+        reach_rad = min(loop.sigmas * sigma_rad + 0.1, loop.max_reach_rad)
+        chains = self._chains(pose, old, reach_m + OVERLAP_M)
+        if not chains:
+            return False
+        query = self._query(first, here)
+        accepted: list[Edge] = []
+        for chain in chains[: loop.chains]:
+            nearest = min(chain, key=lambda k: float(((self._poses[k, :2] - pose[:2]) ** 2).sum()))
+            at = chain.index(nearest)
+            half = loop.chain_keyframes // 2
+            members = chain[max(0, at - half) : at + half + 1]
+            surfaces = [
+                Surface(self._poses[k], self._keyframes[k].scan.points, self._keyframes[k].scan.joined) for k in members
+            ]
+            self._field.draw(pose, surfaces)
+            found = self._search.find(self._field, query, pose, reach_m, reach_rad)
+            if found is None or not self._good(found):
+                continue
+            edge = self._edge(nearest, here, found)
+            correction = relative2(pose, found.pose)
+            sure = math.hypot(correction[0], correction[1]) <= loop.sure_m and abs(correction[2]) <= loop.sure_rad
+            if sure and reach_m <= 4 * loop.sure_m:
+                accepted.append(edge)
+            else:
+                accepted += self._confirm(_Candidate(edge, self._travelled[here]))
+        if not accepted:
+            return False
+        self.edges += accepted
+        for edge in accepted:
+            self._anchor(edge)
+        self._unsettled += len(accepted)
+        if self._unsettled < SETTLED_EDGES and all(self._fits(edge, SETTLED_M, SETTLED_RAD) for edge in accepted):
+            self.closed += len(accepted)
+            return False
+        return self._optimise(accepted)
+
+    def _chains(self, pose: FloatArray, old: int, radius_m: float) -> list[list[int]]:
+        """Runs of keyframes before ``old`` within ``radius_m`` of a pose, those that the map knows best first."""
+        way = self._poses[:old, :2] - pose[:2]
+        near = np.flatnonzero((way**2).sum(axis=1) <= radius_m**2)
+        if len(near) == 0:
+            return []
+        runs = np.split(near, np.flatnonzero(np.diff(near) > 3) + 1)
+        chains = [[int(k) for k in run] for run in runs if len(run) >= self.config.loop.min_chain_keyframes]
+        return sorted(chains, key=lambda chain: float(np.trace(self._drifts[chain[0]][:2, :2])))
+
+    def _query(self, first: int, here: int) -> FloatArray:
+        """Points of the last keyframes in the frame of the newest, (n, 2)."""
+        loop = self.config.loop
+        parts = []
+        for k in range(first, here + 1):
+            x, y, yaw = relative2(self._poses[here], self._poses[k])
+            points = self._keyframes[k].scan.points
+            points = points[(points**2).sum(axis=1) <= loop.max_range_m**2]
+            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+            parts.append(points @ np.array([[cos_yaw, sin_yaw], [-sin_yaw, cos_yaw]]) + (x, y))
+        return spread(np.concatenate(parts), 0.1, loop.max_points)
+
+    def _good(self, found: Found) -> bool:
+        loop = self.config.loop
+        return (
+            found.score >= loop.min_score
+            and found.shape >= loop.min_shape
+            and found.runner_up <= loop.unique * found.score
+        )
+
+    def _edge(self, there: int, here: int, found: Found) -> Edge:
+        loop = self.config.loop
+        cos_yaw, sin_yaw = math.cos(self._poses[there, 2]), math.sin(self._poses[there, 2])
+        turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
+        covariance = turn @ found.covariance @ turn.T
+        covariance += np.diag(np.square([loop.loop_sigma_m, loop.loop_sigma_m, loop.loop_sigma_rad]))
+        return Edge(there, here, relative2(self._poses[there], found.pose), covariance, robust=True)
+
+    def _confirm(self, candidate: _Candidate) -> list[Edge]:
+        """The loops that, with this one, say the same often enough; else none, and it waits for others."""
+        loop = self.config.loop
+        here = candidate.edge.b
+        self._pending = [other for other in self._pending if here - other.edge.b <= PENDING_KEYFRAMES]
+        agreeing = [other for other in self._pending if self._consistent(other.edge, candidate.edge)]
+        self._pending.append(candidate)
+        ends = {other.edge.b for other in agreeing} | {here}
+        way = candidate.travelled_m - min((other.travelled_m for other in agreeing), default=candidate.travelled_m)
+        if len(ends) < loop.confirmations or way < (loop.confirmations - 1) * loop.spacing_m:
+            return []
+        self._pending = [other for other in self._pending if other not in agreeing and other is not candidate]
+        return [other.edge for other in agreeing] + [candidate.edge]
+
+    def _consistent(self, one: Edge, two: Edge) -> bool:
+        """Whether two loops agree: round the cycle of both and the graph between their ends nothing remains."""
+        start = relative2(self._poses[one.a], self._poses[two.a])
+        end = relative2(self._poses[one.b], self._poses[two.b])
+        rest = relative2(compose2(one.a_from_b, end), compose2(start, two.a_from_b))
+        way = math.hypot(end[0], end[1]) + math.hypot(start[0], start[1])
+        return math.hypot(rest[0], rest[1]) <= 0.15 + 0.03 * way and abs(wrap_angle(float(rest[2]))) <= 0.06
+
+    def _anchor(self, edge: Edge) -> None:
+        """The end of a loop is as well known in the map as its start, and the step between."""
+        pose = self._poses[edge.a]
+        way = compose2(pose, edge.a_from_b)[:2] - pose[:2]
+        drift = grown_drift(self._drifts[edge.a], way, float(pose[2]), edge.covariance)
+        for k in range(edge.b, len(self._drifts)):
+            if np.trace(drift) < np.trace(self._drifts[k]):
+                self._drifts[k] = drift
+            if k + 1 < len(self._drifts):
+                step = self._poses[k + 1, :2] - self._poses[k, :2]
+                drift = grown_drift(drift, step, float(self._poses[k, 2]), self._keyframes[k + 1].step_covariance)
+
+    # -- graph ------------------------------------------------------------------------------------
+
+    def _fits(self, edge: Edge, within_m: float, within_rad: float) -> bool:
+        error = residuals(self._poses, np.array([edge.a]), np.array([edge.b]), edge.a_from_b[None])[0]
+        return math.hypot(error[0], error[1]) <= within_m and abs(float(error[2])) <= within_rad
+
+    def _optimise(self, accepted: Sequence[Edge]) -> bool:
+        """Bring the poses in accord with all edges; loops that the rest contradicts are taken back."""
+        self._unsettled = 0
+        index = {k: k for k in range(len(self))}
+        solution = optimise(self.poses, self.edges, index)
+        wrong = {id(edge) for edge, weight in zip(self.edges, solution.weights, strict=True) if weight < 0.5}
+        if wrong:
+            self.refused += len(wrong)
+            self.edges = [edge for edge in self.edges if id(edge) not in wrong]
+            solution = optimise(self.poses, self.edges, index)
+        self.closed += sum(id(edge) not in wrong for edge in accepted)
+        self._poses[: len(self)] = solution.poses
+        return True
+
+    def _redraw(self, last: bool) -> OccupancyMap | None:
+        """The map anew when the keyframes have moved from where they were drawn, and not too often."""
+        count, drawn = len(self), len(self._drawn)
+        if count == 0:
+            return None
+        moved = self.poses[:drawn] - self._drawn
+        far = float(np.hypot(moved[:, 0], moved[:, 1]).max()) if drawn else math.inf
+        turned = float(np.abs(np.arctan2(np.sin(moved[:, 2]), np.cos(moved[:, 2]))).max()) if drawn else math.inf
+        if far < 0.5 * self.config.map.resolution_m and turned < 0.005:
+            return None
+        # All keyframes cost time in proportion to their number: at that rate the cost for each new one stays the same.
+        if not last and far < 0.2 and turned < 0.05 and count - drawn < max(20, count // 10):
+            return None
+        drawing = OccupancyMap(self.config.map)
+        for keyframe, pose in zip(self._keyframes, self.poses, strict=True):
+            drawing.insert(pose, keyframe.scan)
+        self._drawn = self.poses.copy()
+        return drawing
+
+
+def correction(before: FloatArray, after: FloatArray) -> FloatArray:
+    """What moved a pose (3,) from ``before`` to ``after``: ``after ∘ before⁻¹``."""
+    return compose2(after, inverse2(before))

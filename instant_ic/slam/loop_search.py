@@ -1,0 +1,211 @@
+"""Search for the place of recent scans in an older part of the map, which may be metres from where they are believed.
+
+Coarse to fine (Olson, 2015, in idea): every pose of a wide window is scored on a pooled field, whose cells hold the
+best value near them; the best few, apart from each other, are searched on the field itself and refined. The second
+best place tells whether the answer is the only one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from instant_ic.geometry.poses import wrap_angle
+from instant_ic.slam.likelihood_field import LikelihoodField
+from instant_ic.slam.matcher import correlate, refine
+from instant_ic.slam.scan import FloatArray
+
+POOL = 4
+"""Cells of the field along a side of a pooled cell."""
+
+
+@njit(cache=True)
+def pool(field, size):  # type: ignore[no-untyped-def]
+    """Best value near each pooled cell.
+
+    Args:
+        field: float32 (H, W).
+        size: cells along a side of a pooled cell.
+
+    Returns:
+        float32 (ceil(H/size), ceil(W/size)); cell (j, i) holds the maximum within ``size`` cells of the field's cell
+        (j·size, i·size) along either axis.
+    """
+    height, width = field.shape
+    rows, columns = (height + size - 1) // size, (width + size - 1) // size
+    pooled = np.zeros((rows, columns), dtype=np.float32)
+    for y in range(height):
+        j = y // size
+        for x in range(width):
+            value = field[y, x]
+            if value > 0.05:
+                i = x // size
+                for v in range(j, min(j + 2, rows)):
+                    for u in range(i, min(i + 2, columns)):
+                        if value > pooled[v, u]:
+                            pooled[v, u] = value
+    return pooled
+
+
+@njit(cache=True)
+def score_volume(field, origin, resolution, points, centre, cells, rotations, rotation_step):  # type: ignore[no-untyped-def]
+    """Mean field value of the points at each pose of a window.
+
+    Args:
+        field: float32 (H, W).
+        origin: (2,) centre of cell (0, 0).
+        resolution: metres a cell.
+        points: (n, 2) in the base frame, n > 0.
+        centre: field_from_base (3,), middle of the window.
+        cells: half width of the window.
+        rotations: half its number of rotations.
+        rotation_step: radians.
+
+    Returns:
+        float32 (2·rotations + 1, 2·cells + 1, 2·cells + 1): rotation, y, x.
+    """
+    height, width = field.shape
+    n = points.shape[0]
+    size = 2 * cells + 1
+    sums = np.zeros((2 * rotations + 1, size, size), dtype=np.float32)
+    for r in range(2 * rotations + 1):
+        yaw = centre[2] + (r - rotations) * rotation_step
+        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+        plane = sums[r]
+        for i in range(n):
+            x = centre[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1]
+            y = centre[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1]
+            ix = round((x - origin[0]) / resolution) - cells
+            iy = round((y - origin[1]) / resolution) - cells
+            first_u, last_u = max(0, -ix), min(size, width - ix)
+            for v in range(max(0, -iy), min(size, height - iy)):
+                for u in range(first_u, last_u):
+                    plane[v, u] += field[iy + v, ix + u]
+    sums /= np.float32(n)
+    return sums
+
+
+@njit(cache=True)
+def peaks(volume, count, apart, apart_rotations):  # type: ignore[no-untyped-def]
+    """The best poses of a score volume that are not near a better one; rows of rotation, y, x indices."""
+    turns, rows, columns = volume.shape
+    left = volume.copy()
+    found = np.zeros((count, 3), dtype=np.int64)
+    taken = 0
+    while taken < count:
+        best = np.float32(0.0)
+        for r in range(turns):
+            for j in range(rows):
+                for i in range(columns):
+                    if left[r, j, i] > best:
+                        best = left[r, j, i]
+                        found[taken, 0], found[taken, 1], found[taken, 2] = r, j, i
+        if best <= 0.0:
+            break
+        r0, j0, i0 = found[taken]
+        taken += 1
+        for r in range(max(0, r0 - apart_rotations), min(turns, r0 + apart_rotations + 1)):
+            for j in range(max(0, j0 - apart), min(rows, j0 + apart + 1)):
+                for i in range(max(0, i0 - apart), min(columns, i0 + apart + 1)):
+                    left[r, j, i] = 0.0
+    return found[:taken]
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where the query fits.
+
+    Attributes:
+        pose: field_from_base (3,).
+        covariance: (3, 3) in the field's frame, of the scans alone.
+        score: 0..1, mean field value over the points.
+        shape: smallest over largest information along a direction, 0..1; near 0 in a bare corridor.
+        runner_up: score of the best place that is another one; 0 where there is none.
+    """
+
+    pose: FloatArray
+    covariance: FloatArray
+    score: float
+    shape: float
+    runner_up: float
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """Wide search in a field.
+
+    Attributes:
+        residual_sigma: as in `Matcher`.
+        rotation_step_rad: of the coarse search.
+        candidates: so many coarse peaks are looked at closely.
+        apart_m: places at least so far apart, or turned by ``apart_rad``, are different ones.
+    """
+
+    residual_sigma: float = 0.6
+    rotation_step_rad: float = 0.035
+    candidates: int = 12
+    apart_m: float = 0.6
+    apart_rad: float = 0.3
+
+    def find(
+        self, field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
+    ) -> Found | None:
+        """Best pose of ``points`` (n, 2) within ``reach_m`` and ``reach_rad`` of ``centre`` (3,); None: nothing fits."""
+        resolution = field.resolution
+        coarse = POOL * resolution
+        cells = max(1, math.ceil(reach_m / coarse))
+        rotations = max(1, min(math.ceil(reach_rad / self.rotation_step_rad), int(math.pi / self.rotation_step_rad)))
+        volume = score_volume(
+            pool(field.values, POOL), field.origin, coarse, points, centre, cells, rotations, self.rotation_step_rad
+        )
+        tops = peaks(volume, self.candidates, 1, 1)
+        none = np.zeros(3)
+        close: list[tuple[float, FloatArray, FloatArray, float]] = []
+        for r, j, i in tops:
+            start = centre + np.array(
+                [(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * self.rotation_step_rad]
+            )
+            if close and volume[r, j, i] < close[0][0] - 0.1:
+                break  # a pooled score is an upper bound: nothing to come can be near the best
+            x, y, yaw, _ = correlate(
+                field.values, field.origin, resolution, points, start, POOL, 4, self.rotation_step_rad / 4, start,
+                none, 1.0, 1.0,
+            )  # fmt: skip
+            start = np.array([x, y, yaw])
+            pose, hessian, score, squares = refine(
+                field.values, field.origin, resolution, points, start, start, none, 1.0, 12, 0.15, 0.04
+            )
+            close.append((float(score), pose, hessian.copy(), float(squares)))
+            close.sort(key=lambda entry: -entry[0])
+        if not close:
+            return None
+        score, pose, hessian, squares = close[0]
+        others = [entry[0] for entry in close[1:] if self._apart(entry[1], pose)]
+        try:
+            covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
+            # What translation is known of when the heading is not: the Schur complement.
+            known = hessian[:2, :2] - np.outer(hessian[:2, 2], hessian[2, :2]) / hessian[2, 2]
+            low, high = np.linalg.eigvalsh(known)
+        except np.linalg.LinAlgError:
+            return None
+        shape = float(max(low, 0.0) / high) if high > 0 else 0.0
+        pose = np.array([pose[0], pose[1], wrap_angle(float(pose[2]))])
+        return Found(pose, 0.5 * (covariance + covariance.T), score, shape, max(others, default=0.0))
+
+    def _apart(self, a: FloatArray, b: FloatArray) -> bool:
+        turn = abs(wrap_angle(float(a[2] - b[2])))
+        return math.hypot(a[0] - b[0], a[1] - b[1]) >= self.apart_m or turn >= self.apart_rad
+
+
+def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:
+    """One point a cell of ``cell_m``, at most ``max_points``, evenly chosen, (n, 2)."""
+    if len(points) == 0:
+        return points
+    _, first = np.unique(np.floor(points / cell_m).astype(np.int64), axis=0, return_index=True)
+    kept = points[first]  # in the order of their cells, so that an even choice covers the place
+    if len(kept) > max_points:
+        kept = kept[(np.arange(max_points) * len(kept)) // max_points]
+    return np.ascontiguousarray(kept)
