@@ -1,10 +1,26 @@
-"""Topics over ZeroMQ, with the file system as registry: node, publisher, subscriber, clock, parameters."""
+"""Topics between processes, with the file system as registry: node, publisher, subscriber, clock, parameters.
 
-from .main import main
-from .node import ERROR, OK, STALE, WARN, Latest, Node, NodeError, Publisher, Subscription, Worker
-from .params import ParameterError
-from .qos import LATCHED, RECORD, RELIABLE, SENSOR, QoS
-from .registry import RegistryError
+Names are loaded when they are first used: a command that only reads the registry need not load the whole bus.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .node import ERROR, OK, STALE, WARN, Latest, Node, NodeError, Publisher, Subscription, Worker
+    from .params import ParameterError
+    from .process import main
+    from .qos import LATCHED, RECORD, RELIABLE, SENSOR, QoS
+    from .registry import RegistryError
+
+_NAMES = {
+    "node": "ERROR OK STALE WARN Latest Node NodeError Publisher Subscription Worker",
+    "params": "ParameterError",
+    "process": "main",
+    "qos": "LATCHED RECORD RELIABLE SENSOR QoS",
+    "registry": "RegistryError",
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
     "ERROR",
@@ -26,3 +42,12 @@ __all__ = [
     "Worker",
     "main",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, from the module that has it."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
+    globals()[name] = value
+    return value

@@ -13,7 +13,7 @@ def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
     Programs given by path (``exec: my_node.py``) are not looked into.
     """
     from instant_ic.bag.replay import ReplayError, find_node_class
-    from instant_ic.bus.main import argument_parser, load_config, parse_remaps
+    from instant_ic.bus.process import argument_parser, load_config, parse_remaps
     from instant_ic.bus.params import ParameterError
 
     problems: list[str] = []

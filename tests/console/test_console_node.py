@@ -334,7 +334,7 @@ def test_vspace_and_battery_are_told(setup):
 def test_configuration_file_holds_the_defaults():
     from pathlib import Path
 
-    from instant_ic.bus.main import load_config
+    from instant_ic.bus.process import load_config
 
     file = Path(__file__).resolve().parents[2] / "config" / "console.yaml"
     assert load_config(ConsoleNode, "console", [file], [])[0] == ConsoleConfig()

@@ -72,7 +72,7 @@ def add_parser(subparsers: Any) -> None:
 def record(args: argparse.Namespace) -> int:
     """Runs the recorder node in this process."""
     from instant_ic.bag.replay import find_node_class
-    from instant_ic.bus.main import run
+    from instant_ic.bus.process import run
 
     if args.output and Path(args.output).exists():
         raise UserError(f"{args.output} exists already, not overwriting")
@@ -85,7 +85,7 @@ def record(args: argparse.Namespace) -> int:
 def play(args: argparse.Namespace) -> int:
     """Runs the player node in this process."""
     from instant_ic.bag.replay import find_node_class
-    from instant_ic.bus.main import run
+    from instant_ic.bus.process import run
 
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")

@@ -29,6 +29,6 @@ def run(args: argparse.Namespace) -> int:
     if args.node not in known_nodes():
         raise UserError(f"there is no node {args.node!r}; there are {', '.join(known_nodes())}", 2)
     from instant_ic.bag.replay import find_node_class
-    from instant_ic.bus.main import run as run_node
+    from instant_ic.bus.process import run as run_node
 
     return run_node(find_node_class(args.node), args.arguments)
