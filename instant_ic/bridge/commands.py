@@ -54,9 +54,9 @@ class CommandGate:
         """
         age_s = (now_ns - source_ns) / 1e9
         if age_s > self.limits.max_age_s:
-            raise self._refuse("old", f"{age_s:.2f} s old, at most {self.limits.max_age_s:g} s allowed")
+            raise self.refuse("old", f"{age_s:.2f} s old, at most {self.limits.max_age_s:g} s allowed")
         if age_s < -self.limits.max_age_s:
-            raise self._refuse("future", f"stamped {-age_s:.2f} s ahead of this machine's clock: set both by NTP")
+            raise self.refuse("future", f"stamped {-age_s:.2f} s ahead of this machine's clock: set both by NTP")
 
     def check_drive(self, sender: str, v: float, w: float, now_ns: int) -> None:
         """Refuses what no sane operator sends (m/s, rad/s), and a second driver.
@@ -65,12 +65,12 @@ class CommandGate:
             CommandRefused: see above.
         """
         if not (math.isfinite(v) and math.isfinite(w)):
-            raise self._refuse("not finite", f"v {v}, w {w}: not finite")
+            raise self.refuse("not finite", f"v {v}, w {w}: not finite")
         if abs(v) > self.limits.max_linear_mps or abs(w) > self.limits.max_angular_rps:
             limits = f"{self.limits.max_linear_mps:g} m/s, {self.limits.max_angular_rps:g} rad/s"
-            raise self._refuse("too fast", f"{v:g} m/s, {w:g} rad/s: beyond {limits}")
+            raise self.refuse("too fast", f"{v:g} m/s, {w:g} rad/s: beyond {limits}")
         if self._driver not in (None, sender) and now_ns - self._driver_ns <= self.limits.lease_s * 1e9:
-            raise self._refuse("second driver", f"{sender} may not drive while {self._driver} does")
+            raise self.refuse("second driver", f"{sender} may not drive while {self._driver} does")
         self._driver, self._driver_ns = sender, now_ns
 
     def release(self, sender: str) -> bool:
@@ -82,8 +82,5 @@ class CommandGate:
 
     def refuse(self, reason: str, words: str) -> CommandRefused:
         """Counts a refusal by its reason and gives the error to raise."""
-        return self._refuse(reason, words)
-
-    def _refuse(self, reason: str, words: str) -> CommandRefused:
         self.refused[reason] = self.refused.get(reason, 0) + 1
         return CommandRefused(words)

@@ -15,6 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from ..paths import shipped_file
 from .zenoh_format import ADMIN_SPACE, GID_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
@@ -57,6 +58,18 @@ def zenoh() -> Any:
     except ImportError as error:
         raise ZenohError(f"Zenoh is not installed ({error}): pip install 'instant-ic[zenoh]'") from None
     return zenoh
+
+
+def config_path(name: str) -> Path | None:
+    """A configuration by path, or by name among the files of config/; None for an empty name.
+
+    Raises:
+        FileNotFoundError: neither is there.
+    """
+    if not name:
+        return None
+    path = Path(name).expanduser()
+    return path if path.is_file() or "/" in name else shipped_file("config", name)
 
 
 def load_config(
@@ -170,9 +183,7 @@ class RosSession:
             if token is not None and token.session != self.id:
                 on_token(token, sample.kind == put)
 
-        self._watch = self.zenoh.liveliness().declare_subscriber(
-            f"{ADMIN_SPACE}/{self.domain}/**", heard, history=True
-        )
+        self._watch = self.zenoh.liveliness().declare_subscriber(f"{ADMIN_SPACE}/{self.domain}/**", heard, history=True)
 
 
 class RosNode:
@@ -216,7 +227,7 @@ class RosPublisher:
         session = node.session
         key = data_key(session.domain, topic, type_name, type_hash)
         reliability = package.Reliability.RELIABLE if qos.reliable else package.Reliability.BEST_EFFORT
-        # As rmw_zenoh: a link that cannot keep up loses messages, which the reader counts; it never holds the sender up.
+        # As rmw_zenoh: a link that cannot keep up loses messages, which the reader counts; it never holds us up.
         options = {"congestion_control": package.CongestionControl.DROP, "reliability": reliability}
         if qos.latched:
             self._publisher = package.ext.declare_advanced_publisher(

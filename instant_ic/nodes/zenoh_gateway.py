@@ -1,0 +1,118 @@
+"""Hands topics to Zenoh as topics of ROS 2 (rmw_zenoh's format), byte for byte, and takes topics from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from instant_ic.bridge.commands import CommandGate, CommandLimits
+from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing
+from instant_ic.bridge.zenoh_session import RosSession, ZenohError, config_path, load_config
+from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
+from instant_ic.msg import MessageError
+
+
+@dataclass(frozen=True)
+class ZenohGatewayConfig:
+    """Parameters.
+
+    Attributes:
+        namespace: the robot's name in the fleet; ``/scan`` here is ``/robot1/scan`` there. Empty: names stay.
+        domain: ROS domain (``ROS_DOMAIN_ID``).
+        connect: routers to connect to; empty: those of the session file.
+        session_file: Zenoh configuration (JSON5), path or file of config/; empty: as rmw_zenoh, router on localhost.
+        publish: topics that go out, names or patterns.
+        subscribe: topics that come in: NAME, PATTERN, or "NAME TYPE" to have it before anybody publishes it.
+        commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop.
+        limits: what commands have to pass.
+        discovery_period_s: how often to look for topics that come and go, s.
+    """
+
+    namespace: str = ""
+    domain: int = 0
+    connect: tuple[str, ...] = ()
+    session_file: str = ""
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    limits: CommandLimits = field(default_factory=CommandLimits)
+    discovery_period_s: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        try:
+            Namespace(self.namespace)
+        except registry.RegistryError:
+            raise ValueError(f"namespace {self.namespace!r} must look like robot1 or fleet/robot1") from None
+        if not 0 <= self.domain <= 232:
+            raise ValueError(f"domain must lie in 0..232 (got {self.domain})")
+        if unknown := set(self.commands) - set(COMMANDS):
+            raise ValueError(f"commands may only hold {', '.join(COMMANDS)} (got {', '.join(sorted(unknown))})")
+        if not 0.05 <= self.discovery_period_s <= 10:
+            raise ValueError(f"discovery_period_s must be 0.05 to 10 s (got {self.discovery_period_s})")
+
+
+class ZenohGatewayNode(Node[ZenohGatewayConfig]):
+    """Looks for topics on both sides, tells counts and losses."""
+
+    name = "zenoh_gateway"
+    session: RosSession | None = None
+
+    def setup(self) -> None:
+        """Opens the session."""
+        if self.run_dir is None:
+            raise NodeError("the gateway needs the real bus and a real Zenoh session; it has no place in lockstep")
+        if self.namespace:
+            raise NodeError(f"--namespace {self.namespace}: for the names there set the parameter namespace instead")
+        config = self.config
+        self.gate = CommandGate(config.limits)
+        namespace = Namespace(config.namespace)
+        try:
+            zenoh_config = load_config(config_path(config.session_file), config.connect)
+            self.session = RosSession(zenoh_config, config.domain)
+            self.outgoing = Outgoing(self, self.session, namespace, config.publish)
+            self.incoming = Incoming(self, self.session, namespace, config.subscribe, config.commands, self.gate)
+        except (ZenohError, MessageError, ValueError, FileNotFoundError, registry.RegistryError) as error:
+            raise NodeError(str(error)) from None
+        self.session.watch(self.incoming.on_token)
+        self._lost = 0
+        self.look()
+        self.timer(config.discovery_period_s, self.look)
+        self.timer(1.0, self.tell)
+
+    def look(self) -> None:
+        """Follows what comes and goes."""
+        assert self.run_dir is not None
+        self.outgoing.reconcile(registry.list_topics(self.run_dir))
+        self.incoming.reconcile()
+
+    def tell(self) -> None:
+        """Tells links, counts and losses."""
+        assert self.session is not None
+        routers, peers = self.session.routers(), self.session.peers()
+        if routers or peers:
+            self.diagnose("link", OK, f"{len(routers)} routers, {len(peers)} peers")
+        else:
+            where = ", ".join(self.config.connect) or self.config.session_file or "tcp/localhost:7447"
+            self.diagnose("link", WARN, f"no router answers at {where}: is it running? (ic run zenoh_router)")
+        lost_by = self.incoming.lost_by()
+        lost = sum(count for by in lost_by.values() for count in by.values())
+        words = (
+            f"{self.outgoing.count} messages out on {len(self.outgoing.topics)} topics, "
+            f"{self.incoming.count} in on {len(self.incoming.topics)}"
+        )
+        losses = {f"lost {topic} from {gid[:8]}": n for topic, by in lost_by.items() for gid, n in by.items()}
+        if lost:
+            words += f"; lost: {', '.join(f'{topic} {sum(by.values())}' for topic, by in sorted(lost_by.items()))}"
+        level = WARN if lost > self._lost else OK
+        self._lost = lost
+        refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
+        self.diagnose("topics", level, words, malformed=self.incoming.malformed(), **losses, **refused)
+
+    def teardown(self) -> None:
+        """Leaves the ROS graph."""
+        if self.session is not None:
+            self.session.close()
+
+
+if __name__ == "__main__":
+    main(ZenohGatewayNode)

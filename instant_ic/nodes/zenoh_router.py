@@ -1,0 +1,53 @@
+"""A Zenoh router, for a fleet on one machine and for tests; on a real site run zenohd, which is the same router."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from instant_ic.bridge.zenoh_session import ROUTER_DEFAULTS, ZenohError, config_path, load_config, open_zenoh
+from instant_ic.bus import OK, Node, NodeError, main
+
+
+@dataclass(frozen=True)
+class ZenohRouterConfig:
+    """Parameters.
+
+    Attributes:
+        listen: endpoints to listen on; empty: those of the session file.
+        session_file: Zenoh configuration (JSON5), a path or a file of config/; empty: tcp/localhost:7447, open to all.
+    """
+
+    listen: tuple[str, ...] = ()
+    session_file: str = ""
+
+
+class ZenohRouterNode(Node[ZenohRouterConfig]):
+    """Holds the session; Zenoh does the rest."""
+
+    name = "zenoh_router"
+    session: Any = None
+
+    def setup(self) -> None:
+        """Listens."""
+        try:
+            path = config_path(self.config.session_file)
+            self.session = open_zenoh(load_config(path, (), self.config.listen, ROUTER_DEFAULTS))
+        except (ZenohError, FileNotFoundError) as error:
+            raise NodeError(str(error)) from None
+        self.log.info("router %s", self.session.info.zid())
+        self.timer(1.0, self.tell)
+
+    def tell(self) -> None:
+        """Tells who is connected."""
+        info = self.session.info
+        self.diagnose("link", OK, f"{len(info.peers_zid())} peers, {len(info.routers_zid())} other routers")
+
+    def teardown(self) -> None:
+        """Closes every link."""
+        if self.session is not None:
+            self.session.close()
+
+
+if __name__ == "__main__":
+    main(ZenohRouterNode)

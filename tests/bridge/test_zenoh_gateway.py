@@ -1,0 +1,475 @@
+"""The gateway between our bus and Zenoh: against raw Zenoh sessions, an independent client, and itself."""
+
+import os
+import sys
+import threading
+import time
+
+import pytest
+from live_nodes import LiveNode, Neighbour, cdr, wait_for
+
+from instant_ic.bridge.zenoh_format import Attachment, TopicQoS, data_key
+from instant_ic.bridge.zenoh_session import (
+    ROUTER_DEFAULTS,
+    RosNode,
+    RosPublisher,
+    RosSession,
+    ZenohError,
+    load_config,
+    open_zenoh,
+)
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
+from instant_ic.evaluation.stack import free_port
+from instant_ic.msg import (
+    Bool,
+    String,
+    TFMessage,
+    deserialize,
+    transform_message,
+    twist_stamped,
+    twist_values,
+    type_hash,
+)
+from instant_ic.nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
+
+zenoh = pytest.importorskip("zenoh")
+pytestmark = pytest.mark.xdist_group("zenoh")
+STRING = "std_msgs/msg/String"
+TWIST = "geometry_msgs/msg/TwistStamped"
+
+
+@pytest.fixture(scope="module")
+def router():
+    """Endpoint of a router that runs for all tests of this file."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    session = open_zenoh(load_config(None, (), (endpoint,), ROUTER_DEFAULTS))
+    yield endpoint
+    session.close()
+
+
+@pytest.fixture
+def world(router, tmp_path_factory):
+    """Makes gateways, neighbours on the bus and sessions, each in the run directory of its name, and ends them all."""
+    open_things = []
+    run_dirs = {}
+
+    class World:
+        endpoint = router
+
+        def run_dir(self, name):
+            return run_dirs.setdefault(name, tmp_path_factory.mktemp("r"))
+
+        def keep(self, thing):
+            open_things.append(thing)
+            return thing
+
+        def gateway(self, where, **parameters):
+            config = ZenohGatewayConfig(connect=(router,), **parameters)
+            return self.keep(LiveNode(self.run_dir(where), ZenohGatewayNode, config, "zenoh_gateway"))
+
+        def neighbour(self, where, name="talker"):
+            return self.keep(Neighbour(self.run_dir(where), name))
+
+        def session(self):
+            return self.keep(RosSession(load_config(None, (router,))))
+
+        def topics(self, where):
+            return {info.topic for info in registry.list_topics(self.run_dir(where))}
+
+    yield World()
+    for thing in reversed(open_things):
+        thing.close()
+
+
+@pytest.fixture
+def sdk(world):
+    """zenoh-ros2-sdk on the same router."""
+    from zenoh_ros2_sdk.session import ZenohSession
+
+    host, port = world.endpoint.removeprefix("tcp/").split(":")
+    ZenohSession._instance = None
+    ZenohSession.get_instance(host, int(port))
+    yield {"router_ip": host, "router_port": int(port)}
+    ZenohSession.get_instance().close()
+
+
+def publish_until(publisher, message, condition, what):
+    """Publishes again and again: a reader that has just appeared misses the first."""
+
+    def once():
+        publisher.publish(message)
+        time.sleep(0.02)
+        return condition()
+
+    return wait_for(once, what)
+
+
+# -- out ---------------------------------------------------------------------------------------------
+
+
+def test_message_goes_out_byte_for_byte_under_rmw_zenohs_key_with_its_attachment(world):
+    world.gateway("robot", namespace="robot1", publish=("/chat*",))
+    out = world.neighbour("robot").publisher("/chatter", String)
+    listener = world.session()
+    samples = []
+    listener.zenoh.declare_subscriber("0/robot1/**", samples.append)
+    message = String("hello")
+    before_ns = time.time_ns()
+    publish_until(out, message, lambda: len(samples) >= 3, "samples")
+    assert {str(s.key_expr) for s in samples} == {data_key(0, "/robot1/chatter", STRING, type_hash(STRING))}
+    assert {s.payload.to_bytes() for s in samples} == {cdr(message)}
+    attachments = [Attachment.unpack(s.attachment.to_bytes()) for s in samples]
+    first = attachments[0].sequence
+    assert [a.sequence for a in attachments] == list(range(first, first + len(samples)))
+    assert len({a.gid for a in attachments}) == 1
+    assert all(before_ns <= a.source_ns <= time.time_ns() for a in attachments)
+
+
+def test_each_node_that_publishes_stands_in_the_ros_graph_until_it_ends(world):
+    tokens = {}
+    world.session().watch(lambda token, alive: tokens.update({token: alive}))
+    gateway = world.gateway("robot", namespace="robot1", publish=("/chatter", "/latched"))
+    talker = world.neighbour("robot", "talker")
+    talker.publisher("/chatter", String, SENSOR)
+    talker.publisher("/latched", String, LATCHED)
+    wait_for(lambda: sum(t.kind == "MP" for t in tokens) == 2, "tokens of both publishers")
+    by_topic = {t.topic: t for t in tokens if t.kind == "MP"}
+    assert by_topic["/robot1/chatter"].qos == TopicQoS(reliable=False, depth=5)
+    assert by_topic["/robot1/latched"].qos == TopicQoS(latched=True, depth=1)
+    assert {(t.namespace, t.node) for t in tokens if t.kind == "NN"} == {
+        ("/robot1", "talker"),
+        ("/robot1", "zenoh_gateway"),
+    }
+    node = next(t for t in tokens if t.kind == "NN" and t.node == "talker")
+    assert {t.node_id for t in by_topic.values()} == {node.node_id} and node.entity_id == node.node_id
+    talker.node.drop(talker.node.publishers[0])
+    wait_for(lambda: not tokens[by_topic["/robot1/chatter"]], "the end of one token")
+    assert tokens[by_topic["/robot1/latched"]] and tokens[node]
+    gateway.close()
+    wait_for(lambda: not any(tokens.values()), "the end of all tokens")
+
+
+def test_independent_client_sees_our_topics_types_and_messages(world, sdk):
+    from zenoh_ros2_sdk import ROS2Subscriber
+    from zenoh_ros2_sdk.discovery import get_topic_info, get_topic_names_and_types
+
+    world.gateway("robot", namespace="robot1", publish=("/chatter", "/scan"))
+    talker = world.neighbour("robot")
+    out = talker.publisher("/chatter", String)
+    talker.node.publisher_raw("/scan", "sensor_msgs/msg/LaserScan", SENSOR)
+    wanted = {("/robot1/chatter", STRING), ("/robot1/scan", "sensor_msgs/msg/LaserScan")}
+
+    def seen():
+        topics = {(topic, name) for topic, names in get_topic_names_and_types(0, **sdk) for name in names}
+        return wanted <= topics
+
+    wait_for(seen, "our topics in the client's list")
+    info = get_topic_info("/robot1/chatter", 0, verbose=True, **sdk)
+    (publisher,) = info.publishers
+    assert (publisher.node_name, publisher.node_namespace.strip("/")) == ("talker", "robot1")
+    assert publisher.type_hash == type_hash(STRING)
+    texts = []
+    subscriber = ROS2Subscriber(
+        "/robot1/chatter", STRING, lambda m: texts.append(m.data), msg_definition="string data\n", domain_id=0, **sdk
+    )
+    try:
+        assert subscriber.type_hash == type_hash(STRING)  # computed by the client from the definition
+        publish_until(out, String("hello"), lambda: texts, "message at the client")
+    finally:
+        subscriber.close()
+    assert set(texts) == {"hello"}
+
+
+def static(child):
+    import numpy as np
+
+    return TFMessage([transform_message(np.eye(4), "base_link", child, 1)])
+
+
+def test_late_joiners_get_the_latched_values_of_every_node(world):
+    """ROS 2: latched topics lost on their way (rosbag2 1049)."""
+    world.gateway("robot", namespace="robot1", publish=("/tf_static",))
+    for name in ("camera", "velodyne"):
+        world.neighbour("robot", name).publisher("/tf_static", TFMessage, LATCHED).publish(static(name))
+    robot = world.session()
+    tokens = []
+    robot.watch(lambda token, alive: tokens.append(token))
+    wait_for(lambda: sum(t.kind == "MP" for t in tokens) == 2, "both publishers")
+    # At the station both come by one gateway, which can keep one value: it holds the transforms of both.
+    world.gateway("station", namespace="robot1", subscribe=("/tf_static",))
+    early = world.neighbour("station", "early")
+    frames = lambda heard: {t.child_frame_id for t in deserialize(heard[-1].payload, heard[-1].type_name).transforms}  # noqa: E731
+    heard = early.listen("/tf_static", LATCHED)
+    early.wait(lambda: heard and frames(heard) == {"camera", "velodyne"}, "both transforms")
+    late = world.neighbour("station", "late")
+    heard = late.listen("/tf_static", LATCHED)
+    late.wait(lambda: heard and frames(heard) == {"camera", "velodyne"}, "both transforms, late")
+
+
+# -- in ----------------------------------------------------------------------------------------------
+
+
+def test_independent_clients_messages_come_in_byte_for_byte(world, sdk):
+    from zenoh_ros2_sdk import ROS2Publisher
+
+    world.gateway("robot", namespace="robot1", subscribe=("/chat*",))
+    listener = world.neighbour("robot", "listener")
+    heard = listener.listen("/chatter")
+    publisher = ROS2Publisher("/robot1/chatter", STRING, msg_definition="string data\n", domain_id=0, **sdk)
+    try:
+        before_ns = time.time_ns()
+        listener.wait(lambda: publisher.publish(data="from ROS") or heard, "message on the bus")
+    finally:
+        publisher.close()
+    assert heard[0].payload == cdr(String("from ROS"))
+    assert heard[0].type_name == STRING
+    assert before_ns - 1_000_000 <= heard[0].publish_ns <= time.time_ns()  # the client's own time of publication
+    wait_for(lambda: "/chatter" not in world.topics("robot"), "the end of the topic")
+
+
+def test_gaps_are_counted_by_publisher_and_told(world):
+    gateway = world.gateway("station", subscribe=("/robot1/chatter std_msgs/msg/String",))
+    robot = world.session()
+    key = data_key(0, "/robot1/chatter", STRING, type_hash(STRING))
+    publisher = robot.zenoh.declare_publisher(key)
+    one, other = os.urandom(16), os.urandom(16)
+    wait_for(lambda: publisher.matching_status.matching, "the gateway's subscription")
+    for gid, sequence in [(one, 1), (other, 7), (one, 2), (one, 5), (one, 5), (other, 8), (one, 6), (other, 10)]:
+        publisher.put(cdr(String("x")), attachment=Attachment(sequence, 1, gid).pack())
+    publisher.put(cdr(String("no attachment")))
+    publisher.put(cdr(String("cut")), attachment=b"123")
+    wait_for(lambda: gateway.node.incoming.malformed() == 2, "the refused ones")
+    assert gateway.node.incoming.lost_by() == {"/robot1/chatter": {one.hex(): 2, other.hex(): 1}}
+    assert gateway.node.incoming.count == 7  # the repeated one is not handed on
+    wait_for(lambda: "lost: /robot1/chatter 3" in gateway.told("topics"), "the words")
+
+
+def test_what_came_in_does_not_go_out_again(world):
+    gateway = world.gateway("robot", publish=("/chatter",), subscribe=("/chatter",))
+    outside = world.session()
+    publisher = RosPublisher(RosNode(outside, "/", "ros_node"), "/chatter", STRING, type_hash(STRING), TopicQoS())
+    samples = []
+    outside.zenoh.declare_subscriber("0/chatter/**", samples.append, allowed_origin=zenoh.Locality.REMOTE)
+    listener = world.neighbour("robot", "listener")
+    heard = listener.listen("/chatter")
+    listener.wait(lambda: publisher.put(cdr(String("in")), 1) or len(heard) >= 3, "messages on the bus")
+    listener.spin(0.5)
+    assert gateway.node.outgoing.count == 0 and samples == []
+    own = world.neighbour("robot", "talker").publisher("/chatter", String)
+    publish_until(own, String("out"), lambda: samples, "our own message outside")
+    assert {s.payload.to_bytes() for s in samples} == {cdr(String("out"))}
+
+
+def test_another_definition_of_a_type_is_told_and_kept_out(world):
+    gateway = world.gateway("robot", subscribe=("/chatter", "/odd"))
+    outside = RosNode(world.session(), "/", "ros_node")
+    other_hash = "RIHS01_" + "0" * 64
+    publishers = [
+        RosPublisher(outside, "/chatter", STRING, other_hash, TopicQoS()),
+        RosPublisher(outside, "/odd", "their_msgs/msg/Odd", other_hash, TopicQoS()),
+    ]
+    wait_for(lambda: "another definition" in gateway.told("in /chatter"), "words about the definition")
+    wait_for(lambda: "not known here" in gateway.told("in /odd"), "words about the type")
+    assert len(publishers) == 2 and not {"/chatter", "/odd"} & world.topics("robot")
+
+
+# -- commands ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def operator(world):
+    """A robot that takes commands, and somebody outside who sends them with times and senders as told."""
+    gateway = world.gateway("robot", namespace="robot1", commands=("/operator/cmd_vel", "/operator/estop"))
+    listener = world.neighbour("robot", "listener")
+    driven, stops = listener.listen("/operator/cmd_vel", SENSOR), listener.listen("/operator/estop", LATCHED)
+    outside = RosNode(world.session(), "/robot1", "station")
+    drive = RosPublisher(outside, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST), TopicQoS())
+    stop = RosPublisher(
+        outside, "/robot1/operator/estop", "std_msgs/msg/Bool", type_hash("std_msgs/msg/Bool"), TopicQoS(True, True, 1)
+    )
+
+    def command(v, w=0.0, age_s=0.0):
+        drive.put(cdr(twist_stamped(v, w, time.time_ns())), time.time_ns() - int(age_s * 1e9))
+        return True
+
+    listener.wait(lambda: command(0.1) and driven, "a command on the bus")
+    return gateway, listener, driven, stops, command, stop, drive
+
+
+def test_fresh_commands_come_in_and_old_or_mad_ones_do_not(operator):
+    gateway, listener, driven, _, command, _, _ = operator
+    listener.spin(0.3)  # what the fixture sent is through
+    for send, words in [
+        (lambda: command(0.3, age_s=1.0), "1.0"),
+        (lambda: command(0.3, age_s=-5.0), "ahead of this machine's clock"),
+        (lambda: command(float("nan")), "not finite"),
+        (lambda: command(50.0), "beyond"),
+    ]:
+        driven.clear()
+        send()
+        wait_for(lambda words=words: words in gateway.told("in /operator/cmd_vel"), words)
+        listener.spin(0.1)
+        assert driven == []
+    listener.wait(lambda: command(0.25) and driven, "a fresh command")
+    assert twist_values(deserialize(driven[-1].payload, TWIST)) == (0.25, 0.0)
+    wait_for(lambda: gateway.told("in /operator/cmd_vel") == "commands come in", "all clear")
+    refused = gateway.node.gate.refused
+    assert refused == {"old": 1, "future": 1, "not finite": 1, "too fast": 1}
+
+
+def test_second_driver_is_refused_until_the_first_is_silent(operator, world):
+    gateway, listener, driven, _, command, _, _ = operator
+    node = RosNode(world.session(), "/", "other_station")
+    second = RosPublisher(node, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST), TopicQoS())
+
+    def both():
+        command(0.1)
+        second.put(cdr(twist_stamped(-0.1, 0.0, time.time_ns())), time.time_ns())
+        return "while" in gateway.told("in /operator/cmd_vel") and gateway.node.gate.refused.get("second driver", 0) > 2
+
+    listener.wait(both, "refusals of the second driver")
+    assert all(twist_values(deserialize(m.payload, TWIST))[0] > 0 for m in driven)
+
+    def alone():
+        second.put(cdr(twist_stamped(-0.1, 0.0, time.time_ns())), time.time_ns())
+        return driven and twist_values(deserialize(driven[-1].payload, TWIST))[0] < 0
+
+    listener.wait(alone, "the second driver's command after the first one's silence")
+
+
+def test_a_stop_comes_in_however_old_it_is_and_only_a_fresh_release_does(operator):
+    gateway, listener, _, stops, _, stop, _ = operator
+    hour = 3_600_000_000_000
+    stop.put(cdr(Bool(True)), time.time_ns() - hour)
+    listener.wait(lambda: stops and deserialize(stops[-1].payload, "std_msgs/msg/Bool").data, "the stop")
+    stop.put(cdr(Bool(False)), time.time_ns() - hour)
+    wait_for(lambda: "command refused" in gateway.told("in /operator/estop"), "refusal of the old release")
+    assert deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
+    stop.put(cdr(Bool(False)), time.time_ns())
+    listener.wait(lambda: not deserialize(stops[-1].payload, "std_msgs/msg/Bool").data, "the fresh release")
+
+
+def test_robot_is_told_to_stand_when_the_last_driver_leaves(operator):
+    _, listener, driven, _, command, _, drive = operator
+    listener.wait(lambda: command(0.3) and len(driven) > 3, "driving")
+    drive.close()
+    listener.wait(lambda: twist_values(deserialize(driven[-1].payload, TWIST)) == (0.0, 0.0), "a zero command")
+
+
+def test_commands_do_not_come_in_where_they_are_not_configured(world):
+    gateway = world.gateway("robot", namespace="robot1", subscribe=("/*", "/operator/cmd_vel"))
+    outside = RosNode(world.session(), "/robot1", "station")
+    drive = RosPublisher(outside, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST), TopicQoS())
+    chat = RosPublisher(outside, "/robot1/chatter", STRING, type_hash(STRING), TopicQoS())
+    wait_for(lambda: "/chatter" in world.topics("robot"), "the harmless topic")
+    drive.put(cdr(twist_stamped(0.3, 0.0, time.time_ns())), time.time_ns())
+    chat.put(cdr(String("x")), time.time_ns())
+    wait_for(lambda: gateway.node.incoming.count, "the harmless message")
+    assert world.topics("robot") & {"/operator/cmd_vel", "/cmd_vel"} == set()
+
+
+# -- a fleet, links, configuration ---------------------------------------------------------------------
+
+
+def test_two_robots_and_a_station_do_not_mix(world):
+    out = {}
+    for name in ("robot1", "robot2"):
+        world.gateway(name, namespace=name, publish=("/chatter",))
+        out[name] = world.neighbour(name).publisher("/chatter", String)
+    world.gateway("station", namespace="robot2", subscribe=("/chatter",))
+    world.keep(
+        LiveNode(
+            world.run_dir("station"),
+            ZenohGatewayNode,
+            ZenohGatewayConfig(connect=(world.endpoint,), subscribe=("/robot*/chatter",)),
+            "fleet_gateway",
+        )
+    )
+    listener = world.neighbour("station", "listener")
+    chosen, first, second = (listener.listen(t) for t in ("/chatter", "/robot1/chatter", "/robot2/chatter"))
+
+    def all_heard():
+        for name, publisher in out.items():
+            publisher.publish(String(name))
+        return chosen and first and second
+
+    listener.wait(all_heard, "messages of both robots")
+    said = [{deserialize(m.payload, STRING).data for m in messages} for messages in (chosen, first, second)]
+    assert said == [{"robot2"}, {"robot1"}, {"robot2"}]
+
+
+def test_a_missing_router_is_told_and_found_when_it_comes(tmp_path_factory):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    config = ZenohGatewayConfig(connect=(endpoint,), publish=("/chatter",))
+    gateway = LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, config, "zenoh_gateway")
+    try:
+        wait_for(lambda: "no router answers" in gateway.told("link"), "words about the router")
+        router = open_zenoh(load_config(None, (), (endpoint,), ROUTER_DEFAULTS))
+        try:
+            wait_for(lambda: "1 routers" in gateway.told("link"), "the router")
+        finally:
+            router.close()
+        wait_for(lambda: "no router answers" in gateway.told("link"), "words about the router's end")
+    finally:
+        gateway.close()
+
+
+def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path_factory):
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    with pytest.raises(NodeError, match=r"pip install 'instant-ic\[zenoh\]'"):
+        LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, ZenohGatewayConfig(), "zenoh_gateway")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"namespace": "/robot 1"}, "namespace '/robot 1' must look like robot1"),
+        ({"domain": 300}, "domain must lie in 0..232"),
+        ({"commands": ("/cmd_vel",)}, r"commands may only hold /operator/cmd_vel, /operator/estop \(got /cmd_vel\)"),
+        ({"discovery_period_s": 0.0}, "discovery_period_s"),
+    ],
+)
+def test_wrong_parameters_are_named(parameters, words):
+    with pytest.raises(ValueError, match=words):
+        ZenohGatewayConfig(**parameters)
+
+
+def test_wrong_files_types_and_endpoints_are_named(tmp_path, tmp_path_factory):
+    broken = tmp_path / "broken.json5"
+    broken.write_text('{mode: "sideways"}')
+    with pytest.raises(ZenohError, match=r"broken\.json5: not a Zenoh configuration"):
+        load_config(broken)
+    with pytest.raises(ZenohError, match=r"missing\.json5: cannot be read: No such file"):
+        load_config(tmp_path / "missing.json5")
+    with pytest.raises(ZenohError, match="connect/endpoints"):
+        load_config(None, ("localhost",))
+    for parameters, words in [
+        ({"session_file": "nothing.json5"}, "nothing.json5 does not exist"),
+        ({"subscribe": ("/chatter std_msgs/msg/Strin",)}, "no message type"),
+        ({"subscribe": ("chatter std_msgs/msg/String",)}, "topic name 'chatter' is not legal"),
+    ]:
+        with pytest.raises(NodeError, match=words):
+            LiveNode(tmp_path_factory.mktemp("r"), ZenohGatewayNode, ZenohGatewayConfig(**parameters), "zenoh_gateway")
+
+
+def test_nothing_of_a_gateway_is_left_running(world):
+    before = threading.active_count()
+    gateway = world.gateway("robot", publish=("/chatter",), subscribe=("/x std_msgs/msg/String",))
+    gateway.close()
+    wait_for(lambda: threading.active_count() <= before, "the end of its threads")
+    assert world.topics("robot") == set()
+
+
+def test_reliable_topics_lose_nothing_on_the_way_through_two_gateways(world):
+    world.gateway("robot", namespace="robot1", publish=("/numbers",))
+    world.gateway("station", namespace="robot1", subscribe=("/numbers",))
+    out = world.neighbour("robot").publisher("/numbers", String, RELIABLE)
+    listener = world.neighbour("station", "listener")
+    heard = listener.listen("/numbers")
+    listener.wait(lambda: out.publish(String("first")) or heard, "the link")
+    for number in range(300):
+        out.publish(String(str(number)))
+        listener.spin(0.002)
+    listener.wait(lambda: len(heard) and deserialize(heard[-1].payload, STRING).data == "299", "the last one")
+    texts = [deserialize(m.payload, STRING).data for m in heard]
+    assert [t for t in texts if t != "first"] == [str(n) for n in range(300)]
