@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from instant_ic.bus import registry
 from instant_ic.launch.description import LaunchDescription
-from instant_ic.launch.health import HealthMonitor
-from instant_ic.launch.process import ManagedProcess
+from instant_ic.launch.health import HealthMonitor, TopicFault
+from instant_ic.launch.outlet import Outlet
+from instant_ic.launch.process import ManagedProcess, State
 from instant_ic.launch.rundir import StackLock
-from instant_ic.launch.screen import Screen
+from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.launch.supervisor import Supervisor
+from instant_ic.launch.topics import nominal_rate
+
+_VIEW_PERIOD_S = 0.5
+_WAITING_LINES = 2000  # lines that a terminal may be behind
+_NOT_SHOWN = ("heartbeat", "diagnostics", "rosout", "parameter_events")  # every node's
 
 
 def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None = None) -> int:
@@ -20,44 +29,127 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
 
     Args:
         description: what to start.
-        run_dir: run directory; made if missing.
+        run_dir: run directory; made if missing, with those of the groups in it.
         live: table of the nodes below the lines; default where standard output is a terminal.
 
     Returns:
         Exit status, see :meth:`Supervisor.run`.
 
     Raises:
-        RegistryError: the run directory cannot be used.
-        StackRunningError: another stack has it.
+        RegistryError: a run directory cannot be used.
+        StackRunningError: another stack has one.
     """
-    registry.prepare(run_dir)
-    with StackLock(run_dir, description.file.name):
-        registry.sweep(run_dir)
-        names = [node.name for node in description.nodes]
-        with Screen(names, sys.stdout.isatty() if live is None else live) as screen:
-            screen.event(f"{len(names)} nodes of {description.file}, run directory {run_dir}")
-            output = _WithHealth(screen, description, run_dir)
-            try:
-                return Supervisor(description.nodes, run_dir, output).run()
-            finally:
-                output.close()
+    with ExitStack() as locks:
+        for folder in description.run_dirs(run_dir):
+            registry.prepare(folder)
+            locks.enter_context(StackLock(folder, description.file.name))
+            registry.sweep(folder)
+        output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
+        try:
+            output.event(f"{len(description.nodes)} nodes of {description.file}, run directory {run_dir}")
+            return Supervisor(
+                description.nodes,
+                run_dir,
+                output,
+                make_health=output.make_health,
+                announcements=description.announcements,
+                shutdown=description.shutdown,
+            ).run()
+        finally:
+            output.close()
 
 
-class _WithHealth:
-    """A screen whose eyes on the bus open after the processes have been started, so that they need not wait."""
+class _Output:
+    """The screen, on a thread of its own so that a terminal that takes nothing does not hold up the stack."""
 
-    def __init__(self, screen: Screen, description: LaunchDescription, run_dir: Path) -> None:
-        self._screen, self._description, self._run_dir = screen, description, run_dir
-        self.node_line, self.event = screen.node_line, screen.event
+    def __init__(self, description: LaunchDescription, run_dir: Path, live: bool) -> None:
+        self._description, self._run_dir = description, run_dir
+        self._screen = Screen([node.label for node in description.nodes], live)
+        self._outlet = Outlet("screen", _WAITING_LINES)
+        self._outlet.put(self._screen.start, always=True)
+        self._health: HealthMonitor | None = None
+        self._ending = False
+        self._left_out = 0  # lines for the terminal
+        self._next_view_s = 0.0
+        self._address: str | None = None
+
+    def make_health(self) -> HealthMonitor:
+        """Eyes on the bus; they open after the processes have been started, so that they need not wait."""
+        self._health = HealthMonitor(self._description.nodes, self._run_dir)
+        return self._health
+
+    def node_line(self, node: str, text: str) -> None:
+        """A line that a node has written."""
+        if self._left_out and self._outlet.put(
+            self._screen.event, f"{self._left_out} lines left out: see the logs"
+        ):
+            self._left_out = 0
+        if not self._outlet.put(self._screen.node_line, node, text):
+            self._left_out += 1
+
+    def event(self, text: str, bad: bool = False) -> None:
+        """Something that the supervisor has done or seen."""
+        self._outlet.put(self._screen.event, text, bad, always=True)
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        if self._screen.health is None:
-            self._screen.health = HealthMonitor(self._description.nodes, self._run_dir)
-        self._screen.refresh(processes)
+        """Looks twice a second."""
+        if time.monotonic() >= self._next_view_s:
+            self._next_view_s = time.monotonic() + _VIEW_PERIOD_S
+            self._outlet.put(self._screen.refresh, self._view(processes))
 
     def stopping(self) -> None:
-        self._screen.ending = True
+        """The end begins."""
+        self._ending = True
+        self._next_view_s = 0.0
+
+    def _view(self, processes: Sequence[ManagedProcess]) -> View:
+        health = self._health
+        if health is None:
+            return View(tuple(_row(process, None, []) for process in processes), looked=False, ending=self._ending)
+        faults = health.topic_faults()
+        self._address = self._address or health.console_address()
+        if not self._ending:
+            down = {p.spec.label: p.state.value for p in processes if p.state in (State.FAILED, State.WAITING)}
+            health.publish(down, faults)
+        return View(
+            rows=tuple(_row(process, health, faults) for process in processes),
+            missing=tuple(health.nodes_missing()),
+            waiting=tuple(health.waiting_for()),
+            address=self._address,
+            faults=tuple(f"{fault.topic} of {fault.label}: {fault.words}" for fault in faults),
+            ending=self._ending,
+        )
 
     def close(self) -> None:
-        if self._screen.health is not None:
-            self._screen.health.close()
+        """Shows what is left and takes the table away."""
+        self._outlet.put(self._screen.stop, always=True)
+        if not self._outlet.close(timeout_s=3.0):
+            # The terminal takes nothing (Ctrl-S): its thread holds standard output, and the interpreter would wait for
+            # it for ever. The nodes have ended, the logs are written.
+            os._exit(1)
+
+
+def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequence[TopicFault]) -> Row:
+    label, starts = process.spec.label, process.limit.retries
+    if process.state is not State.RUNNING:
+        return Row(label, process.state.value, starts=starts, text=process.reason)
+    if process.ending:
+        return Row(label, "stopping", starts=starts, text=process.reason)
+    if not process.spec.heartbeat:
+        return Row(label, "running", starts=starts)
+    health = monitor.nodes.get(label) if monitor is not None else None
+    if health is None or health.pid != process.pid:
+        return Row(label, "starting", starts=starts)
+    own = {fault.topic: fault for fault in faults if fault.label == label}
+    state = "silent" if health.silent else health.state
+    if state == "running" and own:
+        state = "slow"
+    text = health.message or ", ".join(f"{f.topic.lstrip('/')} {f.words}" for f in own.values() if f.stopped)
+    sends = tuple(
+        (topic, rate_hz, topic not in own)
+        for topic, rate_hz in health.rates_hz.items()
+        if rate_hz > 0 and topic.rpartition("/")[2] not in _NOT_SHOWN
+    )
+    # Wrong ones first, then those with a known rate: what does not fit into the line matters least.
+    order = sorted(sends, key=lambda send: (send[2], nominal_rate(send[0], process.spec.namespace) is None))
+    return Row(label, state, health.cpu_percent, health.rss_mb, starts, text, tuple(order))

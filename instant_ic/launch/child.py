@@ -20,7 +20,7 @@ def _start() -> None:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
     if os.getppid() != launcher:  # it died before the line above
         raise SystemExit(1)
-    os.execv(program[0], program)
+    os.execvp(program[0], program)
 
 
 if __name__ == "__main__":

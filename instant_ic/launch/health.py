@@ -1,4 +1,4 @@
-"""What the nodes tell of themselves, as the launcher shows it: heartbeats, and what the stack still waits for."""
+"""What the nodes tell of themselves, as the launcher sees it: heartbeats, topic rates, what is still waited for."""
 
 from __future__ import annotations
 
@@ -10,15 +10,22 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bus import RELIABLE, registry
+from instant_ic.bus.node import ERROR, OK, WARN
 from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.launch.description import NodeSpec
-from instant_ic.msg import deserialize
+from instant_ic.launch.topics import nominal_rate
+from instant_ic.msg import deserialize, header, message_type, serialize
 
 SILENT_AFTER_S = 3.0
 """A node without a heartbeat for longer than this is shown as silent."""
 
+FAULT_HOLDS_S = 3.0
+"""A wrong rate counts once it has been wrong for this long."""
+
 _STATES = ("starting", "running", "degraded", "failed", "stopping")
+_UP = ("running", "degraded")
 _VSPACE_READY = 2
+_DIAGNOSTICS_S = 1.0
 
 MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("camera", "theta_camera", "/camera/image/compressed"),
@@ -41,6 +48,8 @@ class NodeHealth:
         rss_mb: resident memory.
         rates_hz: topic → messages a second that it sends.
         seen_s: monotonic time when it came.
+        pid: process that sent it.
+        ages_s: topic → seconds since the newest message; inf before the first.
     """
 
     state: str
@@ -49,6 +58,8 @@ class NodeHealth:
     rss_mb: float
     rates_hz: dict[str, float] = field(default_factory=dict)
     seen_s: float = 0.0
+    pid: int = 0
+    ages_s: dict[str, float] = field(default_factory=dict)
 
     @property
     def silent(self) -> bool:
@@ -56,79 +67,180 @@ class NodeHealth:
         return time.monotonic() - self.seen_s > SILENT_AFTER_S
 
 
+@dataclass(frozen=True)
+class TopicFault:
+    """A topic that does not flow as it should."""
+
+    label: str
+    """Node that sends it."""
+    topic: str
+    words: str
+    stopped: bool
+
+
 class HealthMonitor:
     """Listens to ``/heartbeat`` (and ``/vspace/status`` where a ``nerf`` runs) without a node of its own.
 
     Args:
         nodes: the nodes of the stack.
-        run_dir: prepared run directory.
+        run_dir: prepared run directory; those of groups lie in it, prepared too.
     """
 
     def __init__(self, nodes: Sequence[NodeSpec], run_dir: Path) -> None:
         self.nodes: dict[str, NodeHealth] = {}
-        self._specs = list(nodes)
+        """By label."""
+        self._specs = [spec for spec in nodes if spec.heartbeat]
         self._run_dir = run_dir
-        self._transport = ZmqTransport(run_dir, f"launch_{os.getpid()}", time.time_ns)
-        status = "instant_ic_msgs/msg/NodeStatus"
-        prefixes = sorted({f"/{spec.namespace.strip('/')}" if spec.namespace else "" for spec in nodes})
-        self._beats = [
-            self._transport.subscribe(f"{prefix}/heartbeat", status, RELIABLE, lambda: None) for prefix in prefixes
-        ]
+        groups = {spec.group: spec.run_dir or run_dir for spec in nodes} | {"": run_dir}
+        name = f"launch_{os.getpid()}"
+        self._transports = {group: ZmqTransport(folder, name, time.time_ns) for group, folder in groups.items()}
+        self._folders = groups
+        self._beats = [(spec_group, beat) for spec_group, beat in self._subscribe_beats()]
         self._vspace = [
-            self._transport.subscribe("/vspace/status", "instant_ic_msgs/msg/VspaceStatus", RELIABLE, lambda: None)
-            for spec in nodes
+            (
+                _labelled(spec, "v-space"),
+                self._transports[spec.group].subscribe(
+                    "/vspace/status", "instant_ic_msgs/msg/VspaceStatus", RELIABLE, lambda: None
+                ),
+            )
+            for spec in self._specs
             if spec.exec == "nerf" and not spec.namespace
         ]
+        array = "diagnostic_msgs/msg/DiagnosticArray"
+        self._diagnostics = {
+            group: transport.advertise("/diagnostics", array, RELIABLE) for group, transport in self._transports.items()
+        }
+        self._next_diagnostics_s = 0.0
         self._reached: set[str] = set()
+        self._flowed: set[tuple[str, str]] = set()
+        self._wrong_since: dict[tuple[str, str], float] = {}
+
+    def _subscribe_beats(self) -> Iterable[tuple[str, Any]]:
+        status = "instant_ic_msgs/msg/NodeStatus"
+        for group, namespace in sorted({(spec.group, spec.namespace.strip("/")) for spec in self._specs}):
+            topic = f"/{namespace}/heartbeat" if namespace else "/heartbeat"
+            yield group, self._transports[group].subscribe(topic, status, RELIABLE, lambda: None)
 
     def poll(self) -> None:
         """Takes in what has come; never waits."""
-        for subscription in self._beats:
+        for group, subscription in self._beats:
             for received in subscription.take():
-                self._take(deserialize(received.payload, received.type_name))
-        for subscription in self._vspace:
+                self._take(deserialize(received.payload, received.type_name), group)
+        for label, subscription in self._vspace:
             for received in subscription.take():
                 if deserialize(received.payload, received.type_name).state == _VSPACE_READY:
-                    self._reached.add("v-space")
-        for label, program, topic in MILESTONES:
-            for spec in self._specs:
-                health = self.nodes.get(spec.name)
-                if spec.exec == program and health is not None and health.rates_hz.get(topic, 0.0) > 0:
                     self._reached.add(label)
+        for word, program, topic in MILESTONES:
+            for spec in self._specs:
+                health = self.nodes.get(spec.label)
+                if spec.exec == program and health is not None and health.rates_hz.get(topic, 0.0) > 0:
+                    self._reached.add(_labelled(spec, word))
 
-    def _take(self, message: Any) -> None:
-        outputs = zip(message.outputs, message.output_rates_hz, strict=False)
+    def _take(self, message: Any, group: str) -> None:
         state = _STATES[message.state] if message.state < len(_STATES) else "unknown"
-        self.nodes[message.node] = NodeHealth(
+        label = f"{group}/{message.node}" if group else message.node
+        outputs = list(message.outputs)
+        self.nodes[label] = NodeHealth(
             state,
             message.message,
             float(message.cpu_percent),
             float(message.rss_mb),
-            {topic: float(rate) for topic, rate in outputs},
+            dict(zip(outputs, map(float, message.output_rates_hz), strict=False)),
             time.monotonic(),
+            int(message.pid),
+            dict(zip(outputs, map(float, message.output_ages_s), strict=False)),
         )
+
+    def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
+        """Monotonic time of the newest heartbeat in which this process said that it runs; None before the first."""
+        health = self.nodes.get(spec.label)
+        return health.seen_s if health is not None and health.pid == pid and health.state in _UP else None
 
     def nodes_missing(self) -> list[str]:
         """Nodes that have not said yet that they run."""
-        up = ("running", "degraded")
-        return [s.name for s in self._specs if s.name not in self.nodes or self.nodes[s.name].state not in up]
+        return [s.label for s in self._specs if s.label not in self.nodes or self.nodes[s.label].state not in _UP]
 
     def waiting_for(self) -> list[str]:
         """What of ``MILESTONES`` (and the v-space) has not been reached, of the nodes in this stack."""
-        programs = {spec.exec for spec in self._specs}
-        wanted = [label for label, program, _ in MILESTONES if program in programs]
-        return [label for label in [*wanted, *["v-space"] * len(self._vspace)] if label not in self._reached]
+        wanted = [
+            _labelled(spec, word) for word, program, _ in MILESTONES for spec in self._specs if spec.exec == program
+        ]
+        return [label for label in [*wanted, *(label for label, _ in self._vspace)] if label not in self._reached]
+
+    def topic_faults(self) -> list[TopicFault]:
+        """Topics that have flowed once and now have stopped or are too slow (config/topics.yaml), for a while already.
+
+        One that never came is what :meth:`waiting_for` and the node's own diagnoses are for.
+        """
+        now_s = time.monotonic()
+        faults: list[TopicFault] = []
+        for spec in self._specs:
+            health = self.nodes.get(spec.label)
+            if health is None or health.silent or health.state not in _UP:
+                continue
+            for topic, rate_hz in health.rates_hz.items():
+                expected = nominal_rate(topic, spec.namespace)
+                if expected is None:
+                    continue
+                key, age_s = (spec.label, topic), health.ages_s.get(topic, float("inf"))
+                words = expected.fault(rate_hz, age_s)
+                if not words:
+                    self._flowed.add(key)
+                    self._wrong_since.pop(key, None)
+                elif key in self._flowed and now_s - self._wrong_since.setdefault(key, now_s) > FAULT_HOLDS_S:
+                    faults.append(TopicFault(spec.label, topic, words, not expected.alive(age_s)))
+        return faults
+
+    def publish(self, down: dict[str, str], faults: Sequence[TopicFault]) -> None:
+        """Sends ``/diagnostics`` once a second.
+
+        Args:
+            down: label → words, of the nodes that should run and do not.
+            faults: see :meth:`topic_faults`.
+        """
+        now_s = time.monotonic()
+        if now_s < self._next_diagnostics_s:
+            return
+        self._next_diagnostics_s = now_s + _DIAGNOSTICS_S
+        for group, publisher in self._diagnostics.items():
+            labels = {spec.label: spec.name for spec in self._specs if spec.group == group}
+            entries = [(ERROR, labels[label], words) for label, words in down.items() if label in labels]
+            entries += [
+                (WARN if f.stopped else OK, f"{labels[f.label]} {f.topic}", f.words)
+                for f in faults
+                if f.label in labels
+            ]
+            publisher.send(serialize(_diagnostic_array(entries)))
 
     def console_address(self) -> str | None:
         """Address of the operator's page once a node of the console says that it runs."""
-        names = {spec.name for spec in self._specs if spec.exec == "console"}
-        if not any(name in self.nodes and self.nodes[name].state == "running" for name in names):
-            return None
-        return find_console(registry.list_nodes(self._run_dir), names)
+        for spec in self._specs:
+            health = self.nodes.get(spec.label)
+            if spec.exec != "console" or health is None or health.state != "running":
+                continue
+            if address := find_console(registry.list_nodes(self._folders[spec.group]), [spec.name]):
+                return address
+        return None
 
     def close(self) -> None:
         """Lets go of the bus."""
-        self._transport.close()
+        for transport in self._transports.values():
+            transport.close()
+
+
+def _labelled(spec: NodeSpec, word: str) -> str:
+    return f"{spec.group}/{word}" if spec.group else word
+
+
+def _diagnostic_array(entries: Sequence[tuple[int, str, str]]) -> Any:
+    status = message_type("DiagnosticStatus")
+    return message_type("DiagnosticArray")(
+        header=header("", time.time_ns()),
+        status=[
+            status(level=level, name=f"launch: {name}", message=words, hardware_id="", values=[])
+            for level, name, words in entries
+        ],
+    )
 
 
 def find_console(infos: Iterable[registry.NodeInfo], names: Iterable[str]) -> str | None:

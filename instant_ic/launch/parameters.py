@@ -13,8 +13,8 @@ def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
     Programs given by path (``exec: my_node.py``) are not looked into.
     """
     from instant_ic.bag.replay import ReplayError, find_node_class
-    from instant_ic.bus.process import argument_parser, load_config, parse_remaps
     from instant_ic.bus.params import ParameterError
+    from instant_ic.bus.process import argument_parser, load_config, parse_remaps
 
     problems: list[str] = []
     for spec in nodes:

@@ -4,20 +4,71 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.rule import Rule
 from rich.table import Table
 from rich.text import Text
 
-from instant_ic.launch.process import ManagedProcess, State
-
-if TYPE_CHECKING:
-    from instant_ic.launch.health import HealthMonitor, NodeHealth
-
 _COLOURS = ("cyan", "green", "magenta", "yellow", "blue", "bright_cyan", "bright_green", "bright_magenta")
-_STATE_COLOURS = {"running": "green", "starting": "yellow", "degraded": "yellow"}
+_STATE_STYLES = {
+    "running": ("●", "green"),
+    "starting": ("◌", "yellow"),
+    "waiting to start": ("◌", "yellow"),
+    "degraded": ("●", "yellow"),
+    "slow": ("●", "yellow"),
+    "stopping": ("◌", "dim"),
+    "ended": ("○", "dim"),
+}
+_BAD_STYLE = ("●", "bold red")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A node in the table.
+
+    Attributes:
+        label: its name.
+        state: in one or two words.
+        cpu_percent: of one core; None where nothing is known.
+        rss_mb: resident memory; None likewise.
+        starts: how often it has been started again.
+        text: its worst diagnosis, or what is wrong with its topics; empty when all is well.
+        sends: topic and rate for each topic that flows, with whether the rate is right.
+    """
+
+    label: str
+    state: str
+    cpu_percent: float | None = None
+    rss_mb: float | None = None
+    starts: int = 0
+    text: str = ""
+    sends: tuple[tuple[str, float, bool], ...] = ()
+
+
+@dataclass(frozen=True)
+class View:
+    """How a stack is at one time.
+
+    Attributes:
+        rows: its processes, in the order of the launch file.
+        missing: nodes that have not said yet that they run.
+        waiting: what an operator still waits for (camera, map, ...).
+        address: of the operator's page; None until it is there.
+        faults: topics that do not flow as they should, in words.
+        looked: whether the nodes' heartbeats are heard already.
+        ending: whether the stack is being stopped; then nothing is waited for any more.
+    """
+
+    rows: tuple[Row, ...] = ()
+    missing: tuple[str, ...] = ()
+    waiting: tuple[str, ...] = ()
+    address: str | None = None
+    faults: tuple[str, ...] = field(default=())
+    looked: bool = True
+    ending: bool = False
 
 
 class Screen:
@@ -44,105 +95,129 @@ class Screen:
         self._progress_period_s = progress_period_s
         self._started_s = time.monotonic()
         self._next_progress_s = self._started_s + progress_period_s
-        self._next_table_s = 0.0
         self._told_nodes = self._told_ready = False
         self._address: str | None = None
-        self.health: HealthMonitor | None = None
-        self.ending = False
-        """Set once the stack is being stopped: then nothing is waited for any more."""
+        self._told_faults: tuple[str, ...] = ()
 
     def __enter__(self) -> Screen:
         """Shows the table."""
-        if self._live is not None:
-            self._live.start()
+        self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Takes the table away."""
+        self.stop()
+
+    def start(self) -> None:
+        """Shows the table."""
+        if self._live is not None:
+            self._live.start()
+
+    def stop(self) -> None:
         """Takes the table away."""
         if self._live is not None:
             self._live.stop()
 
     def node_line(self, node: str, text: str) -> None:
         """A line that a node has written."""
-        line = Text(f"{node:>{self._width}} | ", style=self._colours.get(node, "white"))
+        line = Text(f"{node:>{self._width}} │ ", style=self._colours.get(node, "white"))
         self._console.print(line + Text.from_ansi(text))
 
     def event(self, text: str, bad: bool = False) -> None:
         """Something that the supervisor has done or seen."""
-        self._console.print(Text(f"{'launch':>{self._width}} | {text}", style="bold red" if bad else "bold"))
+        self._console.print(Text(f"{'launch':>{self._width}} │ {text}", style="bold red" if bad else "bold"))
 
-    def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Looks at the heartbeats; updates the table twice a second."""
+    def refresh(self, view: View) -> None:
+        """Tells what is new since the last view, and draws the table again."""
         now = time.monotonic()
-        if self.health is not None and not self.ending:
-            self.health.poll()
-            self._tell_progress(self.health, now)
-        if self._live is not None and now >= self._next_table_s:
-            self._next_table_s = now + 0.5
-            self._live.update(Group(self._table(processes), Text(self._footer())), refresh=True)
+        if view.looked and not view.ending:
+            self._tell_progress(view, now)
+        if self._live is not None:
+            self._live.update(self.table(view), refresh=True)
 
-    def _tell_progress(self, health: HealthMonitor, now: float) -> None:
-        missing = health.nodes_missing()
-        if not missing and not self._told_nodes:
+    def _tell_progress(self, view: View, now: float) -> None:
+        if not view.missing and not self._told_nodes:
             self._told_nodes = True
             self.event(f"all {len(self._colours)} nodes are up after {now - self._started_s:.1f} s")
-        if self._address is None and (address := health.console_address()):
-            self._address = address
-            self.event(f"console: {address}")
-        waiting = health.waiting_for()
-        if self._told_nodes and not waiting and not self._told_ready:
+        if self._address is None and view.address:
+            self._address = view.address
+            self.event(f"console: {view.address}")
+        if self._told_nodes and not view.waiting and not self._told_ready:
             self._told_ready = True
             at = f": {self._address}" if self._address else ""
             self.event(f"ready after {now - self._started_s:.1f} s{at}")
-        if self._live is None and not self._told_ready and now >= self._next_progress_s:
+        if self._live is not None:
+            return  # the table shows the rest
+        if now >= self._next_progress_s:
             self._next_progress_s = now + self._progress_period_s
-            self.event(f"waiting for {', '.join(missing or waiting)}")
+            if not self._told_ready:
+                self.event(f"waiting for {', '.join(view.missing or view.waiting)}")
+            self._tell_faults(view.faults)
 
-    def _footer(self) -> str:
-        if self.health is None:
-            return "starting"
-        if self.ending:
-            return "stopping"
-        waiting = self.health.nodes_missing() or self.health.waiting_for()
-        words = [f"waiting for {', '.join(waiting)}" if waiting else "ready"]
-        if self._address:
-            words.insert(0, self._address)
-        return " · ".join([*words, f"{time.monotonic() - self._started_s:.0f} s", "Ctrl-C ends everything"])
+    def _tell_faults(self, faults: tuple[str, ...]) -> None:
+        """A topic is told when it becomes wrong and when it is right again; the numbers in between change nothing."""
+        before = {fault.partition(":")[0] for fault in self._told_faults}
+        now = {fault.partition(":")[0] for fault in faults}
+        for fault in faults:
+            if fault.partition(":")[0] not in before:
+                self.event(fault, bad=True)
+        for topic in sorted(before - now):
+            self.event(f"{topic} flows as it should again")
+        self._told_faults = faults
 
-    def _table(self, processes: Sequence[ManagedProcess]) -> Table:
-        table = Table(box=None, pad_edge=False, expand=False)
+    def table(self, view: View) -> RenderableType:
+        """The nodes, and a line below them."""
+        table = Table(box=None, pad_edge=False, expand=False, header_style="dim")
         # Least widths, or a long message in the last column would squeeze the others away.
         for name, justify, width in (
             ("node", "left", self._width),
-            ("state", "left", 8),
+            ("state", "left", 10),
             ("CPU %", "right", 5),
             ("MB", "right", 5),
         ):
             table.add_column(name, justify=justify, no_wrap=True, min_width=width)  # type: ignore[arg-type]
         table.add_column("sends, Hz", no_wrap=True, overflow="ellipsis")
-        for process in processes:
-            health = self.health.nodes.get(process.spec.name) if self.health is not None else None
-            table.add_row(*_row(process, health))
-        return table
+        for row in view.rows:
+            table.add_row(*self._cells(row))
+        return Group(Rule(style="dim"), table, self._footer(view))
+
+    def _cells(self, row: Row) -> tuple[Text, ...]:
+        sign, style = _STATE_STYLES.get(row.state, _BAD_STYLE)
+        state = Text(f"{sign} {row.state}", style=style)
+        if row.starts:
+            state.append(f" ↻{row.starts}", style="yellow")
+        last = Text()
+        if row.text:
+            last.append(row.text, style="yellow" if row.state in _STATE_STYLES else "red")
+        for topic, rate_hz, right in row.sends:
+            last.append("  " if last else "")
+            last.append(f"{topic.lstrip('/')} ", style="dim")
+            last.append(f"{rate_hz:.1f}", style="" if right else "yellow")
+        return (
+            Text(row.label, style=self._colours.get(row.label, "white")),
+            state,
+            Text("" if row.cpu_percent is None else f"{row.cpu_percent:.0f}"),
+            Text("" if row.rss_mb is None else f"{row.rss_mb:.0f}"),
+            last,
+        )
+
+    def _footer(self, view: View) -> Text:
+        words = Text(overflow="ellipsis", no_wrap=True)
+        if view.ending:
+            return words.append("stopping", style="bold yellow")
+        waiting = view.missing or view.waiting
+        if not view.looked:
+            words.append("starting", style="yellow")
+        elif waiting:
+            words.append(f"waiting for {', '.join(waiting)}", style="yellow")
+        else:
+            words.append("ready", style="bold green")
+        if self._address:
+            words.append(" · ").append(self._address, style="bold underline")
+        words.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C ends everything", style="dim")
+        return words
 
 
-def _row(process: ManagedProcess, health: NodeHealth | None) -> tuple[Text | str, ...]:
-    name = process.spec.name
-    if process.state is not State.RUNNING:
-        colour = "dim" if process.state is State.ENDED else "red"
-        return (name, Text(process.state.value, style=colour), "", "", "")
-    if health is None:
-        return (name, Text("starting", style="yellow"), "", "", "")
-    state = "silent" if health.silent else health.state
-    sends = " ".join(
-        f"{topic.lstrip('/')} {rate:.1f}"
-        for topic, rate in health.rates_hz.items()
-        if rate > 0 and topic not in ("/heartbeat", "/diagnostics", "/rosout")
-    )
-    return (
-        name,
-        Text(state, style=_STATE_COLOURS.get(state, "red")),
-        f"{health.cpu_percent:.0f}",
-        f"{health.rss_mb:.0f}",
-        health.message or sends,
-    )
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

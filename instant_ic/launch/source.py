@@ -51,6 +51,11 @@ class Value:
         """Line in the file, from 1."""
         return int(self.node.start_mark.line) + 1
 
+    @property
+    def place(self) -> str:
+        """``file:line``."""
+        return f"{_shorten(self.file)}:{self.line}"
+
     def problem(self, text: str) -> None:
         """Notes a mistake at this line."""
         self.problems.append(Problem(self.file, self.line, text))

@@ -1,14 +1,17 @@
 """``$(var x)``, ``$(env X default)``, ``$(config file.yaml)`` and the like in launch files.
 
-Nothing is ever executed: ``$(eval ...)`` knows ``==``, ``!=``, ``and``, ``or``, ``not`` and parentheses, and a nested
+Nothing is ever executed: ``$(eval ...)`` knows comparisons, ``and``, ``or``, ``not`` and parentheses, and a nested
 substitution is one operand of it, whatever its value looks like.
 """
 
 from __future__ import annotations
 
+import itertools
+import operator
 import os
 import re
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,8 +20,25 @@ from instant_ic import paths
 TRUE_WORDS = ("true", "1")
 FALSE_WORDS = ("false", "0", "")
 
-_TOKEN = re.compile(r"\s*(?:(==|!=|\(|\))|'([^']*)'|\"([^\"]*)\"|([^\s()=!'\"]+))")
+_TOKEN = re.compile(r"\s*(?:(==|!=|<=|>=|<|>|\(|\))|'([^']*)'|\"([^\"]*)\"|([^\s()=!<>'\"]+))")
 _VARIABLE = re.compile(r"\w+")
+_ORDER: dict[str, Callable[[float, float], bool]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_KNOWN = (
+    "var, env, config, launch-file, dirname, filename, run-dir, find-pkg-share, find-exec, anon, eval, equals, "
+    "not-equals, not, and, or, if"
+)
+_NOT_HERE = {
+    "command": "nothing is executed while a launch file is read",
+    "find-pkg-prefix": "$(find-pkg-share instant_ic) is the folder that holds launch/ and config/",
+    "exec-in-pkg": "give the program's path, or $(find-exec NAME)",
+    "optenv": "use $(env NAME default)",
+}
+_anonymous = itertools.count(1)
 
 
 class SubstitutionError(ValueError):
@@ -39,11 +59,11 @@ class Context:
     launch_file: Path
     run_dir: Path
     variables: dict[str, str] = field(default_factory=dict)
-    environment: Mapping[str, str] = field(default_factory=lambda: dict(os.environ))
+    environment: dict[str, str] = field(default_factory=lambda: dict(os.environ))
 
     def child(self) -> Context:
-        """A copy whose variables can change without changing these (a group's scope)."""
-        return Context(self.launch_file, self.run_dir, dict(self.variables), self.environment)
+        """A copy whose variables and environment can change without changing these (a group's scope)."""
+        return Context(self.launch_file, self.run_dir, dict(self.variables), dict(self.environment))
 
 
 def substitute(text: str, context: Context) -> str:
@@ -98,17 +118,17 @@ def _matching_parenthesis(text: str, position: int) -> int:
 def _evaluate(body: str, context: Context) -> str:
     name, _, rest = body.strip().partition(" ")
     if name == "eval":
-        return "true" if _Expression(rest, context).value() else "false"
-    words = substitute(rest, context).split()
+        return _word(_Expression(_unwrapped(rest.strip()), context).value())
+    words = _arguments(rest, context)
 
-    def one_word(what: str) -> str:
-        if len(words) != 1:
-            raise SubstitutionError(f"$({name} ...) takes one {what}, got {rest.strip()!r}")
-        return words[0]
+    def exactly(count: int, what: str) -> list[str]:
+        if len(words) != count:
+            raise SubstitutionError(f"$({name} ...) takes {what}, got {rest.strip()!r}")
+        return words
 
     match name:
         case "var":
-            variable = one_word("name")
+            [variable] = exactly(1, "one name")
             if variable not in context.variables:
                 have = ", ".join(sorted(context.variables)) or "none"
                 raise SubstitutionError(f"unknown variable {variable!r} (in scope: {have})")
@@ -122,15 +142,88 @@ def _evaluate(body: str, context: Context) -> str:
                 raise SubstitutionError(f"environment variable {words[0]} is not set and has no default")
             return " ".join(words[1:])
         case "config":
-            return str(_file_in("config", one_word("file name")))
+            return str(_file_in("config", exactly(1, "one file name")[0]))
         case "launch-file":
             return str(_file_in("launch", words[0])) if words else str(context.launch_file)
+        case "filename":
+            return str(context.launch_file)
         case "dirname":
             return str(context.launch_file.parent)
         case "run-dir":
             return str(context.run_dir)
-    known = "var, env, config, launch-file, dirname, run-dir, eval"
-    raise SubstitutionError(f"unknown substitution $({name} ...); there are {known}")
+        case "find-pkg-share":
+            [package] = exactly(1, "one package")
+            if package != "instant_ic":
+                raise SubstitutionError(f"package {package!r}: only instant_ic has a share folder here")
+            return str(paths.share_dir("launch").parent)
+        case "find-exec":
+            [program] = exactly(1, "one program")
+            found = shutil.which(program, path=context.environment.get("PATH"))
+            if found is None:
+                raise SubstitutionError(f"program {program!r} is not in PATH")
+            return found
+        case "anon":
+            [stem] = exactly(1, "one name")
+            return f"{stem}_{os.getpid()}_{next(_anonymous)}"
+        case "equals" | "not-equals":
+            left, right = exactly(2, "two values")
+            return _word((left == right) == (name == "equals"))
+        case "not":
+            return _word(not truth(exactly(1, "one truth value")[0]))
+        case "and" | "or":
+            one, other = map(truth, exactly(2, "two truth values"))
+            return _word(one and other if name == "and" else one or other)
+        case "if":
+            if len(words) not in (2, 3):
+                raise SubstitutionError(f"$(if CONDITION THEN ELSE) takes two or three values, got {rest.strip()!r}")
+            return words[1] if truth(words[0]) else "".join(words[2:])
+    if name in _NOT_HERE:
+        raise SubstitutionError(f"$({name} ...) is ROS 2's, but not here: {_NOT_HERE[name]}")
+    raise SubstitutionError(f"unknown substitution $({name} ...); there are {_KNOWN}")
+
+
+def _word(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _arguments(text: str, context: Context) -> list[str]:
+    """The words of a substitution; quotes hold one together, and a nested substitution is never split."""
+    words: list[str] = []
+    current: str | None = None
+    quote = ""
+    position = 0
+    while position < len(text):
+        letter = text[position]
+        if text.startswith("$(", position):
+            end = _matching_parenthesis(text, position + 2)
+            current = (current or "") + _evaluate(text[position + 2 : end], context)
+            position = end
+        elif quote:
+            if letter == quote:
+                quote = ""
+            else:
+                current = (current or "") + letter
+        elif letter in "'\"" and current is None:
+            quote, current = letter, ""
+        elif letter.isspace():
+            words += [current] if current is not None else []
+            current = None
+        else:
+            current = (current or "") + letter
+        position += 1
+    if quote:
+        raise SubstitutionError(f"unclosed {quote} in {text.strip()!r}")
+    return words + ([current] if current is not None else [])
+
+
+def _unwrapped(text: str) -> str:
+    """ROS 2 puts the whole expression of an ``eval`` into quotes: what is inside; other text as it is."""
+    for quote in "'\"":
+        inside = text[1:-1]
+        if len(text) > 1 and text[0] == text[-1] == quote and quote not in inside.replace(f"\\{quote}", ""):
+            # A single word in quotes is an operand here too, so nothing is lost by looking inside.
+            return inside.replace(f"\\{quote}", quote)
+    return text
 
 
 def _file_in(folder: str, name: str) -> Path:
@@ -217,7 +310,16 @@ class _Expression:
             return left == self._operand()
         if self._take("!="):
             return left != self._operand()
+        for symbol, holds in _ORDER.items():
+            if self._take(symbol):
+                return holds(self._number(left), self._number(self._operand()))
         return truth(left)
+
+    def _number(self, text: str) -> float:
+        try:
+            return float(text)
+        except ValueError:
+            raise SubstitutionError(f"$(eval {self.text}): {text!r} is not a number") from None
 
     def _operand(self) -> str:
         if self.position < len(self.tokens) and self.tokens[self.position][0] == "operand":

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
+import os
 import selectors
 import signal
+import subprocess
+import sys
 import threading
 import time
+import uuid
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Protocol
 
-from instant_ic.launch.description import NodeSpec
-from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, RespawnLimit, State, describe_exit
+from instant_ic.launch.description import Announcement, NodeSpec, Shutdown
+from instant_ic.launch.outlet import Outlet
+from instant_ic.launch.process import USAGE_STATUS, ManagedProcess, RespawnLimit, Schedule, State, describe_exit
+from instant_ic.launch.reaper import kill_marked
 
-STOP_SCHEDULE: tuple[tuple[signal.Signals, float], ...] = (
+STOP_SCHEDULE: Schedule = (
     (signal.SIGINT, 2.5),
     (signal.SIGTERM, 1.2),
     (signal.SIGKILL, 1.0),
 )
 """What is sent to the process groups at the end, and the longest wait after each; under 5 s in all."""
+
+HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
+"""What a node that hangs is sent: first what makes it write the stack of every thread, then what ends it."""
+
+BUSY_FACTOR = 6.0
+"""A node without heartbeat that computes (a compiler at its first picture) is given this many times longer."""
+
+_BUSY_SHARE = 0.5  # of one core
+_LOG_BYTES = 32 << 20  # what may wait for the disk
+_REAPER = Path(__file__).with_name("reaper.py")
 
 
 class Output(Protocol):
@@ -39,8 +56,50 @@ class Output(Protocol):
         """Called once, when the end begins."""
 
 
+class Health(Protocol):
+    """What the nodes tell of themselves."""
+
+    def poll(self) -> None:
+        """Takes in what has come; never waits."""
+
+    def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
+        """Monotonic time of the newest heartbeat in which this process said that it runs; None before the first."""
+
+    def close(self) -> None:
+        """Lets go of the bus."""
+
+
+class _Silence:
+    """How long a process has gone without a heartbeat, by the time that the launcher has looked."""
+
+    def __init__(self) -> None:
+        self.beat_s: float | None = None
+        self.lasts_s = 0.0
+        self.told = False
+        self._cpu_s = 0.0
+
+    def look(self, beat_s: float | None, pid: int, since_last_look_s: float) -> None:
+        """Takes note of the newest heartbeat."""
+        if beat_s is None or beat_s != self.beat_s:
+            self.beat_s, self.lasts_s, self.told = beat_s, 0.0, False
+            self._cpu_s = 0.0
+            return
+        if self.lasts_s == 0.0:
+            self._cpu_s = _cpu_s(pid)
+        # A launcher that was held up itself (stopped, swapped out) must not blame the nodes for it.
+        self.lasts_s += min(since_last_look_s, 0.5)
+
+    def busy(self, pid: int) -> bool:
+        """Whether it has used the CPU for most of the silence."""
+        return _cpu_s(pid) - self._cpu_s > _BUSY_SHARE * self.lasts_s
+
+
 class Supervisor:
-    """Runs a list of nodes as processes until they end, one that is required ends, or a stop is asked for.
+    """Brings the processes from what they are to what they should be, again and again, until the end.
+
+    Each round compares for every process whether it is wanted with whether it runs, and does the one next thing:
+    start it, send it the next signal of its end, find out that it hangs, or leave it alone. The order of starts does
+    not matter to the nodes.
 
     Args:
         nodes: what to start.
@@ -48,6 +107,9 @@ class Supervisor:
         output: where lines and events go.
         make_limit: the respawn limit of a node; for tests.
         stop_schedule: signals of the end and the wait after each.
+        make_health: called once all are started; None: nobody looks at heartbeats.
+        announcements: words to say at their time.
+        shutdown: when to end by itself.
     """
 
     def __init__(
@@ -55,16 +117,35 @@ class Supervisor:
         nodes: Sequence[NodeSpec],
         run_dir: Path,
         output: Output,
-        make_limit: Callable[[NodeSpec], RespawnLimit] = lambda spec: RespawnLimit(spec.respawn_delay_s),
-        stop_schedule: Sequence[tuple[signal.Signals, float]] = STOP_SCHEDULE,
+        make_limit: Callable[[NodeSpec], RespawnLimit] | None = None,
+        stop_schedule: Schedule = STOP_SCHEDULE,
+        make_health: Callable[[], Health] | None = None,
+        announcements: Sequence[Announcement] = (),
+        shutdown: Shutdown | None = None,
     ) -> None:
         self._stop_schedule = tuple(stop_schedule)
-        self.processes = [ManagedProcess(node, run_dir, make_limit(node)) for node in nodes]
         self._output = output
+        self._mark = uuid.uuid4().hex
+        self._disk = Outlet("log files", _LOG_BYTES)
+        self._told: deque[str] = deque()
+        """Words from the thread that writes the logs."""
+        self.processes = [
+            ManagedProcess(
+                node, run_dir, self._mark, self._disk, self._told.append, make_limit(node) if make_limit else None
+            )
+            for node in nodes
+        ]
+        self._make_health = make_health
+        self._health: Health | None = None
+        self._silences = {process: _Silence() for process in self.processes}
+        self._announcements = sorted(announcements, key=lambda announcement: announcement.delay_s)
+        self._shutdown = shutdown
         self._selector = selectors.DefaultSelector()
         self._stop = False
         self._hurry = False
         self._status = 0
+        self._start_s = 0.0
+        self._last_look_s = 0.0
 
     def request_stop(self, hurry: bool = False) -> None:
         """Asks for the end, from a signal handler or another thread; ``hurry`` goes straight to SIGKILL."""
@@ -79,10 +160,11 @@ class Supervisor:
             ended and one of them badly.
         """
         try:
-            with self._signals():
+            with self._reaper(), self._signals():
+                self._start_s = self._last_look_s = time.monotonic()
+                for process in self.processes:
+                    process.start_s = self._start_s + process.spec.start_delay_s
                 try:
-                    for process in self.processes:
-                        self._start(process)
                     while not self._stop:
                         self._step(0.1)
                         if all(process.state in (State.ENDED, State.FAILED) for process in self.processes):
@@ -95,7 +177,33 @@ class Supervisor:
             self._selector.close()
             for process in self.processes:
                 process.close()
+            if not self._disk.close():
+                self._output.event("the disk does not take the rest of the logs", bad=True)
+            self._tell()
+            if self._health is not None:
+                self._health.close()
         return self._status
+
+    @contextmanager
+    def _reaper(self) -> Iterator[None]:
+        """Somebody who kills what is left when this process is gone, even by SIGKILL."""
+        process = subprocess.Popen(
+            (sys.executable, "-I", "-S", str(_REAPER), self._mark),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+        try:
+            yield
+        finally:
+            try:
+                left, _ = process.communicate(timeout=5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                left, _ = process.communicate()
+                self._output.event("what the nodes have started could not be killed in 5 s", bad=True)
+            for line in left.decode(errors="replace").splitlines():
+                self._output.event(f"killed what a node had left behind: {line}", bad=True)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
@@ -115,38 +223,109 @@ class Supervisor:
             for signum, handler in before:
                 signal.signal(signum, handler)
 
-    def _start(self, process: ManagedProcess) -> None:
-        try:
-            process.start()
-        except OSError as error:
-            process.state, process.exit_status = State.FAILED, 127
-            self._output.event(f"{process.spec.name} cannot be started: {error}", bad=True)
-            self._after_end(process)
-            return
-        assert process.output is not None
-        self._selector.register(process.output, selectors.EVENT_READ, process)
+    # -- one round -------------------------------------------------------------------------------
 
     def _step(self, wait_s: float) -> None:
-        """Passes on what the nodes write, sees who has ended, starts who is due."""
+        """Passes on what the nodes write, then brings every process nearer to what it should be."""
+        flooded = False
         if self._selector.get_map():
             ready = self._selector.select(wait_s)
         else:
             time.sleep(wait_s)
             ready = []
         for key, _ in ready:
-            self._pass_on(key.data)
+            flooded |= self._pass_on(key.data)
+        if self._health is not None:
+            self._health.poll()
+        self._reconcile(time.monotonic())
+        if self._health is None and self._make_health is not None and not self._stop:
+            self._health = self._make_health()  # after the starts, so that no process waits for it
+        self._tell()
+        self._output.refresh(self.processes)
+        if flooded:
+            time.sleep(0.005)  # somebody writes without end: the CPU is for the others
+
+    def _reconcile(self, now_s: float) -> None:
+        since_s, self._last_look_s = now_s - self._last_look_s, now_s
+        sent: dict[signal.Signals, list[str]] = {}
         for process in self.processes:
             if process.has_ended():
                 self._reap(process)
-            elif process.state is State.WAITING and not self._stop and time.monotonic() >= process.start_again_s:
+            wanted = not self._stop and process.state in (State.WAITING, State.RUNNING) and now_s >= process.start_s
+            runs = process.state is State.RUNNING
+            if wanted and not runs:
                 self._start(process)
-        self._output.refresh(self.processes)
+            elif wanted and not process.ending:
+                self._judge(process, since_s)
+            elif not wanted and runs and not process.ending:
+                process.begin_end(self._schedule(process))
+            if runs and (signum := process.press_on(now_s)) is not None:
+                sent.setdefault(signum, []).append(process.spec.label)
+        for signum, names in sent.items():
+            if signum is not signal.SIGINT:
+                self._output.event(f"{signum.name} to {', '.join(names)}", bad=True)
+        self._keep_time(now_s - self._start_s)
 
-    def _pass_on(self, process: ManagedProcess) -> None:
-        for line in process.read_lines():
-            self._output.node_line(process.spec.name, line)
+    def _keep_time(self, since_start_s: float) -> None:
+        """What the launch file wants to be said, or the end that it wants."""
+        while self._announcements and self._announcements[0].delay_s <= since_start_s:
+            self._output.event(self._announcements.pop(0).text)
+        if self._shutdown is not None and since_start_s >= self._shutdown.delay_s and not self._stop:
+            self._output.event(f"the stack ends: {self._shutdown.reason}")
+            self._stop = True
+
+    def _schedule(self, process: ManagedProcess) -> Schedule:
+        if self._hurry:
+            return ((signal.SIGKILL, 1.0),)
+        own = {signal.SIGINT: process.spec.sigterm_timeout_s, signal.SIGTERM: process.spec.sigkill_timeout_s}
+        return [(signum, wait_s if (w := own.get(signum)) is None else w) for signum, wait_s in self._stop_schedule]
+
+    def _judge(self, process: ManagedProcess, since_s: float) -> None:
+        """Ends a process that has stopped sending heartbeats."""
+        if self._health is None or process.pid is None or not process.spec.heartbeat:
+            return
+        limit_s, silence = process.spec.hang_timeout_s, self._silences[process]
+        silence.look(self._health.beat_s(process.spec, process.pid), process.pid, since_s)
+        if silence.beat_s is None or limit_s <= 0 or silence.lasts_s < limit_s:
+            return
+        if _is_traced(process.pid):
+            return  # a debugger holds it
+        if silence.lasts_s < BUSY_FACTOR * limit_s and silence.busy(process.pid):
+            if not silence.told:
+                silence.told = True
+                words = f"no heartbeat for {silence.lasts_s:.0f} s, but it computes"
+                self._output.event(
+                    f"{process.spec.label}: {words}: ends at {BUSY_FACTOR * limit_s:.0f} s", bad=True
+                )
+            return
+        reason = f"hangs: no heartbeat for {silence.lasts_s:.0f} s"
+        self._output.event(f"{process.spec.label} {reason}; its stack goes to {process.log_path}", bad=True)
+        process.begin_end(HANG_SCHEDULE, reason)
+
+    def _start(self, process: ManagedProcess) -> None:
+        self._silences[process] = _Silence()
+        try:
+            process.start()
+        except OSError as error:
+            process.state, process.exit_status = State.FAILED, 127
+            self._output.event(f"{process.spec.label} cannot be started: {error}", bad=True)
+            self._after_end(process)
+            return
+        assert process.output is not None
+        self._selector.register(process.output, selectors.EVENT_READ, process)
+
+    def _tell(self) -> None:
+        while self._told:
+            self._output.event(self._told.popleft(), bad=True)
+
+    def _pass_on(self, process: ManagedProcess) -> bool:
+        """Hands on what a process has written; whether it was so much that the most was left out."""
+        for line in process.read_lines(time.monotonic()):
+            if process.spec.to_terminal:
+                self._output.node_line(process.spec.label, line)
         if process.output_closed:
             self._forget_output(process)
+        return process.flooding
 
     def _forget_output(self, process: ManagedProcess) -> None:
         watched = {key.fileobj for key in self._selector.get_map().values()}
@@ -156,16 +335,22 @@ class Supervisor:
     def _reap(self, process: ManagedProcess) -> None:
         self._forget_output(process)
         for line in process.reap():
-            self._output.node_line(process.spec.name, line)
-        if not self._stop:
-            self._after_end(process)
+            if process.spec.to_terminal:
+                self._output.node_line(process.spec.label, line)
+        if self._stop:
+            return
+        # Children that have left the process group for a session of their own would hold its devices and ports.
+        for pid, command in kill_marked(process.mark).items():
+            self._output.event(f"killed what {process.spec.label} had left behind: {pid} {command}", bad=True)
+        self._after_end(process)
 
     def _after_end(self, process: ManagedProcess) -> None:
-        """Starts a node again, ends the stack, or only says that the node has ended."""
+        """Starts a process again, ends the stack, or only says that it has ended."""
         spec, status = process.spec, process.exit_status or 0
-        what = f"{spec.name} ended ({describe_exit(status)})"
+        what = f"{spec.label} ended ({process.reason or describe_exit(status)})"
+        status = status or (1 if process.reason else 0)
         hint = f", see {process.log_path}" if status else ""
-        if status == USAGE_STATUS:
+        if status == USAGE_STATUS and spec.heartbeat:
             self._status = 1
             self._output.event(f"{what}: its parameters are wrong, so the stack ends{hint}", bad=True)
             self._stop = True
@@ -173,16 +358,12 @@ class Supervisor:
         if spec.respawn:
             delay_s = process.limit.next_delay_s(time.monotonic())
             if delay_s is not None:
-                process.state, process.start_again_s = State.WAITING, time.monotonic() + delay_s
+                process.state, process.start_s = State.WAITING, time.monotonic() + delay_s
                 used, most = process.limit.used, process.limit.max_starts
                 self._output.event(f"{what}; starts again in {delay_s:.1f} s ({used} of {most})", bad=True)
                 return
             process.state = State.FAILED
-            self._output.event(
-                f"{what}, {process.limit.max_starts} new starts within {process.limit.window_s:.0f} s did not "
-                f"help: given up{hint}",
-                bad=True,
-            )
+            self._output.event(f"{what}, {process.limit} did not help: given up{hint}", bad=True)
             status = status or 1
         if spec.required:
             self._status = 1 if status else 0
@@ -197,20 +378,33 @@ class Supervisor:
         running = [process for process in self.processes if process.state is State.RUNNING]
         if running:
             self._output.event(f"stopping {len(running)} node{'s' if len(running) > 1 else ''}")
-        for signum, wait_s in self._stop_schedule:
-            if self._hurry and signum is not signal.SIGKILL:
-                continue
-            left = [process for process in self.processes if process.state is State.RUNNING]
-            if not left:
+        hurried = self._hurry
+        while left := [process for process in self.processes if process.state is State.RUNNING]:
+            if self._hurry and not hurried:
+                hurried = True
+                for process in left:
+                    process.begin_end(self._schedule(process))
+            self._step(0.02)
+            if all(process.state is not State.RUNNING or process.out_of_means(time.monotonic()) for process in left):
+                stuck = [f"{p.spec.label} (pid {p.pid})" for p in left if p.state is State.RUNNING]
+                if stuck:
+                    self._output.event(f"not even SIGKILL ends {', '.join(stuck)}: it waits in the kernel", bad=True)
                 return
-            if signum is not signal.SIGINT:
-                names = ", ".join(process.spec.name for process in left)
-                self._output.event(f"{signum.name} to {names}", bad=True)
-            for process in left:
-                process.send(signum)
-            deadline_s = time.monotonic() + wait_s
-            hurried = self._hurry
-            while time.monotonic() < deadline_s and self._hurry == hurried:
-                self._step(0.02)
-                if all(process.state is not State.RUNNING for process in left):
-                    break
+
+
+def _cpu_s(pid: int) -> float:
+    """CPU time that a process has used, all its threads together; 0 when it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _is_traced(pid: int) -> bool:
+    """Whether a debugger holds a process."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+    return any(line.startswith("TracerPid:") and line.split()[1] != "0" for line in status.splitlines())

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from instant_ic.bus.params import parse_override
 from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
-from instant_ic.launch.description import _as_yaml
 from instant_ic.launch.substitutions import Context, SubstitutionError, substitute, truth
+from instant_ic.launch.values import as_yaml
 
 
 @pytest.fixture
@@ -259,7 +259,7 @@ def test_mistake(tmp_path: Path, program: Path, text: str, expected: str) -> Non
     )
 )
 def test_a_parameter_arrives_as_it_was_written(value: object) -> None:
-    word = f"key:={_as_yaml(value)}"
+    word = f"key:={as_yaml(value)}"
     assert "\n" not in word
     assert parse_override(word)[1].value == value
 

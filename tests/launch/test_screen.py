@@ -1,7 +1,6 @@
 import io
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,39 +8,12 @@ import pytest
 from rich.console import Console
 
 from instant_ic.bus import RELIABLE
-from instant_ic.bus.registry import NodeInfo
+from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.launch import NodeSpec
-from instant_ic.launch.health import HealthMonitor, NodeHealth, find_console
-from instant_ic.launch.process import State
-from instant_ic.launch.screen import Screen
+from instant_ic.launch.health import HealthMonitor, find_console
+from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.msg import NodeStatus, header, serialize
-
-
-class Health:
-    """What a monitor would say, set by hand."""
-
-    def __init__(self) -> None:
-        self.nodes: dict[str, NodeHealth] = {}
-        self.missing = ["slam", "page"]
-        self.waiting = ["map"]
-        self.address: str | None = None
-
-    def poll(self) -> None:
-        pass
-
-    def nodes_missing(self) -> list[str]:
-        return self.missing
-
-    def waiting_for(self) -> list[str]:
-        return self.waiting
-
-    def console_address(self) -> str | None:
-        return self.address
-
-
-def process(name: str, state: State = State.RUNNING) -> Any:
-    return SimpleNamespace(spec=SimpleNamespace(name=name), state=state)
 
 
 @pytest.fixture
@@ -55,42 +27,75 @@ def screen_on(out: io.StringIO, live: bool, period_s: float = 0.0) -> Screen:
 
 
 def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
-    health = Health()
     with screen_on(out, live=False) as screen:
-        screen.health = health  # type: ignore[assignment]
         screen.node_line("slam", "hello \x1b[31mred\x1b[0m")
-        screen.refresh([])
-        health.missing = []
-        screen.refresh([])
-        health.waiting, health.address = [], "http://127.0.0.1:8080"
-        screen.refresh([])
-        screen.refresh([])
-        screen.ending = True
-        health.waiting = ["map"]
-        screen.refresh([])
+        screen.refresh(View(looked=False, missing=("slam",)))  # nobody has listened yet: nothing to tell
+        screen.refresh(View(missing=("slam", "page"), waiting=("map",)))
+        screen.refresh(View(waiting=("map",)))
+        screen.refresh(View(address="http://127.0.0.1:8080"))
+        screen.refresh(View(address="http://127.0.0.1:8080"))
+        screen.refresh(View(waiting=("map",), ending=True))
     lines = out.getvalue().splitlines()
-    assert lines[0] == "  slam | hello red"
-    assert lines[1] == "launch | waiting for slam, page"
-    assert lines[2].startswith("launch | all 2 nodes are up after ")
-    assert lines[3] == "launch | waiting for map"
-    assert lines[4] == "launch | console: http://127.0.0.1:8080"
-    assert lines[5].startswith("launch | ready after ") and lines[5].endswith(": http://127.0.0.1:8080")
+    assert lines[0] == "  slam │ hello red"
+    assert lines[1] == "launch │ waiting for slam, page"
+    assert lines[2].startswith("launch │ all 2 nodes are up after ")
+    assert lines[3] == "launch │ waiting for map"
+    assert lines[4] == "launch │ console: http://127.0.0.1:8080"
+    assert lines[5].startswith("launch │ ready after ") and lines[5].endswith(": http://127.0.0.1:8080")
     assert len(lines) == 6  # said once, and nothing is waited for at the end
 
 
+def test_plain_lines_tell_a_degraded_topic_once_and_its_recovery(out: io.StringIO) -> None:
+    with screen_on(out, live=False) as screen:
+        screen.refresh(View())
+        screen.refresh(View(faults=("/pose of slam: 7.2 of 10 Hz",)))
+        screen.refresh(View(faults=("/pose of slam: 7.9 of 10 Hz",)))
+        screen.refresh(View())
+    assert out.getvalue().splitlines()[2:] == [
+        "launch │ /pose of slam: 7.2 of 10 Hz",
+        "launch │ /pose of slam flows as it should again",
+    ]
+
+
 def test_table_of_nodes(out: io.StringIO) -> None:
-    health = Health()
-    rates = {"/pose": 9.96, "/heartbeat": 2.0, "/map": 0.0}
-    health.nodes["slam"] = NodeHealth("running", "", 12.3, 99.6, rates, time.monotonic())
-    health.nodes["page"] = NodeHealth("running", "", 1.0, 10.0, {}, time.monotonic() - 60)
+    rows = (
+        Row("slam", "running", 12.3, 99.6, sends=(("/pose", 9.96, True),)),
+        Row("page", "silent", 1.0, 10.0, starts=2),
+        Row("gone", "failed", text="hangs: no heartbeat for 10 s"),
+        Row("new", "starting"),
+    )
     with screen_on(out, live=True) as screen:
-        screen.health = health  # type: ignore[assignment]
-        screen.refresh([process("slam"), process("page"), process("gone", State.FAILED), process("new")])
+        screen.refresh(View(rows, missing=("new",)))
     text = out.getvalue()
-    rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line and line[0].isalpha()}
-    assert rows["slam"] == ["running", "12", "100", "pose", "10.0"]
-    assert rows["page"][0] == "silent"
-    assert rows["gone"] == ["failed"] and rows["new"] == ["starting"]
+    found = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line and line[0].isalpha()}
+    assert found["slam"] == ["●", "running", "12", "100", "pose", "10.0"]
+    assert found["page"] == ["●", "silent", "↻2", "1", "10"]
+    assert found["gone"] == ["●", "failed", "hangs:", "no", "heartbeat", "for", "10", "s"]
+    assert found["new"] == ["◌", "starting"]
+    assert found["waiting"][:2] == ["for", "new"]
+
+
+def beat(node: str, state: int = 1, pid: int = 1, rate_hz: float = 10.0, age_s: float = 0.1) -> Any:
+    empty, none = np.zeros(0, np.float32), np.zeros(0, np.uint64)
+    return NodeStatus(
+        header=header("", 5),
+        node=node,
+        pid=pid,
+        state=state,
+        message="all well",
+        cpu_percent=3.0,
+        rss_mb=4.0,
+        inputs=[],
+        input_rates_hz=empty,
+        input_ages_s=empty,
+        input_lost=none,
+        lost_topics=[],
+        lost_publishers=[],
+        lost_counts=none,
+        outputs=["/pose"],
+        output_rates_hz=np.array([rate_hz], np.float32),
+        output_ages_s=np.array([age_s], np.float32),
+    )
 
 
 def test_heartbeats_become_health(tmp_path: Path) -> None:
@@ -100,27 +105,8 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
     try:
         assert monitor.nodes_missing() == ["my_slam", "other"] and monitor.waiting_for() == ["map"]
         publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
-        empty = np.zeros(0, np.float32)
-        beat = NodeStatus(
-            header=header("", 5),
-            node="my_slam",
-            pid=1,
-            state=1,
-            message="all well",
-            cpu_percent=3.0,
-            rss_mb=4.0,
-            inputs=[],
-            input_rates_hz=empty,
-            input_ages_s=empty,
-            input_lost=np.zeros(0, np.uint64),
-            lost_topics=[],
-            lost_publishers=[],
-            lost_counts=np.zeros(0, np.uint64),
-            outputs=["/pose"],
-            output_rates_hz=np.array([10.0], np.float32),
-        )
         for _ in range(2000):  # until the subscription is connected
-            publisher.send(serialize(beat))
+            publisher.send(serialize(beat("my_slam", pid=77)))
             monitor.poll()
             if "my_slam" in monitor.nodes:
                 break
@@ -129,6 +115,58 @@ def test_heartbeats_become_health(tmp_path: Path) -> None:
         assert (health.state, health.message, health.rates_hz) == ("running", "all well", {"/pose": 10.0})
         assert monitor.nodes_missing() == ["other"] and monitor.waiting_for() == []
         assert not health.silent
+        assert monitor.beat_s(nodes[0], 77) == health.seen_s
+        assert monitor.beat_s(nodes[0], 78) is None  # of the process before
+        assert monitor.beat_s(nodes[1], 77) is None
+    finally:
+        monitor.close()
+        transport.close()
+
+
+def test_a_topic_that_flowed_and_slows_down_or_stops_is_a_fault_after_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = NodeSpec("my_slam", "grid_slam", ())
+    monitor = HealthMonitor([node], tmp_path)
+    now = [100.0]
+    monkeypatch.setattr("instant_ic.launch.health.time.monotonic", lambda: now[0])
+
+    def faults_after(seconds: float, rate_hz: float, age_s: float) -> list[str]:
+        now[0] += seconds
+        monitor._take(beat("my_slam", rate_hz=rate_hz, age_s=age_s), "")
+        return [fault.words for fault in monitor.topic_faults()]
+
+    try:
+        assert faults_after(0, 0.0, float("inf")) == []  # never came: that is what waiting_for() tells
+        assert faults_after(60, 0.0, float("inf")) == []
+        assert faults_after(1, 9.5, 0.1) == []
+        assert faults_after(1, 8.0, 0.1) == []  # 8 of 10 Hz, but only just now
+        assert faults_after(2, 8.0, 0.1) == []
+        assert faults_after(1.5, 8.0, 0.1) == ["8.0 of 10 Hz"]
+        assert faults_after(1, 1.0, 4.5) == ["stopped 4.5 s ago"]
+        assert faults_after(1, 9.5, 0.1) == []
+    finally:
+        monitor.close()
+
+
+def test_each_group_is_heard_in_its_own_run_directory(tmp_path: Path) -> None:
+    left = tmp_path / "left"
+    nodes = [NodeSpec("slam", "grid_slam", ()), NodeSpec("slam", "grid_slam", (), run_dir=left, group="left")]
+    for folder in (tmp_path, left):
+        prepare(folder)
+    transport = ZmqTransport(left, "slam", lambda: 1)
+    monitor = HealthMonitor(nodes, tmp_path)
+    try:
+        assert monitor.waiting_for() == ["map", "left/map"]
+        publisher = transport.advertise("/heartbeat", "instant_ic_msgs/msg/NodeStatus", RELIABLE)
+        for _ in range(2000):
+            publisher.send(serialize(beat("slam")))
+            monitor.poll()
+            if monitor.nodes:
+                break
+            time.sleep(0.01)
+        assert list(monitor.nodes) == ["left/slam"]
+        assert monitor.nodes_missing() == ["slam"] and monitor.waiting_for() == ["map"]
     finally:
         monitor.close()
         transport.close()

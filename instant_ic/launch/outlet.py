@@ -1,0 +1,161 @@
+"""Output that never makes the launcher wait: calls run on a thread of their own, and what is too much is left out.
+
+A terminal that somebody has stopped with Ctrl-S, a dead ssh connection, a disk that hangs: none of them may hold up
+the process that empties the nodes' pipes, or the nodes would stand still at their next line.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from io import FileIO
+from pathlib import Path
+from typing import Any
+
+
+class Outlet:
+    """Runs calls one after another beside the caller.
+
+    Args:
+        name: of the thread.
+        limit: how much may wait, in the unit of ``put``'s ``size``.
+    """
+
+    def __init__(self, name: str, limit: int) -> None:
+        self.left_out = 0
+        """Sum of the sizes that were refused."""
+        self.broken: OSError | None = None
+        """Set once a call has failed because what it writes to is gone; nothing is run any more."""
+        self._limit = limit
+        self._calls: deque[tuple[int, Callable[..., None], tuple[Any, ...]]] = deque()
+        self._waiting = 0
+        self._closed = False
+        self._condition = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, function: Callable[..., None], *args: Any, size: int = 1, always: bool = False) -> bool:
+        """Hands over a call; False when too much waits already.
+
+        Args:
+            function: is run on the outlet's thread.
+            args: its arguments.
+            size: of the call.
+            always: take it even then; for the few words that matter.
+        """
+        with self._condition:
+            if self.broken is not None or (self._waiting + size > self._limit and not always):
+                self.left_out += size
+                return False
+            self._waiting += size
+            self._calls.append((size, function, args))
+            self._condition.notify()
+            return True
+
+    def close(self, timeout_s: float = 2.0) -> bool:
+        """Waits until everything has been run, at most ``timeout_s``; whether the thread has ended."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._condition:
+                while not self._calls:
+                    if self._closed:
+                        return
+                    self._condition.wait()
+                size, function, args = self._calls.popleft()
+            try:
+                function(*args)
+            except OSError as error:  # the terminal or the reader of a pipe is gone; the nodes go on
+                with self._condition:
+                    self.broken = error
+                    self._calls.clear()
+                return
+            finally:
+                with self._condition:
+                    self._waiting -= size
+
+
+class LogFile:
+    """A node's log file; the run before is kept beside it. Errors are told once and never raised.
+
+    Args:
+        path: where; its folder need not be there yet.
+        tell: called with words when writing fails, and when it works again; from the thread that writes.
+        max_bytes: a file that grows beyond this becomes ``.log.1``, and a new one begins.
+    """
+
+    RETRY_S = 5.0
+    """After a file could not be opened, this long until the next try."""
+
+    def __init__(self, path: Path, tell: Callable[[str], None], max_bytes: int = 64 << 20) -> None:
+        self.path = path
+        self._tell = tell
+        self._max_bytes = max_bytes
+        self._file: FileIO | None = None
+        self._size = 0
+        self._lost = 0
+        self._next_try_s = 0.0
+        self._rotate()
+
+    def write(self, data: bytes) -> None:
+        """Adds output."""
+        try:
+            if self._size + len(data) > self._max_bytes:
+                self.close()
+                self._rotate()
+            if self._file is None:
+                if time.monotonic() < self._next_try_s:
+                    self._lost += len(data)
+                    return
+                self._open()
+            if self._lost:
+                self._put(f"[launch: {self._lost} bytes are missing here: they could not be written]\n".encode())
+                self._tell(f"{self.path} is written again; {self._lost} bytes are missing in it")
+                self._lost = 0
+            self._put(data)
+        except OSError as error:
+            if not self._lost:
+                self._tell(
+                    f"{self.path} cannot be written ({error.strerror}): make room, until then its lines are lost"
+                )
+            self._lost += len(data)
+            self._next_try_s = time.monotonic() + self.RETRY_S
+            self.close()
+
+    def close(self) -> None:
+        """Closes the file; a later write opens it again."""
+        if self._file is not None:
+            file, self._file = self._file, None
+            with suppress(OSError):  # what close() has to say of a full disk, write() has said
+                file.close()
+
+    def _put(self, data: bytes) -> None:
+        assert self._file is not None
+        written = self._file.write(data)
+        self._size += written or 0
+        if written != len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _open(self) -> None:
+        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._file = self.path.open("ab", buffering=0)
+        self._size = self.path.stat().st_size
+
+    def _rotate(self) -> None:
+        self._size = 0
+        try:
+            self.path.replace(self.path.with_suffix(".log.1"))
+        except FileNotFoundError:
+            pass
+        except OSError as error:
+            self._tell(f"{self.path} cannot be put aside ({error.strerror}): it is written on")

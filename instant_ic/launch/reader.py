@@ -1,0 +1,420 @@
+"""Reads the actions of launch files: arguments, variables, conditions, includes, groups, environment, timers.
+
+The keys are those of ROS 2's YAML launch files; docs/launch.md lists them. What ROS 2 has and we have not is refused
+with the reason.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from instant_ic.launch import nodes
+from instant_ic.launch.description import Announcement, LaunchArgument, NodeSpec, Shutdown, find_launch_file
+from instant_ic.launch.source import Problem, Value, load
+from instant_ic.launch.substitutions import Context, truth
+from instant_ic.launch.values import (
+    CONDITION,
+    as_yaml,
+    flag_of,
+    holds,
+    parameter_value,
+    plain_text,
+    seconds_of,
+    text_of,
+)
+
+_MAX_INCLUDE_DEPTH = 8
+_NOT_HERE = {
+    "node_container": "every node is a process of its own: use node",
+    "load_composable_node": "every node is a process of its own: use node",
+    "lifecycle_node": "nodes have no life cycle to step through: use node, with respawn or required",
+    "lifecycle_transition": "nodes have no life cycle to step through",
+    "ros_timer": "use timer",
+    "for": "write the entries out, or include a file several times",
+    "for_each": "write the entries out, or include a file several times",
+    "push_environment": "a group has an environment of its own: use group",
+    "pop_environment": "a group has an environment of its own: use group",
+    "reset_environment": "a group has an environment of its own: use group",
+    "push_launch_configurations": "a group has variables of its own: use group",
+    "pop_launch_configurations": "a group has variables of its own: use group",
+    "reset_launch_configurations": "a group has variables of its own: use group",
+    "set_ros_log_dir": "logs lie in the run directory: ic launch --run-dir DIR",
+}
+_TYPES: dict[str, Callable[[str], object]] = {"str": str, "int": int, "float": float, "bool": truth, "path": Path}
+
+
+@dataclass
+class Scope:
+    """What holds for the actions of one group or file.
+
+    Attributes:
+        context: variables, environment, files.
+        namespace: before the topics of its nodes.
+        group: name of its run directory within the stack's; empty: the stack's own.
+        env: what ``set_env`` and ``unset_env`` (None) ask for.
+        options: ``-p``, ``--params-file`` and ``-r`` words for each node.
+        delay_s: wait after the start of the stack.
+    """
+
+    context: Context
+    namespace: str = ""
+    group: str = ""
+    env: dict[str, str | None] = field(default_factory=dict)
+    options: list[str] = field(default_factory=list)
+    delay_s: float = 0.0
+
+    def child(self) -> Scope:
+        """A copy that can change without changing this one."""
+        return dataclasses.replace(self, context=self.context.child(), env=dict(self.env), options=list(self.options))
+
+    @property
+    def run_dir(self) -> Path | None:
+        """Run directory of its nodes; None: the stack's own."""
+        return self.context.run_dir if self.group else None
+
+
+class Reader:
+    """Collects what a launch file and all that it includes ask for.
+
+    Args:
+        run_dir: run directory of the stack.
+        given: arguments of the command line.
+        conditions: false takes every include and group as if its conditions held, to see which arguments there are.
+    """
+
+    def __init__(self, run_dir: Path, given: Mapping[str, str], conditions: bool = True) -> None:
+        self.problems: list[Problem] = []
+        self.nodes: list[NodeSpec] = []
+        self.arguments: list[LaunchArgument] = []
+        self.included: list[LaunchArgument] = []
+        self.announcements: list[Announcement] = []
+        self.shutdown: Shutdown | None = None
+        self._run_dir, self._given, self._conditions = run_dir, given, conditions
+
+    def read_top(self, file: Path) -> dict[str, str] | None:
+        """Reads the launch file itself; the values of its variables, or None when it cannot be read."""
+        scope = Scope(Context(file.resolve(), self._run_dir))
+        declared = self._file(file.resolve(), scope, dict(self._given), depth=0)
+        if declared is None:
+            return None
+        self.arguments = declared
+        return scope.context.variables
+
+    def _file(self, file: Path, scope: Scope, given: dict[str, str], depth: int) -> list[LaunchArgument] | None:
+        root = load(file, self.problems)
+        if root is None:
+            return None
+        declared: list[LaunchArgument] = []
+        body = root.fields(known=("launch",), required=("launch",)).get("launch")
+        if body is not None:
+            _Actions(self, scope, given, declared, depth, self._conditions).read(body)
+        return declared
+
+    def include(self, file: Path, scope: Scope, given: dict[str, str], place: Value, depth: int) -> None:
+        """Reads an included file.
+
+        Args:
+            file: the file.
+            scope: as it is where the include stands.
+            given: the arguments that the include sets.
+            place: where the include stands.
+            depth: how deep the includes are.
+        """
+        if depth >= _MAX_INCLUDE_DEPTH:
+            place.problem(f"files include each other more than {_MAX_INCLUDE_DEPTH} deep")
+            return
+        inner = scope.child()
+        inner.context = Context(file, scope.context.run_dir, {}, dict(scope.context.environment))
+        # It sees only the arguments that it is given: what a file hides (a switch that is no good for driving) stays
+        # hidden, whatever the command line says.
+        declared = self._file(file, inner, given, depth + 1)
+        known = {(argument.file, argument.name) for argument in self.included}
+        self.included += [
+            argument
+            for argument in declared or []
+            if argument.name not in given and (argument.file, argument.name) not in known
+        ]
+        for name in given:
+            if declared is not None and name not in {argument.name for argument in declared}:
+                place.problem(f"{file.name} has no argument {name!r}")
+
+
+class _Actions:
+    """The actions of one list, in one scope."""
+
+    def __init__(
+        self,
+        reader: Reader,
+        scope: Scope,
+        given: dict[str, str],
+        declared: list[LaunchArgument],
+        depth: int,
+        conditions: bool,
+    ) -> None:
+        self.reader, self.scope, self.given = reader, scope, given
+        self.declared, self.depth, self.conditions = declared, depth, conditions
+        self.handlers: dict[str, Callable[[Value], None]] = {
+            "arg": self._arg,
+            "let": self._let,
+            "node": self._node,
+            "executable": self._executable,
+            "include": self._include,
+            "group": self._group,
+            "set_env": self._set_env,
+            "unset_env": self._unset_env,
+            "append_env": self._append_env,
+            "push_ros_namespace": self._push_namespace,
+            "push-ros-namespace": self._push_namespace,
+            "set_remap": self._set_remap,
+            "set_parameter": self._set_parameter,
+            "set_parameters_from_file": self._set_parameters_from_file,
+            "set_use_sim_time": self._set_use_sim_time,
+            "log": self._log,
+            "timer": self._timer,
+            "shutdown": self._shutdown,
+        }
+
+    @property
+    def context(self) -> Context:
+        """Of the scope."""
+        return self.scope.context
+
+    def read(self, body: Value) -> None:
+        """All of a list."""
+        for entry in body.items():
+            fields = entry.fields()
+            if entry.is_mapping and len(fields) != 1:
+                entry.problem(f"each entry is one of {', '.join(self.handlers)}")
+                continue
+            for kind, value in fields.items():
+                if kind in self.handlers:
+                    self.handlers[kind](value)
+                elif kind in _NOT_HERE:
+                    value.problem(f"{kind!r} is ROS 2's, but not here: {_NOT_HERE[kind]}")
+                else:
+                    value.problem(f"unknown key {kind!r} (known: {', '.join(sorted(self.handlers))})")
+
+    def _inside(self, body: Value, scope: Scope) -> None:
+        _Actions(self.reader, scope, self.given, self.declared, self.depth, self.conditions).read(body)
+
+    def _fields(self, body: Value, known: tuple[str, ...], required: tuple[str, ...] = ()) -> dict[str, Value] | None:
+        """The fields of an action whose conditions hold; else None."""
+        fields = body.fields(known=(*known, *CONDITION), required=required)
+        if any(name not in fields for name in required) or not holds(fields, self.context):
+            return None
+        return fields
+
+    # -- arguments and variables -----------------------------------------------------------------
+
+    def _arg(self, body: Value) -> None:
+        fields = body.fields(known=("name", "default", "description", "type", "choices", "choice"), required=("name",))
+        name = plain_text(fields.get("name"))
+        if not name:
+            return
+        if any(argument.name == name for argument in self.declared):
+            body.problem(f"argument {name!r} is declared a second time")
+            return
+        kind = plain_text(fields.get("type")) or "str"
+        if kind not in _TYPES:
+            fields["type"].problem(f"unknown type {kind!r} (types: {', '.join(_TYPES)})")
+            kind = "str"
+        argument = LaunchArgument(
+            name=name,
+            default=text_of(fields.get("default"), self.context),
+            description=plain_text(fields.get("description")) or "",
+            line=body.line,
+            type=kind,
+            choices=self._choices(fields),
+            file=body.file,
+        )
+        self.declared.append(argument)
+        if name in self.given:
+            value = self.given[name]
+        elif argument.default is not None:
+            value = argument.default
+        else:
+            if "default" not in fields:
+                body.problem(f"argument {name!r} has no default: give {name}:=VALUE")
+            self.context.variables[name] = ""
+            return
+        self.context.variables[name] = self._checked(value, argument, body)
+
+    def _choices(self, fields: Mapping[str, Value]) -> tuple[str, ...]:
+        """``choices: [a, b]``, or ROS 2's ``choice: [{value: a}, {value: b}]``."""
+        found = [entry.text() for entry in fields["choices"].items()] if "choices" in fields else []
+        for entry in fields["choice"].items() if "choice" in fields else []:
+            found.append(text_of(entry.fields(known=("value",), required=("value",)).get("value"), self.context))
+        return tuple(text for text in found if text is not None)
+
+    @staticmethod
+    def _checked(value: str, argument: LaunchArgument, body: Value) -> str:
+        """The value, if the argument may have it; an empty default may stay empty."""
+        if value == "" == argument.default:
+            return value
+        if argument.choices and value not in argument.choices:
+            body.problem(f"argument {argument.name!r} must be one of {', '.join(argument.choices)} (got {value!r})")
+            return value
+        try:
+            _TYPES[argument.type](value)
+        except ValueError:
+            body.problem(f"argument {argument.name!r} must be of type {argument.type} (got {value!r})")
+        return str(Path(value).expanduser()) if argument.type == "path" else value
+
+    def _let(self, body: Value) -> None:
+        if (fields := self._fields(body, ("name", "value"), ("name", "value"))) is None:
+            return
+        name, value = plain_text(fields["name"]), text_of(fields["value"], self.context)
+        if name and value is not None:
+            self.context.variables[name] = value
+
+    # -- groups and files ------------------------------------------------------------------------
+
+    def _group(self, body: Value) -> None:
+        if body.is_list:
+            self._inside(body, self.scope.child())
+            return
+        known = ("launch", "children", "namespace", "run_dir", "scoped", *CONDITION)
+        fields = body.fields(known=known)
+        inside = fields.get("launch", fields.get("children"))
+        if inside is None:
+            body.problem("'launch' is missing")
+            return
+        if self.conditions and not holds(fields, self.context):
+            return
+        scope = self.scope.child() if flag_of(fields.get("scoped"), self.context, default=True) else self.scope
+        if namespace := text_of(fields.get("namespace"), self.context):
+            scope.namespace = nodes.join_namespace(scope.namespace, namespace)
+        if "run_dir" in fields:
+            name = text_of(fields["run_dir"], self.context) or ""
+            if not nodes.NODE_NAME.fullmatch(name) or name in ("topics", "nodes", "dev", "log"):
+                fields["run_dir"].problem(
+                    f"run_dir {name!r}: give a name of letters, digits and underscores, none of topics, nodes, dev, log"
+                )
+            else:
+                scope.context.run_dir = scope.context.run_dir / name
+                scope.group = f"{scope.group}/{name}".strip("/")
+        self._inside(inside, scope)
+
+    def _include(self, body: Value) -> None:
+        fields = body.fields(known=("file", "arg", "let", *CONDITION), required=("file",))
+        name = text_of(fields.get("file"), self.context)
+        given: dict[str, str] = {}
+        for key in ("arg", "let"):
+            for entry in fields[key].items() if key in fields else []:
+                pair = entry.fields(known=("name", "value"), required=("name", "value"))
+                argument, value = plain_text(pair.get("name")), text_of(pair.get("value"), self.context)
+                if argument and value is not None:
+                    given[argument] = value
+        if name is None or (self.conditions and not holds(fields, self.context)):
+            return
+        file = self._find(name)
+        if file is None:
+            fields["file"].problem(f"launch file {name} does not exist")
+        elif file.suffix in (".py", ".xml"):
+            fields["file"].problem(f"{name}: only YAML launch files are read")
+        else:
+            self.reader.include(file, self.scope, given, fields["file"], self.depth)
+
+    def _find(self, name: str) -> Path | None:
+        beside = self.context.launch_file.parent / name
+        if beside.is_file():
+            return beside.resolve()
+        try:
+            return find_launch_file(name)
+        except FileNotFoundError:
+            return None
+
+    # -- processes -------------------------------------------------------------------------------
+
+    def _node(self, body: Value) -> None:
+        self._start(nodes.read_node(body, self.scope))
+
+    def _executable(self, body: Value) -> None:
+        taken = {node.name for node in self.reader.nodes if node.run_dir == self.scope.run_dir}
+        self._start(nodes.read_executable(body, self.scope, taken))
+
+    def _start(self, spec: NodeSpec | None) -> None:
+        self.reader.nodes += [spec] if spec is not None else []
+
+    # -- what holds for the processes that follow ------------------------------------------------
+
+    def _set_env(self, body: Value) -> None:
+        if fields := self._fields(body, ("name", "value"), ("name", "value")):
+            self._put_env(plain_text(fields["name"]), text_of(fields["value"], self.context))
+
+    def _unset_env(self, body: Value) -> None:
+        if (fields := self._fields(body, ("name",), ("name",))) and (name := plain_text(fields["name"])):
+            self.scope.env[name] = None
+            self.context.environment.pop(name, None)
+
+    def _append_env(self, body: Value) -> None:
+        fields = self._fields(body, ("name", "value", "prepend", "separator"), ("name", "value"))
+        if fields is None:
+            return
+        name, value = plain_text(fields["name"]), text_of(fields["value"], self.context)
+        before = self.context.environment.get(name or "")
+        if before is not None and value is not None:
+            separator = plain_text(fields.get("separator")) or ":"
+            first = flag_of(fields.get("prepend"), self.context)
+            value = f"{value}{separator}{before}" if first else f"{before}{separator}{value}"
+        self._put_env(name, value)
+
+    def _put_env(self, name: str | None, value: str | None) -> None:
+        if name and value is not None:
+            self.scope.env[name] = self.context.environment[name] = value
+
+    def _push_namespace(self, body: Value) -> None:
+        if (fields := self._fields(body, ("namespace",), ("namespace",))) and (
+            namespace := text_of(fields["namespace"], self.context)
+        ):
+            self.scope.namespace = nodes.join_namespace(self.scope.namespace, namespace)
+
+    def _set_remap(self, body: Value) -> None:
+        if fields := self._fields(body, ("from", "to"), ("from", "to")):
+            source, target = text_of(fields["from"], self.context), text_of(fields["to"], self.context)
+            self.scope.options += ["-r", f"{source}:={target}"] if source and target else []
+
+    def _set_parameter(self, body: Value) -> None:
+        if fields := self._fields(body, ("name", "value"), ("name", "value")):
+            value = parameter_value(fields["value"], "", self.context)
+            self.scope.options += ["-p", f"{plain_text(fields['name'])}:={as_yaml(value)}"]
+
+    def _set_parameters_from_file(self, body: Value) -> None:
+        if fields := self._fields(body, ("filename",), ("filename",)):
+            self.scope.options += nodes.parameter_file(fields["filename"], self.context)
+
+    def _set_use_sim_time(self, body: Value) -> None:
+        if fields := self._fields(body, ("value",), ("value",)):
+            self.scope.options += ["-p", f"use_sim_time:={str(flag_of(fields['value'], self.context)).lower()}"]
+
+    # -- what the launcher itself does -----------------------------------------------------------
+
+    def _log(self, body: Value) -> None:
+        if (fields := self._fields(body, ("message", "level"), ("message",))) and (
+            text := text_of(fields["message"], self.context)
+        ) is not None:
+            self.reader.announcements.append(Announcement(text, self.scope.delay_s))
+
+    def _timer(self, body: Value) -> None:
+        known = ("period", "launch", "children")
+        if (fields := self._fields(body, known, ("period",))) is None:
+            return
+        period_s = seconds_of(fields["period"], self.context)
+        inside = fields.get("launch", fields.get("children"))
+        if inside is None:
+            body.problem("'launch' is missing")
+        elif period_s is not None:
+            scope = self.scope.child()
+            scope.delay_s += period_s
+            self._inside(inside, scope)
+
+    def _shutdown(self, body: Value) -> None:
+        fields = {} if body.is_null else self._fields(body, ("reason",))
+        if fields is None:
+            return
+        reason = text_of(fields.get("reason"), self.context) or "the launch file says so"
+        if self.reader.shutdown is None or self.scope.delay_s < self.reader.shutdown.delay_s:
+            self.reader.shutdown = Shutdown(reason, self.scope.delay_s)

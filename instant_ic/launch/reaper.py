@@ -1,0 +1,81 @@
+"""Outlives a launcher by a moment and kills what its nodes have left behind; run as a script, never imported.
+
+``python -I -S reaper.py MARK``, with the launcher at the other end of its standard input. When the launcher is gone,
+however it went, every process that carries MARK in its environment is killed: the nodes, their children, and those
+that have left the node's process group for a session of their own, which no signal to a group and no parent-death
+signal reaches. It writes ``PID COMMAND`` for each, and ends.
+"""
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+VARIABLE = "INSTANT_IC_STACK"
+"""Environment variable with the marks of the stacks that a process belongs to: ``MARK/NODE``, separated by ``:``."""
+
+_LONGEST_S = 3.0
+
+
+def marked(mark: str) -> "list[int]":
+    """Processes that carry a mark; those of other users cannot be looked into and cannot be ours."""
+    wanted = mark.encode()
+    found = []
+    for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would stat each of them
+        if name.isdigit() and int(name) != os.getpid() and wanted in _marks(int(name)):
+            found.append(int(name))
+    return found
+
+
+def _marks(pid: int) -> bytes:
+    try:
+        environment = Path(f"/proc/{pid}/environ").read_bytes()
+    except OSError:  # ended, or another user's
+        return b""
+    start = (b"\0" + environment).find(b"\0" + VARIABLE.encode() + b"=")
+    return environment[start:].split(b"\0", 1)[0] if start >= 0 else b""
+
+
+def kill_marked(mark: str) -> "dict[int, str]":
+    """Kills every process that carries a mark, until none is left; process id → command line."""
+    killed: dict[int, str] = {}
+    deadline = time.monotonic() + _LONGEST_S
+    while time.monotonic() < deadline:
+        pids = marked(mark)
+        if not pids:
+            break
+        for pid in pids:
+            try:
+                descriptor = os.pidfd_open(pid)
+            except OSError:
+                continue
+            try:
+                if mark.encode() in _marks(pid):  # still the same: its number has not been given to another
+                    command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+                    signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+                    killed.setdefault(pid, command.strip())
+            except OSError:
+                continue
+            finally:
+                os.close(descriptor)
+        time.sleep(0.01)
+    return killed
+
+
+def main() -> None:
+    """Waits for the launcher's end."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it goes when the launcher has gone
+    while os.read(0, 4096):
+        pass
+    killed = kill_marked(sys.argv[1])
+    try:
+        for pid, command in killed.items():
+            os.write(1, f"{pid} {command}\n".encode())
+    except OSError:  # nobody listens any more
+        pass
+
+
+if __name__ == "__main__":
+    main()

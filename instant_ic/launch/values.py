@@ -1,0 +1,148 @@
+"""Values of a launch file with their substitutions done; what is wrong is noted at its line, never raised."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable, Mapping
+
+import yaml
+
+from instant_ic.launch.source import Value
+from instant_ic.launch.substitutions import Context, SubstitutionError, has_substitution, substitute, truth
+
+CONDITION = ("if", "unless")
+"""Keys that every action may have."""
+
+
+def text_of(value: Value | None, context: Context) -> str | None:
+    """The text; None where there is none or it is wrong."""
+    text = value.text() if value is not None else None
+    return replaced(text, value, context) if value is not None and text is not None else None
+
+
+def plain_text(value: Value | None) -> str | None:
+    """The text as it is written."""
+    return value.text() if value is not None else None
+
+
+def replaced(text: str, value: Value, context: Context) -> str | None:
+    """A text of this place with its substitutions done."""
+    try:
+        return substitute(text, context)
+    except SubstitutionError as error:
+        value.problem(str(error))
+        return None
+
+
+def flag_of(value: Value | None, context: Context, default: bool = False) -> bool:
+    """A truth value."""
+    text = text_of(value, context)
+    if value is None or text is None:
+        return default
+    try:
+        return truth(text)
+    except SubstitutionError as error:
+        value.problem(str(error))
+        return default
+
+
+def holds(fields: Mapping[str, Value], context: Context) -> bool:
+    """Whether ``if`` and ``unless`` let an action through."""
+    return flag_of(fields.get("if"), context, default=True) and not flag_of(fields.get("unless"), context)
+
+
+def seconds_of(value: Value | None, context: Context) -> float | None:
+    """A number of seconds >= 0; None where there is none or it is wrong."""
+    text = text_of(value, context)
+    if value is None or text is None:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        value.problem(f"expected a number, got {text!r}")
+        return None
+    if not 0 <= number < math.inf:
+        value.problem(f"must be a number of seconds >= 0, got {text!r}")
+        return None
+    return number
+
+
+def integer_of(value: Value | None, context: Context, default: int) -> int:
+    """A whole number."""
+    text = text_of(value, context)
+    if value is None or text is None:
+        return default
+    try:
+        return int(text)
+    except ValueError:
+        value.problem(f"expected a whole number, got {text!r}")
+        return default
+
+
+def words_of(value: Value | None, context: Context) -> list[str]:
+    """The words of a command line."""
+    text = text_of(value, context)
+    if value is None or not text:
+        return []
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        value.problem(f"{text!r}: {error}")
+        return []
+
+
+def pair_of(entry: Value, first: str, second: str, context: Context) -> tuple[str, str] | None:
+    """Two keys that belong together; None where either is missing."""
+    fields = entry.fields(known=(first, second, *CONDITION), required=(first, second))
+    one, two = text_of(fields.get(first), context), text_of(fields.get(second), context)
+    return (one, two) if one and two is not None and holds(fields, context) else None
+
+
+def pairs_of(value: Value | None, first: str, second: str, context: Context) -> list[tuple[str, str]]:
+    """The pairs of a list of them."""
+    found = [pair_of(entry, first, second, context) for entry in value.items()] if value is not None else []
+    return [pair for pair in found if pair is not None]
+
+
+def parameter_value(value: Value, kind: str, context: Context) -> object:
+    """The value of a parameter, of the type that it is said to have or else as YAML reads it."""
+    if value.is_list or value.is_mapping:
+        return _substituted(value.plain(), value, context)
+    text = text_of(value, context)
+    if text is None:
+        return None
+    readers: dict[str, Callable[[str], object]] = {
+        "str": str,
+        "int": int,
+        "float": float,
+        "bool": truth,
+        "": yaml.safe_load,
+    }
+    if kind not in readers:
+        value.problem(f"unknown type {kind!r} (types: str, int, float, bool)")
+        return None
+    # Quoted text, and nothing at all, stay text; the rest is read as YAML reads it.
+    if kind == "" and ((value.is_quoted and not has_substitution(value.text() or "")) or not text):
+        return text
+    try:
+        return readers[kind](text)
+    except (ValueError, yaml.YAMLError):
+        value.problem(f"{text!r} is not of type {kind or 'YAML'}")
+        return None
+
+
+def _substituted(plain: object, value: Value, context: Context) -> object:
+    if isinstance(plain, str):
+        return replaced(plain, value, context)
+    if isinstance(plain, list):
+        return [_substituted(entry, value, context) for entry in plain]
+    if isinstance(plain, dict):
+        return {key: _substituted(entry, value, context) for key, entry in plain.items()}
+    return plain
+
+
+def as_yaml(value: object) -> str:
+    """A value as one line of YAML."""
+    text = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=1 << 20)
+    return text.removesuffix("...\n").rstrip("\n")
