@@ -25,8 +25,9 @@ class ClockSample:
 class ClockFilter:
     """Offset of a clock out of exchanges of time stamps.
 
-    Of the exchanges of the last ``window_s`` the one with the shortest round trip counts: it waited least in queues, and
-    its offset is wrong by half its round trip at most. Both clocks must be such that never step (``CLOCK_MONOTONIC``).
+    Of the exchanges of the last ``window_s`` the one with the shortest round trip counts: it waited least in queues,
+    and its offset is wrong by half its round trip at most. Both clocks must be of the kind that never steps
+    (``CLOCK_MONOTONIC``).
 
     Args:
         window_s: long enough to meet a quiet moment, short enough that quartz drift (50 ppm) does not matter.

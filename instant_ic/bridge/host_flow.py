@@ -31,7 +31,7 @@ class Item:
         payload: CDR bytes.
         publish_ns: when it was published first.
         admitted_ns: when the bridge got it, by its monotonic clock.
-        sequence: 0 takes the next number of its channel when it leaves.
+        sequence: its number, where the channel is queued; others get theirs when they leave.
         wall_time: ``publish_ns`` is the machine's time.
     """
 
@@ -76,8 +76,8 @@ class Channel:
 class Window:
     """How many bytes may be on their way, so that the link is used and its queues stay short.
 
-    Delay-based as LEDBAT (RFC 6817): more while the round trip is close to the shortest known, less when it shows that a
-    queue has formed.
+    Delay-based as LEDBAT (RFC 6817): more while the round trip is close to the shortest known, less when it shows that
+    a queue has formed.
 
     Args:
         target_s: time that a chunk may wait in queues.
@@ -139,7 +139,11 @@ class _Outgoing:
     turn: int = 0
     announced: bool = False
     refused: str = ""
-    sequence: int = 0
+
+    @property
+    def queued(self) -> bool:
+        """Whether every message counts; not where the other side asked for fewer."""
+        return self.channel.queued and not self.period_ns
 
 
 class Outbox:
@@ -148,12 +152,17 @@ class Outbox:
     Args:
         wants: topic → most messages a second that the other takes (0: all); others are not sent.
         window: how much may be on its way.
+        sequences: channel → number of the last message that left, kept over the links with one host, so that it sees
+            what a broken link swallowed.
     """
 
-    def __init__(self, wants: dict[str, float], window: Window | None = None) -> None:
+    def __init__(
+        self, wants: dict[str, float], window: Window | None = None, sequences: dict[int, int] | None = None
+    ) -> None:
         self.wants = wants
         self.window = window or Window()
         self.counts: dict[str, TopicCounts] = {}
+        self._sequences = {} if sequences is None else sequences
         self._channels: dict[int, _Outgoing] = {}
         self._current: list[tuple[_Outgoing, Item, int] | None] = [None] * len(LANES)
         self._turns = itertools.count(1)
@@ -168,7 +177,7 @@ class Outbox:
         if out is None or out.refused:
             return
         counts = self.counts[channel.rule.topic]
-        if channel.queued:
+        if out.queued:
             if len(out.waiting) >= QUEUE_DEPTH:
                 out.waiting.popleft()
                 counts.overflowed += 1
@@ -271,15 +280,16 @@ class Outbox:
             out.turn = next(self._turns)
             if out.period_ns and out.channel.latched:
                 out.due_ns = now_ns + out.period_ns
-            out.sequence = item.sequence or out.sequence + 1
+            number = out.channel.number
+            self._sequences[number] = item.sequence if out.queued else self._sequences.get(number, 0) + 1
             return out, item, 0
         return None
 
     def _ready(self, lane: str, now_ns: int) -> Iterable[_Outgoing]:
         for out in self._channels.values():
-            if out.waiting and out.channel.rule.lane == lane:
-                if not (out.period_ns and out.channel.latched and now_ns < out.due_ns):
-                    yield out
+            its_turn = now_ns >= out.due_ns or not (out.period_ns and out.channel.latched)
+            if out.waiting and out.channel.rule.lane == lane and its_turn:
+                yield out
 
     def _chunk(self, lane: int, out: _Outgoing, item: Item, offset: int, now_ns: int) -> Data:
         total = len(item.payload)
@@ -295,12 +305,13 @@ class Outbox:
             self._current[lane] = (out, item, end)
         return Data(
             out.channel.number,
-            out.sequence,
+            self._sequences[out.channel.number],
             item.publish_ns,
             item.admitted_ns,
             now_ns,
             total,
             offset,
             chunk,
+            lane,
             item.wall_time,
         )

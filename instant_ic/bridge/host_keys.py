@@ -256,7 +256,7 @@ class KeyStore:
         scratch = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             scratch.unlink(missing_ok=True)
-            with open(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())

@@ -25,7 +25,6 @@ _DATA = struct.Struct("<BBHIIQqqq")
 _PING = struct.Struct("<BIqq")
 _PONG = struct.Struct("<BIqqqq")
 _ACK = struct.Struct("<Bq3Q")
-_ORIGINAL_TIME = 1
 
 
 class ProtocolError(ValueError):
@@ -53,6 +52,11 @@ class _Json:
             raise ProtocolError(f"{cls.__name__}: not JSON: {error}") from None
         hints = get_type_hints(cls)
         names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
+        if isinstance(content, dict) and "version" in names and content.get("version") != VERSION:
+            # Another version greets with other fields: only who it is matters, for the answer.
+            content = {name: content.get(name) for name in names}
+            kinds = {name: get_origin(hints[name]) or hints[name] for name in names}
+            content = {n: value if isinstance(value, kinds[n]) else kinds[n]() for n, value in content.items()}
         if not isinstance(content, dict) or set(content) != set(names):
             raise ProtocolError(f"{cls.__name__}: expected the fields {', '.join(names)}")
         for name in names:
@@ -243,6 +247,7 @@ class Data:
         total: bytes of the message.
         offset: where this chunk begins.
         chunk: the bytes.
+        lane: the sender's, as an index of :data:`LANES`; a lane carries one message after the other.
         wall_time: ``publish_ns`` is the machine's time (a simulated clock is the same on both hosts).
     """
 
@@ -255,11 +260,12 @@ class Data:
     total: int
     offset: int
     chunk: bytes | memoryview = field(repr=False)
+    lane: int = 0
     wall_time: bool = True
 
     def encode(self) -> bytes:
         """Bytes of the message."""
-        flags = _ORIGINAL_TIME if self.wall_time else 0
+        flags = self.lane << 1 | self.wall_time
         head = _DATA.pack(
             self.KIND,
             flags,
@@ -282,7 +288,9 @@ class Data:
         chunk = data[_DATA.size :]
         if len(chunk) > MAX_CHUNK or offset + len(chunk) > total or (len(chunk) == 0 and total > 0):
             raise ProtocolError(f"Data: {len(chunk)} bytes at {offset} of {total} cannot be")
-        return cls(channel, sequence, publish, admitted, sent, total, offset, chunk, bool(flags & _ORIGINAL_TIME))
+        if flags >> 1 >= len(LANES):
+            raise ProtocolError(f"Data: unknown lane {flags >> 1}")
+        return cls(channel, sequence, publish, admitted, sent, total, offset, chunk, flags >> 1, bool(flags & 1))
 
 
 Message = Hello | Welcome | Bye | Announce | Refuse | Notice | Ping | Pong | Ack | Data

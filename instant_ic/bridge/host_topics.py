@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 
 from .host_protocol import LANES
@@ -57,7 +58,7 @@ class TopicRule:
             if not separator or key not in kinds or key in values:
                 raise ValueError(f"{words[0]}: {word!r} is not one of {', '.join(f'{k}=' for k in kinds)}, once each")
             try:
-                values[key] = {"float": float, "str": str, "bool": _bool}[str(kinds[key])](value)
+                values[key] = _READERS[str(kinds[key])](value)
             except ValueError:
                 raise ValueError(f"{words[0]}: {key} must be {kinds[key]} (got {value!r})") from None
         return cls(words[0], **values)  # type: ignore[arg-type]
@@ -67,6 +68,9 @@ def _bool(text: str) -> bool:
     if text not in ("true", "false"):
         raise ValueError(text)
     return text == "true"
+
+
+_READERS: dict[str, Callable[[str], object]] = {"float": float, "str": str, "bool": _bool}
 
 
 def parse_rules(lines: tuple[str, ...]) -> dict[str, TopicRule]:

@@ -1,0 +1,486 @@
+"""One link between two hosts as a state machine: bytes in, bytes and events out; no sockets, no threads."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from .host_clock import ClockFilter
+from .host_flow import Channel, Item, Outbox, Window
+from .host_protocol import (
+    DATA_OVERHEAD,
+    LANES,
+    VERSION,
+    Ack,
+    Announce,
+    Bye,
+    Data,
+    Hello,
+    Message,
+    Notice,
+    Ping,
+    Pong,
+    ProtocolError,
+    Refuse,
+    Welcome,
+    decode,
+)
+from .host_topics import TopicCounts, TopicRule
+
+MAX_MESSAGE = 64 << 20
+"""Bytes of the longest message that is put together."""
+
+_FIRST_PINGS = 8
+_FIRST_PING_S = 0.02
+_CLOCK_STEP_NS = 20_000_000
+
+
+class Clocks:
+    """The machine's two clocks: one that never steps, and the time of day."""
+
+    def mono_ns(self) -> int:
+        """Nanoseconds of the monotonic clock."""
+        return time.monotonic_ns()
+
+    def wall_ns(self) -> int:
+        """Nanoseconds since the epoch."""
+        return time.time_ns()
+
+
+@dataclass(frozen=True)
+class LinkTimes:
+    """When a link counts as what; seconds.
+
+    Attributes:
+        ping_s: time between two signs of life.
+        timeout_s: nothing heard for this long: the link is lost.
+        queue_s: time that a picture may wait in the link's queues.
+    """
+
+    ping_s: float = 0.25
+    timeout_s: float = 1.0
+    queue_s: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not 0.02 <= self.ping_s <= 5:
+            raise ValueError(f"ping_s must be in 0.02..5 (got {self.ping_s})")
+        if not 2 * self.ping_s <= self.timeout_s <= 60:
+            raise ValueError(f"timeout_s must be at least two ping_s, and 60 at most (got {self.timeout_s})")
+        if not 0.005 <= self.queue_s <= 1:
+            raise ValueError(f"queue_s must be in 0.005..1 (got {self.queue_s})")
+
+
+@dataclass(frozen=True)
+class Side:
+    """What one host brings into a link.
+
+    Attributes:
+        name: what it calls itself.
+        instance: new with every start.
+        imports: topics that it takes, by name.
+        digest: digest of a message type's fields, hex digits; raises ValueError where the type is not known.
+    """
+
+    name: str
+    instance: str
+    imports: dict[str, TopicRule]
+    digest: Callable[[str], str]
+
+
+@dataclass(frozen=True)
+class Up:
+    """The link stands; the other host is called ``name``."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The link is over; ``code`` is that of :class:`Bye`, or timeout, or gone."""
+
+    code: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """A whole message of a topic.
+
+    Attributes:
+        announce: topic, type, QoS, and who published it.
+        payload: CDR bytes.
+        publish_ns: by this host's clock.
+        age_ns: since the other bridge got it.
+    """
+
+    announce: Announce
+    payload: bytes | bytearray = field(repr=False)
+    publish_ns: int
+    age_ns: int
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A topic is not taken, by this host (``here``) or the other."""
+
+    topic: str
+    reason: str
+    here: bool
+
+
+@dataclass(frozen=True)
+class ClockStepped:
+    """The other host's clock jumped by ``step_ns``."""
+
+    step_ns: int
+
+
+Event = Up | Ended | Arrived | Refused | ClockStepped
+
+
+@dataclass
+class Memory:
+    """What outlives a link, kept for each host: it comes back and must see what it missed.
+
+    Attributes:
+        sent: channel → number of the last message that left.
+        received: (the other's start, topic, publisher) → number of the last message that came.
+        counts_out, counts_in: by topic, over all links with this host.
+    """
+
+    sent: dict[int, int] = field(default_factory=dict)
+    received: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    counts_out: dict[str, TopicCounts] = field(default_factory=dict)
+    counts_in: dict[str, TopicCounts] = field(default_factory=dict)
+
+
+@dataclass
+class _Incoming:
+    announce: Announce
+    rule: TopicRule
+    counts: TopicCounts
+    refused: str = ""
+    kept: Arrived | None = None  # latched, from a host that does not drive yet
+
+
+class Session:
+    """One side of one link, from the first word to the last.
+
+    Args:
+        side: this host.
+        connecting: whether this side says :class:`Hello`.
+        memory: what is known of the other host from earlier links.
+        clocks: the machine's, or simulated ones.
+        times: pings and timeouts.
+        may_send: whether the other's topics are taken at all (a viewer's are not); its topics are refused otherwise.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        connecting: bool,
+        memory: Memory | None = None,
+        clocks: Clocks | None = None,
+        times: LinkTimes | None = None,
+        may_send: bool = True,
+    ) -> None:
+        self.side = side
+        self.clocks = clocks or Clocks()
+        self.times = times or LinkTimes()
+        self.memory = memory or Memory()
+        self.may_send = may_send
+        self.drives = connecting  # who connects takes all that the robot sends; the robot's link decides who drives
+        self.up = False
+        self.ended: Ended | None = None
+        self.peer_name = ""
+        self.peer_instance = ""
+        self.notices: dict[str, str] = {}
+        self.clock = ClockFilter()
+        self.outbox = Outbox({}, Window(self.times.queue_s), self.memory.sent)
+        now = self.clocks.mono_ns()
+        self.heard_ns = self.up_ns = now
+        self._connecting = connecting
+        self._peer_epoch_ns: int | None = None
+        self._incoming: dict[int, _Incoming] = {}
+        self._partial: dict[int, tuple[Data, bytearray]] = {}
+        self._replies: deque[Message] = deque()
+        self._taken = [0] * len(LANES)
+        self._ack: int | None = None
+        self._pings = 0
+        self._next_ping_ns = now
+        if connecting:
+            self._replies.append(Hello(VERSION, side.name, side.instance, self._wants(), now))
+
+    def _wants(self) -> dict[str, Any]:
+        return {topic: rule.rate_hz for topic, rule in self.side.imports.items()}
+
+    # -- out --------------------------------------------------------------------------------------
+
+    def offer(self, channel: Channel, item: Item) -> None:
+        """A message for the other host."""
+        if self.up:
+            self.outbox.offer(channel, item, self.clocks.mono_ns())
+
+    def outgoing(self) -> Iterator[bytes]:
+        """What is to be sent now."""
+        now = self.clocks.mono_ns()
+        while self._replies:
+            yield self._replies.popleft().encode()
+        if not self.up:
+            return
+        if self._ack is not None:
+            yield Ack(self._ack, tuple(self._taken)).encode()
+            self._ack = None
+        if now >= self._next_ping_ns:
+            self._pings += 1
+            period_s = _FIRST_PING_S if self._pings < _FIRST_PINGS else self.times.ping_s
+            self._next_ping_ns = now + int(period_s * 1e9)
+            yield Ping(self._pings, now, self.clocks.wall_ns()).encode()
+        while self.up and (message := self.outbox.next(self.clocks.mono_ns())) is not None:
+            yield message.encode()
+
+    def next_due_ns(self) -> int:
+        """When :meth:`outgoing` or :meth:`check` has to be called next, if nothing happens before."""
+        dues = [self.heard_ns + int(self.times.timeout_s * 1e9)]
+        if self.up:
+            dues.append(self._next_ping_ns)
+            due = self.outbox.next_due_ns()
+            if due is not None:
+                dues.append(due)
+        return min(dues)
+
+    def check(self) -> list[Event]:
+        """Ends a link on which nothing was heard for too long."""
+        silent_s = (self.clocks.mono_ns() - self.heard_ns) / 1e9
+        if self.ended is None and silent_s > self.times.timeout_s:
+            return self.end("timeout", f"nothing heard for {silent_s:.1f} s")
+        return []
+
+    def end(self, code: str, reason: str, tell: bool = False) -> list[Event]:
+        """Ends the link from this side; ``tell`` says so to the other."""
+        if self.ended is not None:
+            return []
+        self.up = False
+        self._replies.clear()
+        if tell:
+            self._replies.append(Bye(code, reason))
+        for topic, counts in self.outbox.counts.items():
+            self.memory.counts_out.setdefault(topic, TopicCounts()).add(counts)
+        self.outbox.counts = {}
+        self.ended = Ended(code, reason)
+        return [self.ended]
+
+    def notify(self, name: str, text: str) -> None:
+        """Tells the other host's user something; an empty text takes it back."""
+        self._replies.append(Notice(name, text))
+
+    def set_drives(self, drives: bool) -> list[Event]:
+        """Whether the other host's commands are taken; its latched values, held back so far, come now."""
+        self.drives = drives
+        if not drives:
+            return []
+        kept = [incoming for incoming in self._incoming.values() if incoming.kept is not None]
+        events: list[Event] = []
+        for incoming in kept:
+            assert incoming.kept is not None
+            incoming.counts.messages += 1
+            events.append(incoming.kept)
+            incoming.kept = None
+        return events
+
+    # -- clocks -----------------------------------------------------------------------------------
+
+    @property
+    def wall_offset_ns(self) -> int | None:
+        """The other's time of day minus ours; None before the first exchange."""
+        if self._peer_epoch_ns is None or not self.clock.ready:
+            return None
+        return self._peer_epoch_ns - (self.clocks.wall_ns() - self.clocks.mono_ns()) + self.clock.offset_ns
+
+    def _heard_clock(self, mono_ns: int, wall_ns: int) -> list[Event]:
+        epoch, before = wall_ns - mono_ns, self._peer_epoch_ns
+        self._peer_epoch_ns = epoch
+        if before is not None and abs(epoch - before) > _CLOCK_STEP_NS:
+            return [ClockStepped(epoch - before)]
+        return []
+
+    # -- in ---------------------------------------------------------------------------------------
+
+    def receive(self, data: bytes | memoryview) -> list[Event]:
+        """Takes one frame of the other host; what cannot be understood ends the link."""
+        if self.ended is not None:
+            return []
+        self.heard_ns = self.clocks.mono_ns()
+        try:
+            return self._take(decode(data))
+        except ProtocolError as error:
+            return self.end("protocol", str(error), tell=True)
+
+    def _take(self, message: Message) -> list[Event]:
+        now = self.clocks.mono_ns()
+        match message:
+            case Bye():
+                return self.end(message.code, message.reason)
+            case Hello() if not self._connecting and not self.up:
+                if message.version != VERSION:
+                    return self._wrong_version(message)
+                self._replies.append(
+                    Welcome(
+                        VERSION, self.side.name, self.side.instance, self._wants(), message.mono_ns, now,
+                        self.clocks.mono_ns(),
+                    )
+                )  # fmt: skip
+                return self._begin(message)
+            case Welcome() if self._connecting and not self.up:
+                if message.version != VERSION:
+                    return self._wrong_version(message)
+                self.clock.add(message.echo_ns, message.arrived_ns, message.mono_ns, now)
+                return self._begin(message)
+            case _ if not self.up:
+                raise ProtocolError(f"{type(message).__name__} before the greeting")
+            case Ping():
+                self._replies.append(
+                    Pong(message.number, message.mono_ns, now, self.clocks.mono_ns(), self.clocks.wall_ns())
+                )
+                return self._heard_clock(message.mono_ns, message.wall_ns)
+            case Pong():
+                sample = self.clock.add(message.echo_ns, message.arrived_ns, message.mono_ns, now)
+                if sample is not None:
+                    self.outbox.window.observe(sample.rtt_ns, now)
+                return self._heard_clock(message.mono_ns, message.wall_ns)
+            case Ack():
+                if not self.outbox.acked(message.taken, now - message.echo_ns, now):
+                    raise ProtocolError(f"{message} acknowledges what was not sent")
+                return []
+            case Notice():
+                self.notices[message.name] = message.text
+                return []
+            case Refuse():
+                channel = self.outbox.refuse(message.channel, message.reason)
+                return [] if channel is None else [Refused(channel.rule.topic, message.reason, here=False)]
+            case Announce():
+                return self._announced(message)
+            case Data():
+                return self._data(message, now)
+        raise ProtocolError(f"{type(message).__name__} does not belong here")
+
+    def _wrong_version(self, message: Hello | Welcome) -> list[Event]:
+        return self.end(
+            "version",
+            f"{message.name} speaks version {message.version} of the bridge, {self.side.name} version {VERSION}: "
+            "install the same Instant IC on both",
+            tell=True,
+        )
+
+    def _begin(self, message: Hello | Welcome) -> list[Event]:
+        wants = message.wants
+        for topic, rate in wants.items():
+            if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
+                raise ProtocolError(f"{type(message).__name__}: rate of {topic} must be a number >= 0 (got {rate!r})")
+        self.peer_name, self.peer_instance = message.name[:64], message.instance[:64]
+        self.outbox.wants = {topic: float(rate) for topic, rate in wants.items()}
+        self.up, self.up_ns = True, self.clocks.mono_ns()
+        self._next_ping_ns = self.up_ns
+        # Starts of the other that are over: their numbers say nothing any more.
+        received = self.memory.received
+        for key in [key for key in received if key[0] != self.peer_instance]:
+            del received[key]
+        return [Up(self.peer_name)]
+
+    def _announced(self, announce: Announce) -> list[Event]:
+        rule = self.side.imports.get(announce.topic)
+        reason = ""
+        if rule is None:
+            reason = f"{announce.topic} is not on the list of {self.side.name}"
+        elif not self.may_send:
+            reason = f"{self.peer_name} may only watch {self.side.name} (role viewer)"
+        else:
+            try:
+                if self.side.digest(announce.type_name) != announce.digest:
+                    reason = (
+                        f"{announce.type_name} has other fields on {self.peer_name} than on {self.side.name}: "
+                        "install the same Instant IC on both"
+                    )
+            except ValueError as error:
+                reason = str(error)
+        if len(self._incoming) >= 4096:
+            raise ProtocolError("more than 4096 topics are announced")
+        topic = announce.topic
+        counts = self.memory.counts_in.setdefault(topic, TopicCounts()) if rule is not None else TopicCounts()
+        self._incoming[announce.channel] = _Incoming(announce, rule or TopicRule("/none"), counts, reason)
+        if not reason:
+            return []
+        return self.refuse(announce, reason)
+
+    def refuse(self, announce: Announce, reason: str) -> list[Event]:
+        """Tells the other host that a topic of its is not taken."""
+        self._incoming[announce.channel].refused = reason
+        self._replies.append(Refuse(announce.channel, reason))
+        return [Refused(announce.topic, reason, here=True)]
+
+    def _data(self, data: Data, now: int) -> list[Event]:
+        incoming = self._incoming.get(data.channel)
+        if incoming is None:
+            raise ProtocolError(f"data of channel {data.channel}, which was not announced")
+        lane = data.lane  # the sender's: its list may rank the topic otherwise
+        self._taken[lane] += len(data.chunk) + DATA_OVERHEAD
+        self._ack = data.sent_ns
+        if incoming.refused:
+            return []
+        payload = self._assemble(lane, data)
+        if payload is None:
+            return []
+        return self._whole(incoming, data, payload, now)
+
+    def _assemble(self, lane: int, data: Data) -> bytes | bytearray | None:
+        """The whole message, when this was its last chunk."""
+        if data.offset == 0:
+            if len(data.chunk) == data.total:
+                return bytes(data.chunk)
+            if data.total > MAX_MESSAGE:
+                raise ProtocolError(f"message of {data.total} bytes; {MAX_MESSAGE} at most")
+            self._partial[lane] = (data, bytearray(data.chunk))
+            return None
+        first, payload = self._partial.get(lane, (None, bytearray()))
+        if (
+            first is None
+            or (first.channel, first.sequence, first.total) != (data.channel, data.sequence, data.total)
+            or len(payload) != data.offset
+        ):
+            raise ProtocolError(f"chunk at {data.offset} of channel {data.channel} has no beginning")
+        payload += data.chunk
+        if len(payload) < data.total:
+            return None
+        del self._partial[lane]
+        return payload
+
+    def _whole(self, incoming: _Incoming, data: Data, payload: bytes | bytearray, now: int) -> list[Event]:
+        announce, counts = incoming.announce, incoming.counts
+        key = (self.peer_instance, announce.topic, announce.origin)
+        last = self.memory.received.get(key)
+        if last is not None and data.sequence > last + 1:
+            counts.lost += data.sequence - last - 1
+        self.memory.received[key] = data.sequence
+        # Our clock at the moment when the other bridge got the message.
+        age_ns = now - (data.admitted_ns - self.clock.offset_ns) if self.clock.ready else None
+        rule = incoming.rule
+        if rule.max_age_s and (age_ns is None or age_ns > rule.max_age_s * 1e9):
+            counts.expired += 1
+            return []
+        publish_ns = data.publish_ns
+        if data.wall_time and (offset := self.wall_offset_ns) is not None:
+            publish_ns -= offset
+        arrived = Arrived(announce, payload, publish_ns, age_ns or 0)
+        if not (self.drives or rule.shared):
+            counts.not_driving += 1
+            if announce.qos == "latched":
+                incoming.kept = arrived
+            return []
+        counts.messages += 1
+        counts.bytes += len(payload)
+        counts.newest_age_ns = arrived.age_ns
+        return [arrived]

@@ -1,0 +1,408 @@
+"""The link's state machine over simulated links."""
+
+import pytest
+
+from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Ping, decode
+from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
+from instant_ic.bridge.host_topics import TopicRule
+
+from simulated_link import DIGEST, MS, Way, World
+
+COMMAND = TopicRule("/operator/cmd_vel", lane="command", max_age_s=0.25)
+PICTURE = TopicRule("/camera/image/compressed", lane="bulk")
+STATE = TopicRule("/ic/state")
+
+
+def every(period_ms, action):
+    """Calls ``action(now)`` each period of the simulation."""
+
+    def each(now):
+        if (now // MS) % period_ms == 0:
+            action(now)
+
+    return each
+
+
+def test_greeting_and_messages_both_ways():
+    world = World([PICTURE], [COMMAND])
+    world.run(0.1)
+    assert [e for _, e in world.events["robot"]] == [Up("station")]
+    assert [e for _, e in world.events["station"]] == [Up("robot")]
+    world.publish("robot", PICTURE.topic, b"p" * 300_000)
+    world.publish("station", COMMAND.topic, b"c" * 60)
+    world.run(0.1)
+    ((_, picture),) = world.arrived("station")
+    ((_, command),) = world.arrived("robot")
+    assert bytes(picture.payload) == b"p" * 300_000 and picture.announce.topic == PICTURE.topic
+    assert picture.announce.type_name == "std_msgs/msg/String" and picture.announce.origin == "node"
+    assert bytes(command.payload) == b"c" * 60
+
+
+def test_empty_message_arrives():
+    world = World([STATE])
+    world.run(0.05)
+    world.publish("robot", STATE.topic, b"")
+    world.run(0.05)
+    assert [bytes(e.payload) for _, e in world.arrived("station")] == [b""]
+
+
+def test_what_the_station_does_not_want_is_not_sent():
+    world = World([PICTURE, STATE])
+    world.connect(not_wanted={STATE.topic})
+    world.run(0.05)
+    world.publish("robot", STATE.topic, b"x")
+    world.run(0.05)
+    assert world.arrived("station") == [] and sum(world.sessions["robot"].outbox.sent) == 0
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 3.5, -120.0])
+def test_clock_offset_and_publication_time_are_told_in_our_clock(ahead_s):
+    ahead = int(ahead_s * 1e9)
+    ways = [Way(delay_ns=20 * MS, jitter_ns=10 * MS, seed=s) for s in (1, 2)]
+    world = World([STATE], down=ways[0], up=ways[1], station_ahead_ns=ahead, mono_ahead_ns=7_000_000_000)
+    world.run(3.0)
+    # Symmetric but for the jitter of 10 ms: the best of some 20 exchanges is wrong by far less than half of it.
+    assert world.sessions["robot"].wall_offset_ns == pytest.approx(ahead, abs=3 * MS)
+    assert world.sessions["station"].wall_offset_ns == pytest.approx(-ahead, abs=3 * MS)
+    assert 40 * MS <= world.sessions["robot"].clock.min_rtt_ns <= 50 * MS
+    sent_wall = world.clocks["robot"].wall_ns()
+    world.publish("robot", STATE.topic, b"x")
+    world.run(0.1)
+    ((_, event),) = world.arrived("station")
+    assert event.publish_ns == pytest.approx(sent_wall + ahead, abs=3 * MS)
+    assert 19 * MS <= event.age_ns <= 33 * MS
+
+
+def test_offset_error_is_bound_by_half_the_round_trip_on_an_asymmetric_way():
+    # 5 ms there, 45 ms back: no exchange can tell this from a clock that is 20 ms off.
+    world = World(down=Way(delay_ns=5 * MS), up=Way(delay_ns=45 * MS))
+    world.run(2.0)
+    session = world.sessions["robot"]
+    assert abs(session.wall_offset_ns) == pytest.approx(20 * MS, abs=2 * MS)
+    assert abs(session.wall_offset_ns) <= session.clock.min_rtt_ns / 2
+
+
+def test_step_of_the_other_clock_is_told_and_followed_at_once():
+    world = World(station_ahead_ns=0)
+    world.run(1.0)
+    world.clocks["station"].wall_ahead += 1_500 * MS
+    world.run(0.4)
+    assert ClockStepped(1_500 * MS) in [e for _, e in world.events["robot"]]
+    assert world.sessions["robot"].wall_offset_ns == pytest.approx(1_500 * MS, abs=2 * MS)
+
+
+def test_age_of_a_command_does_not_depend_on_the_time_of_day():
+    world = World(to_robot=[COMMAND], station_ahead_ns=86_400_000_000_000)
+    world.run(0.5)
+    world.publish("station", COMMAND.topic, b"go")
+    world.run(0.05)
+    assert len(world.arrived("robot")) == 1
+
+
+def test_picture_after_a_stall_is_new():
+    """Foxglove's bridge 329: a flood of stale messages after a stall. Here the first picture after it is a fresh one."""
+    down = Way(delay_ns=10 * MS, rate=2e6)
+    world = World([PICTURE], down=down, times=LinkTimes(timeout_s=5.0))
+    world.run(1.0)
+    taken = {}
+
+    def picture(now):
+        index = len(taken)
+        taken[index] = now
+        world.publish("robot", PICTURE.topic, index.to_bytes(4, "little") + bytes(30_000))
+
+    world.run(2.0, each=every(100, picture))
+    down.stalled_until = world.now + 3_000 * MS
+    world.run(6.0, each=every(100, picture))
+    late = [
+        (now - taken[int.from_bytes(event.payload[:4], "little")]) / MS
+        for now, event in world.arrived("station")
+        if now > down.stalled_until
+    ]
+    # What was on its way as the stall began (a window of 64 kB), not the 30 pictures of the stall.
+    assert sum(age > 300 for age in late) <= 3, sorted(late)[-5:]
+    assert len(late) > 25
+    superseded = world.sessions["robot"].outbox.counts[PICTURE.topic].superseded
+    assert 20 <= superseded <= 32  # the 30 pictures of the stall but the last
+
+
+def test_commands_of_a_stall_are_dropped_and_counted():
+    up = Way(delay_ns=10 * MS)
+    world = World(to_robot=[COMMAND], up=up, times=LinkTimes(timeout_s=5.0))
+    world.run(0.5)
+    sent = []
+
+    def command(now):
+        sent.append(now)
+        world.publish("station", COMMAND.topic, len(sent).to_bytes(4, "little") + bytes(60))
+
+    world.run(1.0, each=every(50, command))
+    up.stalled_until = world.now + 2_000 * MS
+    world.run(4.0, each=every(50, command))
+    world.run(0.1)
+    arrivals = world.arrived("robot", COMMAND.topic)
+    ages = [now - sent[int.from_bytes(e.payload[:4], "little") - 1] for now, e in arrivals]
+    assert max(ages) <= 260 * MS
+    counts = world.memories["robot"].counts_in[COMMAND.topic]
+    out = world.sessions["station"].outbox.counts[COMMAND.topic]
+    assert counts.expired > 5
+    # Nothing is lost in silence: what did not arrive is told by one number or another.
+    assert len(sent) == counts.messages + counts.expired + counts.lost + out.superseded + out.expired
+
+
+@pytest.mark.parametrize("rate", [125e3, 1.25e6])
+def test_state_and_commands_do_not_wait_for_pictures_on_a_slow_link(rate):
+    """1 and 10 Mbit/s, with far more pictures than fit."""
+    rules = [PICTURE, STATE, TopicRule("/operator/cmd_vel", lane="command")]
+    world = World(rules, down=Way(delay_ns=20 * MS, rate=rate), up=Way(delay_ns=20 * MS))
+    world.run(0.5)
+    born = {}
+
+    def all_of_it(now):
+        if (now // MS) % 33 == 0:
+            world.publish("robot", PICTURE.topic, bytes(200_000))
+        if (now // MS) % 50 == 0:
+            for topic in (STATE.topic, "/operator/cmd_vel"):
+                mark = len(born).to_bytes(4, "little")
+                born[mark] = now
+                world.publish("robot", topic, mark + bytes(200))
+
+    world.run(20.0, each=all_of_it)
+    worst = {}
+    for topic in (STATE.topic, "/operator/cmd_vel"):
+        ages = sorted(now - born[bytes(e.payload[:4])] for now, e in world.arrived("station", topic)[100:])
+        worst[topic] = ages[int(len(ages) * 0.95)] / MS
+        assert len(ages) > 150
+    # Before it only what is on its way already: the window is at its least 8 kB (64 ms at 1 Mbit/s).
+    assert worst["/operator/cmd_vel"] < 20 + 130, worst
+    assert worst[STATE.topic] < 20 + 150, worst
+    pictures = world.arrived("station", PICTURE.topic)
+    used = sum(len(e.payload) for _, e in pictures) / 20.5 / rate
+    assert used > 0.7, f"only {used:.0%} of the link is used"
+
+
+def test_window_fills_a_fast_link():
+    world = World([PICTURE], down=Way(delay_ns=10 * MS, rate=12.5e6), up=Way(delay_ns=10 * MS))
+    world.run(0.5)
+    world.run(5.0, each=every(20, lambda now: world.publish("robot", PICTURE.topic, bytes(200_000))))
+    got = sum(len(e.payload) for _, e in world.arrived("station")) / 5.0
+    assert got > 0.8 * 10e6  # 50 pictures a second of 200 kB are offered
+
+
+def test_rate_limit_keeps_the_newest():
+    rule = TopicRule("/lidar/points", rate_hz=3.0, lane="bulk")
+    world = World([rule])
+    world.run(0.1)
+    world.run(10.0, each=every(100, lambda now: world.publish("robot", rule.topic, now.to_bytes(8, "little"))))
+    arrivals = world.arrived("station")
+    assert 28 <= len(arrivals) <= 32
+    assert all(now - int.from_bytes(e.payload, "little") <= 5 * MS for now, e in arrivals)
+    counts = world.sessions["robot"].outbox.counts[rule.topic]
+    assert counts.thinned == 100 - counts.messages and counts.superseded == 0
+    assert world.memories["station"].counts_in[rule.topic].lost == 0
+
+
+def test_rate_limit_of_a_latched_topic_still_brings_the_last_value():
+    rule = TopicRule("/map", rate_hz=1.0)
+    world = World([rule])
+    world.run(0.1)
+    for index in range(5):
+        world.publish("robot", rule.topic, bytes([index]), latched=True)
+        world.run(0.05)
+    world.run(2.0)
+    assert [e.payload[0] for _, e in world.arrived("station")] == [0, 4]
+
+
+def test_source_at_the_limit_is_not_halved_by_its_jitter():
+    rule = TopicRule("/scan", rate_hz=10.0)
+    world = World([rule], down=Way())
+    world.run(0.1)
+    times = iter([i * 100 + (7, -6, 4, -8, 2)[i % 5] for i in range(5, 105)])
+    state = {"next": next(times)}
+    begin = world.now
+
+    def each(now):
+        if state["next"] is not None and (now - begin) // MS >= state["next"]:
+            state["next"] = next(times, None)
+            world.publish("robot", rule.topic, b"x")
+
+    world.run(11.0, each=each)
+    assert len(world.arrived("station")) >= 98
+
+
+def test_queue_of_a_reliable_topic_loses_nothing_and_tells_what_did_not_fit():
+    rule = TopicRule("/rosout")
+    down = Way(rate=1e5)
+    world = World([rule], down=down, times=LinkTimes(timeout_s=60, ping_s=0.25))
+    world.run(0.1)
+    for index in range(900):
+        world.publish("robot", rule.topic, index.to_bytes(2, "little") + bytes(98), queued=True)
+    world.run(5.0)
+    assert [int.from_bytes(e.payload[:2], "little") for _, e in world.arrived("station")] == list(range(900))
+    for index in range(1500):
+        world.publish("robot", rule.topic, index.to_bytes(2, "little") + bytes(98), queued=True)
+    world.run(8.0)
+    overflowed = world.sessions["robot"].outbox.counts[rule.topic].overflowed
+    assert overflowed > 300
+    assert world.memories["station"].counts_in[rule.topic].lost == overflowed
+    assert len(world.arrived("station")) == 900 + 1500 - overflowed
+
+
+def test_what_a_broken_link_swallowed_is_counted_as_lost():
+    rule = TopicRule("/tf")
+    world = World([rule], down=Way(delay_ns=20 * MS), up=Way(delay_ns=20 * MS))
+    world.run(0.2)
+    for _ in range(10):
+        world.publish("robot", rule.topic, b"before", queued=True)
+    world.run(0.1)
+    for _ in range(7):
+        world.publish("robot", rule.topic, b"in the air", queued=True)
+    world.run(0.01)
+    world.connect()
+    for _ in range(5):
+        world.publish("robot", rule.topic, b"nobody there", queued=True)
+    world.run(0.2)
+    world.publish("robot", rule.topic, b"after", queued=True)
+    world.run(0.1)
+    assert [bytes(e.payload) for _, e in world.arrived("station")] == [b"after"]
+    assert world.memories["station"].counts_in[rule.topic].lost == 12
+
+
+def test_silence_ends_the_link_on_both_sides():
+    down, up = Way(), Way()
+    world = World([STATE], down=down, up=up, times=LinkTimes(ping_s=0.25, timeout_s=1.0))
+    world.run(1.0)
+    down.stalled_until = up.stalled_until = world.now + 10_000 * MS
+    cut = world.now
+    world.run(2.0)
+    for who in ("robot", "station"):
+        ((when, ended),) = [(t, e) for t, e in world.events[who] if isinstance(e, Ended)]
+        assert ended.code == "timeout" and 0.7e9 < when - cut < 1.4e9
+
+
+def test_idle_link_stays_up():
+    world = World([STATE])
+    world.run(10.0, step_ns=5 * MS)
+    assert world.sessions["robot"].up and world.sessions["station"].up
+
+
+def test_other_version_is_told_to_both():
+    world = World([STATE])
+    session = world.sessions["robot"]
+    hello = Hello(VERSION + 1, "station", "s", {}, 0)
+    (ended,) = session.receive(hello.encode())
+    assert ended.code == "version" and "install the same" in ended.reason
+    (data,) = session.outgoing()
+    assert decode(data) == Bye("version", ended.reason)
+
+
+def test_hello_of_a_future_version_with_other_fields_is_still_answered():
+    world = World([STATE])
+    frame = bytes([Hello.KIND]) + b'{"version": 9, "name": "station", "compression": "zstd"}'
+    (ended,) = world.sessions["robot"].receive(frame)
+    assert ended.code == "version" and "version 9" in ended.reason
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Ping(1, 0, 0),
+        Announce(1, "/scan", "n", "t", "d", "sensor"),
+        Data(1, 1, 0, 0, 0, 1, 0, b"x"),
+    ],
+)
+def test_nothing_is_taken_before_the_greeting(message):
+    world = World([STATE])
+    (ended,) = world.sessions["robot"].receive(message.encode())
+    assert ended.code == "protocol" and "before the greeting" in ended.reason
+
+
+def test_other_fields_of_a_type_are_refused_and_told_on_both_sides():
+    world = World([STATE])
+    world.run(0.1)
+    world.sessions["station"].side = world.sessions["station"].side.__class__(
+        "station", "station-1", world.rules["robot"], lambda name: "f" * 16
+    )
+    world.publish("robot", STATE.topic, b"x")
+    world.run(0.1)
+    world.publish("robot", STATE.topic, b"x")
+    world.run(0.1)
+    for who, here in (("station", True), ("robot", False)):
+        (refused,) = [e for _, e in world.events[who] if isinstance(e, Refused)]
+        assert refused.here is here and refused.topic == STATE.topic and "other fields" in refused.reason
+    assert world.arrived("station") == []
+    assert DIGEST != "f" * 16
+
+
+def test_viewer_may_send_nothing():
+    world = World([STATE], [COMMAND])
+    world.sessions["robot"].may_send = False
+    world.run(0.1)
+    world.publish("station", COMMAND.topic, b"go")
+    world.publish("robot", STATE.topic, b"x")
+    world.run(0.1)
+    assert world.arrived("robot") == [] and len(world.arrived("station")) == 1
+    (refused,) = [e for _, e in world.events["station"] if isinstance(e, Refused)]
+    assert "viewer" in refused.reason
+
+
+def test_topic_that_is_not_on_the_list_is_refused_even_from_a_driver():
+    """A station can never write /cmd_vel past the arbiter."""
+    world = World([], [COMMAND])
+    world.run(0.1)
+    session = world.sessions["robot"]
+    events = session.receive(Announce(9, "/cmd_vel", "evil", "std_msgs/msg/String", DIGEST, "sensor").encode())
+    assert [e.here for e in events] == [True] and "not on the list" in events[0].reason
+    assert session.receive(Data(9, 1, 0, 0, 0, 1, 0, b"x").encode()) == []
+    assert session.up
+
+
+def test_only_the_driving_host_is_taken_in_and_its_latched_values_come_with_the_lease():
+    status, estop = TopicRule("/vspace/status"), TopicRule("/operator/estop", lane="command", shared=True)
+    world = World([], [COMMAND, status, estop])
+    world.sessions["robot"].drives = False
+    world.run(0.1)
+    for topic, latched in ((COMMAND.topic, False), (status.topic, True), (estop.topic, True)):
+        world.publish("station", topic, topic.encode(), latched=latched)
+    world.run(0.1)
+    assert [e.announce.topic for _, e in world.arrived("robot")] == [estop.topic]
+    assert world.memories["robot"].counts_in[COMMAND.topic].not_driving == 1
+    events = world.sessions["robot"].set_drives(True)
+    assert [e.announce.topic for e in events] == [status.topic]
+    assert world.sessions["robot"].set_drives(True) == []
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        [Data(7, 1, 0, 0, 0, 1, 0, b"x")],
+        [
+            Announce(1, STATE.topic, "n", "t", DIGEST, "sensor"),
+            Data(1, 1, 0, 0, 0, 10, 0, b"01234"),
+            Data(1, 1, 0, 0, 0, 10, 6, b"6789"),
+        ],
+        [Announce(1, STATE.topic, "n", "t", DIGEST, "sensor"), Data(1, 1, 0, 0, 0, 10, 5, b"56789")],
+        [Announce(1, STATE.topic, "n", "t", DIGEST, "sensor"), Data(1, 1, 0, 0, 0, 1 << 31, 0, b"0")],
+    ],
+    ids=["unannounced", "hole", "no beginning", "two gigabytes"],
+)
+def test_chunks_that_do_not_fit_end_the_link(frames):
+    world = World([STATE])
+    world.run(0.1)
+    session = world.sessions["station"]
+    events = [event for frame in frames for event in session.receive(frame.encode())]
+    assert isinstance(events[-1], Ended) and events[-1].code == "protocol"
+
+
+def test_many_topics_share_the_link_in_turn():
+    rules = [TopicRule(f"/camera{i}", lane="bulk") for i in range(4)]
+    world = World(rules, down=Way(delay_ns=5 * MS, rate=1e6), up=Way(delay_ns=5 * MS))
+    world.run(0.2)
+
+    def each(now):
+        for rule in rules:
+            world.publish("robot", rule.topic, bytes(20_000))
+
+    world.run(10.0, each=every(20, each))
+    counts = [len(world.arrived("station", rule.topic)) for rule in rules]
+    assert min(counts) > 80 and max(counts) - min(counts) <= 3
