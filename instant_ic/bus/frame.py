@@ -1,18 +1,39 @@
-"""The frame on the wire: topic, fixed header, CDR payload; three ZeroMQ message parts."""
+"""What goes over a topic's socket: a fixed header before every body, a greeting first.
+
+Publisher to reader: ``HELLO`` (JSON: who sends what), then ``DATA`` (CDR bytes) and ``SHARED`` (a place in shared
+memory; the file descriptor of a buffer that the reader does not know comes along with it). ``RETIRED`` names a buffer
+that will not be used again. Reader to publisher: one :data:`GREETING`, then the number (:data:`BUFFER_ID`) of each
+buffer that it has finished with.
+"""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import json
 import struct
 from dataclasses import dataclass
 
 from ..msg import type_hash
 
-VERSION = 1
-_HEADER = struct.Struct("<4sHHQq8s8s")
-_MAGIC = b"IIC\0"
-HEADER_SIZE = _HEADER.size
+VERSION = 2
+MAGIC = b"IIC\0"
+
+HEADER = struct.Struct("<4sBBHIIQq")
+"""Magic, version, kind, zero, messages skipped for this reader, bytes of the body, sequence, publish time in ns."""
+
+SHARED_BODY = struct.Struct("<IIQ")
+"""Number of the buffer, 1 if its file descriptor comes along, bytes of the message in it."""
+
+BUFFER_ID = struct.Struct("<I")
+
+GREETING = struct.Struct("<4sB?2xI")
+"""Magic, version, whether shared memory is understood, how many messages the reader keeps (1: the newest only)."""
+
+HELLO, DATA, SHARED, RETIRED = 1, 2, 3, 4
+
+MOST_BYTES = 0xFFFFFFFF
+"""Largest body."""
 
 
 class FrameError(ValueError):
@@ -20,41 +41,58 @@ class FrameError(ValueError):
 
 
 @dataclass(frozen=True)
-class FrameHeader:
-    """What stands before the payload.
+class Hello:
+    """What a publisher says of itself to a new reader.
 
     Attributes:
-        sequence: grows by one with each message of a publisher, from 1.
-        publish_ns: the publisher's clock.
-        publisher: 8 random bytes, new with every start of a publisher.
-        type_digest: see :func:`type_digest`.
+        node: name of its node.
+        topic: full name.
+        type_name: for example ``sensor_msgs/msg/Image``.
+        digest: see :func:`type_digest`.
+        publisher: 8 random bytes in hex, new with every start.
     """
 
-    sequence: int
-    publish_ns: int
-    publisher: bytes
-    type_digest: bytes
+    node: str
+    topic: str
+    type_name: str
+    digest: str
+    publisher: str
 
     def pack(self) -> bytes:
-        """The header's 40 bytes."""
-        return _HEADER.pack(_MAGIC, VERSION, 0, self.sequence, self.publish_ns, self.publisher, self.type_digest)
+        """The whole frame."""
+        body = json.dumps(self.__dict__).encode()
+        return HEADER.pack(MAGIC, VERSION, HELLO, 0, 0, len(body), 0, 0) + body
 
     @classmethod
-    def unpack(cls, data: bytes | memoryview) -> FrameHeader:
-        """Reads a header.
+    def unpack(cls, body: bytes) -> Hello:
+        """Reads the body of a frame.
 
         Raises:
-            FrameError: wrong length, magic or version.
+            FrameError: not the greeting of a publisher.
         """
-        if len(data) != HEADER_SIZE:
-            raise FrameError(f"header of {len(data)} bytes, {HEADER_SIZE} expected")
-        magic, version, _, sequence, publish_ns, publisher, digest = _HEADER.unpack(data)
-        if magic != _MAGIC or version != VERSION:
-            raise FrameError(f"not a frame of version {VERSION} (magic {magic!r}, version {version})")
-        return cls(sequence, publish_ns, publisher, digest)
+        try:
+            values = json.loads(body)
+            hello = cls(**values)
+        except (ValueError, TypeError) as error:
+            raise FrameError(f"a greeting that cannot be read: {error}") from None
+        if not all(isinstance(value, str) for value in values.values()):
+            raise FrameError("a greeting whose fields are not text")
+        return hello
+
+
+def parse_header(data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[int, int, int, int, int]:
+    """``(kind, skipped, bytes of the body, sequence, publish_ns)`` of the header at ``offset``.
+
+    Raises:
+        FrameError: wrong magic, version or kind.
+    """
+    magic, version, kind, _, skipped, size, sequence, publish_ns = HEADER.unpack_from(data, offset)
+    if magic != MAGIC or version != VERSION or not HELLO <= kind <= RETIRED:
+        raise FrameError(f"not a frame of version {VERSION} (magic {magic!r}, version {version}, kind {kind})")
+    return kind, skipped, size, sequence, publish_ns
 
 
 @functools.cache
-def type_digest(type_name: str) -> bytes:
-    """First 8 bytes of the SHA-256 of a type's name and RIHS01 hash: two sides agree on the type's fields."""
-    return hashlib.sha256(f"{type_name} {type_hash(type_name)}".encode()).digest()[:8]
+def type_digest(type_name: str) -> str:
+    """First 16 hex digits of the SHA-256 of a type's name and RIHS01 hash: two sides agree on the type's fields."""
+    return hashlib.sha256(f"{type_name} {type_hash(type_name)}".encode()).hexdigest()[:16]

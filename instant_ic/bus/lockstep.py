@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import threading
 from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from ..msg import deserialize, serialize, type_name
 from .clock import ManualClock
 from .node import Node
 from .qos import LATCHED, QoS
-from .transport import Payload, Received, Stats, joined
+from .transport import Payload, PublisherStats, Received, Stats, joined
 
 NodeT = TypeVar("NodeT", bound=Node[Any])
 
@@ -40,7 +41,7 @@ class _Publisher:
         self._bus = bus
         self._node = node
         self.topic, self.type_name, self.qos = topic, name, qos
-        self.stats = Stats()
+        self.stats = PublisherStats()
 
     @property
     def subscriber_count(self) -> int:
@@ -50,6 +51,11 @@ class _Publisher:
         data = bytes(joined(payload))
         self.stats.add(self._bus.clock.now_ns(), len(data))
         self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns)
+
+    def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
+        data = bytearray(size)
+        fill(memoryview(data))
+        self.send(data, publish_ns)
 
     def close(self) -> None:
         pass
@@ -76,6 +82,9 @@ class _Subscription:
 
 class _Transport:
     run_dir: Path | None = None
+
+    def waker(self) -> threading.Event:
+        return threading.Event()
 
     def __init__(self, bus: LockstepBus, node: str) -> None:
         self._bus = bus
@@ -215,7 +224,14 @@ class LockstepBus:
         subscription.stats.add(now, len(record.payload))
         subscription.queue.append(
             Received(
-                record.topic, record.type_name, record.payload, record.stamp_ns, now, next(self._orders), record.node
+                record.topic,
+                record.type_name,
+                record.payload,
+                record.stamp_ns,
+                now,
+                next(self._orders),
+                record.node,
+                now,
             )
         )
 

@@ -239,7 +239,7 @@ class Node(Generic[ConfigT]):
         self._timers: list[tuple[int, int, _Timer]] = []
         self._timer_orders = itertools.count()
         self._soon: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
-        self._wake = threading.Event()
+        self._wake = transport.waker()
         self._stop = threading.Event()
         self._workers: list[Worker] = []
         self._diagnoses: dict[str, tuple[int, str, dict[str, Any]]] = {}

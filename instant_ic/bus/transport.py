@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from .qos import QoS
 
@@ -16,9 +15,16 @@ Payload = Buffer | Sequence[Buffer]
 """CDR bytes: one buffer, or several that follow each other on the wire."""
 
 
-@dataclass(frozen=True)
-class Received:
-    """One message as it came."""
+class TransportError(RuntimeError):
+    """A message that the bus cannot carry."""
+
+
+class Received(NamedTuple):
+    """One message as it came.
+
+    ``payload`` is read-only. A large one is a view of its publisher's memory: it stays as it is for as long as
+    anything refers to it, and a reader that keeps many gets copies.
+    """
 
     topic: str
     type_name: str
@@ -28,16 +34,22 @@ class Received:
     order: int
     """Place in the order of arrival over all subscriptions of a node."""
     publisher: str = ""
-    """Name of the node that published it; its id in hex digits where the name is not known yet."""
+    """Name of the node that published it."""
+    steady_ns: int = 0
+    """When it came, on a clock that never jumps; for ages."""
 
 
 class Stats:
-    """Counts, rate, age and losses of one direction of a topic."""
+    """Counts, rate, age and losses of one direction of a topic.
+
+    Times are of a clock that never jumps: :func:`time.monotonic_ns` between processes, the bus's own in lockstep.
+    """
 
     def __init__(self) -> None:
         self.count = 0
         self.lost_by: dict[str, int] = {}
         self.rejected = 0
+        self.torn = 0
         self.bytes = 0
         self.newest_ns = 0
         self._arrivals: deque[int] = deque(maxlen=50)
@@ -73,18 +85,31 @@ class Stats:
         return (now_ns - self.newest_ns) / 1e9 if self.count else float("inf")
 
 
+class PublisherStats(Stats):
+    """Of a publisher; ``not_shared`` counts large messages for which there was no shared memory, and why."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.not_shared = 0
+        self.not_shared_why = ""
+
+
 class RawPublisher(Protocol):
     """Sends CDR bytes."""
 
     topic: str
     type_name: str
     qos: QoS
-    stats: Stats
+    stats: PublisherStats
 
     @property
     def subscriber_count(self) -> int: ...
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         """Sends one message; ``publish_ns`` keeps the publication time of a message that is only passed on."""
+        ...
+
+    def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
+        """Sends ``size`` bytes that ``fill`` writes straight to where readers find them."""
         ...
 
     def close(self) -> None: ...
@@ -112,12 +137,24 @@ class RawSubscription(Protocol):
     def close(self) -> None: ...
 
 
+class Waker(Protocol):
+    """What a node's thread waits on; a :class:`threading.Event` is one."""
+
+    def set(self) -> None: ...
+    def clear(self) -> None: ...
+    def wait(self, timeout: float) -> object: ...
+
+
 class Transport(Protocol):
     """Topics in and out of one node."""
 
     @property
     def run_dir(self) -> Path | None:
         """Where the topics are found; None in lockstep."""
+        ...
+
+    def waker(self) -> Waker:
+        """For the node's own thread; waiting on it may read the node's sockets."""
         ...
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> RawPublisher: ...

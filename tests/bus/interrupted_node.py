@@ -1,4 +1,4 @@
-"""A node that is interrupted just while it holds the lock of its own loop."""
+"""A node that is interrupted just while it holds the locks of its own bus."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ class Interrupted(Node[InterruptedConfig]):
         self.timer(0.05, self.tick)
 
     def tick(self) -> None:
-        with self._wake._cond:  # as inside Event.wait, Event.clear and Event.set
+        with self._transport._lock, self._transport._read_lock:  # as inside any call of the transport
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
 

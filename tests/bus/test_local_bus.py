@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, RegistryError, registry
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import Node, Publisher
-from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.msg import String, deserialize, serialize
 
 TALKER = Path(__file__).with_name("talker_node.py")
@@ -42,7 +42,7 @@ def wait_for(condition, timeout_s: float = 30.0):
 class Inbox:
     """Collects the strings of one topic."""
 
-    def __init__(self, transport: ZmqTransport, topic: str, qos=RELIABLE):
+    def __init__(self, transport: LocalTransport, topic: str, qos=RELIABLE):
         self.event = threading.Event()
         self.raw = transport.subscribe(topic, "std_msgs/msg/String", qos, self.event.set)
         self.texts: list[str] = []
@@ -54,7 +54,7 @@ class Inbox:
 
 @pytest.fixture
 def transport(run_dir: Path):
-    transport = ZmqTransport(run_dir, "tester", time.time_ns)
+    transport = LocalTransport(run_dir, "tester", time.time_ns)
     yield transport
     transport.close()
 
@@ -164,7 +164,7 @@ def test_other_type_on_a_topic_is_refused_and_counted(transport, caplog):
     publisher.send(b"\x00\x01\x00\x00\x01")
     wait_for(lambda: inbox.raw.stats.rejected == 1)
     assert inbox.poll() == []
-    assert "/numbers: a publisher sends std_msgs/msg/Bool, std_msgs/msg/String expected" in caplog.text
+    assert "/numbers: node tester sends std_msgs/msg/Bool, std_msgs/msg/String expected" in caplog.text
 
 
 def test_topic_that_is_a_prefix_of_another_is_separate(transport):
@@ -180,7 +180,7 @@ def test_topic_that_is_a_prefix_of_another_is_separate(transport):
 
 def test_path_too_long_for_a_socket(tmp_path):
     long = tmp_path / ("x" * 100)
-    transport = ZmqTransport(long, "tester", time.time_ns)
+    transport = LocalTransport(long, "tester", time.time_ns)
     try:
         with pytest.raises(RegistryError, match="set INSTANT_IC_RUN_DIR to a shorter folder"):
             transport.advertise("/a", "std_msgs/msg/String", SENSOR)
@@ -191,7 +191,7 @@ def test_path_too_long_for_a_socket(tmp_path):
 def test_run_directory_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RegistryError, match="set INSTANT_IC_RUN_DIR"):
-        ZmqTransport(tmp_path / "file" / "run", "tester", time.time_ns)
+        LocalTransport(tmp_path / "file" / "run", "tester", time.time_ns)
 
 
 def test_publish_checks_the_type(transport):

@@ -1,0 +1,519 @@
+"""One topic of one node: a Unix socket that readers connect to, and shared memory for what is large.
+
+A message goes from the publishing thread straight into each reader's socket: no thread and no process stands between
+them. A reader that does not keep up gets what it asked for: the newest message, or a queue.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+import select
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from . import registry
+from .frame import (
+    BUFFER_ID,
+    DATA,
+    GREETING,
+    HEADER,
+    MAGIC,
+    MOST_BYTES,
+    RETIRED,
+    SHARED,
+    SHARED_BODY,
+    VERSION,
+    Hello,
+    type_digest,
+)
+from .qos import QoS
+from .shm import BufferPool, SharedBuffer
+from .transport import Buffer, Payload, PublisherStats, TransportError
+
+if TYPE_CHECKING:
+    from .local_transport import LocalTransport
+
+SHARED_FROM_BYTES = 1 << 16
+"""Messages of this size and more go through shared memory (measured: benchmarks/bus.py threshold)."""
+
+BUFFERS_A_READER = 8
+"""How many buffers one reader can hold; see also :data:`~.local_subscription.VIEWS_HELD`."""
+
+_SPARE_BUFFERS = 3
+_SOCKET_BYTES = 1 << 20
+_QUEUE_BYTES = 128 << 20
+_LINGER_S = 0.2  # a last zero command still goes out when a node ends
+_MEMORY_RETRY_S = 5.0
+_READ_ONLY = select.EPOLLIN | select.EPOLLRDHUP
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Outgoing:
+    """A message on its way to readers: bytes, or a buffer."""
+
+    sequence: int
+    publish_ns: int
+    size: int
+    body: bytes | memoryview = b""
+    buffer: SharedBuffer | None = None
+
+    def kept(self) -> _Outgoing:
+        """The same, independent of the caller's memory."""
+        if self.buffer is not None or isinstance(self.body, bytes):
+            return self
+        return _Outgoing(self.sequence, self.publish_ns, self.size, bytes(self.body))
+
+    def inline(self) -> _Outgoing:
+        """The same as bytes."""
+        if self.buffer is None:
+            return self
+        return _Outgoing(self.sequence, self.publish_ns, self.size, bytes(self.buffer.view(self.size)))
+
+
+class _Reader:
+    """One connected reader; every call holds the publisher's lock."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.socket = connection
+        self.depth = 0  # 0: it has not greeted yet
+        self.shared = True
+        self.gone = False
+        self.deaf = False  # reads no more, but may still hold buffers
+        self.events = _READ_ONLY
+        self._flying: dict[int, SharedBuffer] = {}
+        self._known: set[int] = set()
+        self._queue: deque[_Outgoing] = deque()
+        self._queue_bytes = 0
+        self._part: memoryview | None = None  # what is left of a frame that went out in part
+        self._skipped = 0
+        self._incoming = b""
+
+    def greet(self) -> bool:
+        """Reads the reader's greeting; True once it is whole.
+
+        Raises:
+            ValueError: it is not of this version.
+        """
+        self._receive()
+        if len(self._incoming) < GREETING.size:
+            return False
+        magic, version, self.shared, depth = GREETING.unpack_from(self._incoming)
+        if magic != MAGIC or version != VERSION or not depth:
+            raise ValueError(f"a reader that does not speak version {VERSION} of the bus (it sent {magic!r} {version})")
+        self._incoming = self._incoming[GREETING.size :]
+        self.depth = depth
+        return True
+
+    def offer(self, message: _Outgoing) -> None:
+        """Sends a message, or queues it when the reader does not keep up."""
+        if self.deaf or self.gone:
+            return
+        if not self.shared:
+            message = message.inline()
+        if self._part is None and not self._queue and self._may_fly(message):
+            self._start(message)
+        else:
+            self._enqueue(message)
+
+    def flush(self) -> None:
+        """Sends what waits, as far as the socket and the reader's buffers allow."""
+        if self._part is not None:
+            self._send_part()
+        while self._part is None and self._queue and self._may_fly(self._queue[0]) and not (self.deaf or self.gone):
+            message = self._queue.popleft()
+            self._queue_bytes -= message.size
+            self._start(message)
+
+    def release(self) -> None:
+        """Takes back the buffers that the reader has finished with."""
+        if not self._flying:
+            return
+        self._receive()
+        whole = len(self._incoming) // BUFFER_ID.size * BUFFER_ID.size
+        for (number,) in BUFFER_ID.iter_unpack(self._incoming[:whole]):
+            if (buffer := self._flying.pop(number, None)) is not None:
+                buffer.holders.discard(self)
+        self._incoming = self._incoming[whole:]
+
+    def retire(self, buffer: SharedBuffer) -> None:
+        """Tells that a buffer will not come again, so that the reader lets go of its memory."""
+        if buffer.number in self._known:
+            self._known.discard(buffer.number)
+            frame = HEADER.pack(MAGIC, VERSION, RETIRED, 0, 0, BUFFER_ID.size, 0, 0) + BUFFER_ID.pack(buffer.number)
+            if self._part is not None:
+                self._part = memoryview(bytes(self._part) + frame)
+            else:
+                self._write(frame)
+
+    def wanted_events(self) -> int:
+        """What epoll should wait for."""
+        if self._part is not None:
+            return select.EPOLLRDHUP | select.EPOLLOUT
+        return _READ_ONLY if self._queue or not self.depth else select.EPOLLRDHUP
+
+    @property
+    def waiting(self) -> bool:
+        """Whether something is still to be sent."""
+        return not (self.gone or self.deaf) and (self._part is not None or bool(self._queue))
+
+    def close(self) -> None:
+        """Lets go of the connection and of all that was lent to it."""
+        self.gone = True
+        for buffer in self._flying.values():
+            buffer.holders.discard(self)
+        self._flying.clear()
+        self._drop_queue()
+        self.socket.close()
+
+    def _drop_queue(self) -> None:
+        for message in self._queue:
+            if message.buffer is not None:
+                message.buffer.holders.discard(self)
+        self._queue.clear()
+        self._part = None
+
+    def _may_fly(self, message: _Outgoing) -> bool:
+        if message.buffer is None or len(self._flying) < BUFFERS_A_READER:
+            return True
+        self.release()
+        return len(self._flying) < BUFFERS_A_READER
+
+    def _enqueue(self, message: _Outgoing) -> None:
+        message = message.kept()
+        if self.depth > 1 and len(self._flying) >= BUFFERS_A_READER:
+            message = message.inline()
+        if message.buffer is not None:
+            message.buffer.holders.add(self)
+        while self._queue and (len(self._queue) >= self.depth or self._queue_bytes + message.size > _QUEUE_BYTES):
+            old = self._queue.popleft()
+            self._queue_bytes -= old.size
+            if old.buffer is not None:
+                old.buffer.holders.discard(self)
+            if self.depth == 1:  # it asked for the newest only: what it does not see is not lost
+                self._skipped += 1
+        self._queue.append(message)
+        self._queue_bytes += message.size
+
+    def _start(self, message: _Outgoing) -> None:
+        skipped, self._skipped = self._skipped, 0
+        buffer = message.buffer
+        if buffer is None:
+            head = HEADER.pack(MAGIC, VERSION, DATA, 0, skipped, message.size, message.sequence, message.publish_ns)
+            if message.size < 16384:  # one copy is cheaper than a scattered write
+                self._write(head + message.body)
+            else:
+                self._write(head, message.body)
+            return
+        new = buffer.number not in self._known
+        frame = HEADER.pack(
+            MAGIC, VERSION, SHARED, 0, skipped, SHARED_BODY.size, message.sequence, message.publish_ns
+        ) + SHARED_BODY.pack(buffer.number, new, message.size)
+        buffer.holders.add(self)
+        self._flying[buffer.number] = buffer
+        self._known.add(buffer.number)
+        self._write(frame, fd=buffer.fd if new else None)
+
+    def _write(self, head: bytes, body: bytes | memoryview | None = None, fd: int | None = None) -> None:
+        """Sends a frame; what the socket does not take is kept for :meth:`flush`."""
+        try:
+            if fd is not None:
+                sent = socket.send_fds(self.socket, [head], [fd])
+            elif body is None:
+                sent = self.socket.send(head)
+            else:
+                sent = self.socket.sendmsg((head, body))
+        except BlockingIOError:
+            sent = 0
+        except OSError:  # EPIPE, ECONNRESET: it reads no more
+            self.deaf = True
+            self._drop_queue()
+            return
+        total = len(head) + (0 if body is None else len(body))
+        if sent < total:
+            if fd is not None and sent == 0:
+                self._unsent_fd(head, fd)
+                return
+            rest = head[sent:] + bytes(body[max(0, sent - len(head)) :] if body is not None else b"")
+            self._part = memoryview(rest)
+
+    def _unsent_fd(self, head: bytes, fd: int) -> None:
+        """The socket is full: the frame with its descriptor goes out when it has room again."""
+        self._part, self._part_fd = memoryview(head), fd
+
+    _part_fd: int | None = None
+
+    def _send_part(self) -> None:
+        assert self._part is not None
+        try:
+            while self._part:
+                if self._part_fd is not None:
+                    sent = socket.send_fds(self.socket, [self._part], [self._part_fd])
+                    self._part_fd = None
+                else:
+                    sent = self.socket.send(self._part)
+                self._part = self._part[sent:]
+            self._part = None
+        except BlockingIOError:
+            return
+        except OSError:
+            self.deaf = True
+            self._drop_queue()
+
+    def _receive(self) -> None:
+        try:
+            while data := self.socket.recv(4096):
+                self._incoming += data
+                if len(data) < 4096:
+                    return
+        except BlockingIOError:
+            return
+        except OSError:  # epoll tells it too, and then the reader is closed
+            self.deaf = True
+
+
+class LocalPublisher:
+    """One topic of one node.
+
+    Raises:
+        RegistryError: the node publishes the topic already, or the path is too long.
+    """
+
+    def __init__(self, transport: LocalTransport, topic: str, type_name: str, qos: QoS) -> None:
+        self.topic = topic
+        self.type_name = type_name
+        self.qos = qos
+        self.stats = PublisherStats()
+        self._transport = transport
+        self._lock = threading.RLock()  # publish may come from any thread, the bus thread serves the readers
+        self._sequence = 0
+        self._readers: dict[int, _Reader] = {}
+        self._pool = BufferPool()
+        self._memory_retry_s = 0.0
+        self._last: _Outgoing | None = None
+        self._closed = False
+        digest = type_digest(type_name)
+        self._claim, self._path = registry.claim_socket(transport.run_dir, topic, transport.node)
+        identity = os.urandom(8).hex()
+        self._hello = Hello(transport.node, topic, type_name, digest, identity).pack()
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        try:
+            self._listener.bind(str(self._path))
+            self._listener.listen(128)
+            self._claim.write(
+                {
+                    "topic": topic,
+                    "type": type_name,
+                    "qos": qos.name,
+                    "node": transport.node,
+                    "pid": os.getpid(),
+                    "socket": str(self._path),
+                    "id": identity,
+                    "started_ns": time.time_ns(),
+                }
+            )
+        except OSError as error:
+            self._listener.close()
+            self._claim.release()
+            raise registry.RegistryError(f"publisher of {topic} by node {transport.node}: {error}") from error
+        transport.watch(self._listener.fileno(), select.EPOLLIN, self._on_listener)
+
+    @property
+    def subscriber_count(self) -> int:
+        """How many readers are connected now."""
+        return sum(1 for reader in list(self._readers.values()) if reader.depth and not reader.deaf)
+
+    def send(self, payload: Payload, publish_ns: int | None = None) -> None:
+        """Sends one message; never waits. The payload may be changed as soon as this returns.
+
+        Raises:
+            TransportError: more than 4 GiB.
+        """
+        parts = [_flat(payload)] if isinstance(payload, (bytes, bytearray, memoryview)) else [_flat(p) for p in payload]
+        size = sum(len(part) for part in parts)
+        if size >= SHARED_FROM_BYTES:
+
+            def copy(target: memoryview) -> None:
+                at = 0
+                for part in parts:
+                    target[at : at + len(part)] = part
+                    at += len(part)
+
+            self.send_filled(size, copy, publish_ns)
+            return
+        body = parts[0] if len(parts) == 1 else b"".join(parts)
+        if isinstance(body, bytearray):
+            body = memoryview(body)
+        with self._lock:
+            if not self._closed:
+                self._distribute(*self._next(publish_ns), size, body, None)
+
+    def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
+        """Sends ``size`` bytes that ``fill`` writes where they are to be, without a further copy; never waits.
+
+        Raises:
+            TransportError: more than 4 GiB.
+        """
+        if size > MOST_BYTES:
+            raise TransportError(f"{self.topic}: a message of {size} bytes; the bus carries at most {MOST_BYTES}")
+        with self._lock:
+            if self._closed:
+                return
+            buffer = self._buffer(size) if size >= SHARED_FROM_BYTES else None
+            if buffer is None:
+                body = memoryview(bytearray(size))
+                fill(body)
+                self._distribute(*self._next(publish_ns), size, body, None)
+                return
+            target = buffer.begin(size)
+            try:
+                fill(target)
+            finally:
+                target.release()
+            sequence, stamp = self._next(publish_ns)
+            buffer.finish(sequence)
+            self._distribute(sequence, stamp, size, b"", buffer)
+
+    def close(self) -> None:
+        """Ends the topic and takes it out of the registry."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            self._claim.release()
+            self._transport.unwatch(self._listener.fileno())
+            self._listener.close()
+        deadline = time.monotonic() + _LINGER_S
+        while any(reader.waiting for reader in list(self._readers.values())) and time.monotonic() < deadline:
+            with self._lock:
+                for reader in self._readers.values():
+                    reader.flush()
+            time.sleep(0.002)
+        with self._lock:
+            for reader in list(self._readers.values()):
+                self._drop(reader)
+            self._pool.close()
+        self._path.unlink(missing_ok=True)
+        self._transport.forget(self)
+
+    # -- under the lock --------------------------------------------------------------------------
+
+    def _next(self, publish_ns: int | None) -> tuple[int, int]:
+        self._sequence += 1
+        return self._sequence, self._transport.now_ns() if publish_ns is None else publish_ns
+
+    def _distribute(
+        self, sequence: int, publish_ns: int, size: int, body: bytes | memoryview, buffer: SharedBuffer | None
+    ) -> None:
+        message = _Outgoing(sequence, publish_ns, size, body, buffer)
+        if self.qos.latched:
+            if self._last is not None and self._last.buffer is not None:
+                self._last.buffer.holders.discard(self)
+            self._last = message = message.kept()
+            if buffer is not None:
+                buffer.holders.add(self)
+        for reader in self._readers.values():
+            if reader.depth:
+                reader.offer(message)
+                self._rewatch(reader)
+        self.stats.add(time.monotonic_ns(), size)
+
+    def _buffer(self, size: int) -> SharedBuffer | None:
+        """A free buffer, or None when this message must go through the sockets."""
+        readers = list(self._readers.values())
+        if not readers and not self.qos.latched:
+            return None
+        for reader in readers:
+            reader.release()
+        if time.monotonic() < self._memory_retry_s:
+            self.stats.not_shared += 1
+            return None
+        try:
+            buffer, retired = self._pool.acquire(size, _SPARE_BUFFERS + (BUFFERS_A_READER + 1) * len(readers))
+        except OSError as error:
+            self._memory_retry_s = time.monotonic() + _MEMORY_RETRY_S
+            self.stats.not_shared += 1
+            self.stats.not_shared_why = f"no shared memory for {size} bytes: {error.strerror or error}"
+            log.warning("%s: %s; large messages go through the socket, slower", self.topic, self.stats.not_shared_why)
+            return None
+        for old in retired:
+            for reader in readers:
+                reader.retire(old)
+        if buffer is None:
+            self.stats.not_shared += 1
+            self.stats.not_shared_why = "readers hold all buffers"
+        return buffer
+
+    def _rewatch(self, reader: _Reader) -> None:
+        if reader.gone:
+            return
+        events = reader.wanted_events()
+        if events != reader.events:
+            reader.events = events
+            self._transport.rewatch(reader.socket.fileno(), events)
+
+    def _drop(self, reader: _Reader) -> None:
+        fd = reader.socket.fileno()
+        self._transport.unwatch(fd)
+        self._readers.pop(fd, None)
+        reader.close()
+
+    # -- on the bus thread -----------------------------------------------------------------------
+
+    def _on_listener(self, _: int) -> None:
+        with self._lock:
+            if self._closed:
+                return
+            while True:
+                try:
+                    connection, _address = self._listener.accept()
+                except BlockingIOError:
+                    return
+                except OSError as error:  # too many open files: told, and tried again with the next reader
+                    log.error("%s: a reader cannot be let in: %s", self.topic, error)
+                    time.sleep(0.05)
+                    return
+                connection.setblocking(False)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
+                reader = _Reader(connection)
+                self._readers[connection.fileno()] = reader
+                self._transport.watch(connection.fileno(), reader.events, functools.partial(self._on_reader, reader))
+                self._on_reader(reader, select.EPOLLIN)  # its greeting is there already, as a rule
+
+    def _on_reader(self, reader: _Reader, events: int) -> None:
+        with self._lock:
+            if reader.gone:
+                return
+            if events & (select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR):
+                self._drop(reader)
+                return
+            if not reader.depth:
+                try:
+                    if not reader.greet():
+                        return
+                except ValueError as error:
+                    log.error("%s: refused %s", self.topic, error)
+                    self._drop(reader)
+                    return
+                reader._write(self._hello)
+                if self._last is not None:
+                    reader.offer(self._last)
+            else:
+                reader.release()
+                reader.flush()
+            self._rewatch(reader)
+
+
+def _flat(part: Buffer) -> bytes | bytearray | memoryview:
+    """A buffer whose items are bytes, so that its length is its size."""
+    if isinstance(part, memoryview) and (part.format != "B" or part.ndim != 1):
+        return part.cast("B")
+    return part

@@ -1,0 +1,356 @@
+"""All publishers of one topic, as one node hears them."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import socket
+import struct
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+
+from . import registry
+from .frame import (
+    BUFFER_ID,
+    DATA,
+    GREETING,
+    HEADER,
+    HELLO,
+    MAGIC,
+    SHARED,
+    SHARED_BODY,
+    VERSION,
+    FrameError,
+    Hello,
+    parse_header,
+    type_digest,
+)
+from .qos import QoS
+from .shm import SharedMapping
+from .transport import Received, Stats
+
+if TYPE_CHECKING:
+    from .local_transport import LocalTransport
+
+VIEWS_HELD = 4
+"""Views into shared memory that one reader keeps; what comes beyond them is copied, so that a queue or a node that
+collects messages cannot take the publisher's buffers away."""
+
+SCRATCH_BYTES = 1 << 19
+_FDS_AT_ONCE = 8
+_FULL_LOOK_S = 1.0
+
+log = logging.getLogger(__name__)
+
+
+class Inlet:
+    """The connection to one publisher; reads frames, maps its buffers, gives them back."""
+
+    def __init__(self, subscription: LocalSubscription, path: str, scratch: memoryview) -> None:
+        self.subscription = subscription
+        self.hello: Hello | None = None
+        self.refused = False
+        self._scratch = scratch
+        self._rest = b""  # the start of a frame whose end has not come yet
+        self._header: tuple[int, int, int, int, int] | None = None
+        self._body: memoryview | None = None  # a large body that comes in pieces
+        self._got = 0
+        self._fds: deque[int] = deque()
+        self._mappings: dict[int, SharedMapping] = {}
+        self._views: dict[int, weakref.ref[Any]] = {}
+        self._closing = False
+        self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        try:
+            self.socket.connect(path)
+            self.socket.send(GREETING.pack(MAGIC, VERSION, subscription.shared, subscription.qos.depth))
+        except OSError:
+            self.socket.close()
+            raise
+
+    def read(self) -> bool:
+        """Takes in what waits on the socket; False when the publisher is gone.
+
+        Raises:
+            FrameError: what comes is not of this version of the bus.
+        """
+        while True:
+            try:
+                if self._body is not None:
+                    count = self.socket.recv_into(self._body[self._got :])
+                    if count == 0:
+                        return False
+                    self._got += count
+                    if self._got == len(self._body):
+                        assert self._header is not None
+                        body, self._body = self._body, None
+                        self._frame(self._header, body.toreadonly())
+                    continue
+                start = len(self._rest)
+                self._scratch[:start] = self._rest
+                space = len(self._scratch) - start
+                count, ancillary, flags, _ = self.socket.recvmsg_into(
+                    [self._scratch[start:]], socket.CMSG_SPACE(4 * _FDS_AT_ONCE), socket.MSG_CMSG_CLOEXEC
+                )
+            except BlockingIOError:
+                return True
+            except OSError:  # ECONNRESET: it died with data of ours unread
+                return False
+            for _level, _kind, data in ancillary:
+                self._fds.extend(fd for (fd,) in struct.iter_unpack("@i", data[: len(data) // 4 * 4]))
+            if flags & socket.MSG_CTRUNC:
+                self._without_shared_memory("too many open files")
+            if count == 0:
+                return False
+            self._rest = b""
+            self._parse(start + count)
+            if count < space and self._body is None and not ancillary:
+                return True
+
+    def _parse(self, end: int) -> None:
+        at = 0
+        scratch = self._scratch
+        while end - at >= HEADER.size:
+            header = parse_header(scratch, at)
+            size = header[2]
+            body_at = at + HEADER.size
+            if body_at + size > end:
+                if size > len(scratch) // 2:  # comes in pieces straight to where it stays
+                    self._header, self._got = header, end - body_at
+                    self._body = memoryview(np.empty(size, np.uint8).data)
+                    self._body[: self._got] = scratch[body_at:end]
+                    return
+                break
+            self._frame(header, bytes(scratch[body_at : body_at + size]))
+            at = body_at + size
+        self._rest = bytes(scratch[at:end])
+
+    def _frame(self, header: tuple[int, int, int, int, int], body: bytes | memoryview) -> None:
+        kind, skipped, _, sequence, publish_ns = header
+        if kind == DATA:
+            self.subscription.deliver(self, sequence, skipped, publish_ns, body)
+        elif kind == SHARED:
+            self.subscription.deliver(self, sequence, skipped, publish_ns, self._shared(bytes(body), sequence))
+        elif kind == HELLO:
+            self.hello = Hello.unpack(bytes(body))
+            self.subscription.met(self)
+        elif len(body) == BUFFER_ID.size:  # RETIRED
+            self._mappings.pop(BUFFER_ID.unpack(body)[0], None)
+
+    def _shared(self, body: bytes, sequence: int) -> memoryview | None:
+        """The message in shared memory; None when it is not what was announced."""
+        if len(body) != SHARED_BODY.size:
+            raise FrameError(f"a place in shared memory of {len(body)} bytes")
+        number, new, size = SHARED_BODY.unpack(body)
+        if new:
+            if not self._fds:
+                raise FrameError("a buffer without its file descriptor")
+            try:
+                self._mappings[number] = SharedMapping(self._fds.popleft())
+            except OSError as error:
+                self._without_shared_memory(error.strerror or str(error))
+        mapping = self._mappings.get(number)
+        if mapping is None or not mapping.fits(size):
+            raise FrameError(f"a message of {size} bytes in buffer {number}, which is not known or smaller")
+        if mapping.sequence != sequence:
+            self._give_back(number)
+            return None
+        if len(self._views) >= VIEWS_HELD or self.refused:
+            copy = memoryview(b"" if self.refused else bytes(mapping.view(size)))
+            torn = mapping.sequence != sequence
+            self._give_back(number)
+            return None if torn else copy
+        array = np.frombuffer(mapping.view(size), np.uint8)
+        # Everything made of the message refers to this array: when it goes, nobody looks at the buffer any more.
+        self._views[number] = weakref.ref(array, functools.partial(self._done, number, sequence, mapping))
+        return array.data
+
+    def _without_shared_memory(self, why: str) -> NoReturn:
+        self.subscription.shared = False
+        raise FrameError(f"shared memory cannot be used ({why}); connecting again without it, slower")
+
+    def _done(self, number: int, sequence: int, mapping: SharedMapping, _: object) -> None:
+        """The last view of a buffer is gone; may run in any thread."""
+        if mapping.sequence != sequence:
+            self.subscription.tell_torn(self)
+        self._views.pop(number, None)
+        self._give_back(number)
+        if self._closing and not self._views:
+            self.socket.close()
+
+    def _give_back(self, number: int) -> None:
+        with contextlib.suppress(OSError):  # the publisher is gone, and its buffers with it
+            self.socket.send(BUFFER_ID.pack(number), socket.MSG_NOSIGNAL)
+
+    def close(self) -> None:
+        """No more messages. While the node still looks at one, the publisher must not write over it: so the connection
+        stays for as long as that.
+        """
+        while self._fds:
+            os.close(self._fds.popleft())
+        self._closing = True
+        if self._views:
+            with contextlib.suppress(OSError):  # the publisher closed first
+                self.socket.shutdown(socket.SHUT_RD)
+            if self._views:
+                return
+        self.socket.close()
+
+
+class LocalSubscription:
+    """All publishers of one topic.
+
+    Raises:
+        RegistryError: the topic's name is not legal.
+    """
+
+    def __init__(
+        self, transport: LocalTransport, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]
+    ) -> None:
+        self.topic = registry.check_topic(topic)
+        self.type_name = type_name
+        self.qos = qos
+        self.stats = Stats()
+        self.on_ready = on_ready
+        self.fresh = False
+        self.shared = True  # until this process turns out not to be able to map memory
+        self.publishers: list[registry.PublisherInfo] = []
+        self._transport = transport
+        self._digest = type_digest(type_name) if type_name else None
+        self._sequences: dict[str, int] = {}
+        self._told: set[str] = set()
+        self._lock = threading.Lock()
+        self._queue: deque[tuple[str, Received]] = deque()
+        self._folder = registry.topic_dir(transport.run_dir, topic)
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._seen_mtime = -1
+        self._next_full_look = 0.0
+        self._inlets: dict[str, tuple[str, Inlet]] = {}  # by the publisher's identity: its socket's path, connection
+
+    # -- on the reading thread, under the transport's read lock ------------------------------------
+
+    def discover(self) -> None:
+        """Connects to publishers that appeared, lets go of those that left.
+
+        Raises:
+            OSError: the run directory is gone.
+        """
+        mtime = self._folder.stat().st_mtime_ns
+        now = time.monotonic()
+        if mtime == self._seen_mtime and now < self._next_full_look:
+            return
+        self._seen_mtime, self._next_full_look = mtime, now + _FULL_LOOK_S
+        self.publishers = registry.topic_publishers(self._transport.run_dir, self.topic)
+        wanted = {info.id: str(info.socket) for info in self.publishers}
+        for identity in [i for i in self._inlets if i not in wanted]:
+            # Its registration went before its socket: what it sent last may still be on the way.
+            self._transport.read_inlet(self._inlets[identity][1])
+            self.lose_inlet(self._inlets[identity][1])
+        for identity, path in wanted.items():
+            if identity not in self._inlets:
+                try:
+                    inlet = Inlet(self, path, self._transport.scratch)
+                except OSError:  # it is just starting or just ending: the next look decides
+                    self._next_full_look = now
+                    continue
+                self._inlets[identity] = (path, inlet)
+                self._transport.add_inlet(inlet)
+
+    def lose_inlet(self, inlet: Inlet) -> None:
+        """Lets go of a connection; a live publisher is found again."""
+        for identity, (_, other) in list(self._inlets.items()):
+            if other is inlet:
+                del self._inlets[identity]
+        self._next_full_look = 0.0
+        self._transport.remove_inlet(inlet)
+        inlet.close()
+
+    def met(self, inlet: Inlet) -> None:
+        """A publisher has said what it sends."""
+        hello = inlet.hello
+        assert hello is not None
+        if hello.topic != self.topic:
+            raise FrameError(f"a publisher of {hello.topic}")
+        inlet.refused = self._digest is not None and hello.digest != self._digest
+
+    def deliver(
+        self, inlet: Inlet, sequence: int, skipped: int, publish_ns: int, payload: bytes | memoryview | None
+    ) -> None:
+        """Takes one message."""
+        hello = inlet.hello
+        if hello is None:
+            raise FrameError("a message before the publisher's greeting")
+        if inlet.refused:
+            same = hello.type_name == self.type_name
+            why = f"{hello.type_name} with other fields" if same else f"{hello.type_name}, {self.type_name} expected"
+            self._reject(hello, f"{self.topic}: node {hello.node} sends {why}")
+            return
+        last = self._sequences.get(hello.publisher)
+        if last is not None:
+            if sequence <= last:  # a latched value that comes again with a new connection
+                return
+            self.stats.lose(hello.node, sequence - last - 1 - skipped)
+        self._sequences[hello.publisher] = sequence
+        if payload is None:
+            self.stats.lose(hello.node, 1)
+            self.tell_torn(inlet)
+            return
+        now, steady = self._transport.now_ns(), time.monotonic_ns()
+        type_name = self.type_name or hello.type_name
+        message = Received(
+            self.topic, type_name, payload, publish_ns, now, self._transport.next_order(), hello.node, steady
+        )
+        self.stats.add(steady, len(payload))
+        self.fresh = True
+        with self._lock:
+            queue = self._queue
+            if self.qos.depth == 1:
+                for index, (publisher, _) in enumerate(queue):
+                    if publisher == hello.publisher:
+                        del queue[index]
+                        break
+            elif len(queue) >= self.qos.depth:
+                self.stats.lose(self._node_of(queue.popleft()[0]), 1)
+            queue.append((hello.publisher, message))
+
+    def tell_torn(self, inlet: Inlet) -> None:
+        """A buffer was written over while it was lent: a fault of the publisher, counted and told."""
+        self.stats.torn += 1
+        node = inlet.hello.node if inlet.hello else "?"
+        log.error("%s: %s wrote over a message that was still being read", self.topic, node)
+
+    def _node_of(self, publisher: str) -> str:
+        return next((info.node for info in self.publishers if info.id == publisher), publisher)
+
+    def _reject(self, hello: Hello, why: str) -> None:
+        self.stats.rejected += 1
+        if hello.publisher not in self._told:
+            self._told.add(hello.publisher)
+            log.error("%s; its messages are refused and counted", why)
+
+    def shut(self) -> None:
+        """Closes every connection."""
+        for _, inlet in list(self._inlets.values()):
+            self.lose_inlet(inlet)
+
+    # -- on the node's thread --------------------------------------------------------------------
+
+    def take(self) -> list[Received]:
+        """See :class:`~.transport.RawSubscription`."""
+        if not self._queue:
+            return []
+        with self._lock:
+            messages = [message for _, message in self._queue]
+            self._queue.clear()
+        return messages
+
+    def close(self) -> None:
+        """Ends the subscription."""
+        self._transport.forget(self)

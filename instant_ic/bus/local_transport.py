@@ -1,0 +1,294 @@
+"""Topics of one node on one machine: Unix sockets found through the registry; no broker, no master.
+
+Who reads: while the node's thread waits in :meth:`Waker.wait`, it reads its sockets itself, so that a message wakes one
+thread and no other. When a callback lasts, the bus thread reads instead, so that the newest message never turns into
+an old one in a queue. The bus thread also lets readers in, sends on what a slow reader left, and looks for publishers.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import itertools
+import logging
+import os
+import select
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from . import registry
+from .frame import FrameError
+from .local_publisher import LocalPublisher
+from .local_subscription import SCRATCH_BYTES, Inlet, LocalSubscription
+from .qos import QoS
+
+_DISCOVERY_S = 0.1
+_IDLE_S = 5.0
+_BUSY_NS = 15_000_000  # a callback that lasts longer has the bus thread read in its place
+_CLOSE_S = 5.0
+
+log = logging.getLogger(__name__)
+
+
+class _OneShot:
+    """A timer in the kernel that makes a file descriptor readable; set for each callback, so it must cost little."""
+
+    def __init__(self, delay_ns: int) -> None:
+        libc = ctypes.PyDLL(None, use_errno=True)
+        self.fd = libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
+        if self.fd < 0:
+            raise OSError(ctypes.get_errno(), "timerfd_create")
+        self._settime = libc.timerfd_settime
+        timespec = ctypes.c_long * 4  # interval s, ns; value s, ns
+        self._on = (ctypes.c_int(self.fd), ctypes.c_int(0), timespec(0, 0, 0, delay_ns), None)
+        self._off = (ctypes.c_int(self.fd), ctypes.c_int(0), timespec(0, 0, 0, 0), None)
+
+    def start(self) -> None:
+        self._settime(*self._on)
+
+    def stop(self) -> None:
+        self._settime(*self._off)
+
+    def consume(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # it was stopped in this moment
+            os.read(self.fd, 8)
+
+
+class Waker:
+    """As a :class:`threading.Event` for the one thread that waits; waiting, it reads the node's sockets."""
+
+    def __init__(self, transport: LocalTransport) -> None:
+        self._transport = transport
+        self._set = False
+        self._written = False
+        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    def set(self) -> None:
+        """Ends the present or the next wait; from any thread."""
+        if self._set:
+            return
+        self._set = True
+        if threading.get_ident() != self._transport.driver:
+            self._written = True
+            os.eventfd_write(self.fd, 1)
+
+    def clear(self) -> None:
+        """Forgets what was set."""
+        self._set = False
+        if self._written:
+            self._written = False
+            with contextlib.suppress(BlockingIOError):  # who set it has not written yet: one wait ends for nothing
+                os.eventfd_read(self.fd)
+
+    def wait(self, timeout: float) -> None:
+        """Reads the node's sockets until something came, it was set, or the time is over."""
+        if not self._set:
+            self._transport.wait(timeout)
+
+
+class LocalTransport:
+    """Topics of one node.
+
+    Args:
+        run_dir: the run directory, made if missing.
+        node: the node's name; names the publishers' sockets.
+        now_ns: the node's clock.
+
+    Raises:
+        RegistryError: the run directory cannot be used.
+    """
+
+    def __init__(self, run_dir: Path, node: str, now_ns: Callable[[], int]) -> None:
+        self.run_dir = registry.prepare(run_dir)
+        self.node = registry.check_node_name(node)
+        self.now_ns = now_ns
+        self.driver: int | None = None
+        self.scratch = memoryview(bytearray(SCRATCH_BYTES))
+        self._orders = itertools.count()
+        self._lock = threading.Lock()
+        self._read_lock = threading.RLock()
+        self._publishers: list[LocalPublisher] = []
+        self._subscriptions: list[LocalSubscription] = []
+        self._inlets: dict[int, Inlet] = {}
+        self._stop = threading.Event()
+        self._inputs = select.epoll()
+        self._events = select.epoll()
+        self._handlers: dict[int, Callable[[int], None]] = {}
+        self._poke = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._events.register(self._poke, select.EPOLLIN)
+        self._busy = _OneShot(_BUSY_NS)
+        self._waiting = False
+        self._bus_reads = True
+        self._events.register(self._inputs.fileno(), select.EPOLLIN)
+        self._waker: Waker | None = None
+        self._look_now = False
+        self._thread = threading.Thread(target=self._run, name="bus", daemon=True)
+        self._thread.start()
+
+    def waker(self) -> Waker:
+        """What the node's thread waits on; one a transport."""
+        if self._waker is None:
+            self._waker = Waker(self)
+            self._inputs.register(self._waker.fd, select.EPOLLIN)
+        return self._waker
+
+    def next_order(self) -> int:
+        """Place of a message in the order of arrival."""
+        return next(self._orders)
+
+    def advertise(self, topic: str, type_name: str, qos: QoS) -> LocalPublisher:
+        """A publisher that readers find from now on.
+
+        Raises:
+            RegistryError: the node publishes the topic already, or the path is too long.
+        """
+        publisher = LocalPublisher(self, registry.check_topic(topic), type_name, qos)
+        with self._lock:
+            self._publishers.append(publisher)
+        return publisher
+
+    def subscribe(self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> LocalSubscription:
+        """A subscription to all present and coming publishers; ``type_name`` None takes any type."""
+        subscription = LocalSubscription(self, topic, type_name, qos, on_ready)
+        with self._lock:
+            self._subscriptions.append(subscription)
+            self._look_now = True
+        os.eventfd_write(self._poke, 1)
+        return subscription
+
+    def forget(self, item: LocalPublisher | LocalSubscription) -> None:
+        """Lets go of a closed publisher or subscription."""
+        with self._lock:
+            if isinstance(item, LocalPublisher):
+                if item in self._publishers:
+                    self._publishers.remove(item)
+                return
+            if item not in self._subscriptions:
+                return
+            self._subscriptions.remove(item)
+        with self._read_lock:
+            item.shut()
+
+    def close(self) -> None:
+        """Closes everything; last messages get up to 0.2 s to leave."""
+        if self._stop.is_set():
+            return
+        for publisher in list(self._publishers):
+            publisher.close()
+        self._stop.set()
+        os.eventfd_write(self._poke, 1)
+        self._thread.join(timeout=_CLOSE_S)
+        for subscription in list(self._subscriptions):
+            subscription.close()
+        with self._read_lock:
+            self._inputs.close()
+            self._events.close()
+            for fd in (self._poke, self._busy.fd, *([self._waker.fd] if self._waker else [])):
+                os.close(fd)
+
+    # -- for publishers: sockets that the bus thread serves ------------------------------------------
+
+    def watch(self, fd: int, events: int, handler: Callable[[int], None]) -> None:
+        """Calls ``handler(events)`` on the bus thread."""
+        self._handlers[fd] = handler
+        self._events.register(fd, events)
+
+    def rewatch(self, fd: int, events: int) -> None:
+        """Other events from now on."""
+        self._events.modify(fd, events)
+
+    def unwatch(self, fd: int) -> None:
+        """No more calls; before the file descriptor is closed."""
+        if self._handlers.pop(fd, None) is not None:
+            self._events.unregister(fd)
+
+    # -- for subscriptions, under the read lock --------------------------------------------------
+
+    def add_inlet(self, inlet: Inlet) -> None:
+        """Reads from a connection from now on."""
+        self._inlets[inlet.socket.fileno()] = inlet
+        self._inputs.register(inlet.socket.fileno(), select.EPOLLIN)
+
+    def remove_inlet(self, inlet: Inlet) -> None:
+        """Reads from it no more."""
+        if self._inlets.pop(inlet.socket.fileno(), None) is not None:
+            self._inputs.unregister(inlet.socket.fileno())
+
+    def read_inlet(self, inlet: Inlet) -> None:
+        """Takes in what came over one connection."""
+        try:
+            alive = inlet.read()
+        except (FrameError, OSError) as error:
+            log.error("%s: %s; the connection is closed", inlet.subscription.topic, error)
+            alive = False
+        if not alive:
+            inlet.subscription.lose_inlet(inlet)
+
+    # -- reading ---------------------------------------------------------------------------------
+
+    def wait(self, timeout: float) -> None:
+        """Reads the node's sockets until something came or the time is over; on the node's thread."""
+        self._waiting = True
+        self._busy.stop()
+        if self._bus_reads:
+            self._bus_reads = False
+            self._events.modify(self._inputs.fileno(), 0)
+        if self.driver is None:
+            self._events.register(self._busy.fd, select.EPOLLIN)
+        self.driver = threading.get_ident()
+        events = self._inputs.poll(timeout, 16)
+        self._drain(events)
+        self._waiting = False
+        self._busy.start()
+
+    def _drain(self, events: list[tuple[int, int]]) -> None:
+        ready: list[LocalSubscription] = []
+        with self._read_lock:
+            for fd, _ in events:
+                inlet = self._inlets.get(fd)
+                if inlet is not None:
+                    self.read_inlet(inlet)
+                    if inlet.subscription.fresh:
+                        inlet.subscription.fresh = False
+                        ready.append(inlet.subscription)
+        for subscription in ready:
+            subscription.on_ready()
+
+    def _run(self) -> None:
+        inputs = self._inputs.fileno()
+        next_look = 0.0
+        while not self._stop.is_set():
+            now = time.monotonic()
+            if self._look_now or now >= next_look:
+                self._look_now = False
+                next_look = now + (_DISCOVERY_S if self._look() else 1.0)
+            timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
+            for fd, events in self._events.poll(max(0.0, timeout), 64):
+                if fd == inputs:
+                    self._drain(self._inputs.poll(0, 64))
+                elif fd == self._poke:
+                    os.eventfd_read(fd)
+                elif fd == self._busy.fd:
+                    self._busy.consume()
+                    if not self._waiting:
+                        self._bus_reads = True
+                        self._events.modify(inputs, select.EPOLLIN)
+                elif (handler := self._handlers.get(fd)) is not None:
+                    handler(events)
+
+    def _look(self) -> bool:
+        """Looks for publishers; False when the run directory is gone."""
+        fine = True
+        for subscription in list(self._subscriptions):
+            with self._read_lock:
+                try:
+                    subscription.discover()
+                except OSError as error:
+                    log.error("%s: %s", subscription.topic, error)
+                    fine = False
+                fresh, subscription.fresh = subscription.fresh, False
+            if fresh:
+                subscription.on_ready()
+        return fine
