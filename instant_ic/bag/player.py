@@ -1,19 +1,23 @@
-"""Plays a bag at its own pace, or faster; the clock goes before each message."""
+"""Plays a bag at its own pace, or another; can be paused, stepped, and told to play from elsewhere."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from instant_ic.bag.choice import EVERYTHING, TopicChoice
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagMessage, BagReader
-from instant_ic.bag.recorder import EVERYTHING, TopicChoice
+from instant_ic.bag.read_ahead import ReadAhead
 
-NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics")
+NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics", "/parameter_events")
 """What nodes tell of themselves and the time itself: those who run now tell their own."""
+
+RATES = (0.01, 100.0)
+"""Slowest and fastest that a player may be told to play while it plays."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,8 @@ class PlayOptions:
         duration_s: end after this much of the bag; 0 plays to the end.
         loop: begin again at the end.
         choice: which topics.
+        start_paused: wait at the beginning for :meth:`BagPlayer.resume` or :meth:`BagPlayer.step`.
+        clock_hz: how often at least the time is told, also while paused and between messages.
     """
 
     rate: float = 1.0
@@ -33,19 +39,21 @@ class PlayOptions:
     duration_s: float = 0.0
     loop: bool = False
     choice: TopicChoice = EVERYTHING
+    start_paused: bool = False
+    clock_hz: float = 40.0
 
     def __post_init__(self) -> None:
         """Checks the values."""
-        if not self.rate > 0:
-            raise ValueError(f"rate must be > 0 (got {self.rate})")
-        if self.start_offset_s < 0:
-            raise ValueError(f"start_offset_s must be >= 0 (got {self.start_offset_s})")
-        if self.duration_s < 0:
-            raise ValueError(f"duration_s must be >= 0 (got {self.duration_s})")
+        for key in ("rate", "clock_hz"):
+            if not getattr(self, key) > 0:
+                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        for key in ("start_offset_s", "duration_s"):
+            if getattr(self, key) < 0:
+                raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
 
 
 class BagPlayer:
-    """Paces the messages of a bag; knows no bus.
+    """Paces the messages of a bag; knows no bus. Its controls may be called from any thread.
 
     Args:
         path: the bag.
@@ -59,9 +67,13 @@ class BagPlayer:
         self.options = options
         self._reader = BagReader(path)
         played = {t.topic for t in self._reader.topics if options.choice.takes(t.topic)} - set(NEVER_PLAYED)
-        self.topics = [t for t in self._reader.topics if t.topic in played]
+        # Of a topic with several types the one with most messages: a publisher has one type.
+        chosen = {t.topic: t for t in sorted(self._reader.topics, key=lambda t: t.count) if t.topic in played}
+        self.topics = [chosen[topic] for topic in sorted(chosen)]
         """What will be sent."""
-        self._names = {t.topic for t in self.topics}
+        self.left_out = [t for t in self._reader.topics if t.topic in chosen and t != chosen[t.topic]]
+        """Topics with another type than the one that is sent."""
+        self._types = {t.topic: t.type_name for t in self.topics}
         self.start_ns = self._reader.start_ns + int(options.start_offset_s * 1e9)
         self.end_ns = self._reader.end_ns
         if options.duration_s:
@@ -72,13 +84,103 @@ class BagPlayer:
         if self.start_ns > self.end_ns:
             self._reader.close()
             raise BagError(f"bag {path} ends before start_offset_s = {options.start_offset_s}")
+        self.position_ns = self.start_ns
+        """The time of the bag that holds now."""
+        self.sent = 0
+        """Messages sent."""
+        self.rounds = 0
+        """How often it has come to the end."""
+        self.latest_s = 0.0
+        """By how much the latest message was late: the machine, or who takes them, is slower than the bag."""
+        self._rate = options.rate
+        self._paused = options.start_paused
+        self._steps = 0
+        self._seek_ns: int | None = None
+        self._anchor_s = 0.0
+        self._anchor_ns = self.start_ns
+        self._lock = threading.Lock()
+        self._now_s: Callable[[], float] = time.monotonic
 
     def close(self) -> None:
         """Closes the bag."""
         self._reader.close()
 
+    def differing_types(self) -> list[str]:
+        """Types of what is played whose definition in the bag is another than ours."""
+        return [name for name in self._reader.differing_types() if name in {t.type_name for t in self.topics}]
+
+    # -- controls ----------------------------------------------------------------------------------
+
+    @property
+    def rate(self) -> float:
+        """2 plays twice as fast."""
+        return self._rate
+
+    @property
+    def paused(self) -> bool:
+        """Whether time stands still."""
+        return self._paused
+
+    def set_rate(self, rate: float) -> None:
+        """Plays faster or slower from here on.
+
+        Raises:
+            ValueError: out of :data:`RATES`.
+        """
+        if not RATES[0] <= rate <= RATES[1]:
+            raise ValueError(f"rate must lie in {RATES[0]:g}..{RATES[1]:g} (got {rate})")
+        with self._lock:
+            self._anchor(self.position_ns)
+            self._rate = rate
+
+    def pause(self) -> None:
+        """Stops the time."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Goes on from where the time stands."""
+        with self._lock:
+            self._anchor(self.position_ns)
+            self._paused = False
+
+    def toggle(self) -> None:
+        """Pauses, or goes on."""
+        if self._paused:
+            self.resume()
+        else:
+            self.pause()
+
+    def step(self, count: int = 1) -> None:
+        """Sends the next messages, and stands still again.
+
+        Raises:
+            ValueError: less than one.
+        """
+        if count < 1:
+            raise ValueError(f"count must be >= 1 (got {count})")
+        with self._lock:
+            self._paused = True
+            self._steps += count
+
+    def seek(self, offset_s: float) -> None:
+        """Plays from elsewhere: seconds from the beginning of what is played; the latched values of there are sent.
+
+        Raises:
+            ValueError: outside of it.
+        """
+        length_s = (self.end_ns - self.start_ns) / 1e9
+        if not 0 <= offset_s <= length_s:
+            raise ValueError(f"offset_s must lie in 0..{length_s:.3f} (got {offset_s})")
+        self._seek_ns = self.start_ns + int(offset_s * 1e9)
+
+    # -- playing -----------------------------------------------------------------------------------
+
     def play(
-        self, send: Callable[[BagMessage], None], stop: threading.Event, now_s: Callable[[], float] = time.monotonic
+        self,
+        send: Callable[[BagMessage], None],
+        stop: threading.Event,
+        now_s: Callable[[], float] = time.monotonic,
+        on_clock: Callable[[int], None] = lambda stamp_ns: None,
     ) -> bool:
         """Sends every message at its time; returns at the end, or when ``stop`` is set.
 
@@ -86,36 +188,87 @@ class BagPlayer:
             send: called with each message, once its time has come.
             stop: ends it; also interrupts waiting.
             now_s: the clock of the pace.
+            on_clock: told the bag's time now and then, first at the beginning; in between :attr:`position_ns` holds.
 
         Returns:
             Whether it came to the end.
         """
+        self._now_s = now_s
+        begin_ns = self.start_ns
         while True:
-            self._send_latched_before_start(send)
-            began_s = now_s()
-            for message in self._reader.messages(self._names, self.start_ns, self.end_ns + 1):
-                due_s = began_s + (message.stamp_ns - self.start_ns) / 1e9 / self.options.rate
-                if stop.wait(max(0.0, due_s - now_s())):
-                    return False
-                send(message)
-            if not self.options.loop:
-                return True
+            self.position_ns = begin_ns
+            on_clock(begin_ns)
+            self._send_latched_before(begin_ns, send)
+            with self._lock:
+                self._anchor(begin_ns)
+            with ReadAhead(self._messages(set(self._types), begin_ns, self.end_ns + 1), stop) as messages:
+                finished = self._play_once(messages, send, stop, on_clock)
             if stop.is_set():
                 return False
+            if not finished:
+                begin_ns, self._seek_ns = self._seek_ns or self.start_ns, None
+                continue
+            self.rounds += 1
+            if not self.options.loop:
+                return True
+            begin_ns = self.start_ns
 
-    def _send_latched_before_start(self, send: Callable[[BagMessage], None]) -> None:
+    def _play_once(
+        self,
+        messages: ReadAhead,
+        send: Callable[[BagMessage], None],
+        stop: threading.Event,
+        on_clock: Callable[[int], None],
+    ) -> bool:
+        """True at the end of the messages; False when it shall stop or play from elsewhere."""
+        period_s = 1.0 / self.options.clock_hz
+        next_clock_s = self._now_s() + period_s
+        for message in messages:
+            while True:
+                if stop.is_set() or self._seek_ns is not None:
+                    return False
+                now_s = self._now_s()
+                with self._lock:
+                    if self._steps and self._paused:
+                        self._steps -= 1
+                        self._anchor(message.stamp_ns)
+                        break
+                    due_s = self._anchor_s + (message.stamp_ns - self._anchor_ns) / 1e9 / self._rate
+                    if not self._paused:
+                        if now_s >= due_s:
+                            self.latest_s = max(self.latest_s, now_s - due_s)
+                            break
+                        at_ns = self._anchor_ns + int((now_s - self._anchor_s) * self._rate * 1e9)
+                        self.position_ns = min(max(self.position_ns, at_ns), message.stamp_ns)
+                if now_s >= next_clock_s:
+                    next_clock_s = now_s + period_s
+                    on_clock(self.position_ns)
+                stop.wait(period_s if self._paused else min(due_s - now_s, max(0.0, next_clock_s - now_s)))
+            self.position_ns = max(self.position_ns, message.stamp_ns)
+            send(message)
+            self.sent += 1
+        return self._seek_ns is None
+
+    def _messages(self, topics: set[str], start_ns: int | None, stop_ns: int) -> Iterator[BagMessage]:
+        messages = self._reader.messages(topics, start_ns, stop_ns)
+        return (message for message in messages if message.type_name == self._types[message.topic])
+
+    def _anchor(self, stamp_ns: int) -> None:
+        self._anchor_s, self._anchor_ns = self._now_s(), stamp_ns
+
+    def _send_latched_before(self, begin_ns: int, send: Callable[[BagMessage], None]) -> None:
         """The state that the skipped part left: the last value of each latched topic; transforms, all of them."""
         latched = {topic.topic for topic in self.topics if topic.qos.latched}
-        if not self.options.start_offset_s or not latched:
+        if begin_ns == self._reader.start_ns or not latched:
             return
         newest: dict[str, BagMessage] = {}
-        for message in self._reader.messages(latched, None, self.start_ns):
+        for message in self._messages(latched, None, begin_ns):
             if message.topic == "/tf_static":  # each publisher sends its own
-                send(_at(message, self.start_ns))
+                send(_at(message, begin_ns))
             else:
                 newest[message.topic] = message
         for message in newest.values():
-            send(_at(message, self.start_ns))
+            send(_at(message, begin_ns))
 
 
 def _at(message: BagMessage, stamp_ns: int) -> BagMessage:

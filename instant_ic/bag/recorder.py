@@ -1,16 +1,27 @@
-"""Records topics as they come: new publishers are found while it runs, nothing is decoded, losses are counted."""
+"""Records topics as they come: new publishers are found while it runs, nothing is decoded, what is lost is counted.
+
+The node that hands over messages never waits for the disk: they go into a queue, bounded by bytes, that a thread writes
+from. What finds no place there is counted by topic and told.
+"""
 
 from __future__ import annotations
 
-import fnmatch
 import json
+import logging
+import shutil
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.errors import BagError, DiskFullError
+from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bag.snapshot import Entry, SnapshotCache
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
@@ -18,27 +29,14 @@ from instant_ic.bus.registry import NodeInfo, TopicInfo
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock was made by another clock."""
 
+RECORDING, PAUSED, DISK_FULL, FAILED, ENDED = "recording", "paused", "disk full", "failed", "ended"
 
-@dataclass(frozen=True)
-class TopicChoice:
-    """Which topics to take.
+_FLUSH_S = 1.0
+_KEEP_CUSTOM_S = 10.0
+_SPACE_S = 1.0
+_ROOM_AGAIN = 64_000_000  # so much above the reserve, before it begins again
 
-    Attributes:
-        topics: names or patterns (``/camera/*``); empty takes all.
-        exclude: names or patterns to leave out.
-    """
-
-    topics: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
-
-    def takes(self, topic: str) -> bool:
-        """Whether a topic is wanted."""
-        if any(fnmatch.fnmatchcase(topic, pattern) for pattern in self.exclude):
-            return False
-        return not self.topics or any(fnmatch.fnmatchcase(topic, pattern) for pattern in self.topics)
-
-
-EVERYTHING = TopicChoice()
+log = logging.getLogger(__name__)
 
 
 class LossCounter(Protocol):
@@ -48,46 +46,193 @@ class LossCounter(Protocol):
     def lost(self) -> int:
         """Messages missing by the gaps in the sequence."""
 
+    @property
+    def lost_by(self) -> dict[str, int]:
+        """The same by publisher."""
 
-RawCallback = Callable[[str, str, bytes | memoryview, int], None]
-Subscribe = Callable[[str, RawCallback], LossCounter]
+
+class TakeMessage(Protocol):
+    """Takes ``(topic, type_name, payload, publish_ns, publisher)``."""
+
+    def __call__(
+        self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""
+    ) -> None: ...
+
+
+Subscribe = Callable[[str, TakeMessage], LossCounter]
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """How a recording is written.
+
+    Attributes:
+        compressed: chunks are compressed with zstd.
+        max_bytes: a file of this size is followed by the next; 0 makes one file.
+        max_duration_s: the same by time; 0 makes one file.
+        queue_bytes: what may wait for the disk.
+        reserve_bytes: stop while the disk has less free space than this.
+        snapshot_s: keep only so many seconds, in memory, and write them when asked; 0 writes everything at once.
+        cache_bytes: memory for them.
+    """
+
+    compressed: bool = False
+    max_bytes: int = 0
+    max_duration_s: float = 0.0
+    queue_bytes: int = 256_000_000
+    reserve_bytes: int = 100_000_000
+    snapshot_s: float = 0.0
+    cache_bytes: int = 256_000_000
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        for key in ("max_bytes", "max_duration_s", "reserve_bytes", "snapshot_s"):
+            if getattr(self, key) < 0:
+                raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
+        for key in ("queue_bytes", "cache_bytes"):
+            if getattr(self, key) < 1_000_000:
+                raise ValueError(f"{key} must be >= 1000000 (got {getattr(self, key)})")
+
+
+class _Queue:
+    """Messages and calls on their way to the writing thread."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self.max_bytes = max_bytes
+        self.bytes = 0
+        self._items: deque[Entry | Callable[[], None]] = deque()
+        self._condition = threading.Condition()
+
+    def put(self, item: Entry | Callable[[], None]) -> bool:
+        """False where a message finds no place; latched ones and calls always find one."""
+        size = len(item.payload) if isinstance(item, Entry) else 0
+        with self._condition:
+            if isinstance(item, Entry) and not item.qos.latched and self.bytes + size > self.max_bytes:
+                return False
+            self._items.append(item)
+            self.bytes += size
+            self._condition.notify()
+        return True
+
+    def take(self, timeout_s: float) -> Entry | Callable[[], None] | None:
+        """The next; None when there is none for so long."""
+        with self._condition:
+            if not self._items and not self._condition.wait_for(lambda: bool(self._items), timeout_s):
+                return None
+            return self._items.popleft()
+
+    def done(self, item: Entry) -> None:
+        """The message has been written: its bytes count no more."""
+        with self._condition:
+            self.bytes -= len(item.payload)
+
+
+@dataclass
+class Snapshot:
+    """One written snapshot.
+
+    Attributes:
+        path: its bag.
+        state: ``waiting``, ``writing``, ``done`` or ``failed``.
+        words: what it holds, or why it failed.
+        due_s: when it is written, by the monotonic clock.
+    """
+
+    path: Path
+    state: str = "waiting"
+    words: str = ""
+    due_s: float = 0.0
+
+
+@dataclass
+class _Told:
+    """What the metadata tell at the end."""
+
+    overflow: Counter[str] = field(default_factory=Counter)
+    paused: Counter[str] = field(default_factory=Counter)
+    disk_full: Counter[str] = field(default_factory=Counter)
+    no_type: Counter[str] = field(default_factory=Counter)
 
 
 class Recorder:
     """The recording itself, without a bus: it is told of publishers and given bytes.
 
     Args:
-        path: the bag's folder.
+        path: the bag's folder; with snapshots the folder that they go into, each a bag of its own.
         choice: which topics.
-        subscribe: ``(topic, callback)`` subscribes to raw bytes and gives the counter of lost messages.
+        subscribe: ``(topic, take)`` subscribes to raw bytes and gives the counter of lost messages.
         sim_now_ns: the simulated clock, where there is one. Who does not follow it (the recorder itself, the console)
             stamps with the machine's time; such messages get the simulated time of their arrival instead.
+        options: see :class:`RecordOptions`.
+        free_bytes: free space where the bag is; for tests.
 
     Raises:
         BagError: the bag cannot be made.
     """
 
     def __init__(
-        self, path: Path, choice: TopicChoice, subscribe: Subscribe, sim_now_ns: Callable[[], int] | None = None
+        self,
+        path: Path,
+        choice: TopicChoice,
+        subscribe: Subscribe,
+        sim_now_ns: Callable[[], int] | None = None,
+        options: RecordOptions | None = None,
+        free_bytes: Callable[[Path], int] = lambda path: shutil.disk_usage(path).free,
     ) -> None:
         self.path = path
-        self.writer = BagWriter(path)
+        self.options = options or RecordOptions()
         self.counts: Counter[str] = Counter()
         self.early = 0
+        self.error = ""
+        """Why it failed, or why it waits, in words."""
+        self.failed = False
+        """Whether something went wrong since it began."""
+        self.told = _Told()
+        self.snapshots: list[Snapshot] = []
         self._choice = choice
         self._subscribe = subscribe
         self._sim_now_ns = sim_now_ns
+        self._free_bytes = free_bytes
+        self._paused = False
+        self._state = RECORDING
         self._begun_ns = 0
-        self._held: list[tuple[str, str, bytes, int]] = []
+        self._held: list[tuple[str, str, bytes, int, str]] = []
+        self._missed = LatchedValues()
+        self._not_written: deque[Entry] = deque()
         self._losses: dict[str, LossCounter] = {}
         self._qos: dict[str, QoS] = {}
         self._parameters: dict[str, object] = {}
-        self._flushed_s = time.monotonic()
+        self._writer: BagWriter | None = None
+        self._cache: SnapshotCache | None = None
+        if self.options.snapshot_s:
+            try:
+                path.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise BagError(f"folder {path} for snapshots cannot be made: {error.strerror}") from None
+            self._cache = SnapshotCache(self.options.snapshot_s, self.options.cache_bytes)
+        else:
+            self._writer = BagWriter(path, self.options.compressed, self.options.max_bytes, self.options.max_duration_s)
+        self._queue = _Queue(self.options.queue_bytes)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
+        self._thread.start()
+
+    # -- on the node's thread ----------------------------------------------------------------------
 
     @property
     def topics(self) -> Collection[str]:
         """Topics that it listens to."""
         return self._losses.keys()
+
+    @property
+    def state(self) -> str:
+        """``recording``, ``paused``, ``disk full``, ``failed`` or ``ended``."""
+        return PAUSED if self._paused and self._state == RECORDING else self._state
+
+    @property
+    def count(self) -> int:
+        """Messages written, in snapshot mode those in memory or written."""
+        return self._writer.count if self._writer is not None else sum(self.counts.values())
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
         """Subscribes to what is new and wanted; notes the parameters of nodes."""
@@ -100,36 +245,156 @@ class Recorder:
         for node in nodes:
             self._parameters[node.name] = {"module": node.module, "params": node.params}
 
-    def take(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
-        """Writes one message.
-
-        Raises:
-            BagError: the disk is full, or the type is unknown.
-        """
+    def take(
+        self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""
+    ) -> None:
+        """Takes one message; never waits. The payload is copied: it may stand in memory that others write again."""
         stamp_ns = self._stamp_ns(publish_ns)
-        if stamp_ns <= 0:  # a node on simulated time, before the first /clock: it has no time to be filed under
+        if not type_name:
+            self.told.no_type[topic] += 1
+        elif stamp_ns <= 0:  # a node on simulated time, before the first /clock: it has no time to be filed under
             self.early += 1
         elif self._begun_ns:
-            self._write(topic, type_name, payload, stamp_ns)
+            self._hand_on(topic, type_name, bytes(payload), stamp_ns, publisher)
         elif self._qos.get(topic, SENSOR).latched:
             # Its value may be minutes old: it waits for the first message that says when this bag begins.
-            self._held.append((topic, type_name, bytes(payload), stamp_ns))
+            self._held.append((topic, type_name, bytes(payload), stamp_ns, publisher))
         else:
             self._begin(stamp_ns)
-            self._write(topic, type_name, payload, stamp_ns)
+            self._hand_on(topic, type_name, bytes(payload), stamp_ns, publisher)
+
+    def pause(self) -> None:
+        """Leaves out what comes from now on; latched values are kept for the end of the pause."""
+        self._paused = True
+
+    def resume(self) -> None:
+        """Records again, beginning with the latched values that came meanwhile."""
+        if self._paused:
+            self._paused = False
+            self.tick()
+
+    def split(self) -> None:
+        """Ends the present file; the next message begins another.
+
+        Raises:
+            ValueError: snapshots are kept; there is no file to split.
+        """
+        if self._writer is None:
+            raise ValueError("snapshots are kept: there is no file to split")
+        self._queue.put(self._end_part)
+
+    def snapshot(self, reason: str = "", after_s: float = 0.0) -> Snapshot:
+        """Writes what is in memory, after so many seconds more, into a bag of its own.
+
+        Raises:
+            ValueError: it does not keep snapshots.
+        """
+        if self._cache is None:
+            raise ValueError("it does not keep snapshots: start it with --snapshot")
+        for waiting in self.snapshots:
+            if waiting.state == "waiting":  # one that is about to be written will have this too
+                return waiting
+        name = f"{datetime.now():%Y%m%d_%H%M%S}" + (f"_{_slug(reason)}" if _slug(reason) else "")
+        path, number = self.path / name, 1
+        while path.exists():
+            number += 1
+            path = self.path / f"{name}_{number}"
+        found = Snapshot(path, due_s=time.monotonic() + after_s)
+        self.snapshots.append(found)
+        self.tick()
+        return found
+
+    def tick(self) -> None:
+        """Called now and then: begins snapshots that are due; after a full disk hands on the latched values again."""
+        while self._not_written:
+            entry = self._not_written.popleft()
+            self._missed.put(LatchedValue(entry.topic, entry.type_name, entry.payload, entry.stamp_ns), entry.publisher)
+        if self.state == RECORDING:
+            self._hand_on_missed()
+        for waiting in self.snapshots:
+            if waiting.state == "waiting" and time.monotonic() >= waiting.due_s:
+                self._write_snapshot(waiting)
+
+    def lost(self) -> dict[str, int]:
+        """Messages lost on the way, by topic, where there are any."""
+        return {topic: counter.lost for topic, counter in self._losses.items() if counter.lost}
+
+    def lost_by(self) -> dict[str, dict[str, int]]:
+        """The same, topic → publisher → messages."""
+        return {topic: dict(counter.lost_by) for topic, counter in self._losses.items() if counter.lost_by}
+
+    def unknown_types(self) -> dict[str, str]:
+        """Types recorded without their definition, with one of their topics."""
+        return dict(self._writer.unknown_types) if self._writer is not None else {}
+
+    def status(self) -> dict[str, Any]:
+        """What ``ic bag status`` shows."""
+        writer, cache = self._writer, self._cache
+        told: dict[str, Any] = {
+            "path": str(self.path),
+            "state": self.state,
+            "error": self.error,
+            "topics": len(self._losses),
+            "messages": self.count,
+            "queued_bytes": self._queue.bytes,
+            "lost": self.lost_by() or self.lost(),
+            "overflow": dict(self.told.overflow),
+        }
+        if writer is not None:
+            told |= {"bytes": writer.bytes, "files": writer.parts}
+        if cache is not None:
+            told |= {"cached_bytes": cache.bytes, "cached_s": round(cache.span_s, 1)}
+            told["snapshots"] = [{"path": str(s.path), "state": s.state, "words": s.words} for s in self.snapshots]
+        return told
+
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Completes the bag; its metadata tell losses and the nodes' parameters.
+
+        Raises:
+            BagError: the disk does not take it.
+        """
+        if self._held:
+            self._begin(max(stamp_ns for _, _, _, stamp_ns, _ in self._held))
+        for waiting in self.snapshots:
+            if waiting.state == "waiting":
+                self._write_snapshot(waiting)
+        self._ending.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            raise BagError(
+                f"bag {self.path}: the disk did not take the last {self._queue.bytes / 1e6:.1f} MB within "
+                f"{timeout_s:g} s; ic bag recover {self.path}"
+            )
+        if self._state == FAILED:
+            raise BagError(self.error)
 
     def _begin(self, stamp_ns: int) -> None:
         self._begun_ns = stamp_ns
         held, self._held = self._held, []
-        for topic, type_name, payload, own_ns in held:
-            self._write(topic, type_name, payload, own_ns)
+        for entry in held:
+            self._hand_on(*entry)
 
-    def _write(self, topic: str, type_name: str, payload: bytes | memoryview, stamp_ns: int) -> None:
+    def _hand_on(self, topic: str, type_name: str, payload: bytes, stamp_ns: int, publisher: str) -> None:
         qos = self._qos.get(topic, SENSOR)
         if qos.latched:
             stamp_ns = max(stamp_ns, self._begun_ns)
-        self.writer.write(topic, type_name, payload, stamp_ns, qos)
+        entry = Entry(topic, type_name, payload, stamp_ns, qos, publisher)
+        if self._paused or self._state in (DISK_FULL, FAILED):
+            if qos.latched:
+                self._not_written.append(entry)
+            (self.told.paused if self._paused else self.told.disk_full)[topic] += 1
+            return
+        if self._cache is not None:
+            self._cache.add(entry, time.monotonic())
+        elif not self._queue.put(entry):
+            self.told.overflow[topic] += 1
+            return
         self.counts[topic] += 1
+
+    def _hand_on_missed(self) -> None:
+        missed, self._missed = self._missed, LatchedValues()
+        for value in missed.values():
+            self._hand_on(value.topic, value.type_name, bytes(value.payload), value.publish_ns, "")
 
     def _stamp_ns(self, publish_ns: int) -> int:
         if self._sim_now_ns is None:
@@ -137,22 +402,133 @@ class Recorder:
         now_ns = self._sim_now_ns()
         return publish_ns if abs(publish_ns - now_ns) < FOREIGN_CLOCK_NS else now_ns
 
-    def lost(self) -> dict[str, int]:
-        """Messages lost on the way, by topic, where there are any."""
-        return {topic: counter.lost for topic, counter in self._losses.items() if counter.lost}
+    def _write_snapshot(self, snapshot: Snapshot) -> None:
+        assert self._cache is not None
+        snapshot.state = "writing"
+        content = self._cache.content()
+        self._queue.put(lambda: self._save(snapshot, content))
 
-    def tick(self, now_s: float | None = None) -> None:
-        """Called now and then: hands what came to the system once a second."""
-        now = time.monotonic() if now_s is None else now_s
-        if now - self._flushed_s >= 1.0:
-            self._flushed_s = now
-            self.writer.flush()
+    # -- on the writing thread ---------------------------------------------------------------------
 
-    def close(self) -> None:
-        """Completes the bag; its metadata tell losses and the nodes' parameters."""
-        if self._held:
-            self._begin(max(stamp_ns for _, _, _, stamp_ns in self._held))
-        self.writer.set_custom("instant_ic.lost", json.dumps(self.lost(), sort_keys=True))
-        self.writer.set_custom("instant_ic.before_clock", str(self.early))
-        self.writer.set_custom("instant_ic.parameters", json.dumps(self._parameters, sort_keys=True))
-        self.writer.close()
+    def _run(self) -> None:
+        next_flush = next_space = 0.0
+        next_custom = time.monotonic() + _KEEP_CUSTOM_S
+        while True:
+            item = self._queue.take(0.0 if self._ending.is_set() else 0.2)
+            if item is None and self._ending.is_set():
+                break
+            try:
+                if isinstance(item, Entry):
+                    self._write(item)
+                elif item is not None:
+                    item()
+                now = time.monotonic()
+                if now >= next_space:
+                    next_space = now + _SPACE_S
+                    self._look_for_space()
+                if self._writer is None or self._state != RECORDING:
+                    continue
+                if now >= next_flush:
+                    next_flush = now + _FLUSH_S
+                    self._writer.flush()
+                if now >= next_custom:
+                    next_custom = now + _KEEP_CUSTOM_S
+                    self._tell(self._writer)
+                    self._writer.keep_custom()
+            except DiskFullError as error:
+                self._stop(DISK_FULL, str(error))
+            except BagError as error:
+                self._stop(FAILED, str(error))
+            except Exception as error:  # a bug here must not leave a recorder that seems to record
+                log.exception("bag writer")
+                self._stop(FAILED, f"{type(error).__name__}: {error}")
+        self._finish()
+
+    def _write(self, entry: Entry) -> None:
+        try:
+            if self._writer is None or self._state != RECORDING:
+                self.told.disk_full[entry.topic] += 1
+                if entry.qos.latched:
+                    self._not_written.append(entry)
+                return
+            self._writer.write(
+                entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos, publisher=entry.publisher
+            )
+        finally:
+            self._queue.done(entry)
+
+    def _end_part(self) -> None:
+        if self._writer is not None and self._state == RECORDING:
+            self._tell(self._writer)
+            self._writer.end_part()
+
+    def _look_for_space(self) -> None:
+        if self._state == FAILED:
+            return
+        try:
+            free = self._free_bytes(self.path)
+        except OSError as error:
+            self._stop(FAILED, f"bag {self.path}: {error.strerror}: its folder was taken away")
+            return
+        reserve = self.options.reserve_bytes
+        if self._state == RECORDING and free < reserve:
+            words = f"only {free / 1e6:.0f} MB are free where {self.path} is, {reserve / 1e6:.0f} MB are the reserve"
+            if self._writer is not None:
+                self._end_part()
+            self._stop(DISK_FULL, f"{words}: not recording; the bag is complete up to here")
+        elif self._state == DISK_FULL and free >= reserve + _ROOM_AGAIN:
+            log.warning("%s: there is room again, recording goes on in a new file", self.path)
+            self._state, self.error = RECORDING, ""
+
+    def _stop(self, state: str, words: str) -> None:
+        self._state, self.error, self.failed = state, words, True
+        log.error("%s", words)
+
+    def _save(self, snapshot: Snapshot, content: list[Entry]) -> None:
+        """Writes a snapshot; what goes wrong concerns this one, the next may succeed."""
+        try:
+            if not content:
+                raise BagError(f"snapshot {snapshot.path}: no message has come yet")
+            with BagWriter(snapshot.path, self.options.compressed) as writer:
+                for entry in content:
+                    writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
+                self._tell(writer)
+        except BagError as error:
+            snapshot.words, snapshot.state = str(error), "failed"
+            self.failed = True
+            log.error("%s", error)
+        else:
+            span_s = (max(e.stamp_ns for e in content) - min(e.stamp_ns for e in content)) / 1e9
+            snapshot.words, snapshot.state = f"{len(content)} messages, {span_s:.1f} s", "done"
+            log.info("snapshot %s: %s", snapshot.path, snapshot.words)
+
+    def _tell(self, writer: BagWriter) -> None:
+        for key, value in (
+            ("lost", self.lost()),
+            ("lost_by", self.lost_by()),
+            ("overflow", self.told.overflow),
+            ("paused", self.told.paused),
+            ("disk_full", self.told.disk_full),
+            ("no_type", self.told.no_type),
+            ("parameters", self._parameters),
+        ):
+            if value or key in ("lost", "parameters"):
+                writer.set_custom(f"instant_ic.{key}", json.dumps(dict(value), sort_keys=True))
+        writer.set_custom("instant_ic.before_clock", str(self.early))
+
+    def _finish(self) -> None:
+        if self._writer is None:
+            self._state = ENDED
+            return
+        try:
+            self._tell(self._writer)
+            self._writer.close()
+            if self._state != FAILED:
+                self._state = ENDED
+        except BagError as error:
+            self._stop(FAILED, str(error))
+
+
+def _slug(text: str) -> str:
+    """Text as part of a file name."""
+    return "".join(c if c.isalnum() else "_" for c in text.strip())[:40].strip("_")

@@ -19,8 +19,8 @@ from instant_ic.bag.player import NEVER_PLAYED
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.lockstep import LockstepBus, Record
-from instant_ic.bus.process import load_config
 from instant_ic.bus.node import Node
+from instant_ic.bus.process import load_config
 from instant_ic.msg import deserialize
 
 BROADCASTS: Mapping[str, tuple[str, ...]] = {

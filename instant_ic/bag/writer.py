@@ -59,6 +59,7 @@ class BagWriter:
         """Type → topic of what is recorded without its definition, which nobody here knows."""
         self._topics: dict[Topic, tuple[QoS, Schema]] = {}
         self._latched = LatchedValues()
+        self._unsure = False
         self._custom: dict[str, str] = {}
         self._done: list[PartInfo] = []
         self._part: _Part | None = None
@@ -243,10 +244,14 @@ class BagWriter:
             return
         assert self._part is not None
         for value in self._latched.values(but, publisher):
+            if self._unsure:  # it may have been in what a full disk did not take: better twice than never
+                self._put(value.topic, value.type_name, value.payload, stamp_ns, stamp_ns)
+                continue
             self._put(value.topic, value.type_name, value.payload, stamp_ns, value.publish_ns)
             repeated, self._part.info.repeated_ns = self._part.info.repeated, stamp_ns
             repeated[value.topic] = repeated.get(value.topic, 0) + 1
             self._part.repeats += 1
+        self._unsure = False
 
     def _put(self, topic: str, type_name: str, payload: Buffer, stamp_ns: int, publish_ns: int) -> None:
         assert self._part is not None
@@ -284,6 +289,7 @@ class BagWriter:
                 topic: sum(n for t, n in part.info.counts.items() if t[0] == topic) for topic in part.info.repeated
             }
             part.info.repeated = {t: min(n, on_disk[t]) for t, n in part.info.repeated.items() if on_disk[t]}
+            self._unsure = True
             self.not_written += lost - (part.repeats - sum(part.info.repeated.values()))
         self._done.append(part.info)
 

@@ -6,15 +6,16 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 from instant_ic.bag import BagError, BagMessage
-from instant_ic.bag.player import BagPlayer, PlayOptions
-from instant_ic.bag.recorder import TopicChoice
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.player import RATES, BagPlayer, PlayOptions
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
-from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.msg import message_type, to_time
+from instant_ic.ranges import NotNegative, Positive, Range, check_ranges
 
 
 @dataclass(frozen=True)
@@ -22,53 +23,61 @@ class BagPlayerConfig:
     """Parameters of the player.
 
     Attributes:
-        bag: folder of the bag, or a ``.mcap`` file.
+        bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
         rate: 2 plays twice as fast.
         start_offset_s: seconds of the beginning to skip; latched values of it are still sent.
         duration_s: seconds of the bag to play; 0 plays to the end.
-        loop: begin again at the end.
+        loop: begin again at the end; the time then goes back.
+        start_paused: wait at the beginning until told to resume or step.
         topics: names or patterns to play; empty plays everything.
         exclude: names or patterns to leave out.
         drop_transforms: transforms with these child frames are left out of ``/tf``: somebody broadcasts them anew.
         publish_clock: whether to send ``/clock``.
+        clock_hz: how often at least, also in a pause and where the bag has gaps.
         wait_for: nodes that must run, and be connected to what they read, before it begins.
         wait_timeout_s: how long to wait for them before it gives up, s.
         linger_s: how long it stays after the last message, so that the others finish their work, s.
     """
 
     bag: str = ""
-    rate: float = 1.0
-    start_offset_s: float = 0.0
-    duration_s: float = 0.0
+    rate: Annotated[float, Range(*RATES)] = 1.0
+    start_offset_s: NotNegative = 0.0
+    duration_s: NotNegative = 0.0
     loop: bool = False
+    start_paused: bool = False
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     drop_transforms: tuple[str, ...] = ()
     publish_clock: bool = True
+    clock_hz: Annotated[float, Range(1, 1000)] = 40.0
     wait_for: tuple[str, ...] = ()
-    wait_timeout_s: float = 60.0
-    linger_s: float = 1.0
+    wait_timeout_s: Positive = 60.0
+    linger_s: NotNegative = 1.0
 
     def __post_init__(self) -> None:
         """Checks the values."""
         if not self.bag:
             raise ValueError("bag must name a folder (got '')")
-        if self.wait_timeout_s <= 0:
-            raise ValueError(f"wait_timeout_s must be > 0 (got {self.wait_timeout_s})")
-        if self.linger_s < 0:
-            raise ValueError(f"linger_s must be >= 0 (got {self.linger_s})")
-        self.play_options()
+        check_ranges(self)
 
     def play_options(self) -> PlayOptions:
         """The part of it that the player takes."""
-        choice = TopicChoice(self.topics, self.exclude)
-        return PlayOptions(self.rate, self.start_offset_s, self.duration_s, self.loop, choice)
+        return PlayOptions(
+            rate=self.rate,
+            start_offset_s=self.start_offset_s,
+            duration_s=self.duration_s,
+            loop=self.loop,
+            choice=TopicChoice(self.topics, self.exclude),
+            start_paused=self.start_paused,
+            clock_hz=self.clock_hz,
+        )
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
     """Sends a bag's bytes from a thread of its own; with ``use_sim_time`` its own clock is the bag's."""
 
     name = "bag_player"
+    live_parameters = ("rate", "linger_s")
     player: BagPlayer | None = None
 
     def setup(self) -> None:
@@ -81,6 +90,21 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         if self.config.publish_clock:
             self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
         self._out = {t.topic: self.publisher_raw(t.topic, t.type_name, t.qos) for t in self.player.topics}
+        for topic in self.player.left_out:
+            self.log.warning(
+                "%s also carries %s: its %d messages are not played", topic.topic, topic.type_name, topic.count
+            )
+        for type_name in self.player.differing_types():
+            self.log.warning("the bag's %s is another than ours: our nodes may refuse it", type_name)
+        self.commands = {
+            "pause": self.player.pause,
+            "resume": self.player.resume,
+            "toggle": self.player.toggle,
+            "step": self.player.step,
+            "rate": self.player.set_rate,
+            "seek": self.player.seek,
+            "status": self.status,
+        }
         self._failed = ""
         self._thread = threading.Thread(target=self._run, name="player", daemon=True)
         self._thread.start()
@@ -92,32 +116,62 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             length_s = (self.player.end_ns - self.player.start_ns) / 1e9
             self.log.info("playing %.1f s of %s", length_s, self.config.bag)
             began_s = time.monotonic()
-            if self.player.play(self._send, self._stop):
-                self.log.info("played to the end in %.1f s", time.monotonic() - began_s)
+            if self.player.play(self._send, self._stop, on_clock=self._tell_time):
+                late = f", up to {self.player.latest_s:.2f} s late" if self.player.latest_s > 0.1 else ""
+                self.log.info("played to the end in %.1f s%s", time.monotonic() - began_s, late)
                 self._stop.wait(self.config.linger_s)
         except (BagError, NodeError) as error:
             self._failed = str(error)
+        except Exception as error:  # else the thread would be gone and the node would wait for ever
+            self.log.exception("player")
+            self._failed = f"{type(error).__name__}: {error}"
         self.stop()
 
     def _send(self, message: BagMessage) -> None:
         payload: bytes | None = message.payload
         if self.config.drop_transforms and message.topic in TRANSFORM_TOPICS:
             payload = without_children(message, self.config.drop_transforms)
-        if isinstance(self.clock, ManualClock):
-            self.clock.set(message.stamp_ns)
-        if self._clock_out is not None:
-            self._clock_out.publish(message_type("Clock")(clock=to_time(message.stamp_ns)))
+        self._tell_time(message.stamp_ns)
         if payload is not None:
             self._out[message.topic].publish_bytes(payload)
 
+    def _tell_time(self, stamp_ns: int) -> None:
+        """The time goes before what happens at it, and goes on where nothing does."""
+        if isinstance(self.clock, ManualClock):
+            self.clock.set(stamp_ns)
+        if self._clock_out is not None:
+            self._clock_out.publish(message_type("Clock")(clock=to_time(stamp_ns)))
+
+    def reconfigure(self, config: BagPlayerConfig) -> None:
+        """A new rate holds at once."""
+        if self.player is not None and config.rate != self.config.rate:
+            self.player.set_rate(config.rate)
+        super().reconfigure(config)
+
+    def status(self) -> dict[str, Any]:
+        """What ``ic bag status`` shows."""
+        assert self.player is not None
+        player = self.player
+        return {
+            "bag": self.config.bag,
+            "state": "paused" if player.paused else "playing",
+            "position_s": round((player.position_ns - player.start_ns) / 1e9, 3),
+            "length_s": round((player.end_ns - player.start_ns) / 1e9, 3),
+            "rate": player.rate,
+            "sent": player.sent,
+            "rounds": player.rounds,
+            "late_s": round(player.latest_s, 3),
+        }
+
     def _wait_for_readers(self) -> None:
         """Until each node of ``wait_for`` runs, reads something of the bag, and is connected to all that it reads."""
-        if not self.config.wait_for or not isinstance(self._transport, ZmqTransport):
+        if not self.config.wait_for or self.run_dir is None or self.player is None:
             return
         deadline_s = time.monotonic() + self.config.wait_timeout_s
         missing = ""
         while time.monotonic() < deadline_s:
-            nodes = {info.name: info for info in registry.list_nodes(self._transport.run_dir)}
+            self._tell_time(self.player.start_ns)
+            nodes = {info.name: info for info in registry.list_nodes(self.run_dir)}
             played = {publisher.topic for publisher in self._out.values()}
             # A recorder subscribes only once it has found the topics: it is ready when it reads one of them.
             absent = [

@@ -1,4 +1,4 @@
-"""Records topics into a rosbag2 folder (MCAP), byte for byte, with losses counted."""
+"""Records topics into a rosbag2 folder (MCAP), byte for byte, losses counted; or keeps the last seconds at hand."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ import time
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Annotated, Any
 
 from instant_ic.bag import BagError
-from instant_ic.bag.recorder import RawCallback, Recorder, TopicChoice
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, Recorder, RecordOptions, TakeMessage
 from instant_ic.bus import ERROR, OK, RECORD, WARN, Node, NodeError, main, registry
-from instant_ic.bus.transport import Stats
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.transport import Received, Stats
+from instant_ic.msg import Bool, ControlState
+from instant_ic.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Range, check_ranges
 
 
 @dataclass(frozen=True)
@@ -20,111 +23,189 @@ class BagRecorderConfig:
     """Parameters of the recorder.
 
     Attributes:
-        path: folder of the bag, which must not exist; empty makes ``runs/bag_DATE_TIME`` in the working directory.
+        path: folder of the bag, which must not exist; empty makes ``runs/bag_DATE_TIME`` in the working directory. With
+            snapshots the folder that they go into.
         topics: names or patterns to record; empty records everything.
         exclude: names or patterns to leave out.
         discovery_period_s: how often to look for new topics, s.
         duration_s: end after this time, s; 0 records until it is stopped.
         parameters: whether to keep the nodes' parameters in the bag's metadata.
+        compressed: compress with zstd.
+        max_bag_size: a file of so many bytes is followed by the next; 0 makes one file.
+        max_bag_duration: a file of so many seconds is followed by the next; 0 makes one file.
+        queue_mb: how much may wait for the disk, MB; what comes beyond is left out and counted.
+        min_free_mb: stop recording while the disk has less free space, MB.
+        start_paused: record only once it is told to resume.
+        snapshot: write nothing until asked (``ic bag snapshot``, emergency stop); keep the last seconds in memory.
+        snapshot_seconds: how many.
+        snapshot_after_s: how much of what follows the moment goes into the snapshot too, s.
+        snapshot_on_estop: write one at each emergency stop.
+        max_cache_mb: memory for the last seconds, MB; with more traffic they are fewer.
     """
 
     path: str = ""
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-    discovery_period_s: float = 0.2
-    duration_s: float = 0.0
+    discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
+    duration_s: NotNegative = 0.0
     parameters: bool = True
+    compressed: bool = False
+    max_bag_size: NotNegativeInt = 0
+    max_bag_duration: NotNegative = 0.0
+    queue_mb: PositiveInt = 256
+    min_free_mb: NotNegativeInt = 100
+    start_paused: bool = False
+    snapshot: bool = False
+    snapshot_seconds: Positive = 30.0
+    snapshot_after_s: NotNegative = 2.0
+    snapshot_on_estop: bool = True
+    max_cache_mb: PositiveInt = 256
 
     def __post_init__(self) -> None:
         """Checks the values."""
-        if not 0.01 <= self.discovery_period_s <= 10:
-            raise ValueError(f"discovery_period_s must be 0.01 to 10 s (got {self.discovery_period_s})")
-        if self.duration_s < 0:
-            raise ValueError(f"duration_s must be >= 0 (got {self.duration_s})")
+        check_ranges(self)
 
     def folder(self) -> Path:
         """Where the bag goes."""
         if self.path:
             return Path(self.path).expanduser()
-        return Path("runs") / f"bag_{datetime.now():%Y%m%d_%H%M%S}"
+        return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
+
+    def options(self) -> RecordOptions:
+        """The part of it that the recorder takes."""
+        return RecordOptions(
+            compressed=self.compressed,
+            max_bytes=self.max_bag_size,
+            max_duration_s=self.max_bag_duration,
+            queue_bytes=self.queue_mb * 1_000_000,
+            reserve_bytes=self.min_free_mb * 1_000_000,
+            snapshot_s=self.snapshot_seconds if self.snapshot else 0.0,
+            cache_bytes=self.max_cache_mb * 1_000_000,
+        )
 
 
 class BagRecorderNode(Node[BagRecorderConfig]):
     """Finds topics, hands their bytes to the recorder, tells size and losses."""
 
     name = "bag_recorder"
+    live_parameters = ("duration_s", "snapshot_after_s", "snapshot_on_estop")
     recorder: Recorder | None = None
-    failed = False
     _next_nodes_s = 0.0
 
     def setup(self) -> None:
         """Makes the bag and starts looking for topics."""
-        if not isinstance(self._transport, ZmqTransport):
+        if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
-        self._run_dir = self._transport.run_dir
         choice = TopicChoice(self.config.topics, self.config.exclude)
         sim_now_ns = self.clock.now_ns if self.use_sim_time else None
         try:
-            self.recorder = Recorder(self.config.folder(), choice, self._listen, sim_now_ns)
+            self.recorder = Recorder(self.config.folder(), choice, self._listen, sim_now_ns, self.config.options())
         except BagError as error:
             raise NodeError(str(error)) from None
-        self.log.info("recording into %s", self.recorder.path)
+        if self.config.start_paused:
+            self.recorder.pause()
+        what = f"keeping the last {self.config.snapshot_seconds:g} s for" if self.config.snapshot else "recording into"
+        self.log.info("%s %s", what, self.recorder.path)
+        self._stopped: dict[str, bool] = {}
+        if self.config.snapshot:
+            self.subscribe("/operator/estop", Bool, lambda m: self._on_stop("operator", bool(m.data)))
+            self.subscribe("/ic/state", ControlState, lambda m: self._on_stop("arbiter", bool(m.estop)))
+        self.commands = {
+            "pause": self.recorder.pause,
+            "resume": self.recorder.resume,
+            "toggle": self._toggle,
+            "split": self.recorder.split,
+            "snapshot": self._snapshot,
+            "status": self.recorder.status,
+        }
+        self._began_s = time.monotonic()
         self._discover()
         # A thread, not a timer: with simulated time the timers stand still while topics already come.
         threading.Thread(target=self._look, name="discovery", daemon=True).start()
-        self.timer(1.0, self._tell)
 
     def _look(self) -> None:
-        end_s = time.monotonic() + (self.config.duration_s or float("inf"))
+        next_tell_s = 0.0
         while not self._stop.wait(self.config.discovery_period_s):
             self.call_soon(self._discover)
-            if time.monotonic() >= end_s:
+            if time.monotonic() >= next_tell_s:
+                next_tell_s = time.monotonic() + 1.0
+                self.call_soon(self._tell)
+            if self.config.duration_s and time.monotonic() >= self._began_s + self.config.duration_s:
                 self.stop()
 
-    def _listen(self, topic: str, callback: RawCallback) -> Stats:
-        def take(name: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
-            try:
-                callback(name, type_name, payload, publish_ns)
-            except BagError as error:
-                if not self.failed:
-                    self.diagnose("bag", ERROR, str(error))
-                self.failed = True
-                self.stop()
+    def _listen(self, topic: str, take: TakeMessage) -> Stats:
+        def forward(message: Received) -> None:
+            take(message.topic, message.type_name, message.payload, message.publish_ns, message.publisher)
 
-        return self.subscribe_raw(topic, take, RECORD).raw.stats
+        return self.subscribe_received(topic, forward, RECORD).raw.stats
 
     def _discover(self) -> None:
-        assert self.recorder is not None
+        assert self.recorder is not None and self.run_dir is not None
         nodes: list[registry.NodeInfo] = []
         if self.config.parameters and time.monotonic() >= self._next_nodes_s:
             self._next_nodes_s = time.monotonic() + 2.0
-            nodes = registry.list_nodes(self._run_dir)
-        self.recorder.discover(registry.list_topics(self._run_dir), nodes)
+            nodes = registry.list_nodes(self.run_dir)
+        self.recorder.discover(registry.list_topics(self.run_dir), nodes)
         self.recorder.tick()
+
+    def _snapshot(self, reason: str = "") -> dict[str, Any]:
+        assert self.recorder is not None
+        made = self.recorder.snapshot(reason, self.config.snapshot_after_s)
+        self.log.info("snapshot %s in %.1f s", made.path, max(0.0, made.due_s - time.monotonic()))
+        return {"path": str(made.path)}
+
+    def _toggle(self) -> None:
+        assert self.recorder is not None
+        if self.recorder.state == PAUSED:
+            self.recorder.resume()
+        else:
+            self.recorder.pause()
+
+    def _on_stop(self, who: str, stopped: bool) -> None:
+        """A snapshot at each stop; one that was there before this recorder is none."""
+        before = self._stopped.get(who)
+        self._stopped[who] = stopped
+        if stopped and before is False and self.config.snapshot_on_estop:
+            self._snapshot("estop")
 
     def _tell(self) -> None:
         assert self.recorder is not None
-        lost = self.recorder.lost()
-        count, megabytes = self.recorder.writer.count, self.recorder.writer.bytes / 1e6
-        words = f"{count} messages, {megabytes:.1f} MB, {len(self.recorder.topics)} topics"
-        if lost:
-            missing = ", ".join(f"{topic} {number}" for topic, number in sorted(lost.items()))
-            self.diagnose("bag", WARN, f"{words}; lost: {missing}", **{t.strip("/"): n for t, n in lost.items()})
+        told = self.recorder.status()
+        words = f"{told['messages']} messages, {told['topics']} topics, {self.recorder.state}"
+        if "bytes" in told:
+            words += f", {told['bytes'] / 1e6:.1f} MB in {told['files']} files"
         else:
-            self.diagnose("bag", OK, words, messages=count)
+            words += f", the last {told['cached_s']:g} s at hand ({told['cached_bytes'] / 1e6:.0f} MB)"
+        if self.recorder.state in (FAILED, DISK_FULL):
+            self.diagnose("bag", ERROR, self.recorder.error)
+        elif self.recorder.told.overflow:
+            self.diagnose("bag", ERROR, f"{words}; the disk is too slow, left out: {_numbers(told['overflow'])}")
+        elif lost := self.recorder.lost():
+            self.diagnose("bag", WARN, f"{words}; lost: {_numbers(lost)}", **{t.strip("/"): n for t, n in lost.items()})
+        else:
+            self.diagnose("bag", OK, words, messages=told["messages"])
+        if unknown := self.recorder.unknown_types():
+            named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
+            self.diagnose("types", WARN, f"recorded without their definition, which is not known here: {named}")
 
     def teardown(self) -> None:
         """Completes the bag."""
-        if self.recorder is not None:
-            self.spin_once()  # what is already in the queues belongs into the bag
-            try:
-                self.recorder.close()
-            except BagError as error:
-                self.log.error("%s", error)
-                self.failed = True
-            self.log.info("%s: %d messages", self.recorder.path, self.recorder.writer.count)
-        if self.failed:
+        if self.recorder is None:
+            return
+        self.spin_once()  # what is already in the queues belongs into the bag
+        try:
+            self.recorder.close()
+        except BagError as error:
+            self.log.error("%s", error)
+            raise SystemExit(1) from None
+        self.log.info("%s: %d messages", self.recorder.path, self.recorder.count)
+        if self.recorder.failed:
+            self.log.error("not everything is in it: %s", self.recorder.error or "see the errors above")
             raise SystemExit(1)
+
+
+def _numbers(counts: dict[str, int]) -> str:
+    return ", ".join(f"{topic} {number}" for topic, number in sorted(counts.items()))
 
 
 if __name__ == "__main__":

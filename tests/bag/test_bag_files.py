@@ -10,8 +10,9 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.compare import compare, digest
-from instant_ic.bag.recorder import Recorder, TopicChoice
+from instant_ic.bag.recorder import Recorder
 from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.qos import QoS
@@ -219,8 +220,10 @@ def test_compare_names_the_first_field(tmp_path: Path) -> None:
     assert [t.topic for t in compare(a, b, ignore=("/scan",))] == ["/keyframe", "/operator/estop"]
 
 
-class Counter:
-    lost = 0
+class Losses:
+    def __init__(self) -> None:
+        self.lost = 0
+        self.lost_by: dict[str, int] = {}
 
 
 def topic_info(topic: str, type_name: str, *presets: QoS) -> TopicInfo:
@@ -229,10 +232,10 @@ def topic_info(topic: str, type_name: str, *presets: QoS) -> TopicInfo:
 
 
 def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -> None:
-    counters: dict[str, Counter] = {}
+    counters: dict[str, Losses] = {}
 
-    def subscribe(topic: str, callback: object) -> Counter:
-        return counters.setdefault(topic, Counter())
+    def subscribe(topic: str, callback: object) -> Losses:
+        return counters.setdefault(topic, Losses())
 
     recorder = Recorder(tmp_path / "bag", TopicChoice(exclude=("/heart*",)), subscribe)
     recorder.discover([topic_info("/estop", BOOL, SENSOR, LATCHED), topic_info("/heartbeat", BOOL, RELIABLE)])
@@ -257,7 +260,7 @@ def test_recorder_files_old_latched_values_under_the_beginning(tmp_path: Path) -
 
 def test_recorder_on_simulated_time_gives_foreign_stamps_its_own(tmp_path: Path) -> None:
     now_ns = [0]
-    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, callback: Counter(), lambda: now_ns[0])
+    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, callback: Losses(), lambda: now_ns[0])
     recorder.discover([topic_info("/scan", SCAN, SENSOR)])
     recorder.take("/scan", SCAN, b"early", 0)
     now_ns[0] = 50_000_000_000

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bag import BagError, BagMessage, BagWriter
+from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.player import BagPlayer, PlayOptions
-from instant_ic.bag.recorder import TopicChoice
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 
 BOOL, TF = "std_msgs/msg/Bool", "tf2_msgs/msg/TFMessage"

@@ -1,0 +1,84 @@
+"""Reads a bag ahead of who plays it, so that no message waits for the disk or for a chunk to be decompressed."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Iterator
+from types import TracebackType
+
+from instant_ic.bag.files import BagMessage
+
+
+class ReadAhead:
+    """Iterates over messages that a thread of its own reads; a context manager.
+
+    Args:
+        messages: what to read; used by that thread alone until :meth:`close`.
+        stop: ends the iteration also while a disk does not answer.
+        max_bytes: how much may lie ready.
+    """
+
+    def __init__(self, messages: Iterator[BagMessage], stop: threading.Event, max_bytes: int = 64_000_000) -> None:
+        self._messages = messages
+        self._stop = stop
+        self._max_bytes = max_bytes
+        self._ready: deque[BagMessage] = deque()
+        self._bytes = 0
+        self._ended = False
+        self._closed = False
+        self._error: Exception | None = None
+        self._condition = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name="read ahead", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> ReadAhead:
+        """Itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends the thread."""
+        self.close()
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        """Ends the thread; what lies ready is dropped."""
+        with self._condition:
+            self._closed = True
+            self._condition.notify_all()
+        self._thread.join(timeout_s)
+
+    def __iter__(self) -> Iterator[BagMessage]:
+        """The messages in their order; raises what reading raised."""
+        while True:
+            with self._condition:
+                while not self._condition.wait_for(lambda: self._ready or self._ended or self._closed, 0.5):
+                    if self._stop.is_set():
+                        return
+                if not self._ready:
+                    if self._error is not None:
+                        raise self._error
+                    return
+                message = self._ready.popleft()
+                self._bytes -= len(message.payload)
+                self._condition.notify_all()
+            yield message
+
+    def _run(self) -> None:
+        try:
+            for message in self._messages:
+                with self._condition:
+                    # Until somebody takes one, which in a pause is never: close() ends it.
+                    self._condition.wait_for(lambda: self._bytes < self._max_bytes or self._closed)
+                    if self._closed:
+                        return
+                    self._ready.append(message)
+                    self._bytes += len(message.payload)
+                    self._condition.notify_all()
+        except Exception as error:  # noqa: BLE001 - it belongs to the one who iterates
+            self._error = error
+        finally:
+            with self._condition:
+                self._ended = True
+                self._condition.notify_all()

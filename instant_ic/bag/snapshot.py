@@ -1,0 +1,66 @@
+"""The last seconds of all topics in memory, ready to be written when something has happened."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bus.qos import QoS
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A message on its way into a bag."""
+
+    topic: str
+    type_name: str
+    payload: bytes
+    stamp_ns: int
+    qos: QoS
+    publisher: str = ""
+
+
+class SnapshotCache:
+    """Keeps messages for a while; not for several threads at once.
+
+    Args:
+        seconds: how long, by the clock that :meth:`add` is given.
+        max_bytes: the oldest go earlier when they are more than this together.
+    """
+
+    def __init__(self, seconds: float, max_bytes: int) -> None:
+        self.seconds = seconds
+        self.max_bytes = max_bytes
+        self.bytes = 0
+        self._entries: deque[tuple[float, Entry]] = deque()
+        self._before = LatchedValues()
+        self._before_qos: dict[str, QoS] = {}
+
+    def add(self, entry: Entry, now_s: float) -> None:
+        """Takes a message that came at ``now_s``; forgets what is too old."""
+        self._entries.append((now_s, entry))
+        self.bytes += len(entry.payload)
+        while self._entries and (self._entries[0][0] < now_s - self.seconds or self.bytes > self.max_bytes):
+            _, old = self._entries.popleft()
+            self.bytes -= len(old.payload)
+            if old.qos.latched:  # its value still holds when the window begins
+                self._before.put(LatchedValue(old.topic, old.type_name, old.payload, old.stamp_ns), old.publisher)
+                self._before_qos[old.topic] = old.qos
+
+    @property
+    def span_s(self) -> float:
+        """Seconds between the oldest and the newest message."""
+        return self._entries[-1][0] - self._entries[0][0] if self._entries else 0.0
+
+    def content(self) -> list[Entry]:
+        """The messages, oldest first; before them the latched values that held when they begin, with their stamp."""
+        entries = [entry for _, entry in self._entries]
+        if not entries:
+            return []
+        begin_ns = min(entry.stamp_ns for entry in entries)
+        held = [
+            Entry(value.topic, value.type_name, bytes(value.payload), begin_ns, self._before_qos[value.topic])
+            for value in self._before.values()
+        ]
+        return held + entries
