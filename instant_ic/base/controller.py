@@ -110,6 +110,10 @@ class BaseController:
     def step(self) -> BaseState:
         """Send the speeds that are due, read the encoders and, from time to time, the health."""
         now_ns = self._now_ns()
+        # The clock may be set back: a wait that was planned by the old time must not last until then.
+        config = self.config
+        self._next_connect_ns = min(self._next_connect_ns, now_ns + int(config.roboclaw.reconnect_max_s * 1e9))
+        self._next_health_ns = min(self._next_health_ns, now_ns + int(config.health_period_s * 1e9))
         if not self.roboclaw.connected:
             return self._connect(now_ns)
         dt_s = 0.0 if self._last_step_ns is None else max(0.0, (now_ns - self._last_step_ns) * 1e-9)

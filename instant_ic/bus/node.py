@@ -29,7 +29,7 @@ from ..msg import (
     type_name,
 )
 from . import params
-from .clock import Clock, ManualClock
+from .clock import Clock, JumpDetector, ManualClock
 from .parameter_event import TOPIC as PARAMETER_EVENTS
 from .parameter_event import parameter_event
 from .parameter_info import ParameterInfo, is_live, parameter_infos, plain
@@ -103,11 +103,12 @@ class Latest:
         self._clock = clock
         self.max_age_s = max_age_s
         self._message: Any = None
-        self._received_ns = 0
+        self._received_ns = 0  # of the steady clock: setting the machine's clock makes nothing older or younger
 
     def put(self, message: Any, received_ns: int) -> None:
         """Takes a newer message."""
-        self._message, self._received_ns = message, received_ns
+        waited_ns = max(0, self._clock.now_ns() - received_ns)
+        self._message, self._received_ns = message, self._clock.steady_ns() - waited_ns
 
     @property
     def message(self) -> Any:
@@ -119,7 +120,7 @@ class Latest:
         """Seconds since it came; inf before the first."""
         if self._message is None:
             return float("inf")
-        age_ns = self._clock.now_ns() - self._received_ns
+        age_ns = self._clock.steady_ns() - self._received_ns
         # From the future: a clock was set back since, as when a player begins again.
         return age_ns / 1e9 if age_ns >= -_WENT_BACK_NS else float("inf")
 
@@ -356,7 +357,7 @@ class Node(Generic[ConfigT]):
         if period_s <= 0:
             raise ValueError(f"timer period must be > 0 (got {period_s})")
         period = int(period_s * 1e9)
-        timer = _Timer(period, self.clock.now_ns() + period, callback)
+        timer = _Timer(period, self.clock.steady_ns() + period, callback)
         heapq.heappush(self._timers, (timer.due_ns, next(self._timer_orders), timer))
         self._wake.set()
         return timer
@@ -525,6 +526,7 @@ class Node(Generic[ConfigT]):
     def spin(self) -> None:
         """Runs callbacks until :meth:`stop`."""
         next_beat = next_diagnostics = 0.0
+        system_clock = JumpDetector()
         while not self._stop.is_set():
             self._wake.clear()
             self.spin_once()
@@ -532,12 +534,14 @@ class Node(Generic[ConfigT]):
             if now >= next_beat:
                 next_beat = now + _HEARTBEAT_S
                 self._beat()
+                if (jump_s := system_clock.jump_s()) and not self.use_sim_time:
+                    self.log.warning("the machine's clock was set by %+.1f s: stamps jump, timers go on", jump_s)
             if now >= next_diagnostics:
                 next_diagnostics = now + _DIAGNOSTICS_S
                 self._publish_diagnostics()
             wait = min(_IDLE_S, next_beat - now, next_diagnostics - now)
             if self._timers:
-                due = (self._timers[0][0] - self.clock.now_ns()) / 1e9
+                due = (self._timers[0][0] - self.clock.steady_ns()) / 1e9
                 # Simulated time may run slower or faster than the machine's: its timers are looked at often.
                 wait = min(wait, 0.01 if self.use_sim_time else due)
             if self._soon:
@@ -562,7 +566,7 @@ class Node(Generic[ConfigT]):
 
     def _fire_timers(self) -> bool:
         fired = False
-        now = self.clock.now_ns()
+        now = self.clock.steady_ns()
         if self.use_sim_time and now == 0:
             return False
         while self._timers and self._timers[0][0] <= now:

@@ -231,3 +231,21 @@ def test_shipped_parameters_are_the_defaults() -> None:
 
     path = Path(__file__).resolve().parents[2] / "config" / "base.yaml"
     assert build(CrawlerBaseConfig, load_file(path, "crawler_base")) == CrawlerBaseConfig()
+
+
+def test_clock_set_back_delays_neither_the_next_connection_nor_the_next_battery_reading() -> None:
+    port = EmulatorPort(RoboclawEmulator())
+    now = [10**15]
+    config = ControllerConfig(roboclaw=RoboclawConfig(port="memory"))
+    controller = BaseController(config, lambda: now[0], opener(port))
+    assert controller.step().connected and controller.step().health is not None
+    port.unplugged = True
+    assert not controller.step().connected
+    port.unplugged = False
+    now[0] -= 3600 * 1000 * MILLISECOND  # an hour back, while a new try is planned by the old time
+    for _ in range(2):
+        now[0] += int(config.roboclaw.reconnect_max_s * 1000) * MILLISECOND
+        state = controller.step()
+    assert state.connected
+    now[0] += int(config.health_period_s * 1000) * MILLISECOND
+    assert controller.step().health is not None
