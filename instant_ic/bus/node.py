@@ -21,7 +21,7 @@ from ..msg import (
     deserialize,
     header,
     message_type,
-    serialize,
+    serializer,
     stamp_ns,
     to_time,
     transform_matrix,
@@ -72,7 +72,7 @@ class Publisher:
         """
         if type_name(message) != self.raw.type_name:
             raise MessageError(f"{self.topic} carries {self.raw.type_name}, not {type_name(message)}")
-        self.raw.send(serialize(message))
+        self.raw.send_filled(*serializer(message))
 
     def publish_bytes(self, payload: Payload, publish_ns: int | None = None) -> None:
         """Sends CDR bytes as they are: one buffer, or several that follow each other.

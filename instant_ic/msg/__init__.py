@@ -36,7 +36,7 @@ from .convert import (
     twist_stamped,
     twist_values,
 )
-from .types import MessageError, deserialize, message_type, serialize, type_hash, type_name, typestore
+from .types import MessageError, deserialize, message_type, serialize, serializer, type_hash, type_name, typestore
 
 __all__ = [
     "POINT_DTYPE",
@@ -60,6 +60,7 @@ __all__ = [
     "pose_stamped",
     "scan_message",
     "serialize",
+    "serializer",
     "stamp_ns",
     "to_time",
     "transform_matrix",

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 DEFINITIONS = Path(__file__).resolve().parent / "definitions"
+
+_LARGE = 1 << 14  # below, clearing all of a message costs less than finding out what need not be cleared
 
 # Short names that several packages of Jazzy share: the one that this stack means.
 _PREFERRED = {
@@ -72,19 +77,55 @@ def type_hash(name: str) -> str:
     return typestore().hash_rihs01(name)
 
 
-def serialize(message: Any) -> bytes | memoryview:
+def serialize(message: Any) -> memoryview:
     """CDR bytes, little-endian, with the 4-byte encapsulation header.
 
     Raises:
         MessageError: a field has a value of the wrong type or length.
     """
+    size, write = serializer(message)
+    data = memoryview(bytearray(size))
+    write(data)
+    return data.toreadonly()
+
+
+def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
+    """Size of a message's CDR bytes, and a function that writes them into memory of that size.
+
+    So a large message can be written once, to where its readers look. What the memory held before does not matter.
+
+    Raises:
+        MessageError: a field has a value of the wrong type or length; the function raises it too.
+    """
     name = type_name(message)
+    store = typestore()
+    definition = store.get_msgdef(name)
     try:
-        return typestore().serialize_cdr(message, name)
-    except (TypeError, ValueError, AttributeError, AssertionError, OverflowError) as error:
-        raise MessageError(f"{name}: {_first_bad_field(message) or error}") from error
-    except Exception as error:  # struct.error and numba/numpy errors of generated code have no common base
-        raise MessageError(f"{name}: {error}") from error
+        size = 4 + definition.getsize_cdr(0, message, store)
+    except Exception as error:  # whatever generated code raises on a wrong value
+        raise _explained(message, error) from error
+
+    def write(target: memoryview) -> None:
+        # Padding must be zero, else the same message would not have the same bytes. It is never inside of an array:
+        # all but the largest array is `rest` bytes, before it or after it.
+        rest = size
+        if size >= _LARGE:
+            rest -= max((v.nbytes for v in vars(message).values() if isinstance(v, np.ndarray)), default=0)
+        zeros = bytes(rest)
+        target[:rest], target[size - rest :] = zeros, zeros
+        target[1] = 1  # little-endian
+        try:
+            end = definition.serialize_cdr_le(target[4:], 0, message, store)
+        except Exception as error:  # whatever generated code raises on a wrong value
+            raise _explained(message, error) from error
+        if end + 4 != size:
+            raise MessageError(f"{name}: {end + 4} bytes written where {size} were expected")
+
+    return size, write
+
+
+def _explained(message: Any, error: Exception) -> MessageError:
+    return MessageError(f"{type_name(message)}: {_first_bad_field(message) or error}")
 
 
 def deserialize(data: bytes | bytearray | memoryview, name: str) -> Any:
