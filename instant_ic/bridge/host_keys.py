@@ -62,6 +62,11 @@ class Identity:
     public_key: bytes
     secret_key: bytes
 
+    @property
+    def fingerprint(self) -> str:
+        """See :func:`fingerprint`."""
+        return fingerprint(self.public_key)
+
 
 def key_dir() -> Path:
     """The folder of keys: ``$XDG_CONFIG_HOME/instant_ic/keys``, else ``~/.config/instant_ic/keys``."""

@@ -338,7 +338,8 @@ class ListeningLink(HostLink):
     Args:
         endpoint: ``tcp://0.0.0.0:7450``; port 0 takes a free one, told by ``port``.
 
-    See :class:`HostLink` for the others.
+    See :class:`HostLink` for the others. ``wanted_driver`` names the host that is to drive; empty leaves it to who came
+    first.
     """
 
     def __init__(
@@ -354,6 +355,7 @@ class ListeningLink(HostLink):
         super().__init__(side, exports, store, on_event, times)
         self._by_route: dict[bytes, _Connection] = {}
         self._told: dict[tuple[str, str], tuple[float, int]] = {}
+        self.wanted_driver = ""
         self._next_list_s = 0.0
         self._list_problem = ""
         self._leaving: list[tuple[float, _Connection]] = []
@@ -524,21 +526,18 @@ class ListeningLink(HostLink):
     # -- who drives --------------------------------------------------------------------------------
 
     def _choose_driver(self) -> None:
-        """One host's commands at a time: the first driver that came, until it leaves."""
+        """One host's commands at a time: the one that is wanted, else the first that came, until it leaves."""
         drivers = [c for c in self._connections() if c.session.up and c.peer.role == "driver"]
-        if not drivers:
-            return
-        holder = next((c for c in drivers if c.session.drives), None)
-        if holder is None:
-            holder = min(drivers, key=lambda c: c.session.up_ns)
-            self._handle(holder, holder.session.set_drives(True))
-            if holder.told:
-                holder.session.notify("driver", "")
-        for other in drivers:
-            text = f"{holder.peer.name} drives this robot; this host's commands are not taken"
-            if other is not holder and other.told != text:
-                other.told = text
-                other.session.notify("driver", text)
+        wanted = [c for c in drivers if c.peer.name == (self.wanted_driver or c.peer.name)]
+        holder = min(wanted, key=lambda c: (not c.session.drives, c.session.up_ns), default=None)
+        who = holder.peer.name if holder is not None else f"only {self.wanted_driver}"
+        for each in drivers:
+            if each.session.drives != (each is holder):
+                self._handle(each, each.session.set_drives(each is holder))
+            text = "" if each is holder else f"{who} drives {self.side.name}; this host's commands are not taken"
+            if each.told != text:
+                each.told = text
+                each.session.notify("driver", text)
 
     @property
     def driver(self) -> str:

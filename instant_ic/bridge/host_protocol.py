@@ -128,7 +128,7 @@ class Announce(_Json):
         topic: without the sender's namespace.
         origin: node that publishes it there.
         type_name: message type.
-        digest: of name and fields of the type, hex digits.
+        digest: of name and fields of the type (ROS 2's RIHS01).
         qos: preset's name.
     """
 

@@ -82,7 +82,7 @@ class Side:
         name: what it calls itself.
         instance: new with every start.
         imports: topics that it takes, by name.
-        digest: digest of a message type's fields, hex digits; raises ValueError where the type is not known.
+        digest: RIHS01 hash of a message type; raises ValueError where the type is not known.
     """
 
     name: str

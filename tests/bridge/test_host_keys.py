@@ -3,6 +3,7 @@
 import os
 import stat
 import threading
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -56,20 +57,20 @@ def test_new_key_is_kept_secret(store):
 
 def test_secret_key_is_never_written_with_a_wider_mode(store, monkeypatch):
     seen = []
-    replace = os.replace
+    replace = Path.replace
 
     def watch(source, target):
-        seen.append(stat.S_IMODE(os.stat(source).st_mode))
-        replace(source, target)
+        seen.append(stat.S_IMODE(source.stat().st_mode))
+        return replace(source, target)
 
-    monkeypatch.setattr(os, "replace", watch)
+    monkeypatch.setattr(Path, "replace", watch)
     before = os.umask(0)
     try:
         store.create("robot")
     finally:
         os.umask(before)
     assert seen == [0o600]
-    assert os.listdir(store.folder) == ["identity"]
+    assert [path.name for path in store.folder.iterdir()] == ["identity"]
 
 
 def test_key_that_others_can_read_is_refused(store):

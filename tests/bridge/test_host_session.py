@@ -1,12 +1,11 @@
 """The link's state machine over simulated links."""
 
 import pytest
+from simulated_link import DIGEST, MS, Way, World
 
 from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Ping, decode
 from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
-
-from simulated_link import DIGEST, MS, Way, World
 
 COMMAND = TopicRule("/operator/cmd_vel", lane="command", max_age_s=0.25)
 PICTURE = TopicRule("/camera/image/compressed", lane="bulk")
@@ -100,7 +99,7 @@ def test_age_of_a_command_does_not_depend_on_the_time_of_day():
 
 
 def test_picture_after_a_stall_is_new():
-    """Foxglove's bridge 329: a flood of stale messages after a stall. Here the first picture after it is a fresh one."""
+    """Foxglove's bridge 329: a flood of stale messages after a stall. Here what comes after it is fresh."""
     down = Way(delay_ns=10 * MS, rate=2e6)
     world = World([PICTURE], down=down, times=LinkTimes(timeout_s=5.0))
     world.run(1.0)

@@ -1,0 +1,129 @@
+"""``ic keys``: keys of this host, and of the hosts that it is linked with."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from instant_ic.bridge.host_keys import KeyStore
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the verb."""
+    parser = subparsers.add_parser(
+        "keys",
+        help="keys of the link between robot and station",
+        description="Makes this host's key, and says which other hosts may be linked with it (docs/bridge.md).",
+        epilog="example: ic keys new",
+    )
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    new = _verb(
+        verbs, "new", make, "make this host's key",
+        "Makes this host's key and prints the line by which the other host allows it.",
+        "example: ic keys new robot",
+    )  # fmt: skip
+    new.add_argument("name", metavar="NAME", nargs="?", help="what this host is called (default: its host name)")
+    new.add_argument("--force", action="store_true", help="replace a key; every other host must then allow the new one")
+    _verb(
+        verbs, "list", show, "this host's key and the allowed hosts",
+        "Shows this host's public key and the hosts that are allowed.",
+        "example: ic keys list",
+    )  # fmt: skip
+    allow = _verb(
+        verbs, "allow", let_in, "allow another host",
+        "Allows another host. A running bridge takes it up at once; the same name again replaces the key or the role.",
+        "example: ic keys allow station ick_...",
+    )  # fmt: skip
+    allow.add_argument("name", metavar="NAME", help="what the other host is called here")
+    allow.add_argument("key", metavar="KEY", help="its public key, as `ic keys list` shows it there")
+    allow.add_argument(
+        "--role", choices=("driver", "viewer"), default="driver", help="viewer: sees, sends nothing (default: driver)"
+    )
+    revoke = _verb(
+        verbs, "revoke", shut_out, "no longer allow another host",
+        "Takes a host off the list. A running bridge cuts it off at once.",
+        "example: ic keys revoke station",
+    )  # fmt: skip
+    revoke.add_argument("name", metavar="NAME", help="as it was allowed")
+
+
+def _verb(verbs: Any, name: str, function: Any, help_: str, description: str, epilog: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = verbs.add_parser(name, help=help_, description=description, epilog=epilog)
+    parser.add_argument(
+        "--dir", type=Path, default=None, metavar="FOLDER", help="folder of keys (default: ~/.config/instant_ic/keys)"
+    )
+    parser.set_defaults(func=function)
+    return parser
+
+
+def _store(args: argparse.Namespace) -> KeyStore:
+    from instant_ic.bridge.host_keys import KeyStore
+
+    return KeyStore(args.dir)
+
+
+def host_name() -> str:
+    """This machine's name as a name of a host here."""
+    import re
+    import socket
+
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", socket.gethostname().partition(".")[0])[:63]
+    return name if name[:1].isalpha() else f"host_{name}"[:63]
+
+
+def make(args: argparse.Namespace) -> int:
+    """Makes the key."""
+    from instant_ic.bridge.host_keys import key_text
+
+    store = _store(args)
+    identity = store.create(args.name or host_name(), args.force)
+    print(f"key of {identity.name} made in {store.folder} (fingerprint {identity.fingerprint})")
+    print(f"on the other host run:\n\n  ic keys allow {identity.name} {key_text(identity.public_key)}\n")
+    return 0
+
+
+def show(args: argparse.Namespace) -> int:
+    """Prints this host's key and a line for each allowed host."""
+    from instant_ic.bridge.host_keys import key_text
+
+    store = _store(args)
+    if store.identity_path.exists():
+        identity = store.identity()
+        print(f"this host: {identity.name}  {identity.fingerprint}  {key_text(identity.public_key)}")
+    else:
+        print("this host: no key yet (ic keys new)")
+    peers = store.peers()
+    width = max([len(peer.name) for peer in peers], default=0)
+    for peer in peers:
+        print(f"allowed:   {peer.name:<{width}}  {peer.role}  {peer.fingerprint}  {key_text(peer.public_key)}")
+    if not peers:
+        print("allowed:   nobody yet (ic keys allow NAME KEY)")
+    return 0
+
+
+def let_in(args: argparse.Namespace) -> int:
+    """Allows a host; makes this host's own key where there is none, for it is needed next."""
+    from instant_ic.bridge.host_keys import Peer, key_text, parse_key
+
+    store = _store(args)
+    peer = Peer(args.name, args.role, parse_key(args.key))
+    if store.identity_path.exists() and store.identity().public_key == peer.public_key:
+        from instant_ic.cli.errors import UserError
+
+        raise UserError("this is this host's own key: allow it on the other host, and the other's here")
+    done = store.allow(peer)
+    print(f"{peer.name} ({peer.role}, fingerprint {peer.fingerprint}): {done}")
+    if not store.identity_path.exists():
+        identity = store.create(host_name())
+        print(f"this host had no key: key of {identity.name} made; on the other host run:\n")
+        print(f"  ic keys allow {identity.name} {key_text(identity.public_key)}\n")
+    return 0
+
+
+def shut_out(args: argparse.Namespace) -> int:
+    """Takes a host off the list."""
+    peer = _store(args).revoke(args.name)
+    print(f"{peer.name} (fingerprint {peer.fingerprint}) is no longer allowed")
+    return 0
