@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.poses import wrap_angle
+from ..ranges import NotNegative, Positive, check_ranges
 from .costmap import Costmap
 from .footprint import Footprint
 from .kinematics import MotionLimits, clip_twist
 from .passage import Passage, PassageConfig, find_passage
-from .planner import GridPlanner, PlannerConfig
+from .planner import HybridPlanner, PlannerConfig
 from .prediction import Prediction, PredictionConfig, Predictor
-from .safety import CollisionMonitor, CollisionMonitorConfig
+from .safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
 from .subgoal import Subgoal, SubgoalConfig, choose_subgoal
 from .walls import WallMap
 
@@ -90,12 +91,15 @@ class Source:
     modes: tuple[Mode, ...]
     words: str = ""
     """What the operator is told of its loss; empty: "no NAME for SECONDS"."""
+    optional: bool = False
+    """Needed only once it has come: a robot without 3D points drives by its flat scan."""
 
 
 OPERATOR_LOST = "the operator's link is lost, the robot waits"
 
 SOURCES: tuple[Source, ...] = (
     Source("scan", "LiDAR scan", (Mode.REAL, Mode.VIRTUAL)),
+    Source("points", "3D points", (Mode.REAL, Mode.VIRTUAL), optional=True),
     Source("odometry", "wheel odometry", (Mode.REAL, Mode.VIRTUAL)),
     Source("pose", "SLAM pose", (Mode.REAL, Mode.VIRTUAL)),
     Source("camera", "camera picture", (Mode.REAL,)),
@@ -110,47 +114,41 @@ SOURCES: tuple[Source, ...] = (
 class TimeoutConfig:
     """Age in seconds beyond which a source is stale and the command is zero."""
 
-    scan: float = 0.3
-    odometry: float = 0.3
-    pose: float = 1.0
-    camera: float = 1.0
-    vbot: float = 0.3
-    nav: float = 0.3
-    command: float = 0.3
-    vspace: float = 2.0
-    stop_after_s: float = 1.5
-    recover_s: float = 0.5
+    scan: Positive = 0.3
+    points: Positive = 0.5
+    odometry: Positive = 0.3
+    pose: Positive = 1.0
+    camera: Positive = 1.0
+    vbot: Positive = 0.3
+    nav: Positive = 0.3
+    command: Positive = 0.3
+    vspace: Positive = 2.0
+    stop_after_s: Positive = 1.5
+    recover_s: Positive = 0.5
 
     def __post_init__(self) -> None:
-        for key, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"timeouts.{key} must be > 0 (got {value})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class SwitchConfig:
     """Thresholds of the change between real and virtual."""
 
-    position_m: float = 0.15
-    yaw_deg: float = 10.0
-    return_dwell_s: float = 0.5
-    min_virtual_s: float = 1.0
-    min_real_s: float = 1.0
-    return_margin_m: float = 0.5
-    return_side_m: float = 0.12
-    neutral_return_s: float = 5.0
-    stop_margin_m: float = 0.15
-    min_switch_speed_m_s: float = 0.03
-    ready_hold_s: float = 2.0
+    position_m: Positive = 0.15
+    yaw_deg: Positive = 10.0
+    return_dwell_s: NotNegative = 0.5
+    min_virtual_s: NotNegative = 1.0
+    min_real_s: NotNegative = 1.0
+    return_margin_m: Positive = 0.5
+    return_side_m: Positive = 0.12
+    neutral_return_s: NotNegative = 5.0
+    stop_margin_m: NotNegative = 0.15
+    min_switch_speed_m_s: NotNegative = 0.03
+    ready_hold_s: NotNegative = 2.0
     require_camera: bool = True
 
     def __post_init__(self) -> None:
-        for key in ("position_m", "yaw_deg", "return_margin_m", "return_side_m"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"switch.{key} must be > 0 (got {getattr(self, key)})")
-        for key, value in vars(self).items():
-            if not value >= 0:
-                raise ValueError(f"switch.{key} must be >= 0 (got {value})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -191,7 +189,7 @@ class ArbiterInputs:
     operator_command: Twist2 = (0.0, 0.0)
     estop: bool = False
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(N, 2) hits of the newest scan in ``base_link``, where the robot is now."""
+    """(N, 2) hits of the newest scan and 3D points in ``base_link``, where the robot is now."""
     costmap: Costmap | None = None
     walls: WallMap | None = None
     vspace: Vspace = field(default_factory=Vspace)
@@ -200,7 +198,7 @@ class ArbiterInputs:
     vbot_velocity: Twist2 = (0.0, 0.0)
     nav_command: Twist2 = (0.0, 0.0)
     ages: dict[str, float] = field(default_factory=dict)
-    """Seconds since the last of: scan, odometry, pose, camera, vbot, nav, command, vspace."""
+    """Seconds since the last of: scan, odometry, pose, camera, vbot, nav, command, vspace; points once they came."""
 
     def age(self, key: str) -> float:
         """Age of a source; inf when it has never been seen."""
@@ -251,12 +249,9 @@ class Arbiter:
     """Runs the table; pure: time comes in as ``now_ns``, everything else as ``ArbiterInputs``."""
 
     def __init__(self, config: ArbiterConfig | None = None) -> None:
-        self.config = config or ArbiterConfig()
+        self.reconfigure(config or ArbiterConfig())
         self.mode = Mode.STOPPED
         self.transitions = 0
-        self.predictor = Predictor(self.config.prediction, self.config.limits, self.config.footprint)
-        self.monitor = CollisionMonitor(self.config.collision_monitor, self.config.footprint)
-        self._planner = GridPlanner(self.config.planner)
         self._since_ns: int | None = None  # of the present mode
         self._returned_ns: int | None = None  # of the last change from VIRTUAL to REAL
         self._fresh_since_ns: int | None = None
@@ -282,6 +277,13 @@ class Arbiter:
             "place_vbot": self._place_vbot,
             "hand_back": self._hand_back,
         }
+
+    def reconfigure(self, config: ArbiterConfig) -> None:
+        """Takes other parameters from the next step on; mode and history stay as they are."""
+        self.config = config
+        self.predictor = Predictor(config.prediction, config.limits, config.footprint)
+        self.monitor = CollisionMonitor(config.collision_monitor, config.footprint)
+        self._planner = HybridPlanner(config.planner, config.footprint)
 
     def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
         """One step: at most one transition, then the command of the state that it left the machine in."""
@@ -369,6 +371,8 @@ class Arbiter:
         lacking = []
         for source in SOURCES:
             if mode not in source.modes or (source.key == "camera" and not self.config.switch.require_camera):
+                continue
+            if source.optional and source.key not in inputs.ages:
                 continue
             age = inputs.age(source.key)
             if source.modes == (Mode.VIRTUAL,):
@@ -535,7 +539,7 @@ class Arbiter:
             wanted = clip_twist(*situation.inputs.nav_command, self.config.limits)
             if situation.inputs.age("nav") > self._timeout("nav"):
                 wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
-            sent = self.monitor.limit(wanted, self._close_points(situation))
+            sent = self._monitored(wanted, situation)
             reason = "you drive the virtual robot" + self._far_from_keyframe(situation)
             if self._subgoal is None:
                 return (0.0, 0.0), False, reason + "; no free place for the robot near it"
@@ -561,19 +565,23 @@ class Arbiter:
             why = self._why_not_virtual(situation) or "obstacle ahead"
             reason = f"blocked: obstacle in {prediction.distance_m:.1f} m; {why}"
             command = self._slowed(command, prediction.distance_m)
-        sent = self.monitor.limit(command, self._close_points(situation))
-        if sent.action != "free" and not blocked:
+        sent = self._monitored(command, situation)
+        if sent.action in ("approach", "stop") and not blocked:
             blocked = True
             reason = f"blocked: contact in {sent.time_to_collision_s:.1f} s"
+        elif sent.action != "free" and not blocked:
+            reason += "; slowed down for something close"
         return sent.command, blocked, reason
 
-    def _close_points(self, situation: _Situation) -> NDArray[np.float64]:
-        """Scan hits, and what the costmap remembers where the LiDAR is blind: right beside the robot."""
+    def _monitored(self, command: Twist2, situation: _Situation) -> MonitoredCommand:
+        """The command past the collision monitor, by all that is seen and remembered near the robot."""
         inputs = situation.inputs
-        if inputs.costmap is None or inputs.robot_pose is None:
-            return inputs.scan_points
-        blind = self.config.collision_monitor.blind_radius_m
-        return np.concatenate([inputs.scan_points, inputs.costmap.lethal_near(inputs.robot_pose, blind)])
+        points = inputs.scan_points
+        if inputs.costmap is not None and inputs.robot_pose is not None:
+            config = self.config.collision_monitor
+            memory = inputs.costmap.memory_near(inputs.robot_pose, config.blind_radius_m, config.memory_range_m)
+            points = np.concatenate([points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
+        return self.monitor.limit(command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
 
     def _slowed(self, command: Twist2, distance_m: float) -> Twist2:
         """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""

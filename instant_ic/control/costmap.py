@@ -1,4 +1,4 @@
-"""Costmap in the map frame: static map, live scan with ray clearing, inflation.
+"""Costmap in the map frame: static map, live scan with ray clearing, heights of 3D points, inflation.
 
 Costs, layers and parameters carry nav2's names (costmap_2d): 0 free, 1..252 inflated, 253 inscribed,
 254 lethal, 255 unknown. Arrays are (H, W), row 0 at the lowest y, as in ``nav_msgs/OccupancyGrid``.
@@ -7,13 +7,15 @@ Costs, layers and parameters carry nav2's names (costmap_2d): 0 free, 1..252 inf
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, Percent, Positive, check_ranges
 from .footprint import Footprint
+from .heights import HeightConfig, HeightLayer, SortedPoints, shifted
 
 FREE = 0
 INSCRIBED = 253
@@ -26,29 +28,25 @@ SLACK_M = 1e-6
 
 @dataclass(frozen=True)
 class CostmapConfig:
-    """Parameters of the rolling window."""
+    """Parameters of the rolling window, by nav2's names."""
 
-    width_m: float = 12.0
-    resolution: float = 0.05
-    inflation_radius: float = 0.70
-    cost_scaling_factor: float = 3.0
-    obstacle_max_range: float = 8.0
-    raytrace_max_range: float = 8.5
+    width: Positive = 12.0
+    resolution: Positive = 0.05
+    update_frequency: Positive = 20.0
+    publish_frequency: Positive = 5.0
+    inflation_radius: NotNegative = 0.70
+    cost_scaling_factor: Positive = 3.0
+    obstacle_max_range: Positive = 8.0
+    raytrace_max_range: Positive = 8.5
     inf_is_valid: bool = False
-    occupied_threshold: int = 65
+    lethal_cost_threshold: Percent = 65
     footprint_clearing_enabled: bool = True
+    points: HeightConfig = field(default_factory=HeightConfig)
 
     def __post_init__(self) -> None:
-        for key in ("width_m", "resolution", "cost_scaling_factor", "obstacle_max_range", "raytrace_max_range"):
-            value = getattr(self, key)
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"costmap.{key} must be > 0 (got {value})")
-        if self.width_m < 10 * self.resolution:
-            raise ValueError(f"costmap.width_m must be at least ten cells (got {self.width_m})")
-        if not self.inflation_radius >= 0:
-            raise ValueError(f"costmap.inflation_radius must be >= 0 (got {self.inflation_radius})")
-        if not 1 <= self.occupied_threshold <= 100:
-            raise ValueError(f"costmap.occupied_threshold must be 1..100 (got {self.occupied_threshold})")
+        check_ranges(self)
+        if self.width < 10 * self.resolution:
+            raise ValueError(f"width must be at least ten cells (got {self.width})")
 
 
 @dataclass(frozen=True)
@@ -60,6 +58,8 @@ class Costmap:
     resolution: float
     origin: NDArray[np.float64]
     """(2,) metres: the outer corner of cell (0, 0)."""
+    remembered: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    """(N, 2) centres of the cells that 3D points marked: low and hanging things, which the flat scan does not see."""
 
     def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Row and column of points (..., 2); not checked against the window."""
@@ -103,6 +103,17 @@ class Costmap:
         c, s = math.cos(pose[2]), math.sin(pose[2])
         seen: NDArray[np.float64] = away @ np.array([[c, -s], [s, c]])
         return seen
+
+    def memory_near(
+        self, pose: NDArray[np.float64], blind_radius_m: float, remembered_radius_m: float
+    ) -> NDArray[np.float64]:
+        """What no sensor may see just now, (N, 2) in the frame of ``pose``: lethal cells in the blind zone round the
+        LiDAR, and farther out what 3D points have marked.
+        """
+        away = self.remembered - np.asarray(pose)[:2]
+        away = away[(away**2).sum(axis=-1) <= remembered_radius_m**2]
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        return np.concatenate([self.lethal_near(pose, blind_radius_m), away @ np.array([[c, -s], [s, c]])])
 
     def occupancy(self) -> NDArray[np.int8]:
         """The costs in the -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
@@ -206,22 +217,32 @@ def scan_rays(
 
 
 class RollingCostmap:
-    """A window that moves with the robot and remembers what the scans saw in it."""
+    """A window that moves with the robot and remembers what scans and 3D points saw in it."""
 
     def __init__(self, config: CostmapConfig, footprint: Footprint) -> None:
         self.config = config
         self.footprint = footprint
-        self.size = round(config.width_m / config.resolution)
+        self.size = round(config.width / config.resolution)
+        self.heights = HeightLayer(config.points, self.size, config.resolution)
         self._observed = np.full((self.size, self.size), UNKNOWN, dtype=np.uint8)
         self._corner: tuple[int, int] | None = None  # window's first column and row in the endless grid
         self._body = footprint.points(0.5 * config.resolution)
+        # What 3D points marked may never be seen again from near: a pose that is a cell off must not wipe it out.
+        self._under = footprint.points(0.5 * config.resolution, -config.resolution)
 
     def reset(self) -> None:
-        """Forgets what the scans saw, as after a jump of the map."""
+        """Forgets what was seen, as after a jump of the map."""
         self._observed.fill(UNKNOWN)
+        self.heights.reset()
 
-    def update(self, robot_pose: NDArray[np.float64], static: StaticMap | None, scan: ScanRays | None) -> Costmap:
-        """Moves the window over the robot (x, y, yaw), takes in a scan, and gives the costs."""
+    def update(
+        self,
+        robot_pose: NDArray[np.float64],
+        static: StaticMap | None,
+        scan: ScanRays | None,
+        points: SortedPoints | None = None,
+    ) -> Costmap:
+        """Moves the window over the robot (x, y, yaw), takes in a scan and a sweep of points, and gives the costs."""
         resolution = self.config.resolution
         self._move_to(float(robot_pose[0]), float(robot_pose[1]))
         assert self._corner is not None
@@ -230,10 +251,14 @@ class RollingCostmap:
             start = (scan.origin - origin) / resolution
             ends = np.ascontiguousarray((scan.ends - origin) / resolution)
             _clear_and_mark(self._observed, float(start[0]), float(start[1]), ends, scan.hits)
+        if points is not None:
+            self.heights.update(points, origin)
         if self.config.footprint_clearing_enabled:
             self._clear_footprint(robot_pose, origin)
         master = self._master(static, origin)
-        return Costmap(self._inflate(master), resolution, origin)
+        rows, columns = np.nonzero(self.heights.occupied())
+        remembered = origin + (np.stack([columns, rows], axis=-1) + 0.5) * resolution
+        return Costmap(self._inflate(master), resolution, origin, remembered)
 
     def _move_to(self, x: float, y: float) -> None:
         half = self.size // 2
@@ -245,55 +270,52 @@ class RollingCostmap:
             return
         if self._corner is not None:
             dx, dy = corner[0] - self._corner[0], corner[1] - self._corner[1]
-            moved = np.full_like(self._observed, UNKNOWN)
-            n = self.size
-            if abs(dx) < n and abs(dy) < n:
-                moved[max(0, -dy) : n - max(0, dy), max(0, -dx) : n - max(0, dx)] = self._observed[
-                    max(0, dy) : n - max(0, -dy), max(0, dx) : n - max(0, -dx)
-                ]
-            self._observed = moved
+            self._observed = shifted(self._observed, dx, dy, UNKNOWN)
+            self.heights.shift(dx, dy)
         self._corner = corner
 
     def _clear_footprint(self, pose: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        points = self._body @ np.array([[c, s], [-s, c]]) + np.asarray(pose)[:2]
-        index = np.floor((points - origin) / self.config.resolution).astype(np.int64)
-        index = index[((index >= 0) & (index < self.size)).all(axis=1)]
-        self._observed[index[:, 1], index[:, 0]] = FREE
+        turn = np.array([[c, s], [-s, c]])
+        for body, layer, value in ((self._body, self._observed, FREE), (self._under, self.heights.hits, 0)):
+            index = np.floor((body @ turn + np.asarray(pose)[:2] - origin) / self.config.resolution).astype(np.int64)
+            index = index[((index >= 0) & (index < self.size)).all(axis=1)]
+            layer[index[:, 1], index[:, 0]] = value
 
     def _master(self, static: StaticMap | None, origin: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Layers joined as nav2's ``combination_method`` max does: what either holds occupied is occupied."""
-        if static is None:
-            return self._observed.copy()
-        centres = (np.arange(self.size) + 0.5) * self.config.resolution
-        columns = np.floor((origin[0] + centres - static.origin[0]) / static.resolution).astype(np.int64)
-        rows = np.floor((origin[1] + centres - static.origin[1]) / static.resolution).astype(np.int64)
-        height, width = static.occupancy.shape
-        in_columns, in_rows = (columns >= 0) & (columns < width), (rows >= 0) & (rows < height)
-        occupancy = np.full((self.size, self.size), -1, dtype=np.int8)
-        occupancy[np.ix_(in_rows, in_columns)] = static.occupancy[np.ix_(rows[in_rows], columns[in_columns])]
-        master = np.where(occupancy < 0, self._observed, FREE).astype(np.uint8)
-        master[(occupancy >= self.config.occupied_threshold) | (self._observed == LETHAL)] = LETHAL
-        return master
+        """Layers joined as nav2's ``combination_method`` max does: what any holds occupied is occupied."""
+        occupancy, shift = np.full((1, 1), -1, dtype=np.int8), np.zeros(2)
+        resolution = self.config.resolution
+        if static is not None:
+            occupancy, resolution, shift = static.occupancy, static.resolution, origin - static.origin
+        return _join(
+            self._observed,
+            self.heights.hits,
+            self.config.points.mark_threshold,
+            occupancy,
+            float(shift[0]),
+            float(shift[1]),
+            self.config.resolution,
+            resolution,
+            self.config.lethal_cost_threshold,
+        )
 
     def _inflate(self, master: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """nav2's inflation: 252·exp(-cost_scaling_factor·(d - inscribed_radius)); inscribed within it."""
         import cv2
 
-        lethal = master == LETHAL
-        if not lethal.any():
+        free = (master != LETHAL).astype(np.uint8)
+        if free.all():
             return master
-        distance = cv2.distanceTransform((~lethal).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(
-            np.float64
+        distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        _inflate(
+            master,
+            distance,
+            self.config.resolution,
+            self.footprint.inscribed_radius_m,
+            self.config.inflation_radius,
+            self.config.cost_scaling_factor,
         )
-        distance *= self.config.resolution
-        inscribed = self.footprint.inscribed_radius_m
-        within = ~lethal & (distance <= inscribed + SLACK_M)
-        near = ~lethal & ~within & (master != UNKNOWN) & (distance <= self.config.inflation_radius + SLACK_M)
-        master[near] = (252.0 * np.exp(-self.config.cost_scaling_factor * (distance[near] - inscribed))).astype(
-            np.uint8
-        )
-        master[within] = INSCRIBED
         return master
 
 
@@ -306,6 +328,59 @@ def inflated_cost(distance_m: float, config: CostmapConfig, footprint: Footprint
     if distance_m > config.inflation_radius + SLACK_M:
         return FREE
     return int(252.0 * math.exp(-config.cost_scaling_factor * (distance_m - footprint.inscribed_radius_m)))
+
+
+@njit(cache=True)
+def _join(
+    observed: NDArray[np.uint8],
+    hits: NDArray[np.uint8],
+    mark_threshold: int,
+    occupancy: NDArray[np.int8],
+    shift_x: float,
+    shift_y: float,
+    resolution: float,
+    map_resolution: float,
+    lethal_threshold: int,
+) -> NDArray[np.uint8]:
+    """Master grid from what was observed and the map, whose origin lies ``shift`` metres before the window's."""
+    size_y, size_x = observed.shape
+    height, width = occupancy.shape
+    master = np.empty_like(observed)
+    columns = np.empty(size_x, dtype=np.int64)
+    for c in range(size_x):
+        columns[c] = math.floor((shift_x + (c + 0.5) * resolution) / map_resolution)
+    for r in range(size_y):
+        row = math.floor((shift_y + (r + 0.5) * resolution) / map_resolution)
+        for c in range(size_x):
+            known = -1
+            if 0 <= row < height and 0 <= columns[c] < width:
+                known = occupancy[row, columns[c]]
+            seen = observed[r, c]
+            if known >= lethal_threshold or seen == 254 or hits[r, c] >= mark_threshold:
+                master[r, c] = 254
+            else:
+                master[r, c] = seen if known < 0 else 0
+    return master
+
+
+@njit(cache=True)
+def _inflate(
+    master: NDArray[np.uint8],
+    distance: NDArray[np.float32],
+    resolution: float,
+    inscribed_m: float,
+    inflation_m: float,
+    scaling: float,
+) -> None:
+    for r in range(master.shape[0]):
+        for c in range(master.shape[1]):
+            away = distance[r, c] * resolution
+            if master[r, c] == 254 or away > max(inflation_m, inscribed_m) + SLACK_M:
+                continue
+            if away <= inscribed_m + SLACK_M:
+                master[r, c] = 253
+            elif master[r, c] != 255:
+                master[r, c] = np.uint8(252.0 * math.exp(-scaling * (away - inscribed_m)))
 
 
 @njit(cache=True)

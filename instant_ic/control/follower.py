@@ -1,4 +1,8 @@
-"""Path follower for a skid-steer robot: regulated pure pursuit, with tracking of a goal that moves."""
+"""Path follower for a skid-steer robot: regulated pure pursuit, with tracking of a goal that moves.
+
+Source: Macenski, Singh, Martin, Gines: Regulated pure pursuit for robot path tracking, Autonomous Robots 47, 2023;
+the tracking law is that of Kanayama et al., ICRA 1990.
+"""
 
 from __future__ import annotations
 
@@ -9,40 +13,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.poses import relative2
-from .kinematics import MotionLimits, clip_twist
+from ..ranges import Positive, check_ranges
+from .costmap import Costmap
+from .footprint import Footprint
+from .kinematics import MotionLimits, clip_twist, move
 from .planner import Plan
+
+CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
+"""Of the lookahead: the carrot comes nearer where the arc to it would touch something."""
 
 
 @dataclass(frozen=True)
 class FollowerConfig:
     """Parameters; those that nav2's regulated pure pursuit has carry its names."""
 
-    desired_linear_vel: float = 0.5
-    lookahead_time: float = 1.0
-    min_lookahead_dist: float = 0.30
-    max_lookahead_dist: float = 0.70
-    regulated_linear_scaling_min_radius: float = 0.60
-    rotate_to_heading_min_angle: float = 0.8
-    rotate_to_heading_stop_angle: float = 0.15
-    rotate_to_heading_gain: float = 2.0
-    approach_decel_m_s2: float = 0.4
-    xy_goal_tolerance: float = 0.05
-    yaw_goal_tolerance: float = 0.05
-    reverse_distance_m: float = 0.6
-    track_distance_m: float = 0.6
-    track_min_speed_m_s: float = 0.05
-    track_gain_x: float = 1.5
-    track_gain_y: float = 6.0
-    track_gain_yaw: float = 3.0
+    desired_linear_vel: Positive = 0.5
+    lookahead_dist: Positive = 0.5
+    use_velocity_scaled_lookahead_dist: bool = True
+    lookahead_time: Positive = 1.0
+    min_lookahead_dist: Positive = 0.30
+    max_lookahead_dist: Positive = 0.70
+    regulated_linear_scaling_min_radius: Positive = 0.60
+    regulated_linear_scaling_min_speed: Positive = 0.05
+    use_rotate_to_heading: bool = True
+    rotate_to_heading_min_angle: Positive = 0.8
+    rotate_to_heading_stop_angle: Positive = 0.15
+    rotate_to_heading_gain: Positive = 2.0
+    approach_decel_m_s2: Positive = 0.4
+    use_collision_detection: bool = True
+    max_allowed_time_to_collision_up_to_carrot: Positive = 1.0
+    collision_padding_m: Positive = 0.02
+    xy_goal_tolerance: Positive = 0.05
+    yaw_goal_tolerance: Positive = 0.05
+    track_distance_m: Positive = 0.6
+    track_min_speed_m_s: Positive = 0.05
+    track_gain_x: Positive = 1.5
+    track_gain_y: Positive = 6.0
+    track_gain_yaw: Positive = 3.0
 
     def __post_init__(self) -> None:
-        for key, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"follower.{key} must be > 0 (got {value})")
+        check_ranges(self)
         if self.min_lookahead_dist > self.max_lookahead_dist:
-            raise ValueError(
-                f"follower.min_lookahead_dist must be <= max_lookahead_dist (got {self.min_lookahead_dist})"
-            )
+            raise ValueError(f"min_lookahead_dist must be <= max_lookahead_dist (got {self.min_lookahead_dist})")
 
 
 @dataclass(frozen=True)
@@ -51,15 +63,19 @@ class FollowerCommand:
 
     command: tuple[float, float]
     state: str
-    """``track``, ``pursue``, ``reverse``, ``rotate``, ``align``, ``arrived`` or ``end``."""
+    """``track``, ``pursue``, ``reverse``, ``rotate``, ``align``, ``arrived``, ``end`` or ``blocked``."""
 
 
 class PathFollower:
-    """Follows a plan; keeps no time, only whether it is turning on the spot or at the goal."""
+    """Follows a plan; keeps no time, only whether it is turning on the spot or at the goal.
 
-    def __init__(self, config: FollowerConfig, limits: MotionLimits) -> None:
+    Pieces of the path that are driven forwards and backwards are followed one after the other.
+    """
+
+    def __init__(self, config: FollowerConfig, limits: MotionLimits, footprint: Footprint | None = None) -> None:
         self.config = config
         self.limits = limits
+        self._body = (footprint or Footprint()).points(0.045, config.collision_padding_m)
         self.reset()
 
     def reset(self) -> None:
@@ -73,6 +89,7 @@ class PathFollower:
         speed_m_s: float,
         plan: Plan,
         goal_velocity: tuple[float, float] = (0.0, 0.0),
+        costmap: Costmap | None = None,
     ) -> FollowerCommand:
         """Twist for the robot at ``pose`` (3,) driving ``speed_m_s``; the goal is the plan's last pose.
 
@@ -81,6 +98,7 @@ class PathFollower:
             speed_m_s: the robot's own.
             plan: newest plan; an empty one stops the robot.
             goal_velocity: of the goal itself (m/s, rad/s), when it is the v-bot driving on.
+            costmap: where arcs to the carrot are looked at for collisions; None: not at all.
         """
         c = self.config
         if len(plan.poses) == 0:
@@ -102,7 +120,7 @@ class PathFollower:
             if abs(turn) <= c.yaw_goal_tolerance:
                 return FollowerCommand((0.0, 0.0), "arrived")
             return FollowerCommand((0.0, self._turn_rate(turn)), "align")
-        return self._pursue(pose, speed_m_s, plan, distance)
+        return self._pursue(pose, speed_m_s, plan, costmap if c.use_collision_detection else None)
 
     def _track(self, ahead: float, left: float, turn: float, goal_velocity: tuple[float, float]) -> tuple[float, float]:
         """Tracking law of Kanayama et al. (1990): the goal's own twist plus the error in the robot's frame."""
@@ -112,24 +130,72 @@ class PathFollower:
         w = angular + linear * (c.track_gain_y * left + c.track_gain_yaw * math.sin(turn))
         return clip_twist(self._cap(v), w, self.limits)
 
-    def _pursue(self, pose: NDArray[np.float64], speed_m_s: float, plan: Plan, distance: float) -> FollowerCommand:
+    def _pursue(
+        self, pose: NDArray[np.float64], speed_m_s: float, plan: Plan, costmap: Costmap | None
+    ) -> FollowerCommand:
         c = self.config
-        lookahead = min(max(abs(speed_m_s) * c.lookahead_time, c.min_lookahead_dist), c.max_lookahead_dist)
-        carrot, remaining = _carrot(pose, plan.poses, lookahead)
-        x, y, _ = (float(value) for value in relative2(pose, np.array([*carrot, 0.0])))
-        bearing = math.atan2(y, x)
-        back = plan.reached and distance < c.reverse_distance_m and abs(bearing) > 2.0 and not self._rotating
-        off = math.remainder(bearing - math.pi, 2 * math.pi) if back else bearing
-        if abs(off) > (c.rotate_to_heading_stop_angle if self._rotating else c.rotate_to_heading_min_angle):
-            self._rotating = True
-            return FollowerCommand((0.0, self._turn_rate(off)), "rotate")
-        self._rotating = False
-        curvature = 2.0 * y / max(x * x + y * y, 1e-4)
+        path, back = _piece(pose, plan, c.xy_goal_tolerance)
+        lookahead = c.lookahead_dist
+        if c.use_velocity_scaled_lookahead_dist:
+            lookahead = min(max(abs(speed_m_s) * c.lookahead_time, c.min_lookahead_dist), c.max_lookahead_dist)
+        remaining = _remaining(pose, path)
         v = min(c.desired_linear_vel, math.sqrt(2.0 * c.approach_decel_m_s2 * remaining))
+        sign = -1.0 if back else 1.0
+        for share in CARROT_SHARES:
+            x, y, _ = (
+                float(value) for value in relative2(pose, np.array([*_carrot(pose, path, share * lookahead), 0]))
+            )
+            bearing = math.atan2(sign * y, sign * x)
+            limit = c.rotate_to_heading_stop_angle if self._rotating else c.rotate_to_heading_min_angle
+            if c.use_rotate_to_heading and abs(bearing) > limit:
+                if share > CARROT_SHARES[-1] and not self._turn_is_free(pose, bearing, costmap):
+                    continue
+                return self._rotate(pose, bearing, costmap)
+            curvature = 2.0 * y / max(x * x + y * y, 1e-4)
+            length = min(math.hypot(x, y), c.max_allowed_time_to_collision_up_to_carrot * v)
+            if self._arc_is_free(pose, sign * curvature, sign * length, costmap):
+                break
+        else:
+            return FollowerCommand((0.0, 0.0), "blocked")
+        self._rotating = False
         radius = 1.0 / abs(curvature) if curvature != 0.0 else math.inf
         v *= min(1.0, radius / c.regulated_linear_scaling_min_radius)
-        v = max(v, 0.05) * (-1.0 if back else 1.0)
+        v = sign * max(v, c.regulated_linear_scaling_min_speed)
         return FollowerCommand(clip_twist(v, v * curvature, self.limits), "reverse" if back else "pursue")
+
+    def _rotate(self, pose: NDArray[np.float64], bearing: float, costmap: Costmap | None) -> FollowerCommand:
+        """Turns on the spot, the other way round where the near way is closed."""
+        if not self._turn_is_free(pose, bearing, costmap):
+            bearing -= math.copysign(2.0 * math.pi, bearing)
+            if not self._turn_is_free(pose, bearing, costmap):
+                return FollowerCommand((0.0, 0.0), "blocked")
+        self._rotating = True
+        return FollowerCommand((0.0, self._turn_rate(bearing)), "rotate")
+
+    def _turn_is_free(self, pose: NDArray[np.float64], turn: float, costmap: Costmap | None) -> bool:
+        if costmap is None:
+            return True
+        count = max(2, math.ceil(abs(turn) / 0.12))
+        poses = np.tile(np.asarray(pose, dtype=np.float64), (count + 1, 1))
+        poses[:, 2] += turn * np.arange(count + 1) / count
+        return self._is_free(poses, costmap)
+
+    def _arc_is_free(
+        self, pose: NDArray[np.float64], curvature: float, length_m: float, costmap: Costmap | None
+    ) -> bool:
+        if costmap is None:
+            return True
+        count = max(2, math.ceil(abs(length_m) / 0.05))
+        along = length_m * np.arange(count + 1) / count
+        # One metre of the arc a second; backwards it bends the other way.
+        turn = curvature * (-1.0 if length_m < 0 else 1.0)
+        poses = np.array([move(pose, math.copysign(1.0, length_m), turn, abs(s)) for s in along])
+        return self._is_free(poses, costmap)
+
+    def _is_free(self, poses: NDArray[np.float64], costmap: Costmap) -> bool:
+        """Whether no pose lies on more obstacle than the first one, on which the robot stands."""
+        overlap = costmap.lethal_overlap(poses, self._body)
+        return bool((overlap <= overlap[0]).all())
 
     def _turn_rate(self, angle: float) -> float:
         rate = max(self.config.rotate_to_heading_gain * abs(angle), 0.1)
@@ -141,15 +207,32 @@ class PathFollower:
         return min(max(linear, -self.config.desired_linear_vel), self.config.desired_linear_vel)
 
 
-def _carrot(
-    pose: NDArray[np.float64], path: NDArray[np.float64], lookahead: float
-) -> tuple[NDArray[np.float64], float]:
-    """Point (2,) of the path ``lookahead`` from the robot, past its nearest point; and metres left to the end."""
+def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[NDArray[np.float64], bool]:
+    """The part of the path that is driven in one direction and is not behind the robot yet; and whether backwards."""
+    if len(plan.reverse) != len(plan.poses) or len(plan.poses) < 2:
+        return plan.poses, False
+    # A turn on the spot belongs to what follows it.
+    moves = np.linalg.norm(np.diff(plan.poses[:, :2], axis=0), axis=1) > 1e-6
+    changes = np.flatnonzero(moves)
+    if changes.size == 0:
+        return plan.poses, False
+    directions = plan.reverse[1:][changes]
+    breaks = np.flatnonzero(np.diff(directions)) + 1
+    first = 0
+    for end in [*breaks, len(directions)]:
+        piece = plan.poses[(changes[first] if first else 0) : changes[end - 1] + 2]
+        if end == len(directions) or float(np.linalg.norm(piece[-1, :2] - pose[:2])) > tolerance_m:
+            return piece, bool(directions[first])
+        first = end
+    raise AssertionError("the last piece is always taken")
+
+
+def _carrot(pose: NDArray[np.float64], path: NDArray[np.float64], lookahead: float) -> NDArray[np.float64]:
+    """Point (2,) of the path ``lookahead`` from the robot, past its nearest point."""
     away = np.linalg.norm(path[:, :2] - np.asarray(pose)[:2], axis=1)
     near = int(np.argmin(away))
     far = np.flatnonzero(away[near:] >= lookahead)
-    index = near + int(far[0]) if far.size else len(path) - 1
-    return path[index, :2], _remaining(pose, path)
+    return path[near + int(far[0]) if far.size else len(path) - 1, :2]
 
 
 def _remaining(pose: NDArray[np.float64], path: NDArray[np.float64]) -> float:

@@ -3,33 +3,32 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import Positive, check_ranges
 from .costmap import Costmap
 from .follower import FollowerCommand, PathFollower
-from .planner import GridPlanner, Plan
+from .planner import HybridPlanner, Plan, no_plan
 
 
 @dataclass(frozen=True)
 class RecoveryConfig:
     """When the robot counts as stuck, and how it gets free."""
 
-    stuck_after_s: float = 1.5
-    duration_s: float = 1.5
-    speed_m_s: float = 0.15
-    moved_m: float = 0.03
-    turned_rad: float = 0.05
+    stuck_after_s: Positive = 1.5
+    duration_s: Positive = 1.5
+    speed_m_s: Positive = 0.15
+    moved_m: Positive = 0.03
+    turned_rad: Positive = 0.05
 
     def __post_init__(self) -> None:
-        for key, value in vars(self).items():
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"recovery.{key} must be > 0 (got {value})")
+        check_ranges(self)
 
 
-_NO_PLAN = Plan(np.zeros((0, 3)), False, "no plan yet", math.inf)
+_NO_PLAN = no_plan("no plan yet")
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Navigator:
 
     def __init__(
         self,
-        planner: GridPlanner,
+        planner: HybridPlanner,
         follower: PathFollower,
         replan_period_s: float = 0.2,
         recovery: RecoveryConfig | None = None,
@@ -84,13 +83,13 @@ class Navigator:
         """Twist towards ``subgoal`` (x, y, yaw) from ``pose``, both in the costmap's frame."""
         due = self._planned_ns is None or now_ns - self._planned_ns >= self.replan_period_s * 1e9
         if due:
-            self._plan = self.planner.plan(costmap, pose, subgoal)
+            self._plan = self.planner.plan(costmap, pose, subgoal, self._plan)
             self._planned_ns = now_ns
         plan = _with_end(self._plan, subgoal)
         if self._recovering(pose, now_ns):
             return NavigatorStep((self._direction * self.recovery.speed_m_s, 0.0), "recover", plan, due)
-        step: FollowerCommand = self.follower.step(pose, speed_m_s, plan, subgoal_velocity)
-        if step.command == (0.0, 0.0):
+        step: FollowerCommand = self.follower.step(pose, speed_m_s, plan, subgoal_velocity, costmap)
+        if step.command == (0.0, 0.0) and step.state != "blocked":
             self._moved_ns = now_ns
         return NavigatorStep(step.command, step.state, plan, due)
 
@@ -116,4 +115,4 @@ def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:
     """The plan with its end where the subgoal is by now: it moves between two plans."""
     if not plan.reached or float(np.linalg.norm(plan.poses[-1, :2] - subgoal[:2])) > 0.3:
         return plan
-    return Plan(np.concatenate([plan.poses[:-1], subgoal[None]]), True, plan.reason, plan.whole_length_m)
+    return replace(plan, poses=np.concatenate([plan.poses[:-1], subgoal[None]]))

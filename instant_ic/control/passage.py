@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..ranges import NotNegative, NotNegativeInt, check_ranges
 from .costmap import UNKNOWN, Costmap
-from .planner import GridPlanner
+from .planner import HybridPlanner
 from .prediction import Prediction
 from .subgoal import extend_ahead
 from .walls import WallMap
@@ -18,15 +19,13 @@ from .walls import WallMap
 class PassageConfig:
     """How far behind the obstacle free space must be, and how long the way round may be."""
 
-    max_pass_m: float = 3.0
-    max_detour_m: float = 4.0
-    max_cost: int = 150
-    wall_clearance_m: float = 0.25
+    max_pass_m: NotNegative = 3.0
+    max_detour_m: NotNegative = 4.0
+    max_cost: NotNegativeInt = 150
+    wall_clearance_m: NotNegative = 0.25
 
     def __post_init__(self) -> None:
-        for key, value in vars(self).items():
-            if not value >= 0:
-                raise ValueError(f"passage.{key} must be >= 0 (got {value})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ def find_passage(
     prediction: Prediction,
     forward: bool,
     walls: WallMap | None,
-    planner: GridPlanner,
+    planner: HybridPlanner,
     config: PassageConfig,
 ) -> Passage:
     """Looks straight on from where the predicted trajectory meets an obstacle, then plans a way there.

@@ -1,45 +1,62 @@
-"""Grid planner: A* over inflated costs, from where the robot stands to a subgoal."""
+"""Planner: hybrid A* over position and heading for a robot that drives arcs, reverses and turns on the spot.
+
+Source: Dolgov, Thrun, Montemerlo, Diebel: Path planning for autonomous vehicles in unknown semi-structured
+environments, IJRR 29(5), 2010; primitives and collision checks for a skid-steer rectangle instead of a car. The
+heuristic is the cost-to-go of the point robot over the same costs (Dijkstra from the goal).
+"""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, PositiveInt, Range, check_ranges
 from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
+from .footprint import Footprint
+
+SPACING_M = 0.05
+"""Between the poses of a path."""
+STEP_CELLS = 3.0
+"""Length of a primitive."""
+LEAST_WEIGHT = 0.8
+"""No cell is cheaper: ``retrospective_gain`` is 0.2 at most."""
+DEAR = np.float32(8.0)
+"""Weight of cells that are closed but for a robot that stands in them."""
+HURRY = 1.2
+"""Weight of the cost-to-go (weighted A*, Pohl 1970): a path may cost this much more than the best, and comes sooner."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """What the planner may cross, and at what price."""
+    """What the planner may cross, and at what price. nav2's (Smac's) names where it has the parameter."""
 
-    cost_travel_multiplier: float = 3.0
+    cost_penalty: NotNegative = 3.0
+    tight_cost: Annotated[int, Range(0, 251)] = 165
+    tight_penalty: NotNegative = 6.0
     allow_unknown: bool = True
-    unknown_penalty: float = 5.0
-    tight_cost: int = 165
-    tight_penalty: float = 6.0
-    unknown_standoff_m: float = 0.3
-    escape_radius_m: float = 0.6
-    tolerance_m: float = 0.5
+    unknown_penalty: NotNegative = 5.0
+    unknown_standoff_m: NotNegative = 0.3
+    angle_quantization_bins: Annotated[int, Range(8, 128)] = 32
+    allow_reverse_expansion: bool = True
+    reverse_penalty: Annotated[float, Range(low=1)] = 2.0
+    change_penalty: NotNegative = 0.3
+    non_straight_penalty: Annotated[float, Range(low=1)] = 1.05
+    rotation_penalty: NotNegative = 0.3
+    retrospective_gain: Annotated[float, Range(0, 0.2)] = 0.15
+    footprint_padding: NotNegative = 0.03
+    escape_radius_m: NotNegative = 0.6
+    tolerance: NotNegative = 0.5
+    max_iterations: PositiveInt = 12000
 
     def __post_init__(self) -> None:
-        for key in (
-            "cost_travel_multiplier",
-            "unknown_penalty",
-            "tight_penalty",
-            "unknown_standoff_m",
-            "escape_radius_m",
-            "tolerance_m",
-        ):
-            if not getattr(self, key) >= 0:
-                raise ValueError(f"planner.{key} must be >= 0 (got {getattr(self, key)})")
-        if not 0 <= self.tight_cost < INSCRIBED - 1:
-            raise ValueError(f"planner.tight_cost must be 0..251 (got {self.tight_cost})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -47,92 +64,221 @@ class Plan:
     """A path and how far it gets."""
 
     poses: NDArray[np.float64]
-    """(N, 3) x, y, yaw in the map frame, 5 cm or less apart; empty when there is no way at all."""
+    """(N, 3) x, y, yaw in the map frame, 5 cm or less apart; empty when there is no way at all. Where the robot turns
+    on the spot, poses of one place follow each other."""
     reached: bool
     """The path ends at the goal (not in front of something)."""
     reason: str
     """Why it does not end at the goal; empty when it does."""
     whole_length_m: float
     """Length to the goal, the part through unknown space included; inf when there is no way."""
+    reverse: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """(N,) whether the robot comes to a pose backwards."""
+    iterations: int = 0
+    """Poses that the search opened."""
 
 
-def _nothing(reason: str) -> Plan:
+def no_plan(reason: str) -> Plan:
+    """A plan without a path."""
     return Plan(np.zeros((0, 3)), False, reason, math.inf)
 
 
-class GridPlanner:
-    """A* with eight neighbours; a step costs its length times (1 + cost_travel_multiplier·cost/252).
+class HybridPlanner:
+    """Paths for the true footprint, from wherever the robot stands.
 
-    Above ``tight_cost``, where the robot cannot turn on the spot, up to ``tight_penalty`` comes on top.
-    Lethal and inscribed cells are never entered; a robot that stands in them is led out. With ``allow_unknown`` a
-    way through unknown cells is taken into account, but the path ends ``unknown_standoff_m`` before the first of
-    them: the robot drives up, sees more, and plans again. Without it, unknown cells are walls.
+    A step costs its length times (1 + cost_penalty·cost/252); above ``tight_cost``, where the robot cannot turn on the
+    spot, up to ``tight_penalty`` comes on top. Reversing, changing direction and turning cost more.
+    No pose lays the footprint (with ``footprint_padding``) on a lethal cell. A robot that stands on some may leave
+    them, never go deeper. With ``allow_unknown`` a way through unknown cells is taken into account, but the path ends
+    ``unknown_standoff_m`` before the first of them: the robot drives up, sees more, and plans again. Without it,
+    unknown cells are walls. Cells near the path before are a little cheaper (``retrospective_gain``), so that two ways
+    that are equally good do not take turns.
     """
 
-    def __init__(self, config: PlannerConfig) -> None:
+    def __init__(self, config: PlannerConfig, footprint: Footprint | None = None) -> None:
         self.config = config
+        self.footprint = footprint or Footprint()
 
-    def plan(self, costmap: Costmap, start: NDArray[np.float64], goal: NDArray[np.float64]) -> Plan:
+    def plan(
+        self,
+        costmap: Costmap,
+        start: NDArray[np.float64],
+        goal: NDArray[np.float64],
+        before: Plan | None = None,
+    ) -> Plan:
         """Path from pose ``start`` to pose ``goal`` (3,); to the nearest place where the goal is out of reach."""
+        start, goal = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
         height, width = costmap.costs.shape
-        row, column = (int(i) for i in costmap.cells(np.asarray(start)[:2]))
+        row, column = (int(i) for i in costmap.cells(start[:2]))
         if not (0 <= row < height and 0 <= column < width):
-            return _nothing("the robot is outside the costmap")
-        goal_row, goal_column = (int(i) for i in costmap.cells(np.asarray(goal)[:2]))
+            return no_plan("the robot is outside the costmap")
+        goal_row, goal_column = (int(i) for i in costmap.cells(goal[:2]))
         outside = not (0 <= goal_row < height and 0 <= goal_column < width)
         goal_row, goal_column = min(max(goal_row, 0), height - 1), min(max(goal_column, 0), width - 1)
-        goal_cost = int(costmap.costs[goal_row, goal_column])
-        # The robot may stand at the goal already, and that inside inflation.
-        at_start = (goal_row, goal_column) == (row, column)
-        taken = not at_start and (
-            goal_cost in (INSCRIBED, LETHAL) or (goal_cost == UNKNOWN and not self.config.allow_unknown)
-        )
-        cells, found = _search(
-            costmap.costs,
-            row,
-            column,
-            goal_row,
-            goal_column,
-            self.config.cost_travel_multiplier,
-            self.config.tight_cost,
-            self.config.tight_penalty,
-            self.config.unknown_penalty if self.config.allow_unknown else -1.0,
-            self.config.escape_radius_m / costmap.resolution,
-        )
-        kept = _shortcut(costmap.costs, cells)
-        points = costmap.centres(kept[:, 0], kept[:, 1])
-        points[0] = np.asarray(start)[:2]
-        exact = bool(found) and not taken and not outside
-        if exact:
-            points = np.concatenate([points[:-1], np.asarray(goal)[None, :2]]) if len(points) > 1 else points
-            if len(points) == 1:
-                points = np.concatenate([points, np.asarray(goal)[None, :2]])
-        poses = _resample(points, 0.05, float(start[2]), float(goal[2]) if exact else None)
+        if (goal_row, goal_column) == (row, column) and not outside:
+            return self._at_the_goal(start, goal)
+        costs = costmap.costs
+        grid = _Grid(self, costmap, before)
+        goal_cost = int(costs[goal_row, goal_column])
+        taken = goal_cost in (INSCRIBED, LETHAL) or (goal_cost == UNKNOWN and not self.config.allow_unknown)
+        to_go, reachable = grid.cost_to_go(goal_row, goal_column, row, column)
+        target = None if taken or outside or not reachable else goal
+        if target is None:
+            # The reachable place nearest to the goal stands in for it; no way ends in what was never seen.
+            from_start, _ = grid.cost_to_go(row, column, -1, -1)
+            near = grid.nearest(from_start, (row, column), (goal_row, goal_column))
+            to_go, _ = grid.cost_to_go(near[0], near[1], row, column)
+            place = costmap.centres(np.array(near[0]), np.array(near[1]))
+            target = np.array([place[0], place[1], np.nan])
+            reachable = False
+        nodes, found, opened = grid.search(to_go, start, target)
+        nodes = grid.smooth(nodes)
+        poses, reverse = _resample(nodes, start, target if found else None)
         length = _length(poses)
+        exact = reachable and found
         cut = self._before_unknown(costmap, poses)
         if cut is not None:
-            return Plan(cut, False, "the way leads through space not seen yet", length if found else math.inf)
+            reason = "the way leads through space not seen yet"
+            return Plan(poses[cut], False, reason, length if found else math.inf, reverse[cut], opened)
         if exact:
-            return Plan(poses, True, "", length)
-        gap = float(np.linalg.norm(poses[-1, :2] - np.asarray(goal)[:2]))
+            return Plan(poses, True, "", length, reverse, opened)
+        gap = float(np.linalg.norm(poses[-1, :2] - goal[:2]))
+        whole = math.inf
         if outside:
-            return Plan(poses, False, f"the goal is outside the costmap, {gap:.1f} m beyond the path", math.inf)
-        if taken and gap <= self.config.tolerance_m:
-            return Plan(poses, False, f"the goal is on an obstacle; the path ends {gap:.1f} m from it", length)
-        return Plan(poses, False, f"no way to the goal: obstacles close it off {gap:.1f} m before it", math.inf)
+            reason = f"the goal is outside the costmap, {gap:.1f} m beyond the path"
+        elif taken and gap <= self.config.tolerance:
+            reason, whole = f"the goal is on an obstacle; the path ends {gap:.1f} m from it", length
+        elif reachable and opened >= self.config.max_iterations:
+            reason = f"no way found within {opened} steps of the search; the path ends {gap:.1f} m before the goal"
+        elif reachable:
+            reason = f"no way to the goal: it is too narrow for the robot {gap:.1f} m before it"
+        elif goal_cost == UNKNOWN and not self.config.allow_unknown:
+            reason = f"the goal is in space not seen yet; the path ends {gap:.1f} m before it"
+        else:
+            reason = f"no way to the goal: obstacles close it off {gap:.1f} m before it"
+        return Plan(poses, False, reason, whole, reverse, opened)
 
-    def _before_unknown(self, costmap: Costmap, poses: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """The part of a path before the first unknown cell; None when there is none on it."""
+    def _at_the_goal(self, start: NDArray[np.float64], goal: NDArray[np.float64]) -> Plan:
+        # It may stand at the goal already, and that inside inflation.
+        back = (goal[:2] - start[:2]) @ np.array([math.cos(start[2]), math.sin(start[2])]) < 0.0
+        return Plan(np.stack([start, goal]), True, "", _length(np.stack([start, goal])), np.array([False, back]))
+
+    def _before_unknown(self, costmap: Costmap, poses: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+        """Which poses of a path lie before the first unknown cell; None when there is none on it."""
         costs = costmap.cost_at(poses[:, :2])
-        start = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
+        from_start = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
         # Right round the robot the scan sees nothing; where it stands is free.
-        unknown = np.flatnonzero((costs == UNKNOWN) & (start > self.config.unknown_standoff_m))
+        unknown = np.flatnonzero((costs == UNKNOWN) & (from_start > self.config.unknown_standoff_m))
         if unknown.size == 0:
             return None
         along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
-        keep = along <= along[unknown[0]] - self.config.unknown_standoff_m
+        keep: NDArray[np.bool_] = along <= along[unknown[0]] - self.config.unknown_standoff_m
         keep[0] = True
-        return poses[keep]
+        return keep
+
+
+class _Grid:
+    """One costmap ready for the search: weights of its cells, distance to obstacles, the footprint at each heading."""
+
+    def __init__(self, planner: HybridPlanner, costmap: Costmap, before: Plan | None) -> None:
+        import cv2
+
+        config = planner.config
+        self.planner, self.config, self.costmap = planner, config, costmap
+        self.bins = config.angle_quantization_bins
+        free = (costmap.costs != LETHAL).astype(np.uint8)
+        if free.all():
+            self.clearance = np.full(free.shape, 1e6, dtype=np.float32)
+        else:
+            self.clearance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        near = np.zeros(free.shape, dtype=np.uint8)
+        if before is not None and len(before.poses) > 1 and config.retrospective_gain > 0:
+            rows, columns = costmap.cells(before.poses[:, :2])
+            line = np.clip(np.stack([columns, rows], axis=-1), -10000, 10000).astype(np.int32)
+            cv2.polylines(near, [line], False, 1, thickness=round(0.3 / costmap.resolution))
+        unknown = 1.0 + config.unknown_penalty if config.allow_unknown else 0.0
+        self.weights = _weights(
+            costmap.costs,
+            near,
+            config.cost_penalty,
+            config.tight_cost,
+            config.tight_penalty,
+            unknown,
+            1.0 - config.retrospective_gain,
+        )
+        # The body in cells, at each heading and all over: posts inside the outline count too.
+        body = planner.footprint.points(0.9 * costmap.resolution, config.footprint_padding) / costmap.resolution
+        yaw = 2.0 * math.pi * np.arange(self.bins) / self.bins
+        c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        self.body = np.ascontiguousarray(body)
+        self.bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
+        # A pose lies anywhere in its cell: 0.71 cells more until nothing can touch.
+        reach = planner.footprint.circumscribed_radius_m + 1.5 * config.footprint_padding
+        self.reach = reach / costmap.resolution + 1.42
+
+    def cost_to_go(self, row: int, column: int, to_row: int, to_column: int) -> tuple[NDArray[np.float32], bool]:
+        """Cost in cells (H, W) of the point robot's way from each cell to one; and whether ``to`` is reached."""
+        escape = self.config.escape_radius_m / self.costmap.resolution
+        from_start = to_row < 0
+        start_row, start_column = (row, column) if from_start else (to_row, to_column)
+        costs: NDArray[np.float32] = _cost_to_go(
+            self.costmap.costs, self.weights, row, column, start_row, start_column, escape, from_start
+        )
+        return costs, from_start or bool(np.isfinite(costs[to_row, to_column]))
+
+    def nearest(
+        self, from_start: NDArray[np.float32], start: tuple[int, int], goal: tuple[int, int]
+    ) -> tuple[int, int]:
+        """The reachable, known cell nearest to the goal in which the robot may face anywhere but along a wall.
+
+        The start itself where none is nearer.
+        """
+        half = 0.5 * max(self.planner.footprint.length_m, self.planner.footprint.width_m)
+        room = (half + self.config.footprint_padding) / self.costmap.resolution + 0.5
+        fits = np.isfinite(from_start) & (self.costmap.costs < INSCRIBED) & (self.clearance > room)
+        rows, columns = np.nonzero(fits)
+        if rows.size == 0:
+            return start
+        away = np.hypot(rows - goal[0], columns - goal[1])
+        best = np.lexsort((from_start[rows, columns], np.round(away, 6)))[0]
+        if away[best] >= math.hypot(start[0] - goal[0], start[1] - goal[1]):
+            return start
+        return int(rows[best]), int(columns[best])
+
+    def search(
+        self, to_go: NDArray[np.float32], start: NDArray[np.float64], goal: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], bool, int]:
+        """Poses (N, 4) in cells and radians, the fourth 1 where it is reached backwards; found; poses opened."""
+        config, resolution = self.config, self.costmap.resolution
+        origin = self.costmap.origin
+        return _search(
+            self.costmap.costs,
+            self.weights,
+            self.clearance,
+            to_go,
+            self.bodies,
+            self.body,
+            self.reach,
+            (start[0] - origin[0]) / resolution,
+            (start[1] - origin[1]) / resolution,
+            start[2],
+            (goal[0] - origin[0]) / resolution,
+            (goal[1] - origin[1]) / resolution,
+            goal[2],
+            config.allow_reverse_expansion,
+            config.reverse_penalty,
+            config.change_penalty / resolution,
+            config.non_straight_penalty,
+            config.rotation_penalty / resolution,
+            config.escape_radius_m / resolution,
+            config.max_iterations,
+        )
+
+    def smooth(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The poses with straight pieces where these cost no more; metres in the map frame."""
+        kept = _smooth(self.costmap.costs, self.weights, self.clearance, self.body, self.reach, nodes)
+        kept[:, :2] = kept[:, :2] * self.costmap.resolution + self.costmap.origin
+        return kept
 
 
 def _length(poses: NDArray[np.float64]) -> float:
@@ -140,139 +286,431 @@ def _length(poses: NDArray[np.float64]) -> float:
 
 
 def _resample(
-    points: NDArray[np.float64], spacing: float, start_yaw: float, goal_yaw: float | None
-) -> NDArray[np.float64]:
-    """Poses no farther apart than ``spacing`` along a polyline (N, 2), facing along it."""
-    pieces = [points[:1]]
-    for a, b in itertools.pairwise(points):
-        count = max(1, math.ceil(float(np.linalg.norm(b - a)) / spacing))
-        pieces.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
-    line = np.concatenate(pieces)
-    yaw = np.full(len(line), start_yaw)
-    if len(line) > 1:
-        step = np.diff(line, axis=0)
-        yaw[:-1] = np.arctan2(step[:, 1], step[:, 0])
-        yaw[-1] = yaw[-2]
-    if goal_yaw is not None:
-        yaw[-1] = goal_yaw
-    return np.column_stack([line, yaw])
+    nodes: NDArray[np.float64], start: NDArray[np.float64], goal: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Poses ``SPACING_M`` or less apart along nodes (N, 4), from the true start to the true goal; and which reverse."""
+    nodes = nodes.copy()
+    nodes[0, :3] = start
+    if goal is not None:
+        nodes[-1, :2] = goal[:2]
+    pieces, back = [nodes[:1, :3]], [False]
+    for a, b in itertools.pairwise(nodes):
+        step = b[:2] - a[:2]
+        length = float(np.hypot(*step))
+        count = max(1, math.ceil(length / SPACING_M - 1e-6))
+        part = (np.arange(1, count + 1) / count)[:, None]
+        piece = np.empty((count, 3))
+        piece[:, :2] = a[:2] + step * part
+        piece[:, 2] = b[2] if length > 1e-6 else a[2] + math.remainder(b[2] - a[2], 2 * math.pi) * part[:, 0]
+        pieces.append(piece)
+        back += [bool(b[3]) and length > 1e-6] * count
+    poses = np.concatenate(pieces)
+    if goal is not None and np.isfinite(goal[2]):
+        poses[-1, 2] = goal[2]
+    poses[:, 2] = np.remainder(poses[:, 2] + math.pi, 2 * math.pi) - math.pi
+    return poses, np.array(back)
+
+
+@njit(cache=True)
+def _weights(
+    costs: NDArray[np.uint8],
+    near: NDArray[np.uint8],
+    penalty: float,
+    tight_cost: int,
+    tight_penalty: float,
+    unknown: float,
+    discount: float,
+) -> NDArray[np.float32]:
+    """Price (H, W) of a cell's length in a cell; 0 where the robot's centre may not go."""
+    weights = np.empty(costs.shape, dtype=np.float32)
+    for r in range(costs.shape[0]):
+        for c in range(costs.shape[1]):
+            cost = costs[r, c]
+            weight = 0.0
+            if cost == 255:
+                weight = unknown
+            elif cost < 253:
+                weight = 1.0 + penalty * cost / 252.0
+                if cost > tight_cost:
+                    weight += tight_penalty * (cost - tight_cost) / (252.0 - tight_cost)
+            weights[r, c] = weight * (discount if near[r, c] else 1.0)
+    return weights
+
+
+@njit(cache=True)
+def _cost_to_go(
+    costs: NDArray[np.uint8],
+    weights: NDArray[np.float32],
+    row: int,
+    column: int,
+    start_row: int,
+    start_column: int,
+    escape: float,
+    everywhere: bool,
+) -> NDArray[np.float32]:
+    """Dijkstra from (row, column); unless ``everywhere``, only where a way to the robot's start may lead through.
+
+    That is where cost and straight distance to the start together are little more than the best way costs (A*).
+
+    Cells within ``escape`` of the start count as dear instead of closed where they are inscribed (lethal: a quarter
+    of that): the robot may stand there.
+    """
+    height, width = costs.shape
+    best = np.full((height, width), np.inf, dtype=np.float32)
+    closed = np.zeros((height, width), dtype=np.bool_)
+    best[row, column] = 0.0
+    queue = [(0.0, row * width + column)]
+    bound = np.inf
+    guide = 0.0 if everywhere else LEAST_WEIGHT
+    while len(queue) > 0:
+        cost, cell = heapq.heappop(queue)
+        if cost > bound:
+            break
+        r, c = cell // width, cell % width
+        if closed[r, c]:
+            continue
+        closed[r, c] = True
+        if r == start_row and c == start_column and not everywhere:
+            bound = 1.1 * cost + 15.0
+        for dr in range(-1, 2):
+            for dc in range(-1, 2):
+                y, x = r + dr, c + dc
+                if (dr == 0 and dc == 0) or y < 0 or x < 0 or y >= height or x >= width or closed[y, x]:
+                    continue
+                weight = weights[y, x]
+                if weight == 0.0:
+                    kind = costs[y, x]
+                    if kind == 255:
+                        continue
+                    away = math.hypot(y - start_row, x - start_column)
+                    if away > (escape if kind == 253 else 0.25 * escape):
+                        continue
+                    weight = DEAR
+                new = best[r, c] + weight * np.float32(1.4142135 if dr != 0 and dc != 0 else 1.0)
+                if new < best[y, x]:
+                    best[y, x] = new
+                    ahead = guide * math.hypot(y - start_row, x - start_column)
+                    heapq.heappush(queue, (float(new + ahead), y * width + x))
+    return best
+
+
+@njit(cache=True)
+def _overlap(costs: NDArray[np.uint8], x: float, y: float, body: NDArray[np.float64]) -> int:
+    """How many of the body's points, already turned, lie in lethal cells; the centre at (x, y) in cells."""
+    height, width = costs.shape
+    count = 0
+    for j in range(body.shape[0]):
+        c, r = math.floor(x + body[j, 0]), math.floor(y + body[j, 1])
+        if 0 <= r < height and 0 <= c < width and costs[r, c] == 254:
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def _turned(body: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
+    c, s = math.cos(yaw), math.sin(yaw)
+    turned = np.empty_like(body)
+    for j in range(body.shape[0]):
+        turned[j, 0] = c * body[j, 0] - s * body[j, 1]
+        turned[j, 1] = s * body[j, 0] + c * body[j, 1]
+    return turned
+
+
+@njit(cache=True)
+def _line_cost(
+    costs: NDArray[np.uint8],
+    weights: NDArray[np.float32],
+    clearance: NDArray[np.float32],
+    body: NDArray[np.float64],
+    reach: float,
+    ax: float,
+    ay: float,
+    bx: float,
+    by: float,
+    yaw: float,
+    dearest: float,
+) -> float:
+    """Price in cells of a straight way at a heading; inf where the footprint meets something.
+
+    Inf, too, where a cell is dearer than ``dearest``.
+    """
+    height, width = costs.shape
+    length = math.hypot(bx - ax, by - ay)
+    count = max(1, math.ceil(length))
+    turned = body
+    is_turned = False
+    total = 0.0
+    for k in range(count + 1):
+        x, y = ax + (bx - ax) * k / count, ay + (by - ay) * k / count
+        c, r = math.floor(x), math.floor(y)
+        if c < 0 or r < 0 or c >= width or r >= height or weights[r, c] == 0.0:
+            return np.inf
+        if weights[r, c] > dearest:
+            return np.inf
+        if clearance[r, c] <= reach:
+            if not is_turned:
+                turned = _turned(body, yaw)
+                is_turned = True
+            if _overlap(costs, x, y, turned) > 0:
+                return np.inf
+        if k > 0:
+            total += weights[r, c] * length / count
+    return total
+
+
+@njit(cache=True)
+def _turn_is_free(
+    costs: NDArray[np.uint8],
+    clearance: NDArray[np.float32],
+    body: NDArray[np.float64],
+    reach: float,
+    x: float,
+    y: float,
+    yaw: float,
+    turn: float,
+) -> bool:
+    """Whether the footprint turns on the spot from ``yaw`` by ``turn`` without meeting anything."""
+    if clearance[math.floor(y), math.floor(x)] > reach:
+        return True
+    count = max(1, math.ceil(abs(turn) / 0.15))
+    for k in range(count + 1):  # noqa: SIM110 (numba knows no generators in all())
+        if _overlap(costs, x, y, _turned(body, yaw + turn * k / count)) > 0:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _wrapped(angle: float) -> float:
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @njit(cache=True)
 def _search(
     costs: NDArray[np.uint8],
-    start_row: int,
-    start_column: int,
-    goal_row: int,
-    goal_column: int,
-    multiplier: float,
-    tight_cost: int,
-    tight_penalty: float,
-    unknown_penalty: float,
-    escape_cells: float,
-) -> tuple[NDArray[np.int64], bool]:
-    """Cells (N, 2) from the start to the goal, or to the cell nearest to it that can be reached."""
+    weights: NDArray[np.float32],
+    clearance: NDArray[np.float32],
+    to_go: NDArray[np.float32],
+    bodies: NDArray[np.float64],
+    body: NDArray[np.float64],
+    reach: float,
+    start_x: float,
+    start_y: float,
+    start_yaw: float,
+    goal_x: float,
+    goal_y: float,
+    goal_yaw: float,
+    may_reverse: bool,
+    reverse_penalty: float,
+    change_penalty: float,
+    curve_penalty: float,
+    turn_price: float,
+    escape: float,
+    most: int,
+) -> tuple[NDArray[np.float64], bool, int]:
+    """Hybrid A*. Headings stay on the bins, places are continuous; one pose is kept for each cell and heading."""
     height, width = costs.shape
-    best = np.full(height * width, np.inf)
-    parent = np.full(height * width, -1, dtype=np.int64)
-    closed = np.zeros(height * width, dtype=np.bool_)
-    start, goal = start_row * width + start_column, goal_row * width + goal_column
-    best[start] = 0.0
-    queue = [(math.hypot(goal_row - start_row, goal_column - start_column), start)]
-    nearest, nearest_distance, nearest_best = start, np.inf, np.inf
-    while len(queue) > 0:
-        _, cell = heapq.heappop(queue)
-        if closed[cell]:
-            continue
-        closed[cell] = True
-        row, column = cell // width, cell % width
-        away = math.hypot(goal_row - row, goal_column - column)
-        # A way that ends in what was never seen is no use as a stand-in for the goal.
-        closer = away < nearest_distance - 1e-9 or (away <= nearest_distance and best[cell] < nearest_best)
-        if closer and (costs[row, column] < 253 or cell == start):
-            nearest, nearest_distance, nearest_best = cell, away, best[cell]
-        if cell == goal:
+    bins = bodies.shape[0]
+    per_bin = 2.0 * math.pi / bins
+    # Signed change of heading (bins) and signed length of each primitive; a length of 0 turns on the spot.
+    turns = np.array([0, 1, -1, 2, -2, 1, -1, 0, 1, -1])
+    lengths = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, -1.0]) * STEP_CELLS
+    kinds = len(turns) if may_reverse else 7
+    best = np.full(bins * height * width, np.inf, dtype=np.float32)
+    room = 4096
+    place = np.empty((room, 2))
+    heading = np.empty(room, dtype=np.int32)
+    parent = np.empty(room, dtype=np.int32)
+    back = np.empty(room, dtype=np.int8)  # 0 forward, 1 backward, 2 turned on the spot
+    price = np.empty(room, dtype=np.float32)
+    overlap = np.zeros(room, dtype=np.int32)
+    first = math.floor(start_yaw / per_bin + 0.5) % bins
+    place[0, 0], place[0, 1] = start_x, start_y
+    heading[0], parent[0], back[0], price[0] = first, -1, 2, 0.0
+    overlap[0] = _overlap(costs, start_x, start_y, bodies[first])
+    count, opened = 1, 0
+    start_row, start_column = math.floor(start_y), math.floor(start_x)
+    best[(first * height + start_row) * width + start_column] = 0.0
+    queue = [(HURRY * float(to_go[start_row, start_column]), 0)]
+    # The goal itself is one more node, reached from any node by a turn, a straight line and a turn.
+    goal_price, goal_parent, goal_backwards = np.inf, -1, 0
+    nearest, nearest_to_go = 0, np.float32(np.inf)
+    closed = np.zeros(bins * height * width, dtype=np.bool_)
+    while len(queue) > 0 and opened < most:
+        f, node = heapq.heappop(queue)
+        if f >= goal_price:
             break
-        here = costs[row, column]
-        for dr in range(-1, 2):
-            for dc in range(-1, 2):
-                r, c = row + dr, column + dc
-                if (dr == 0 and dc == 0) or r < 0 or c < 0 or r >= height or c >= width:
+        x, y, b = place[node, 0], place[node, 1], heading[node]
+        row, column = math.floor(y), math.floor(x)
+        state = (b * height + row) * width + column
+        if closed[state]:
+            continue
+        closed[state] = True
+        opened += 1
+        left = to_go[row, column]
+        if left < nearest_to_go and (costs[row, column] != 255):
+            nearest, nearest_to_go = node, left
+        # Straight to the goal, ahead or (from near) backwards: from near always, from far now and then.
+        away = math.hypot(goal_x - x, goal_y - y)
+        if overlap[node] == 0 and (away < 20.0 or opened % max(1, int(away / 12.0)) == 0):
+            for backwards in range(2 if may_reverse and 0.2 < away < 20.0 else 1):
+                yaw = math.atan2(goal_y - y, goal_x - x) + backwards * math.pi if away > 0.2 else b * per_bin
+                turn = _wrapped(yaw - b * per_bin)
+                end_turn = 0.0 if np.isnan(goal_yaw) else _wrapped(goal_yaw - yaw)
+                total = price[node] + turn_price * (abs(turn) + abs(end_turn))
+                if backwards and back[node] == 0 and abs(turn) < 0.1:
+                    total += change_penalty
+                share = reverse_penalty if backwards else 1.0
+                if total + share * away >= goal_price:
                     continue
-                cost = costs[r, c]
-                if cost == 255:
-                    if unknown_penalty < 0.0:
+                if not _turn_is_free(costs, clearance, body, reach, x, y, b * per_bin, turn):
+                    continue
+                line = _line_cost(costs, weights, clearance, body, reach, x, y, goal_x, goal_y, yaw, np.inf)
+                total += share * line
+                # The point robot's way is no guide to a place beside a better line.
+                if total < goal_price and line <= 1.05 * left + 3.0:
+                    goal_price, goal_parent, goal_backwards = total, node, backwards
+        for k in range(kinds):
+            length = lengths[k]
+            other = (b + turns[k]) % bins
+            if length == 0.0:
+                new_x, new_y = x, y
+            else:
+                middle = (b + 0.5 * turns[k]) * per_bin
+                half = 0.5 * turns[k] * per_bin
+                chord = length * (math.sin(half) / half if turns[k] != 0 else 1.0)
+                new_x, new_y = x + chord * math.cos(middle), y + chord * math.sin(middle)
+            c, r = math.floor(new_x), math.floor(new_y)
+            if c < 0 or r < 0 or c >= width or r >= height:
+                continue
+            left = to_go[r, c]
+            if not np.isfinite(left):
+                continue
+            key = (other * height + r) * width + c
+            if closed[key]:
+                continue
+            weight = weights[r, c]
+            if weight == 0.0:
+                if overlap[node] == 0 and costs[row, column] < 253:
+                    continue  # out of what is closed, never into it
+                weight = DEAR
+            direction = 2 if length == 0.0 else (1 if length < 0.0 else 0)
+            if length == 0.0:
+                step = turn_price * per_bin * weight
+            else:
+                step = abs(length) * weight * (curve_penalty if turns[k] != 0 else 1.0)
+                if direction == 1:
+                    step *= reverse_penalty
+                if back[node] != 2 and back[node] != direction:
+                    step += change_penalty
+            new = price[node] + step
+            if new >= best[key] - 1e-4:
+                continue
+            touching = 0
+            if clearance[r, c] <= reach:
+                touching = _overlap(costs, new_x, new_y, bodies[other])
+                if touching > 0:
+                    # Only a robot that stands on something already, and only to leave it.
+                    near = math.hypot(new_x - start_x, new_y - start_y) <= escape
+                    if overlap[node] == 0 or touching > overlap[node] or not near:
                         continue
-                    weight = 1.0 + unknown_penalty
-                elif cost >= 253:
-                    # Out of inflation, never into it: only from cells of the same kind round the start.
-                    if here < 253 or here == 255:
+                    new += 2.0 * touching / body.shape[0] * 100.0
+                elif length != 0.0 and overlap[node] == 0:
+                    # Half way too: a primitive is three cells long.
+                    half_x, half_y = 0.5 * (x + new_x), 0.5 * (y + new_y)
+                    if _overlap(costs, half_x, half_y, bodies[b]) > 0:
                         continue
-                    from_start = math.hypot(r - start_row, c - start_column)
-                    if from_start > (escape_cells if cost == 253 else 0.25 * escape_cells):
-                        continue
-                    weight = 1.0 + 4.0 * (multiplier + tight_penalty)
-                else:
-                    weight = 1.0 + multiplier * cost / 252.0
-                    if cost > tight_cost:
-                        weight += tight_penalty * (cost - tight_cost) / (252.0 - tight_cost)
-                length = 1.4142135623730951 if dr != 0 and dc != 0 else 1.0
-                new = best[cell] + length * weight
-                other = r * width + c
-                if new < best[other]:
-                    best[other] = new
-                    parent[other] = cell
-                    heapq.heappush(queue, (new + math.hypot(goal_row - r, goal_column - c), other))
-    found = closed[goal]
-    cell = goal if found else nearest
-    count, walk = 1, cell
-    while parent[walk] >= 0:
-        walk = parent[walk]
-        count += 1
-    path = np.empty((count, 2), dtype=np.int64)
-    for i in range(count - 1, -1, -1):
-        path[i, 0], path[i, 1] = cell // width, cell % width
-        cell = parent[cell]
-    return path, found
+            best[key] = new
+            if count == room:
+                room *= 2
+                place = np.concatenate((place, np.empty_like(place)))
+                heading = np.concatenate((heading, np.empty_like(heading)))
+                parent = np.concatenate((parent, np.empty_like(parent)))
+                back = np.concatenate((back, np.empty_like(back)))
+                price = np.concatenate((price, np.empty_like(price)))
+                overlap = np.concatenate((overlap, np.zeros_like(overlap)))
+            place[count, 0], place[count, 1] = new_x, new_y
+            heading[count], parent[count], back[count] = other, node, direction
+            price[count], overlap[count] = new, touching
+            heapq.heappush(queue, (float(new + HURRY * left), count))
+            count += 1
+    found = goal_parent >= 0
+    walk = goal_parent if found else nearest
+    number, node = 0, walk
+    while node >= 0:
+        number += 1
+        node = int(parent[node])
+    path = np.empty((number + (2 if found else 0), 4))
+    node, i = walk, number - 1
+    while node >= 0:
+        path[i, 0], path[i, 1] = place[node, 0], place[node, 1]
+        path[i, 2] = heading[node] * per_bin
+        path[i, 3] = 1.0 if back[node] == 1 else 0.0
+        node, i = int(parent[node]), i - 1
+    path[0, 2] = start_yaw
+    if found:
+        x, y = place[walk, 0], place[walk, 1]
+        yaw = path[number - 1, 2]
+        if math.hypot(goal_x - x, goal_y - y) > 0.2:
+            yaw = math.atan2(goal_y - y, goal_x - x) + goal_backwards * math.pi
+        for k in range(2):
+            path[number + k, 0], path[number + k, 1] = (x, y) if k == 0 else (goal_x, goal_y)
+            path[number + k, 2], path[number + k, 3] = yaw, float(k * goal_backwards)
+    return path, found, opened
 
 
 @njit(cache=True)
-def _shortcut(costs: NDArray[np.uint8], cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Corners of a path whose straight pieces touch nothing dearer than the cells they replace."""
-    kept = np.empty_like(cells)
-    kept[0] = cells[0]
-    count, i = 1, 0
-    while i < len(cells) - 1:
-        dearest, unknown, last = 0, False, i + 1
-        for j in range(i, min(len(cells), i + 120)):
-            cost = costs[cells[j, 0], cells[j, 1]]
-            if cost == 255:
-                unknown = True
-            elif cost >= 253:  # inside inflation the path is walked cell by cell
-                if j > i + 1 or costs[cells[i, 0], cells[i, 1]] < 253:
-                    break
-            elif cost > dearest:
-                dearest = cost
-            if j > i + 1 and _line_is_free(costs, cells[i], cells[j], dearest, unknown):
+def _weight_at(weights: NDArray[np.float32], node: NDArray[np.float64]) -> float:
+    return weights[math.floor(node[1]), math.floor(node[0])]
+
+
+@njit(cache=True)
+def _smooth(
+    costs: NDArray[np.uint8],
+    weights: NDArray[np.float32],
+    clearance: NDArray[np.float32],
+    body: NDArray[np.float64],
+    reach: float,
+    nodes: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Replaces runs of forward nodes by straight lines that cost no more than the run."""
+    count = len(nodes)
+    along = np.zeros(count)  # price from the first node on
+    for i in range(1, count):
+        length = math.hypot(nodes[i, 0] - nodes[i - 1, 0], nodes[i, 1] - nodes[i - 1, 1])
+        along[i] = along[i - 1] + length * max(_weight_at(weights, nodes[i]), 1.0)
+    kept = np.empty((2 * count, 4))
+    kept[0] = nodes[0]
+    number, i = 1, 0
+    while i < count - 1:
+        last = i + 1
+        dearest = max(_weight_at(weights, nodes[i]), _weight_at(weights, nodes[i + 1]))
+        for j in range(i + 2, min(count, i + 80)):
+            if nodes[j, 3] != 0.0 or nodes[i + 1, 3] != 0.0:
+                break
+            dearest = max(dearest, _weight_at(weights, nodes[j]))
+            dx, dy = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
+            if math.hypot(dx, dy) < 1.0:
+                continue
+            yaw = math.atan2(dy, dx)
+            line = _line_cost(
+                *(costs, weights, clearance, body, reach),
+                *(nodes[i, 0], nodes[i, 1], nodes[j, 0], nodes[j, 1], yaw, 1.05 * dearest),
+            )
+            if line > 1.01 * (along[j] - along[i]) + 0.2:
+                continue
+            before = kept[number - 1, 2]
+            turn = _wrapped(yaw - before)
+            end_turn = _wrapped(nodes[j, 2] - yaw) if j < count - 1 else 0.0
+            if _turn_is_free(costs, clearance, body, reach, nodes[i, 0], nodes[i, 1], before, turn) and _turn_is_free(
+                costs, clearance, body, reach, nodes[j, 0], nodes[j, 1], yaw, end_turn
+            ):
                 last = j
-        kept[count] = cells[last]
-        count += 1
+        if last > i + 1:
+            kept[number, 0], kept[number, 1] = nodes[last, 0], nodes[last, 1]
+            kept[number, 2] = math.atan2(nodes[last, 1] - nodes[i, 1], nodes[last, 0] - nodes[i, 0])
+            kept[number, 3] = 0.0
+        else:
+            kept[number] = nodes[last]
+        number += 1
         i = last
-    return kept[:count]
-
-
-@njit(cache=True)
-def _line_is_free(
-    costs: NDArray[np.uint8], a: NDArray[np.int64], b: NDArray[np.int64], dearest: int, unknown: bool
-) -> bool:
-    steps = 2 * max(abs(b[0] - a[0]), abs(b[1] - a[1]))
-    for k in range(steps + 1):
-        row = round(a[0] + (b[0] - a[0]) * k / steps)
-        column = round(a[1] + (b[1] - a[1]) * k / steps)
-        cost = costs[int(row), int(column)]
-        if cost == 255:
-            if not unknown:
-                return False
-        elif cost >= 253 or cost > dearest:
-            return False
-    return True
+    return kept[:number].copy()

@@ -1,37 +1,96 @@
-"""Collision monitor: the last thing before ``/cmd_vel`` (nav2_collision_monitor's ``approach`` and ``stop``).
+"""Collision monitor: the last thing before ``/cmd_vel`` (after nav2_collision_monitor).
 
-It looks at the newest scan and the true footprint; what is too near for the LiDAR to see is the costmap's memory
-(``blind_radius_m``), which the caller adds to the points.
+It looks at the newest scan and 3D points, and the true footprint; what is too near or too low to be seen is the
+costmap's memory (``blind_radius_m``, ``memory_range_m``), which the caller adds to the points.
 """
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Positive, PositiveInt, check_ranges
+from ..ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
 from .footprint import Footprint
+
+ActionType = Literal["stop", "slowdown", "limit", "approach"]
 
 
 @dataclass(frozen=True)
-class CollisionMonitorConfig:
-    """Time to collision at which the robot slows down and stops."""
+class PolygonConfig:
+    """A place round the robot, and what happens to the command when something is in it."""
 
+    enabled: bool = True
+    action_type: ActionType = "approach"
+    points: str = ""
+    padding_m: NotNegative = 0.04
+    min_points: PositiveInt = 2
+    slowdown_ratio: Annotated[float, Range(above=0, high=1)] = 0.6
+    linear_limit: Positive = 0.25
+    angular_limit: Positive = 0.5
     time_before_collision: Positive = 1.2
     stop_time_s: NotNegative = 0.1
     simulation_time_step: Positive = 0.05
-    padding_m: NotNegative = 0.04
-    min_points: PositiveInt = 2
-    blind_radius_m: NotNegative = 0.45
 
     def __post_init__(self) -> None:
         check_ranges(self)
         if not self.stop_time_s < self.time_before_collision:
             raise ValueError(f"stop_time_s must be below time_before_collision (got {self.stop_time_s})")
+        if self.points:
+            parse_polygon(self.points)
+
+    def corners(self, footprint: Footprint) -> NDArray[np.float64]:
+        """Corners (N, 2) in ``base_link``, counter-clockwise: ``points``, or the footprint with ``padding_m``."""
+        return parse_polygon(self.points) if self.points else footprint.corners(self.padding_m)
+
+
+def parse_polygon(text: str) -> NDArray[np.float64]:
+    """Corners (N, 2), counter-clockwise, of a convex polygon written as nav2 does: ``[[0.5, 0.3], [0.5, -0.3], ...]``.
+
+    Raises:
+        ValueError: not that form, fewer than three corners, or not convex; the message begins with ``points``.
+    """
+    try:
+        corners = np.array(json.loads(text), dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"points must be a list like [[0.5, 0.3], [0.5, -0.3], [-0.5, 0]] (got {text!r})") from error
+    if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
+        raise ValueError(f"points must hold three corners [x, y] or more (got {text!r})")
+    edges = np.roll(corners, -1, axis=0) - corners
+    after = np.roll(edges, -1, axis=0)
+    bend = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+    turning = np.arctan2(bend, (edges * after).sum(axis=1)).sum()
+    if not ((bend > 0).all() or (bend < 0).all()) or abs(abs(turning) - 2 * math.pi) > 0.01:
+        raise ValueError(f"points must go once round a convex polygon (got {text!r})")
+    return corners if bend[0] > 0 else corners[::-1].copy()
+
+
+@dataclass(frozen=True)
+class CollisionMonitorConfig:
+    """Polygons, of which the most restrictive wins, and how old their points may be."""
+
+    source_timeout: Positive = 0.5
+    blind_radius_m: NotNegative = 0.45
+    memory_range_m: NotNegative = 2.5
+    stop: PolygonConfig = field(default_factory=lambda: PolygonConfig(action_type="stop", padding_m=0.02))
+    slowdown: PolygonConfig = field(default_factory=lambda: PolygonConfig(action_type="slowdown", padding_m=0.10))
+    limit: PolygonConfig = field(
+        default_factory=lambda: PolygonConfig(enabled=False, action_type="limit", padding_m=0.30)
+    )
+    approach: PolygonConfig = field(default_factory=PolygonConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+    def polygons(self) -> dict[str, PolygonConfig]:
+        """Those that are enabled, by name."""
+        named = {"stop": self.stop, "slowdown": self.slowdown, "limit": self.limit, "approach": self.approach}
+        return {name: polygon for name, polygon in named.items() if polygon.enabled}
 
 
 @dataclass(frozen=True)
@@ -40,50 +99,123 @@ class MonitoredCommand:
 
     command: tuple[float, float]
     action: str
-    """``free``, ``approach`` (slowed) or ``stop``."""
+    """``free``, ``limit``, ``slowdown``, ``approach`` (slowed by the time to collision) or ``stop``."""
     time_to_collision_s: float
     """For the command as asked; inf when nothing is met within ``time_before_collision``."""
+    polygon: str = ""
+    """Name of the polygon that decided; ``source_timeout`` for points that are too old."""
+
+
+@dataclass(frozen=True)
+class _Polygon:
+    name: str
+    config: PolygonConfig
+    normals: NDArray[np.float64]
+    """(E, 2) outward."""
+    offsets: NDArray[np.float64]
+    """(E,) of the edges along their normals: inside, normals @ point < offsets."""
+    reach: float
 
 
 class CollisionMonitor:
-    """Slows a command down in proportion to its time to collision, to zero at the obstacle."""
+    """Cuts a command down to what every polygon allows.
+
+    Linear and angular speed are cut by one factor, so that the robot stays on the arc that was looked at. A robot that
+    is in contact already may move so that the contact gets less: ``stop`` and ``approach`` hold only what goes deeper.
+    """
 
     def __init__(self, config: CollisionMonitorConfig, footprint: Footprint) -> None:
         self.config = config
         self.footprint = footprint
+        self._polygons = [_polygon(name, polygon, footprint) for name, polygon in config.polygons().items()]
+        self.most_points_needed = max((p.config.min_points for p in self._polygons), default=1)
+        """A cell of memory must count as that many points to be seen by every polygon."""
 
-    def limit(self, command: tuple[float, float], points: NDArray[np.float64]) -> MonitoredCommand:
-        """The command (m/s, rad/s) as it may be sent, given scan hits (N, 2) in ``base_link``, now.
+    def limit(
+        self, command: tuple[float, float], points: NDArray[np.float64], source_age_s: float = 0.0
+    ) -> MonitoredCommand:
+        """The command (m/s, rad/s) as it may be sent.
 
-        Linear and angular speed are cut by one factor, so that the robot stays on the arc that was looked at. A
-        robot that is in contact already may move so that the contact gets less.
+        Args:
+            command: as asked for.
+            points: (N, 2) what was seen, in ``base_link``, now.
+            source_age_s: of the oldest source of the points that is needed.
         """
         linear, angular = command
         if not (math.isfinite(linear) and math.isfinite(angular)):
             return MonitoredCommand((0.0, 0.0), "stop", 0.0)
-        if (linear == 0.0 and angular == 0.0) or len(points) < self.config.min_points:
+        if linear == 0.0 and angular == 0.0:
             return MonitoredCommand(command, "free", math.inf)
-        half = np.array([self.footprint.length_m, self.footprint.width_m]) / 2.0 + self.config.padding_m
-        reach = math.hypot(*half) + abs(linear) * self.config.time_before_collision + 0.05
-        near = np.ascontiguousarray(points[(points**2).sum(axis=1) < reach**2], dtype=np.float64)
+        if not source_age_s <= self.config.source_timeout:
+            return MonitoredCommand((0.0, 0.0), "stop", 0.0, "source_timeout")
+        squares = (points**2).sum(axis=1)
+        factor, action, decided, soonest = 1.0, "free", "", math.inf
+        for polygon in self._polygons:
+            share, time_s = self._allowed(polygon, linear, angular, points, squares)
+            soonest = min(soonest, time_s)
+            if share < factor:
+                factor, decided = share, polygon.name
+                action = "stop" if share == 0.0 else polygon.config.action_type
+        return MonitoredCommand((linear * factor, angular * factor), action, soonest, decided)
+
+    def _allowed(
+        self,
+        polygon: _Polygon,
+        linear: float,
+        angular: float,
+        points: NDArray[np.float64],
+        squares: NDArray[np.float64],
+    ) -> tuple[float, float]:
+        """Share of the command that one polygon lets through, and the time to collision, inf if it looks at none."""
+        config = polygon.config
+        looks_ahead = config.action_type in ("approach", "stop")
+        horizon = config.time_before_collision if config.action_type == "approach" else 3 * config.simulation_time_step
+        reach = polygon.reach + 0.05 + (abs(linear) * horizon if looks_ahead else 0.0)
+        near = np.ascontiguousarray(points[squares < reach**2], dtype=np.float64)
+        if len(near) < config.min_points:
+            return 1.0, math.inf
+        if not looks_ahead or config.action_type == "stop":
+            inside = int((near @ polygon.normals.T < polygon.offsets).all(axis=1).sum())
+            if inside < config.min_points:
+                return 1.0, math.inf
+        if config.action_type == "slowdown":
+            return config.slowdown_ratio, math.inf
+        if config.action_type == "limit":
+            share = min(config.linear_limit / max(abs(linear), 1e-9), config.angular_limit / max(abs(angular), 1e-9))
+            return min(1.0, share), math.inf
         time_s = float(
             _time_to_collision(
                 near,
                 linear,
                 angular,
-                float(half[0]),
-                float(half[1]),
-                self.config.simulation_time_step,
-                self.config.time_before_collision,
-                self.config.min_points,
+                polygon.normals,
+                polygon.offsets,
+                config.simulation_time_step,
+                horizon,
+                config.min_points,
             )
         )
         if math.isinf(time_s):
-            return MonitoredCommand(command, "free", time_s)
-        if time_s <= self.config.stop_time_s:
-            return MonitoredCommand((0.0, 0.0), "stop", time_s)
-        factor = time_s / self.config.time_before_collision
-        return MonitoredCommand((linear * factor, angular * factor), "approach", time_s)
+            return 1.0, time_s
+        if config.action_type == "stop" or time_s <= config.stop_time_s:
+            return 0.0, time_s
+        return time_s / config.time_before_collision, time_s
+
+
+def _polygon(name: str, config: PolygonConfig, footprint: Footprint) -> _Polygon:
+    corners = config.corners(footprint)
+    edges = np.roll(corners, -1, axis=0) - corners
+    normals = np.stack([edges[:, 1], -edges[:, 0]], axis=-1) / np.linalg.norm(edges, axis=1)[:, None]
+    offsets = (normals * corners).sum(axis=1)
+    return _Polygon(name, config, normals, offsets, float(np.linalg.norm(corners, axis=1).max()))
+
+
+@njit(cache=True)
+def _depth(x: float, y: float, normals: NDArray[np.float64], offsets: NDArray[np.float64]) -> float:
+    depth = np.inf
+    for e in range(offsets.shape[0]):
+        depth = min(depth, offsets[e] - normals[e, 0] * x - normals[e, 1] * y)
+    return depth
 
 
 @njit(cache=True)
@@ -91,16 +223,16 @@ def _time_to_collision(
     points: NDArray[np.float64],
     linear: float,
     angular: float,
-    half_length: float,
-    half_width: float,
+    normals: NDArray[np.float64],
+    offsets: NDArray[np.float64],
     step: float,
     horizon: float,
     min_points: int,
 ) -> float:
-    """Start of the first step in which at least ``min_points`` points go (deeper) into the footprint."""
+    """Start of the first step in which at least ``min_points`` points go (deeper) into the polygon."""
     depth = np.empty(points.shape[0])
     for j in range(points.shape[0]):
-        depth[j] = min(half_length - abs(points[j, 0]), half_width - abs(points[j, 1]))
+        depth[j] = _depth(points[j, 0], points[j, 1], normals, offsets)
     for k in range(1, math.ceil(horizon / step) + 1):
         turn = angular * step * k
         if abs(turn) > 1e-9:
@@ -112,7 +244,7 @@ def _time_to_collision(
         inside = 0
         for j in range(points.shape[0]):
             dx, dy = points[j, 0] - x, points[j, 1] - y
-            new_depth = min(half_length - abs(c * dx + s * dy), half_width - abs(c * dy - s * dx))
+            new_depth = _depth(c * dx + s * dy, c * dy - s * dx, normals, offsets)
             if new_depth > 0.0 and new_depth > depth[j] + 1e-3:
                 inside += 1
         if inside >= min_points:

@@ -8,18 +8,24 @@ import numpy as np
 
 from .costmap import CostmapConfig, RollingCostmap, scan_rays
 from .footprint import Footprint
+from .heights import sort_points
 from .kinematics import MotionLimits
-from .planner import GridPlanner, PlannerConfig
+from .planner import HybridPlanner, PlannerConfig
 from .prediction import PredictionConfig, Predictor
 from .safety import CollisionMonitor, CollisionMonitorConfig
 
 
 def warm_up() -> None:
     """Runs each numba kernel of this folder once on a small room."""
-    config, footprint = CostmapConfig(width_m=4.0), Footprint()
+    config, footprint = CostmapConfig(width=4.0), Footprint()
     ranges = np.full(90, 1.5, dtype=np.float64)
     rays = scan_rays(ranges, -math.pi, 2 * math.pi / 90, 0.1, 10.0, np.eye(4), config)
-    costmap = RollingCostmap(config, footprint).update(np.zeros(3), None, rays)
+    points = np.array([[1.0, 0.5, -0.3], [1.0, 0.5, -0.55]] * 3, dtype=np.float32)
+    mount = np.eye(4)
+    mount[2, 3] = 0.6
+    sweep = sort_points(points, np.zeros(6, dtype=np.float32), mount[None], 0.0, config.points)
+    sweep.moved(np.zeros(3)).nearest()
+    costmap = RollingCostmap(config, footprint).update(np.zeros(3), None, rays, sweep)
     Predictor(PredictionConfig(), MotionLimits(), footprint).predict(np.zeros(3), (0.0, 0.0), (0.4, 0.0), costmap)
-    GridPlanner(PlannerConfig()).plan(costmap, np.zeros(3), np.array([0.5, 0.5, 0.0]))
+    HybridPlanner(PlannerConfig(), footprint).plan(costmap, np.zeros(3), np.array([0.5, 0.5, 0.0]))
     CollisionMonitor(CollisionMonitorConfig(), footprint).limit((0.4, 0.0), np.array([[0.5, 0.0], [0.5, 0.1]]))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.heights import SortedPoints, sort_points
 from instant_ic.control.walls import WallFinder, WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import Matrix, matrix_from_pose2, pose2_from_matrix, relative2
@@ -19,13 +20,16 @@ from instant_ic.msg import (
     Bool,
     ControlState,
     LaserScan,
+    MessageError,
     OccupancyGrid,
     Odometry,
     Path,
+    PointCloud2,
     PoseStamped,
     PoseWithCovarianceStamped,
     TwistStamped,
     VspaceStatus,
+    cloud_array,
     grid_array,
     grid_message,
     header,
@@ -38,30 +42,35 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
+from instant_ic.ranges import Positive, check_ranges
+
+_MOTION_SAMPLES = 9
+"""Poses of the sensor over a sweep of points; between them it moves evenly."""
 
 
 @dataclass(frozen=True)
 class ArbiterNodeConfig(ArbiterConfig):
     """Parameters of the node ``arbiter``: the library's, and what only the node needs."""
 
-    rate_hz: float = 20.0
-    costmap_rate_hz: float = 5.0
-    wall_min_length_m: float = 1.5
-    wall_period_s: float = 2.0
-    map_jump_m: float = 0.3
-    map_jump_deg: float = 5.0
+    rate_hz: Positive = 20.0
+    wall_min_length_m: Positive = 1.5
+    wall_period_s: Positive = 2.0
+    map_jump_m: Positive = 0.3
+    map_jump_deg: Positive = 5.0
     costmap: CostmapConfig = field(default_factory=CostmapConfig)
 
     def __post_init__(self) -> None:
-        for key in ("rate_hz", "costmap_rate_hz", "wall_min_length_m", "wall_period_s", "map_jump_m", "map_jump_deg"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 class ArbiterNode(Node[ArbiterNodeConfig]):
     """Topics in and out of ``Arbiter`` and ``RollingCostmap``."""
 
     name = "arbiter"
+    live_parameters = (
+        *("limits", "prediction", "collision_monitor", "passage", "planner", "subgoal", "switch", "timeouts"),
+        *("map_jump_m", "map_jump_deg"),
+    )
 
     def setup(self) -> None:
         if not self.lockstep:
@@ -72,9 +81,14 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.static: StaticMap | None = None
         self.walls: WallMap | None = None
         self.map_is_new = False
-        finder = WallFinder(self.config.wall_min_length_m, self.config.costmap.occupied_threshold)
+        finder = WallFinder(self.config.wall_min_length_m, self.config.costmap.lethal_cost_threshold)
         self.wall_worker = self.background(finder.find, self.on_walls)
         self.map_from_odom: Matrix | None = None
+        self.sweep: SortedPoints | None = None  # the newest 3D points, in odom
+        self.sweep_error = ""
+        self.points_seen = False
+        self.taken: tuple[int, int] = (-1, -1)  # stamps of the scan and the points that the costmap holds
+        self.costmap_sent_ns: int | None = None
         self.camera_ns: int | None = None
         self.estop = False
         self.ticks = 0
@@ -87,6 +101,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
         self.operator = self.latest("/operator/cmd_vel", TwistStamped, max_age_s=10.0)
         self.scan = self.latest("/scan", LaserScan, max_age_s=10.0)
+        self.points = (
+            self.latest("/lidar/points", PointCloud2, max_age_s=10.0) if self.config.costmap.points.enabled else None
+        )
         self.odometry = self.latest("/wheel/odom", Odometry, max_age_s=10.0)
         self.pose = self.latest("/pose", PoseWithCovarianceStamped, max_age_s=10.0)
         self.vbot = self.latest("/vbot/odom", Odometry, max_age_s=10.0)
@@ -98,8 +115,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
         _ = self.tf  # listens from now on
         self.timer(self.config.wall_period_s, self.update_walls)
-        self.timer(1.0 / self.config.costmap_rate_hz, self.update_costmap)
+        self.timer(1.0 / self.config.costmap.update_frequency, self.update_costmap)
         self.timer(1.0 / self.config.rate_hz, self.tick)
+
+    def reconfigure(self, config: ArbiterNodeConfig) -> None:
+        super().reconfigure(config)
+        self.arbiter.reconfigure(config)
 
     def teardown(self) -> None:
         if hasattr(self, "cmd_vel"):
@@ -141,7 +162,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def ages(self) -> dict[str, float]:
         camera = math.inf if self.camera_ns is None else (self.clock.now_ns() - self.camera_ns) / 1e9
-        return {
+        ages = {
             "scan": self.age(self.scan),
             "odometry": self.age(self.odometry),
             "pose": self.age(self.pose),
@@ -151,6 +172,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             "command": self.age(self.operator),
             "vspace": self.vspace.age_s,
         }
+        if self.points is not None and self.points_seen:
+            ages["points"] = math.inf if self.sweep_error else self.age(self.points)
+        return ages
 
     def robot_pose(self) -> NDArray[np.float64] | None:
         try:
@@ -162,7 +186,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return pose
 
     def scan_in_base(self) -> NDArray[np.float64] | None:
-        """Hits (N, 2) of the newest scan in ``base_link`` now; by odometry, which does not jump."""
+        """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now; by odometry, which does not jump."""
         scan = self.scan.message
         if scan is None:
             return None
@@ -175,15 +199,60 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         points = scan_points(scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
         self.diagnose("scan", OK, f"{len(points)} points")
         placed: NDArray[np.float64] = points @ base_from_lidar[:2, :2].T + base_from_lidar[:2, 3]
-        return placed
+        if self.sweep is None:
+            return placed
+        base_from_odom = np.linalg.inv(self.tf.lookup("odom", "base_link"))
+        near = self.sweep.nearest() @ base_from_odom[:2, :2].T + base_from_odom[:2, 3]
+        return np.concatenate([placed, near])
+
+    # -- 3D points
+
+    def take_points(self) -> int:
+        """Sorts the newest 3D points by height, in ``odom``; their stamp, -1 while there are none."""
+        message = None if self.points is None else self.points.message
+        if self.points is None:
+            self.diagnose("points", OK, "not used (costmap.points.enabled is false)")
+        if message is None:
+            if self.points is not None and not self.points_seen:
+                self.diagnose("points", OK, "no 3D points yet: low and hanging things are not seen")
+            return -1
+        self.points_seen = True
+        if stamp_ns(message) == self.taken[1]:
+            return self.taken[1]
+        try:
+            self.sweep = self.sorted(message)
+        except (MessageError, TransformError) as error:
+            self.sweep_error = str(error)
+            self.diagnose("points", WARN, f"3D points cannot be used: {error}")
+            return -1
+        self.sweep_error = ""
+        counts = self.sweep.counts()
+        self.diagnose("points", OK, f"{counts['obstacle']} points in the way", **counts)
+        return stamp_ns(message)
+
+    def sorted(self, message: PointCloud2) -> SortedPoints:
+        cloud = cloud_array(message)
+        names = cloud.dtype.names or ()
+        if not {"x", "y", "z"} <= set(names):
+            raise MessageError(f"/lidar/points has the fields {', '.join(names)}; x, y and z are needed")
+        time_s = cloud["time"] if "time" in names else np.zeros(len(cloud), np.float32)
+        duration_s = float(min(max(time_s.max(initial=0.0), 0.0), 1.0))
+        first_ns = stamp_ns(message)
+        instants = [first_ns + round(1e9 * duration_s * k / (_MOTION_SAMPLES - 1)) for k in range(_MOTION_SAMPLES)]
+        poses = np.stack([self.tf.lookup("odom", message.header.frame_id, ns) for ns in instants])
+        points = np.stack([cloud["x"], cloud["y"], cloud["z"]], axis=1)
+        return sort_points(points, time_s, poses, duration_s, self.config.costmap.points)
 
     # -- costmap
 
     def update_costmap(self) -> None:
+        points_ns = self.take_points()
         pose, scan = self.robot_pose(), self.scan.message
         if pose is None or scan is None:
             missing = "no pose" if pose is None else "no LiDAR scan"
             self.diagnose("costmap", WARN if self.costmap is not None else OK, f"costmap stands still: {missing}")
+            return
+        if (stamp_ns(scan), points_ns) == self.taken:
             return
         try:
             map_from_lidar = self.tf.lookup("map", scan.header.frame_id, stamp_ns(scan))
@@ -204,17 +273,22 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             map_from_lidar,
             self.config.costmap,
         )
-        self.costmap = self.costmaps.update(pose, self.static, rays)
+        new_points = self.sweep if points_ns not in (-1, self.taken[1]) else None
+        placed = None if new_points is None else new_points.moved(pose2_from_matrix(map_from_odom))
+        self.costmap = self.costmaps.update(pose, self.static, rays, placed)
+        self.taken = (stamp_ns(scan), points_ns)
         self.diagnose("costmap", OK, "up to date", static_map=self.static is not None)
-        self.costmap_out.publish(
-            grid_message(
-                self.costmap.occupancy(),
-                self.costmap.resolution,
-                (float(self.costmap.origin[0]), float(self.costmap.origin[1])),
-                "map",
-                stamp_ns(scan),
-            )
-        )
+        self.publish_costmap(stamp_ns(scan))
+
+    def publish_costmap(self, scan_ns: int) -> None:
+        now_ns, costmap = self.clock.now_ns(), self.costmap
+        # A little early counts: updates come at the scan's rate, not at this one.
+        due_ns = 0.9e9 / self.config.costmap.publish_frequency
+        if costmap is None or (self.costmap_sent_ns is not None and now_ns - self.costmap_sent_ns < due_ns):
+            return
+        self.costmap_sent_ns = now_ns
+        origin = (float(costmap.origin[0]), float(costmap.origin[1]))
+        self.costmap_out.publish(grid_message(costmap.occupancy(), costmap.resolution, origin, "map", scan_ns))
 
     def jumped(self, before: Matrix, after: Matrix) -> bool:
         # Per costmap period, which is shorter than that of SLAM: a correction comes in one piece.

@@ -11,9 +11,10 @@ from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.control.arbiter import Mode
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
+from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator, RecoveryConfig
-from instant_ic.control.planner import GridPlanner, PlannerConfig
+from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.geometry.transforms import TransformError
@@ -30,32 +31,26 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
+from instant_ic.ranges import Positive, check_ranges
 
 
 @dataclass(frozen=True)
 class NavigatorConfig:
     """Parameters of the node ``navigator``."""
 
-    controller_frequency: float = 20.0
-    replan_period_s: float = 0.2
-    subgoal_timeout_s: float = 0.5
-    costmap_timeout_s: float = 1.0
-    state_timeout_s: float = 0.3
+    controller_frequency: Positive = 20.0
+    replan_period_s: Positive = 0.2
+    subgoal_timeout_s: Positive = 0.5
+    costmap_timeout_s: Positive = 1.0
+    state_timeout_s: Positive = 0.3
     recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
     limits: MotionLimits = field(default_factory=MotionLimits)
+    footprint: Footprint = field(default_factory=Footprint)
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     follower: FollowerConfig = field(default_factory=FollowerConfig)
 
     def __post_init__(self) -> None:
-        for key in (
-            "controller_frequency",
-            "replan_period_s",
-            "subgoal_timeout_s",
-            "costmap_timeout_s",
-            "state_timeout_s",
-        ):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 class NavigatorNode(Node[NavigatorConfig]):
@@ -63,12 +58,13 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     name = "navigator"
 
+    live_parameters = ("replan_period_s", "recovery", "limits", "planner", "follower")
+
     def setup(self) -> None:
         if not self.lockstep:
             warm_up()
         c = self.config
-        follower = PathFollower(c.follower, c.limits)
-        self.navigator = Navigator(GridPlanner(c.planner), follower, c.replan_period_s, c.recovery)
+        self.navigator = self.made(c)
         self.speed = 0.0
         self.cmd_vel = self.publisher("/nav/cmd_vel", TwistStamped, qos=SENSOR)
         self.path = self.publisher("/nav/path", Path, qos=SENSOR)
@@ -78,6 +74,14 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.state = self.latest("/ic/state", ControlState, c.state_timeout_s, qos=LATCHED)
         _ = self.tf  # listens from now on
         self.timer(1.0 / c.controller_frequency, self.tick)
+
+    def made(self, c: NavigatorConfig) -> Navigator:
+        follower = PathFollower(c.follower, c.limits, c.footprint)
+        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s, c.recovery)
+
+    def reconfigure(self, config: NavigatorConfig) -> None:
+        super().reconfigure(config)
+        self.navigator = self.made(config)  # plans anew at once
 
     def tick(self) -> None:
         state = self.state.message

