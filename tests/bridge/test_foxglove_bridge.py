@@ -1,0 +1,545 @@
+"""The Foxglove bridge over a real WebSocket, by a client that speaks Foxglove's protocol (ws-protocol, spec.md)."""
+
+import contextlib
+import json
+import socket
+import struct
+import sys
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from live_nodes import LiveNode, Neighbour, cdr, wait_for
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
+from instant_ic.bus.control import ControlServer
+from instant_ic.bus.node import Node
+from instant_ic.evaluation.stack import free_port
+from instant_ic.msg import (
+    Bool,
+    Clock,
+    ControlState,
+    String,
+    TFMessage,
+    compressed_image_message,
+    deserialize,
+    message_type,
+    stamp_ns,
+    to_time,
+    transform_message,
+    twist_message,
+    twist_stamped,
+    twist_values,
+)
+from instant_ic.nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
+
+pytest.importorskip("foxglove")
+DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
+
+
+class Client:
+    """A client of Foxglove's protocol."""
+
+    def __init__(self, port, **options):
+        # The SDK's name of the protocol since 0.14; foxglove.websocket.v1 before.
+        self._open = contextlib.ExitStack()
+        self.socket = self._open.enter_context(
+            connect(
+                f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None, compression=None, **options
+            )
+        )
+        self.channels = {}
+        self.messages = deque()
+        self.texts = deque()
+        self.times = []
+        self.info = self.until(lambda: self.text("serverInfo"), "serverInfo")
+
+    def send(self, **content):
+        self.socket.send(json.dumps(content))
+
+    def poll(self, timeout_s=0.02):
+        """Takes what comes within the time."""
+        with contextlib.suppress(TimeoutError):
+            frame = self.socket.recv(timeout_s)
+            if isinstance(frame, bytes):
+                if frame[0] == 1:
+                    subscription, log_time = struct.unpack_from("<IQ", frame, 1)
+                    self.messages.append((subscription, log_time, frame[13:]))
+                elif frame[0] == 2:
+                    self.times.append(struct.unpack_from("<Q", frame, 1)[0])
+                return
+            content = json.loads(frame)
+            if content["op"] == "advertise":
+                self.channels.update({c["topic"]: c for c in content["channels"]})
+            elif content["op"] == "unadvertise":
+                for topic in [t for t, c in self.channels.items() if c["id"] in content["channelIds"]]:
+                    del self.channels[topic]
+            else:
+                self.texts.append(content)
+
+    def text(self, op):
+        return next((t for t in self.texts if t["op"] == op), None)
+
+    def until(self, condition, what, timeout_s=30.0):
+        deadline = time.monotonic() + timeout_s
+        while not (value := condition()):
+            assert time.monotonic() < deadline, f"no {what} within {timeout_s:g} s"
+            self.poll()
+        return value
+
+    def spin(self, seconds):
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.poll()
+
+    def subscribe(self, topic, number=1):
+        channel = self.until(lambda: self.channels.get(topic), f"advertisement of {topic}")
+        self.texts.clear()
+        self.send(op="subscribe", subscriptions=[{"id": number, "channelId": channel["id"]}])
+        self.spin(0.1)
+        if (status := self.text("status")) and "Unknown channel" in status["message"]:
+            # The SDK (0.30.3) tells clients of a channel a moment before it knows it itself.
+            self.send(op="subscribe", subscriptions=[{"id": number, "channelId": channel["id"]}])
+        return channel
+
+    def unsubscribe(self, number=1):
+        self.send(op="unsubscribe", subscriptionIds=[number])
+
+    def parameters(self, *names, request="r"):
+        self.texts.clear()
+        self.send(op="getParameters", parameterNames=list(names), id=request)
+        answer = self.until(lambda: self.text("parameterValues"), "parameters")
+        assert answer["id"] == request
+        return {p["name"]: p["value"] for p in answer["parameters"]}
+
+    def advertise(self, topic, name, encoding="json", number=5):
+        self.send(op="advertise", channels=[{"id": number, "topic": topic, "encoding": encoding, "schemaName": name}])
+
+    def publish(self, data, number=5):
+        self.socket.send(struct.pack("<BI", 1, number) + data)
+
+    def close(self):
+        self._open.close()
+
+
+@pytest.fixture
+def world(tmp_path_factory):
+    """A run directory with the bridge, and ways to its bus and its server; everything is ended afterwards."""
+    open_things = []
+
+    class World:
+        run_dir = tmp_path_factory.mktemp("r")
+
+        def keep(self, thing):
+            open_things.append(thing)
+            return thing
+
+        def bridge(self, sim_time=False, **parameters):
+            config = FoxgloveBridgeConfig(port=0, discovery_period_s=0.05, **parameters)
+            self.live = self.keep(LiveNode(self.run_dir, FoxgloveBridgeNode, config, "foxglove_bridge", sim_time))
+            return self.live.node
+
+        def client(self, **options):
+            return self.keep(Client(self.live.node.server.port, **options))
+
+        def neighbour(self, name="talker"):
+            return self.keep(Neighbour(self.run_dir, name))
+
+    yield World()
+    for thing in reversed(open_things):
+        thing.close()
+
+
+# -- topics ------------------------------------------------------------------------------------------
+
+
+def test_topics_are_offered_with_their_whole_definition_as_they_come_and_go(world):
+    world.bridge(exclude=("/hidden",))
+    talker = world.neighbour()
+    talker.publisher("/hidden", String)
+    state = talker.publisher("/ic/state", ControlState, LATCHED)
+    client = world.client()
+    channel = client.until(lambda: client.channels.get("/ic/state"), "the channel")
+    assert (channel["encoding"], channel["schemaName"], channel["schemaEncoding"]) == (
+        "cdr",
+        "instant_ic_msgs/msg/ControlState",
+        "ros2msg",
+    )
+    assert "uint8 VIRTUAL=1" in channel["schema"] and "MSG: geometry_msgs/Quaternion" in channel["schema"]
+    # An independent parser reads bytes of ours by this text alone.
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(channel["schema"], channel["schemaName"]))
+    message = ControlState(**{**empty_state().__dict__, "mode": 2, "reason": "why"})
+    assert store.deserialize_cdr(cdr(message), channel["schemaName"]).reason == "why"
+    talker.node.drop(state)
+    client.until(lambda: "/ic/state" not in client.channels, "the end of the channel")
+    assert "/hidden" not in client.channels
+
+
+def empty_state():
+    from instant_ic.geometry.poses import matrix_from_pose2
+    from instant_ic.msg import header, pose_message
+
+    pose = pose_message(matrix_from_pose2(np.zeros(3)))
+    return ControlState(
+        header("map", 0), 0, "", False, False, 0, pose, pose, pose, twist_message(), twist_message(), 0.0, 0.0, 0.0
+    )
+
+
+def test_bytes_go_through_unchanged_with_their_time_and_only_while_somebody_watches(world):
+    bridge = world.bridge()
+    talker = world.neighbour()
+    out = talker.publisher("/camera/image/compressed", message_type("CompressedImage"), SENSOR)
+    wait_for(lambda: "/camera/image/compressed" in bridge.server.topics, "the topic")
+    assert out.subscriber_count == 0
+    client = world.client()
+    client.spin(0.3)
+    assert out.subscriber_count == 0  # connected, but not watching
+    client.subscribe("/camera/image/compressed", 7)
+    wait_for(lambda: out.subscriber_count == 1, "the bridge's subscription")
+    picture = compressed_image_message(np.arange(256, dtype=np.uint8), "camera", 5)
+    before_ns = time.time_ns()
+    out.publish(picture)
+    client.until(lambda: client.messages, "the picture")
+    number, log_time, payload = client.messages[0]
+    assert (number, payload) == (7, cdr(picture))
+    assert before_ns <= log_time <= time.time_ns()
+    client.unsubscribe(7)
+    wait_for(lambda: out.subscriber_count == 0, "the end of the subscription")
+    client.subscribe("/camera/image/compressed", 8)
+    wait_for(lambda: out.subscriber_count == 1, "the subscription again")
+    client.close()  # without a word, as a browser's tab that is closed
+    wait_for(lambda: out.subscriber_count == 0, "the end after the client has left")
+
+
+def static(child):
+    return TFMessage([transform_message(np.eye(4), "base_link", child, 1)])
+
+
+def test_each_client_gets_the_latched_values_of_every_node_however_late_it_comes(world):
+    """ROS 2: latched topics lost for late subscribers (rosbag2 1049, foxglove bridge)."""
+    world.bridge()
+    for name in ("camera", "velodyne"):
+        world.neighbour(name).publisher("/tf_static", TFMessage, LATCHED).publish(static(name))
+
+    def frames(client):
+        return {
+            t.child_frame_id
+            for _, _, data in client.messages
+            for t in deserialize(data, "tf2_msgs/msg/TFMessage").transforms
+        }
+
+    for _ in range(2):
+        client = world.client()
+        client.subscribe("/tf_static")
+        client.until(lambda client=client: frames(client) == {"camera", "velodyne"}, "both transforms")
+
+
+def test_no_flood_of_old_messages_after_a_stall(world):
+    """Foxglove bridge 329: a viewer that stood still was sent everything that it had missed."""
+    bridge = world.bridge()
+    talker = world.neighbour()
+    out = talker.publisher("/numbers", String, RELIABLE)
+    receiver = socket.create_connection(("127.0.0.1", bridge.server.port))
+    receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    client = world.client(sock=receiver, max_queue=1)
+    client.subscribe("/numbers")
+    wait_for(lambda: out.subscriber_count == 1, "the subscription")
+    filler = "x" * 400_000
+    sent = 200
+    for number in range(sent):  # 80 MB while the client reads nothing
+        out.publish(String(f"{number} {filler}"))
+        time.sleep(0.005)
+    wait_for(lambda: bridge.server.count >= sent, "everything at the server")
+    numbers = []
+
+    def caught_up():
+        while client.messages:
+            numbers.append(int(deserialize(client.messages.popleft()[2], "std_msgs/msg/String").data.split()[0]))
+        return numbers and numbers[-1] == sent - 1
+
+    client.until(caught_up, "the newest message")
+    # The server's queue and what the kernel's buffers held when it filled (4 MB by default), not the 200 sent.
+    assert len(numbers) <= 32 + 16
+    assert numbers == sorted(numbers)
+
+
+def test_a_topic_that_changes_its_type_is_offered_anew(world):
+    world.bridge()
+    talker = world.neighbour()
+    first = talker.publisher("/x", String)
+    client = world.client()
+    assert client.subscribe("/x")["schemaName"] == "std_msgs/msg/String"
+    talker.node.drop(first)
+    out = talker.publisher("/x", Bool)
+    client.until(lambda: client.channels.get("/x", {}).get("schemaName") == "std_msgs/msg/Bool", "the other type")
+    client.subscribe("/x", 2)
+    wait_for(lambda: out.subscriber_count == 1, "the subscription")
+    out.publish(Bool(True))
+    client.until(lambda: client.messages, "the message")
+    assert client.messages[0][2] == cdr(Bool(True))
+
+
+def test_graph_of_nodes_and_topics(world):
+    world.bridge()
+    world.neighbour("talker").publisher("/chatter", String)
+    claim = registry.Claim(world.run_dir / "nodes" / "ears", "node ears")
+    try:
+        entry = {"name": "ears", "module": "m", "pid": 1, "started_ns": 1, "params": {}}
+        claim.write({**entry, "publishes": {}, "subscribes": {"/chatter": "any"}})
+        client = world.client()
+        client.send(op="subscribeConnectionGraph")
+
+        def seen():
+            updates = [t for t in client.texts if t["op"] == "connectionGraphUpdate"]
+            published = {p["name"]: p["publisherIds"] for u in updates for p in u["publishedTopics"]}
+            subscribed = {s["name"]: s["subscriberIds"] for u in updates for s in u["subscribedTopics"]}
+            return published.get("/chatter") == ["talker"] and subscribed.get("/chatter") == ["ears"]
+
+        client.until(seen, "the graph")
+    finally:
+        claim.release()
+
+
+def test_simulated_time_is_told_also_before_topics_flow(world):
+    world.bridge(sim_time=True)
+    clock = world.neighbour("player").publisher("/clock", Clock)
+    client = world.client()
+    assert "time" in client.info["capabilities"]
+    client.until(lambda: "/clock" in client.channels, "topics before the first /clock")
+    client.until(lambda: clock.publish(Clock(to_time(7_000_000_000))) or client.times, "the time")
+    assert set(client.times) == {7_000_000_000}
+
+
+# -- parameters --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class TalkerConfig:
+    """Attributes:
+    rate_hz: how often.
+    words: what.
+    """
+
+    rate_hz: float = 2.0
+    words: str = "hello"
+    places: tuple[float, ...] = (1.0, 2.5)
+
+    def __post_init__(self) -> None:
+        if self.rate_hz <= 0:
+            raise ValueError(f"rate_hz must be > 0 (got {self.rate_hz})")
+
+
+class TalkerNode(Node[TalkerConfig]):
+    name = "talker"
+    live_parameters = ("rate_hz", "places")
+
+
+@pytest.fixture
+def talker(world):
+    """A node with parameters and a control channel, as every process of the stack has one."""
+    live = world.keep(LiveNode(world.run_dir, TalkerNode, TalkerConfig(), "talker"))
+    world.keep(ControlServer(live.node, world.run_dir / "nodes" / "talker.sock"))
+    claim = registry.Claim(world.run_dir / "nodes" / "talker", "node talker")
+    claim.write({**live.node.describe(), "started_ns": 1})
+    yield live.node
+    claim.release()
+
+
+def test_parameters_of_every_node_are_served_and_changed_where_the_node_allows_it(world, talker):
+    bridge = world.bridge()
+    client = world.client()
+    wait_for(lambda: "talker" in bridge.server.parameters.nodes, "the node")
+    values = client.parameters()
+    assert values["/talker.rate_hz"] == 2.0
+    assert values["/talker.words"] == "hello"
+    assert values["/talker.places"] == [1.0, 2.5]
+    assert client.parameters("/talker.words") == {"/talker.words": "hello"}
+
+    client.texts.clear()
+    wanted = [{"name": "/talker.rate_hz", "value": 5, "type": "float64"}, {"name": "/talker.places", "value": [3.5]}]
+    client.send(op="setParameters", parameters=wanted, id="s")
+    answer = client.until(lambda: client.text("parameterValues"), "the new values")
+    assert {p["name"]: p["value"] for p in answer["parameters"]} == {"/talker.rate_hz": 5.0, "/talker.places": [3.5]}
+    assert (talker.config.rate_hz, talker.config.places) == (5.0, (3.5,))
+
+    for name, value, words in [("/talker.rate_hz", -1.0, "must be > 0"), ("/talker.words", "bye", "restart")]:
+        client.texts.clear()
+        client.send(op="setParameters", parameters=[{"name": name, "value": value}], id="t")
+        refusal = client.until(lambda: client.text("status"), "the refusal")
+        assert refusal["level"] == 2 and words in refusal["message"]
+    assert (talker.config.rate_hz, talker.config.words) == (5.0, "hello")
+
+
+def test_a_change_made_elsewhere_is_told_to_those_who_asked(world, talker):
+    world.bridge()
+    client = world.client()
+    client.parameters("/talker.rate_hz")
+    client.send(op="subscribeParameterUpdates", parameterNames=["/talker.rate_hz"])
+
+    def changed():
+        talker.call_soon(talker.set_parameters, {"rate_hz": 3.0 + len(client.texts) % 2})
+        client.spin(0.05)
+        answers = [t for t in client.texts if t["op"] == "parameterValues" and "id" not in t]
+        return any(p["value"] == talker.config.rate_hz for t in answers for p in t["parameters"])
+
+    client.texts.clear()
+    client.until(changed, "the changed value")
+
+
+def test_a_node_that_is_not_there_is_told(world):
+    world.bridge()
+    client = world.client()
+    client.parameters("/nobody.rate_hz")
+    status = client.until(lambda: client.text("status"), "words")
+    assert "nobody" in status["message"] and "does not run" in status["message"]
+
+
+# -- commands ----------------------------------------------------------------------------------------
+
+
+def test_nobody_can_publish_unless_it_is_configured(world):
+    world.bridge()
+    client = world.client()
+    assert "clientPublish" not in client.info["capabilities"]
+    client.advertise(DRIVE, "geometry_msgs/Twist")
+    client.publish(json.dumps({"linear": {"x": 0.2}, "angular": {"z": 0.0}}).encode())
+    client.spin(0.5)
+    assert DRIVE not in {t.topic for t in registry.list_topics(world.run_dir)}
+
+
+@pytest.fixture
+def driving(world):
+    """The bridge with commands allowed, a client, and what arrives on the bus."""
+    bridge = world.bridge(accept_operator=True)
+    listener = world.neighbour("listener")
+    drives, stops = listener.listen(DRIVE, RELIABLE), listener.listen(STOP, LATCHED)
+    client = world.client()
+    client.until(lambda: DRIVE in client.channels, "the bridge's own topic")
+    listener.spin(0.3)
+    return bridge, client, listener, drives, stops
+
+
+def last_drive(drives):
+    return twist_values(deserialize(drives[-1].payload, "TwistStamped"))
+
+
+def test_commands_in_either_encoding_reach_the_bus_stamped(driving):
+    _, client, listener, drives, stops = driving
+    client.advertise(DRIVE, "geometry_msgs/msg/Twist", "json", 1)
+    client.publish(json.dumps({"linear": {"x": 0.2, "y": 0, "z": 0}, "angular": {"z": -0.3}}).encode(), 1)
+    listener.wait(lambda: len(drives) == 1, "the JSON command")
+    assert last_drive(drives) == (0.2, -0.3)
+    assert abs(stamp_ns(deserialize(drives[-1].payload, "TwistStamped")) - time.time_ns()) < 30e9
+    client.advertise(DRIVE, "geometry_msgs/msg/TwistStamped", "cdr", 2)
+    command = twist_stamped(0.1, 0.4, time.time_ns())
+    client.publish(cdr(command), 2)
+    listener.wait(lambda: len(drives) == 2, "the CDR command")
+    assert drives[-1].payload == cdr(command)
+    client.advertise(STOP, "std_msgs/msg/Bool", "json", 3)
+    client.publish(b'{"data": true}', 3)
+    listener.wait(lambda: stops, "the stop")
+    assert deserialize(stops[-1].payload, "std_msgs/msg/Bool").data is True
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("Twist", b'{"linear": {"x": 1e999}, "angular": {"z": 0}}', "not finite"),
+        ("Twist", b'{"linear": {"x": 30}, "angular": {"z": 0}}', "beyond 2 m/s"),
+        ("Twist", b'{"linear": 3}', "TypeError"),
+        ("Twist", b"[1, 2]", "not a JSON object"),
+        ("Twist", b"\xff", "UnicodeDecodeError"),
+        (
+            "TwistStamped",
+            b'{"header": {"stamp": {"sec": 1, "nanosec": 0}}, "twist": {"linear": {"x": 0.1}, "angular": {"z": 0}}}',
+            "s old",
+        ),
+    ],
+)
+def test_bad_commands_are_refused_told_and_counted(driving, name, content, words):
+    bridge, client, listener, drives, _ = driving
+    client.advertise(DRIVE, f"geometry_msgs/msg/{name}")
+    client.publish(content)
+    status = client.until(lambda: client.text("status"), "the refusal")
+    assert "refused" in status["message"] and words in status["message"]
+    wait_for(lambda: words in bridge.diagnoses().get("commands", (0, "", {}))[1], "the diagnosis")
+    listener.spin(0.2)
+    assert drives == []
+
+
+def test_other_topics_and_types_are_not_taken(driving):
+    _, client, listener, drives, _ = driving
+    wrong = [("/cmd_vel", "geometry_msgs/Twist"), (DRIVE, "std_msgs/String"), ("/nav/cmd_vel", "Twist")]
+    for number, (topic, name) in enumerate(wrong):
+        client.texts.clear()
+        client.advertise(topic, name, number=number)
+        status = client.until(lambda: client.text("status"), "the refusal")
+        assert f"{topic} {name} json is not taken; only /operator/cmd_vel" in status["message"]
+        client.publish(b'{"linear": {"x": 0.1}, "angular": {"z": 0}}', number)
+    listener.spin(0.2)
+    assert drives == []
+
+
+def test_robot_is_told_to_stand_when_its_driver_leaves_and_a_second_one_waits(driving, world):
+    bridge, client, listener, drives, _ = driving
+    command = b'{"linear": {"x": 0.2}, "angular": {"z": 0}}'
+    client.advertise(DRIVE, "geometry_msgs/Twist")
+    client.publish(command)
+    listener.wait(lambda: drives, "the command")
+    second = world.client()
+    second.advertise(DRIVE, "geometry_msgs/Twist")
+    second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')
+    assert "may not drive while" in second.until(lambda: second.text("status"), "the refusal")["message"]
+    assert last_drive(drives) == (0.2, 0.0)
+    with contextlib.suppress(ConnectionClosed):
+        client.close()
+    listener.wait(lambda: last_drive(drives) == (0.0, 0.0), "a zero command")
+    second.publish(b'{"linear": {"x": -0.2}, "angular": {"z": 0}}')
+    listener.wait(lambda: last_drive(drives) == (-0.2, 0.0), "the second driver's command")
+    assert bridge.gate.refused == {"second driver": 1}
+
+
+# -- start -------------------------------------------------------------------------------------------
+
+
+def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path_factory):
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(NodeError, match=r"pip install 'instant-ic\[foxglove\]'"):
+        LiveNode(tmp_path_factory.mktemp("r"), FoxgloveBridgeNode, FoxgloveBridgeConfig(port=0), "foxglove_bridge")
+
+
+def test_a_port_in_use_and_wrong_files_are_told(tmp_path_factory):
+    port = free_port()
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", port))
+        other.listen()
+        with pytest.raises(NodeError, match=rf"no server on 127\.0\.0\.1:{port}: .*in use.*set host or port"):
+            LiveNode(
+                tmp_path_factory.mktemp("r"), FoxgloveBridgeNode, FoxgloveBridgeConfig(port=port), "foxglove_bridge"
+            )
+    config = FoxgloveBridgeConfig(port=0, tls_cert="/nowhere/cert.pem", tls_key="/nowhere/key.pem")
+    with pytest.raises(NodeError, match=r"/nowhere/cert\.pem: cannot be read"):
+        LiveNode(tmp_path_factory.mktemp("r"), FoxgloveBridgeNode, config, "foxglove_bridge")
+    with pytest.raises(ValueError, match="tls_cert and tls_key go together"):
+        FoxgloveBridgeConfig(tls_cert="a")
+
+
+def test_default_is_this_machine_only_and_an_open_door_for_drivers_is_told(world):
+    assert FoxgloveBridgeConfig().host == "127.0.0.1"
+    node = world.bridge(host="0.0.0.0", accept_operator=True)
+    assert "can drive the robot" in node.diagnoses()["operator"][1]
+
+
+def test_nothing_is_left_after_the_end(world):
+    node = world.bridge()
+    world.live.close()
+    assert registry.list_topics(world.run_dir) == []
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", node.server.port), 2)
