@@ -59,6 +59,13 @@ class Problem:
 
 
 @dataclass(frozen=True)
+class Failed:
+    """The link's thread has ended by a fault of its own: nothing goes over the link any more."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class LinkEvent:
     """Something that happened on a link.
 
@@ -68,7 +75,7 @@ class LinkEvent:
     """
 
     peer: str
-    event: Event | Stranger | Problem
+    event: Event | Stranger | Problem | Failed
 
 
 @dataclass(frozen=True)
@@ -291,7 +298,7 @@ class HostLink(ABC):
             self._farewell()
         except Exception as error:
             log.exception("the link's thread failed")
-            self._emit("", Problem(f"the link's thread failed: {error!r}; restart the node"))
+            self._emit("", Failed(f"the link's thread failed: {error!r}"))
         finally:
             for each in self._sockets():
                 each.close(linger=200)
@@ -301,7 +308,7 @@ class HostLink(ABC):
             self._woken = True
             self._wake_out.send(b"", zmq.NOBLOCK)
 
-    def _emit(self, peer: str, event: Event | Stranger | Problem) -> None:
+    def _emit(self, peer: str, event: Event | Stranger | Problem | Failed) -> None:
         self._on_event(LinkEvent(peer, event))
 
     def _new_session(self, peer: Peer, connecting: bool, may_send: bool = True) -> Session:

@@ -13,6 +13,7 @@ from instant_ic.bridge.host_bus import ExportedTopics, ImportedTopics
 from instant_ic.bridge.host_keys import KeyFileError, KeyStore
 from instant_ic.bridge.host_link import (
     ConnectingLink,
+    Failed,
     HostLink,
     LinkError,
     LinkEvent,
@@ -148,6 +149,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                     event.fingerprint,
                     event.times,
                 )
+            case Failed():
+                self.log.error("%s", event.text)
+                self.stop()  # the launcher starts it again
             case Problem():
                 self.problem = event.text
                 self.tell()
