@@ -177,6 +177,14 @@ class BagReader:
         return found
 
     @property
+    def compression(self) -> str:
+        """``zstd``, ``lz4``, or empty: how its messages are compressed."""
+        kinds = {str(self._reader.compression_format or "")} if self._ros1 is None else {""}
+        if self._ros1 is None:
+            kinds |= {chunk.compression for storage in self._storages for chunk in getattr(storage, "chunks", ())}
+        return ", ".join(sorted(kinds - {""}))
+
+    @property
     def unlisted(self) -> list[Path]:
         """Files in the folder that ``metadata.yaml`` does not tell: what a killed recorder was writing."""
         if self.path.is_file():

@@ -349,7 +349,7 @@ def test_run_wants_a_node(capsys: pytest.CaptureFixture[str]) -> None:
     status, _, error = ic_process("run", "bag_player", "-p", "bag:=nowhere")
     assert status == 1 and "bag nowhere does not exist" in error and "Traceback" not in error
     status, _, error = ic_process("run", "bag_player", "-p", "rate:=-1", "-p", "bag:=x")
-    assert status == 2 and "rate must be > 0" in error
+    assert status == 2 and "rate must lie in 0.01..100" in error
 
 
 def test_replay_mistakes(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,163 +1,266 @@
-"""``ic bag``: record, play, look at, compare and rescue bags."""
+"""``ic bag``: record, play, look at, compare, convert and rescue bags."""
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
-from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from instant_ic.cli.errors import UserError
+
+COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "split", "status")
+_VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 
 def add_parser(subparsers: Any) -> None:
     """Adds the verb."""
     parser = subparsers.add_parser(
         "bag",
-        help="record, play, inspect, compare and recover bags",
+        help="record, play, inspect, compare, convert and recover bags",
         description="Works with bags: rosbag2 folders (MCAP) that ROS 2, Foxglove and rosbags open as they are.",
         epilog="example: ic bag record -o drive",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
 
-    def verb(name: str, words: str, function: Any, example: str) -> argparse.ArgumentParser:
+    def verb(name: str, words: str, function: str, example: str) -> argparse.ArgumentParser:
         added: argparse.ArgumentParser = verbs.add_parser(
             name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: {example}"
         )
-        added.set_defaults(func=function)
+
+        def run(args: argparse.Namespace) -> int:
+            import importlib
+
+            module, _, name = function.partition(".")
+            status: int = getattr(importlib.import_module(f"instant_ic.cli.{module}"), name)(args)
+            return status
+
+        added.set_defaults(func=run)
         return added
 
     recording = verb(
-        "record", "records topics until Ctrl-C", record, "ic bag record -o drive /scan '/camera/*' -x /camera/raw"
+        "record",
+        "records topics until Ctrl-C; space pauses",
+        "bag_run.record",
+        "ic bag record -o drive /scan '/camera/*' -x /camera/raw --max-bag-size 2GB",
     )
-    recording.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
+    _topics(recording)
     recording.add_argument("-o", "--output", default="", metavar="DIR", help="default: runs/bag_DATE_TIME")
-    recording.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
-    recording.add_argument("--duration", type=float, default=0.0, metavar="S", help="end after this time")
+    recording.add_argument("--duration", type=_seconds, default=0.0, metavar="S", help="end after this time")
+    _files(recording)
+    recording.add_argument(
+        "--max-queue",
+        type=size,
+        default=256_000_000,
+        metavar="SIZE",
+        help="what may wait for the disk (default: 256MB); more is left out and counted",
+    )
+    recording.add_argument(
+        "--min-free",
+        type=size,
+        default=100_000_000,
+        metavar="SIZE",
+        help="stop while the disk has less free space (default: 100MB)",
+    )
+    recording.add_argument(
+        "--snapshot",
+        action="store_true",
+        help="keep the last seconds in memory, write them at ic bag snapshot or an emergency stop",
+    )
+    recording.add_argument("--snapshot-seconds", type=_seconds, default=30.0, metavar="S", help="default: 30")
+    recording.add_argument(
+        "--snapshot-after",
+        type=_seconds,
+        default=2.0,
+        metavar="S",
+        help="seconds after the moment that go in too (default: 2)",
+    )
+    recording.add_argument(
+        "--max-cache-size",
+        type=size,
+        default=256_000_000,
+        metavar="SIZE",
+        help="memory for the last seconds (default: 256MB)",
+    )
+    recording.add_argument("--start-paused", action="store_true", help="record once told to resume")
     recording.add_argument("--use-sim-time", action="store_true", help="file messages by /clock, as while a bag plays")
 
-    playing = verb("play", "plays a bag with /clock", play, "ic bag play drive --rate 2 --start 10")
-    playing.add_argument("bag", metavar="BAG")
-    playing.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
-    playing.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
+    playing = verb(
+        "play",
+        "plays a bag with /clock; space pauses, → steps, ↑ ↓ change the rate",
+        "bag_run.play",
+        "ic bag play drive --rate 2 --start 10",
+    )
+    playing.add_argument("bag", metavar="BAG", help="folder, .mcap, .db3 or ROS 1 .bag file")
+    _topics(playing)
     playing.add_argument("-r", "--rate", type=float, default=1.0, help="2 plays twice as fast (default: %(default)s)")
-    playing.add_argument("--start", type=float, default=0.0, metavar="S", help="skip the beginning")
-    playing.add_argument("--duration", type=float, default=0.0, metavar="S", help="play only so much of the bag")
+    playing.add_argument("--start", type=_seconds, default=0.0, metavar="S", help="skip the beginning")
+    playing.add_argument("--duration", type=_seconds, default=0.0, metavar="S", help="play only so much of the bag")
     playing.add_argument("--loop", action="store_true", help="begin again at the end")
+    playing.add_argument("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
     playing.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="other name; repeatable")
     playing.add_argument("--no-clock", action="store_true", help="send no /clock")
     playing.add_argument("--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads")
 
-    looking = verb("info", "topics, types, counts and losses of a bag", info, "ic bag info drive")
+    looking = verb("info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive")
     looking.add_argument("bag", metavar="BAG")
+    looking.add_argument("--json", action="store_true", help="for programs")
 
     comparing = verb(
-        "diff", "compares two bags; exit status 1 when they differ", diff, "ic bag diff first second --ignore /rosout"
+        "diff",
+        "compares two bags; exit status 1 when they differ",
+        "bag_look.diff",
+        "ic bag diff first second --stamp-tolerance 0.01 --tolerance 'ranges=0.01' --ignore-field header.stamp",
     )
     comparing.add_argument("a", metavar="A")
     comparing.add_argument("b", metavar="B")
-    comparing.add_argument("--ignore", action="append", default=[], metavar="TOPIC", help="leave out")
-
     comparing.add_argument("--common", action="store_true", help="only topics that both bags have")
+    tolerances(comparing)
+    comparing.add_argument("--json", action="store_true", help="for programs")
+
+    converting = verb(
+        "convert",
+        "makes a bag of others: ROS 1 and SQLite bags, bare files; filters, merges, splits, compresses",
+        "bag_look.convert",
+        "ic bag convert old.bag -o drive",
+    )
+    converting.add_argument("bags", nargs="+", metavar="BAG", help="several are merged by their stamps")
+    converting.add_argument("-o", "--output", required=True, metavar="DIR")
+    converting.add_argument(
+        "-t",
+        "--topic",
+        dest="topics",
+        action="append",
+        default=[],
+        metavar="TOPIC",
+        help="name or pattern; repeatable; default: everything",
+    )
+    converting.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
+    converting.add_argument("--start", type=_seconds, default=0.0, metavar="S", help="leave out the beginning")
+    converting.add_argument("--end", type=_seconds, default=0.0, metavar="S", help="end so long after the beginning")
+    converting.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="other name; repeatable")
+    converting.add_argument("--skip-unknown", action="store_true", help="leave out types that nobody knows")
+    _files(converting)
 
     rescuing = verb(
-        "recover", "makes a readable bag of one that was cut short", recover, "ic bag recover broken -o saved"
+        "recover",
+        "makes a readable bag of one that was cut short or damaged",
+        "bag_look.recover",
+        "ic bag recover broken -o saved",
     )
     rescuing.add_argument("bag", metavar="BAG")
     rescuing.add_argument("-o", "--output", default="", metavar="DIR", help="default: BAG_recovered")
 
+    indexing = verb(
+        "reindex", "writes a bag's metadata.yaml anew from its whole files", "bag_look.reindex", "ic bag reindex drive"
+    )
+    indexing.add_argument("bag", metavar="BAG")
 
-def record(args: argparse.Namespace) -> int:
-    """Runs the recorder node in this process."""
-    from instant_ic.bag.replay import find_node_class
-    from instant_ic.bus.process import run
+    snapping = verb(
+        "snapshot",
+        "has a recorder write the last seconds (ic bag record --snapshot)",
+        "bag_run.snapshot",
+        "ic bag snapshot 'door stuck'",
+    )
+    snapping.add_argument("reason", nargs="?", default="", help="becomes part of the folder's name")
+    snapping.add_argument("--node", default="", help="of several recorders, this one")
+    snapping.add_argument("--timeout", type=_seconds, default=60.0, metavar="S", help="default: 60")
 
-    if args.output and Path(args.output).exists():
-        raise UserError(f"{args.output} exists already, not overwriting")
-    words = ["--name", f"bag_recorder_{os.getpid()}", *_parameters(path=args.output, duration_s=args.duration)]
-    words += _parameters(topics=_topics(args.topics), exclude=_topics(args.exclude))
-    words += _parameters(use_sim_time=True) if args.use_sim_time else []
-    return run(find_node_class("bag_recorder"), words)
-
-
-def play(args: argparse.Namespace) -> int:
-    """Runs the player node in this process."""
-    from instant_ic.bag.replay import find_node_class
-    from instant_ic.bus.process import run
-
-    if not Path(args.bag).exists():
-        raise UserError(f"bag {args.bag} does not exist")
-    words = ["--name", f"bag_player_{os.getpid()}", *_parameters(use_sim_time=True, bag=args.bag, rate=args.rate)]
-    words += _parameters(start_offset_s=args.start, duration_s=args.duration, loop=args.loop)
-    words += _parameters(topics=_topics(args.topics), exclude=_topics(args.exclude))
-    words += _parameters(publish_clock=not args.no_clock, wait_for=args.wait_for)
-    for remap in args.remap:
-        words += ["-r", remap]
-    return run(find_node_class("bag_player"), words)
+    steering = verb(
+        "control",
+        "steers a running recorder or player",
+        "bag_run.control",
+        "ic bag control rate 0.5",
+    )
+    steering.add_argument("command", choices=COMMANDS)
+    steering.add_argument("value", nargs="?", type=float, help="of step (messages), rate, seek (seconds)")
+    steering.add_argument("--node", default="", help="of several recorders and players, this one")
 
 
-def _topics(names: list[str]) -> list[str]:
+def tolerances(parser: argparse.ArgumentParser) -> None:
+    """What a comparison forgives."""
+    parser.add_argument("--ignore", action="append", default=[], metavar="TOPIC", help="leave out; name or pattern")
+    parser.add_argument("--atol", type=_seconds, default=0.0, metavar="X", help="numbers may differ by this")
+    parser.add_argument("--rtol", type=_seconds, default=0.0, metavar="X", help="and by this share")
+    parser.add_argument(
+        "--tolerance",
+        action="append",
+        default=[],
+        metavar="FIELD=X",
+        help="of one field: ranges=0.01, /pose:pose.covariance=1e-6; repeatable",
+    )
+    parser.add_argument("--ignore-field", action="append", default=[], metavar="FIELD", help="header.stamp; repeatable")
+    parser.add_argument(
+        "--stamp-tolerance",
+        type=_seconds,
+        default=None,
+        metavar="S",
+        help="pair messages by their stamps, which may differ so much (default: by order)",
+    )
+
+
+def _topics(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("topics", nargs="*", metavar="TOPIC", help="names or patterns; default: everything")
+    parser.add_argument("-x", "--exclude", action="append", default=[], metavar="TOPIC", help="leave out")
+
+
+def _files(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-b", "--max-bag-size", type=size, default=0, metavar="SIZE", help="files of 500MB, 2GB, ...")
+    parser.add_argument("-d", "--max-bag-duration", type=_seconds, default=0.0, metavar="S", help="files of this time")
+    parser.add_argument("--compression", action="store_true", help="compress with zstd")
+
+
+def size(text: str) -> int:
+    """Bytes of ``1000000``, ``500MB``, ``2GB``, ``1.5GiB``."""
+    units = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+    number = text.strip().upper()
+    unit = number.lstrip("0123456789.").strip()
+    try:
+        value = float(number[: len(number) - len(unit)] if unit else number) * units[unit]
+    except (KeyError, ValueError):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size: 1000000, 500MB, 2GB") from None
+    return int(value)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    if not 0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be >= 0 (got {text})")
+    return value
+
+
+def topic_names(names: list[str]) -> list[str]:
+    """Names as they stand in a bag: a slash may be left out on the command line."""
     return [name if name.startswith(("/", "*")) else f"/{name}" for name in names]
 
 
-def _parameters(**values: Any) -> list[str]:
-    """Command-line words of a node (JSON is YAML)."""
-    return [word for key, value in values.items() for word in ("-p", f"{key}:={json.dumps(value)}")]
+def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
+    """``a:=b`` words.
+
+    Raises:
+        UserError: a word of another form.
+    """
+    found = {}
+    for word in words:
+        left, middle, right = word.partition(separator)
+        if not left or not middle or not right:
+            raise UserError(f"{option} {word}: expected FROM{separator}TO", 2)
+        found[left] = right
+    return found
 
 
-def info(args: argparse.Namespace) -> int:
-    """Prints what a bag holds."""
-    from instant_ic.bag import BagReader
+def argument_of(command: str, value: float | None) -> dict[str, Any]:
+    """Arguments of a command to a node.
 
-    path = Path(args.bag)
-    with BagReader(path) as reader:
-        size = sum(f.stat().st_size for f in ([path] if path.is_file() else path.iterdir()))
-        span_s = (reader.end_ns - reader.start_ns) / 1e9
-        print(f"bag:      {path}")
-        print(f"size:     {size / 1e6:.1f} MB")
-        print(f"start:    {datetime.fromtimestamp(reader.start_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S.%f} UTC")
-        print(f"duration: {span_s:.3f} s")
-        print(f"messages: {reader.count}")
-        lost = json.loads(reader.custom.get("instant_ic.lost", "{}"))
-        topics = reader.topics
-        width, type_width = (max([len(getattr(t, a)) for t in topics], default=0) for a in ("topic", "type_name"))
-        for topic in topics:
-            hz = f"{(topic.count - 1) / span_s:8.2f} Hz" if topic.count > 1 and span_s > 0 else " " * 11
-            missing = f"  {lost[topic.topic]} lost" if topic.topic in lost else ""
-            print(
-                f"  {topic.topic:<{width}}  {topic.type_name:<{type_width}}  {topic.count:>7} {hz}"
-                f"  {topic.qos.name}{missing}"
-            )
-        if "recovered_from" in reader.custom:
-            print(f"recovered from {reader.custom['recovered_from']}")
-    return 0
-
-
-def diff(args: argparse.Namespace) -> int:
-    """Compares topic by topic."""
-    from instant_ic.bag.compare import compare
-
-    topics = compare(Path(args.a), Path(args.b), tuple(_topics(args.ignore)), args.common)
-    if not topics:
-        raise UserError("there is no topic to compare")
-    width = max([len(topic.topic) for topic in topics], default=0)
-    for topic in topics:
-        print(f"{topic.topic:<{width}}  {topic.count_a:>6} {topic.count_b:>6}  {topic.first or 'same'}")
-    different = sum(not topic.same for topic in topics)
-    print(f"{len(topics) - different} of {len(topics)} topics are the same")
-    return 1 if different else 0
-
-
-def recover(args: argparse.Namespace) -> int:
-    """Copies what can be read."""
-    from instant_ic.bag.recover import recover as recover_bag
-
-    source = Path(args.bag)
-    target = Path(args.output) if args.output else source.with_name(f"{source.stem}_recovered")
-    result = recover_bag(source, target)
-    print(f"{target}: {result.count} messages")
-    if result.stopped_by:
-        print(f"reading stopped at the cut: {result.stopped_by}")
-    return 0
+    Raises:
+        UserError: a value is missing, or there is none to give.
+    """
+    if command in _VALUES:
+        if value is None and command != "step":
+            raise UserError(f"ic bag control {command} needs a value", 2)
+        number = 1.0 if value is None else value
+        return {_VALUES[command]: int(number) if command == "step" else number}
+    if value is not None:
+        raise UserError(f"ic bag control {command} takes no value", 2)
+    return {}

@@ -1,0 +1,148 @@
+"""Makes one of our bags of others: ROS 1 and SQLite bags, bare files; some topics, a span of time, merged, split."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from instant_ic.bag.choice import EVERYTHING, TopicChoice
+from instant_ic.bag.errors import BagError
+from instant_ic.bag.files import BagReader, TopicSummary
+from instant_ic.bag.latched import LatchedValue, LatchedValues
+from instant_ic.bag.metadata import REPEATED
+from instant_ic.bag.writer import BagWriter
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """What to take, and how to write it.
+
+    Attributes:
+        choice: which topics, by the names of the source.
+        start_s: leave out this much of the beginning of the earliest bag; latched values of it are kept.
+        end_s: end so long after that beginning; 0 takes everything.
+        remap: topic → other name.
+        skip_unknown: leave out topics whose type nobody knows, instead of refusing.
+        compressed: compress with zstd.
+        max_bytes: size of a file; 0 makes one.
+        max_duration_s: the same by time.
+    """
+
+    choice: TopicChoice = EVERYTHING
+    start_s: float = 0.0
+    end_s: float = 0.0
+    remap: Mapping[str, str] = field(default_factory=dict)
+    skip_unknown: bool = False
+    compressed: bool = False
+    max_bytes: int = 0
+    max_duration_s: float = 0.0
+
+
+@dataclass
+class Converted:
+    """What came out: messages by (new) topic, files, and types that were skipped with their topics."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    files: int = 0
+    skipped: dict[str, list[str]] = field(default_factory=dict)
+
+
+def convert(
+    sources: Sequence[Path],
+    target: Path,
+    options: ConvertOptions | None = None,
+    on_progress: Callable[[float], None] | None = None,
+) -> Converted:
+    """Writes the messages of one bag or several, in the order of their stamps, into a new one.
+
+    Args:
+        sources: what :class:`BagReader` opens.
+        target: folder of the new bag, which must not exist.
+        options: what to take, and how to write it.
+        on_progress: called with the share that is done, 0 to 1.
+
+    Raises:
+        BagError: a bag cannot be read or written, nothing was chosen, or a type is not known.
+    """
+    options = options or ConvertOptions()
+    result = Converted()
+    with ExitStack() as stack:
+        readers = [stack.enter_context(BagReader(source)) for source in sources]
+        filled = [reader for reader in readers if reader.count]
+        if not filled:
+            raise BagError(f"{', '.join(map(str, sources))}: there is no message in it")
+        begin_ns = min(reader.start_ns for reader in filled)
+        last_ns = max(reader.end_ns for reader in filled)
+        start_ns = begin_ns + int(options.start_s * 1e9)
+        stop_ns = begin_ns + int(options.end_s * 1e9) if options.end_s else last_ns + 1
+        chosen = [_chosen(reader, options, result) for reader in filled]
+        if not any(chosen):
+            raise BagError("none of the topics that were asked for is in it")
+        writer = stack.enter_context(BagWriter(target, options.compressed, options.max_bytes, options.max_duration_s))
+        for reader in filled:
+            for key, value in reader.custom.items():
+                if key != REPEATED:
+                    writer.set_custom(key, value)
+        writer.set_custom("converted_from", ", ".join(source.name for source in sources))
+        named = [
+            {topic: options.remap.get(topic[0], topic[0]) for topic in topics} for topics in chosen
+        ]  # by (topic, type)
+        for topics, names in zip(chosen, named, strict=True):
+            for entry, summary in topics.items():
+                writer.add_topic(names[entry], summary.type_name, summary.qos, summary.schema)
+        if start_ns > begin_ns:
+            for number, reader in enumerate(filled):
+                _write_latched(reader, chosen[number], named[number], start_ns, writer, result)
+        streams = [
+            ((m.stamp_ns, number, m) for m in reader.messages({t[0] for t in topics}, start_ns, stop_ns))
+            for number, (reader, topics) in enumerate(zip(filled, chosen, strict=True))
+        ]
+        span_ns = max(1, min(stop_ns, last_ns) - start_ns)
+        for stamp_ns, number, message in heapq.merge(*streams, key=lambda entry: entry[0]):
+            entry = (message.topic, message.type_name)
+            if entry not in chosen[number]:
+                continue
+            topic, name = chosen[number][entry], named[number][entry]
+            writer.write(name, message.type_name, message.payload, stamp_ns, topic.qos, topic.schema)
+            result.counts[name] += 1
+            if on_progress is not None:
+                on_progress(min(1.0, (stamp_ns - start_ns) / span_ns))
+        result.files = writer.parts
+    return result
+
+
+def _chosen(reader: BagReader, options: ConvertOptions, result: Converted) -> dict[tuple[str, str], TopicSummary]:
+    wanted = [topic for topic in reader.topics if options.choice.takes(topic.topic)]
+    unknown = [topic for topic in wanted if not topic.schema.encoding]
+    if unknown and not options.skip_unknown:
+        named = ", ".join(f"{topic.type_name} ({topic.topic})" for topic in unknown)
+        raise BagError(
+            f"bag {reader.path} holds no definition of {named}, and nobody here knows it: --skip-unknown leaves it out"
+        )
+    for topic in unknown:
+        result.skipped.setdefault(topic.type_name, []).append(topic.topic)
+    return {(topic.topic, topic.type_name): topic for topic in wanted if topic.schema.encoding}
+
+
+def _write_latched(
+    reader: BagReader,
+    topics: dict[tuple[str, str], TopicSummary],
+    names: dict[tuple[str, str], str],
+    start_ns: int,
+    writer: BagWriter,
+    result: Converted,
+) -> None:
+    """The latched values that held when the span begins, with its stamp."""
+    values = LatchedValues()
+    latched = {topic.topic for topic in topics.values() if topic.qos.latched}
+    for message in reader.messages(latched, None, start_ns) if latched else ():
+        values.put(LatchedValue(message.topic, message.type_name, message.payload, message.stamp_ns))
+    for value in values.values():
+        source = topics[value.topic, value.type_name]
+        name = names[value.topic, value.type_name]
+        writer.write(name, value.type_name, value.payload, start_ns, source.qos, source.schema)
+        result.counts[name] += 1

@@ -1,0 +1,208 @@
+"""``ic bag info``, ``diff``, ``convert``, ``recover`` and ``reindex``: what needs only files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections import Counter
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from instant_ic.bag import BagReader
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.compare import Tolerance, TopicDifference, compare
+from instant_ic.bag.convert import ConvertOptions
+from instant_ic.bag.convert import convert as convert_bags
+from instant_ic.bag.recover import recover as recover_bag
+from instant_ic.bag.recover import reindex as reindex_bag
+from instant_ic.cli.commands.bag import pairs, topic_names
+from instant_ic.cli.errors import UserError
+from instant_ic.cli.progress import progress
+
+_LEFT_OUT = {
+    "overflow": "left out because the disk was too slow",
+    "disk_full": "left out while the disk was full",
+    "paused": "left out while paused",
+    "no_type": "left out, their publisher's type was not known",
+}
+
+
+def info(args: argparse.Namespace) -> int:
+    """Prints what a bag holds."""
+    with BagReader(Path(args.bag)) as reader:
+        told = _info(reader)
+    if args.json:
+        print(json.dumps(told, indent=2))
+        return 0
+    print(f"bag:      {told['path']}")
+    print(f"size:     {told['bytes'] / 1e6:.1f} MB{', ' + told['compression'] if told['compression'] else ''}")
+    print(f"start:    {datetime.fromtimestamp(told['start_ns'] / 1e9, UTC):%Y-%m-%d %H:%M:%S.%f} UTC")
+    print(f"duration: {told['duration_s']:.3f} s")
+    print(f"messages: {told['messages']}")
+    if len(told["files"]) > 1:
+        print("files:")
+        for file in told["files"]:
+            print(f"  {file['name']}  {file['bytes'] / 1e6:.1f} MB  {file['duration_s']:.3f} s  {file['messages']}")
+    topics = told["topics"]
+    width, type_width = (max([len(topic[key]) for topic in topics], default=0) for key in ("topic", "type"))
+    for topic in topics:
+        hz = f"{topic['rate_hz']:8.2f} Hz" if topic["rate_hz"] else " " * 11
+        lost = f"  {topic['lost']} lost" if topic["lost"] else ""
+        by = ", ".join(f"{n} from {node}" for node, n in sorted(topic["lost_by"].items()))
+        print(
+            f"  {topic['topic']:<{width}}  {topic['type']:<{type_width}}  {topic['messages']:>7} {hz}"
+            f"  {topic['qos']}{lost}{f' ({by})' if by else ''}"
+        )
+    for key, words in _LEFT_OUT.items():
+        if told[key]:
+            print(f"{words}: {', '.join(f'{topic} {n}' for topic, n in sorted(told[key].items()))}")
+    if told["recovered_from"]:
+        print(f"recovered from {told['recovered_from']}")
+    for name in told["unlisted"]:
+        print(f"{name} is in the folder but not in the bag: its recording was cut short: ic bag recover {args.bag}")
+    return 0
+
+
+def _info(reader: BagReader) -> dict[str, Any]:
+    def custom(key: str) -> dict[str, Any]:
+        value: dict[str, Any] = json.loads(reader.custom.get(f"instant_ic.{key}", "{}"))
+        return value
+
+    span_s = (reader.end_ns - reader.start_ns) / 1e9
+    lost, lost_by = custom("lost"), custom("lost_by")
+    return {
+        "path": str(reader.path),
+        "bytes": sum(file.stat().st_size for file in reader.files),
+        "compression": reader.compression,
+        "start_ns": reader.start_ns,
+        "end_ns": reader.end_ns,
+        "duration_s": span_s,
+        "messages": reader.count,
+        "files": [
+            {
+                "name": part.path.name,
+                "bytes": part.path.stat().st_size,
+                "start_ns": part.start_ns,
+                "duration_s": (part.end_ns - part.start_ns) / 1e9,
+                "messages": part.count,
+            }
+            for part in reader.parts
+        ],
+        "topics": [
+            {
+                "topic": topic.topic,
+                "type": topic.type_name,
+                "messages": topic.count,
+                "rate_hz": (topic.count - 1) / span_s if topic.count > 1 and span_s > 0 else 0.0,
+                "qos": topic.qos.name,
+                "lost": lost.get(topic.topic, 0),
+                "lost_by": lost_by.get(topic.topic, {}),
+            }
+            for topic in reader.topics
+        ],
+        **{key: custom(key) for key in _LEFT_OUT},
+        "recovered_from": reader.custom.get("recovered_from", ""),
+        "unlisted": [file.name for file in reader.unlisted],
+    }
+
+
+def diff(args: argparse.Namespace) -> int:
+    """Compares topic by topic."""
+    found = compare(Path(args.a), Path(args.b), tuple(topic_names(args.ignore)), args.common, tolerance_of(args))
+    if not found:
+        raise UserError("there is no topic to compare")
+    if args.json:
+        print(json.dumps([_plain(topic) for topic in found], indent=2))
+        return 0 if all(topic.same for topic in found) else 1
+    return print_differences(found)
+
+
+def tolerance_of(args: argparse.Namespace) -> Tolerance:
+    """What the command line forgives.
+
+    Raises:
+        UserError: a tolerance that is no number.
+    """
+    fields = {}
+    for name, text in pairs(args.tolerance, "=", "--tolerance").items():
+        try:
+            fields[name] = float(text)
+        except ValueError:
+            raise UserError(f"--tolerance {name}={text}: {text} is no number", 2) from None
+    try:
+        return Tolerance(args.atol, args.rtol, fields, tuple(args.ignore_field), args.stamp_tolerance)
+    except ValueError as error:
+        raise UserError(str(error), 2) from None
+
+
+def print_differences(found: list[TopicDifference]) -> int:
+    """A line a topic, and one for each field that differs; returns the exit status."""
+    width = max([len(topic.topic) for topic in found], default=0)
+    for topic in found:
+        print(f"{topic.topic:<{width}}  {topic.count_a:>6} {topic.count_b:>6}  {topic.first or 'same'}")
+        if topic.only_a or topic.only_b:
+            print(f"{'':<{width}}  without partner: {topic.only_a} in the first, {topic.only_b} in the second")
+        for path, entry in topic.fields.items():
+            largest = f"largest difference {entry.largest:.6g}, " if math.isfinite(entry.largest) else ""
+            print(f"{'':<{width}}  {path}: {largest}in {entry.messages} messages, first in message {entry.first}")
+    different = sum(not topic.same for topic in found)
+    print(f"{len(found) - different} of {len(found)} topics are the same")
+    return 1 if different else 0
+
+
+def _plain(topic: TopicDifference) -> dict[str, Any]:
+    plain = {**asdict(topic), "same": topic.same}
+    for entry in plain["fields"].values():
+        entry["largest"] = entry["largest"] if math.isfinite(entry["largest"]) else None  # JSON knows no nan
+    return plain
+
+
+def convert(args: argparse.Namespace) -> int:
+    """Writes a new bag."""
+    options = ConvertOptions(
+        choice=TopicChoice(tuple(topic_names(args.topics)), tuple(topic_names(args.exclude))),
+        start_s=args.start,
+        end_s=args.end,
+        remap=pairs(args.remap, ":=", "--remap"),
+        skip_unknown=args.skip_unknown,
+        compressed=args.compression,
+        max_bytes=args.max_bag_size,
+        max_duration_s=args.max_bag_duration,
+    )
+    with progress(f"converting {', '.join(args.bags)}") as step:
+        result = convert_bags([Path(bag) for bag in args.bags], Path(args.output), options, step)
+    print(f"{args.output}: {result.counts.total()} messages in {result.files} files")
+    _print_counts(result.counts)
+    for type_name, topics in sorted(result.skipped.items()):
+        print(f"left out: {type_name} ({', '.join(topics)}) is not known")
+    return 0
+
+
+def recover(args: argparse.Namespace) -> int:
+    """Copies what can be read."""
+    source = Path(args.bag)
+    target = Path(args.output) if args.output else source.with_name(f"{source.stem}_recovered")
+    result = recover_bag(source, target)
+    print(f"{target}: {result.count} messages")
+    if result.stopped_by:
+        print(f"reading stopped at the cut: {result.stopped_by}")
+    for words in result.damaged:
+        print(f"left out, damaged: {words}")
+    for topic, why in sorted(result.skipped.items()):
+        print(f"left out: {topic}, {why}")
+    return 0
+
+
+def reindex(args: argparse.Namespace) -> int:
+    """Writes metadata.yaml."""
+    files, messages = reindex_bag(Path(args.bag))
+    print(f"{args.bag}/metadata.yaml: {messages} messages in {files} files")
+    return 0
+
+
+def _print_counts(counts: Counter[str]) -> None:
+    for topic, count in sorted(counts.items()):
+        print(f"  {topic}: {count}")

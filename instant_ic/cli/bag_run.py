@@ -1,0 +1,191 @@
+"""``ic bag record``, ``play``, ``snapshot`` and ``control``: what needs the bus."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from instant_ic.bus.control import ControlError, NodeControl
+from instant_ic.bus.process import run as run_node
+from instant_ic.bus.registry import NodeInfo, list_nodes
+from instant_ic.cli.commands.bag import argument_of, topic_names
+from instant_ic.cli.errors import UserError
+from instant_ic.cli.terminal import Terminal
+from instant_ic.nodes.bag_player import BagPlayerNode
+from instant_ic.nodes.bag_recorder import BagRecorderNode
+from instant_ic.paths import run_dir
+
+_STEERED = ("bag_recorder", "bag_player")
+
+
+class _Recorder(BagRecorderNode):
+    """With keys and a status line."""
+
+    def setup(self) -> None:
+        super().setup()
+        keys = {" ": lambda: self.call_soon(self._toggle), "s": lambda: self.call_soon(self._on_key)}
+        self.terminal = Terminal(keys, self._line)
+        self.terminal.start()
+
+    def _on_key(self) -> None:
+        if self.config.snapshot:
+            self._snapshot("key")
+
+    def _line(self) -> str:
+        assert self.recorder is not None
+        told = self.recorder.status()
+        words = f"{told['state']}  {told['messages']} messages  {told['topics']} topics"
+        if "bytes" in told:
+            words += f"  {told['bytes'] / 1e6:.1f} MB  {told['files']} files   [space] pause"
+        else:
+            words += f"  last {told['cached_s']:g} s at hand   [s] snapshot [space] pause"
+        lost = sum(self.recorder.lost().values()) + sum(told["overflow"].values())
+        return words + (f"   LOST {lost}" if lost else "")
+
+    def teardown(self) -> None:
+        if hasattr(self, "terminal"):
+            self.terminal.close()
+        super().teardown()
+
+
+class _Player(BagPlayerNode):
+    """With keys and a status line."""
+
+    def setup(self) -> None:
+        super().setup()
+        assert self.player is not None
+        player = self.player
+        keys = {
+            " ": player.toggle,
+            "right": player.step,
+            "up": lambda: player.set_rate(player.rate * 1.1),
+            "down": lambda: player.set_rate(player.rate / 1.1),
+            "left": lambda: player.seek(max(0.0, (player.position_ns - player.start_ns) / 1e9 - 5.0)),
+            "q": self.stop,
+        }
+        self.terminal = Terminal(keys, self._line)
+        self.terminal.start()
+
+    def _line(self) -> str:
+        told = self.status()
+        done = told["position_s"] / max(told["length_s"], 1e-9)
+        bar = "█" * round(20 * done) + "·" * (20 - round(20 * done))
+        return (
+            f"{told['state']:<7} {bar} {told['position_s']:.1f} / {told['length_s']:.1f} s  x{told['rate']:.2g}"
+            "   [space] pause [→] step [↑↓] rate [←] back 5 s [q] end"
+        )
+
+    def teardown(self) -> None:
+        if hasattr(self, "terminal"):
+            self.terminal.close()
+        super().teardown()
+
+
+def record(args: argparse.Namespace) -> int:
+    """Runs the recorder node in this process."""
+    if args.output and Path(args.output).exists() and not args.snapshot:
+        raise UserError(f"{args.output} exists already, not overwriting")
+    words = ["--name", f"bag_recorder_{os.getpid()}"]
+    words += _parameters(
+        path=args.output,
+        duration_s=args.duration,
+        topics=topic_names(args.topics),
+        exclude=topic_names(args.exclude),
+        compressed=args.compression,
+        max_bag_size=args.max_bag_size,
+        max_bag_duration=args.max_bag_duration,
+        queue_mb=_megabytes(args.max_queue),
+        min_free_mb=args.min_free // 1_000_000,
+        snapshot=args.snapshot,
+        max_cache_mb=_megabytes(args.max_cache_size),
+        start_paused=args.start_paused,
+    )
+    if args.snapshot:
+        words += _parameters(snapshot_seconds=args.snapshot_seconds, snapshot_after_s=args.snapshot_after)
+    words += _parameters(use_sim_time=True) if args.use_sim_time else []
+    return run_node(_Recorder, words)
+
+
+def play(args: argparse.Namespace) -> int:
+    """Runs the player node in this process."""
+    if not Path(args.bag).exists():
+        raise UserError(f"bag {args.bag} does not exist")
+    words = ["--name", f"bag_player_{os.getpid()}"]
+    words += _parameters(
+        use_sim_time=True,
+        bag=args.bag,
+        rate=args.rate,
+        start_offset_s=args.start,
+        duration_s=args.duration,
+        loop=args.loop,
+        start_paused=args.start_paused,
+        topics=topic_names(args.topics),
+        exclude=topic_names(args.exclude),
+        publish_clock=not args.no_clock,
+        wait_for=args.wait_for,
+    )
+    for remap in args.remap:
+        words += ["-r", remap]
+    return run_node(_Player, words)
+
+
+def snapshot(args: argparse.Namespace) -> int:
+    """Has a recorder write the last seconds; waits until they are on the disk."""
+    node = _node(("bag_recorder",), args.node)
+    recorder = NodeControl(run_dir(), node.name)
+    path = _call(recorder, "snapshot", reason=args.reason)["path"]
+    deadline_s = time.monotonic() + args.timeout
+    while time.monotonic() < deadline_s:
+        made = next(s for s in _call(recorder, "status")["snapshots"] if s["path"] == path)
+        if made["state"] == "done":
+            print(f"{path}: {made['words']}")
+            return 0
+        if made["state"] == "failed":
+            raise UserError(made["words"])
+        time.sleep(0.1)
+    raise UserError(f"{node.name} did not write {path} within {args.timeout:g} s")
+
+
+def control(args: argparse.Namespace) -> int:
+    """Steers a running recorder or player."""
+    arguments = argument_of(args.command, args.value)
+    kinds = ("bag_player",) if arguments else ("bag_recorder",) if args.command == "split" else _STEERED
+    node = _node(kinds, args.node)
+    result = _call(NodeControl(run_dir(), node.name), args.command, **arguments)
+    if args.command == "status":
+        print(json.dumps({"node": node.name, **result}, indent=2))
+    else:
+        print(f"{node.name}: {args.command}")
+    return 0
+
+
+def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
+    try:
+        return node.call(command, **arguments)
+    except ControlError as error:
+        raise UserError(str(error)) from None
+
+
+def _node(kinds: tuple[str, ...], name: str) -> NodeInfo:
+    running = [node for node in list_nodes(run_dir()) if node.module.rsplit(".", 1)[-1] in kinds]
+    chosen = [node for node in running if not name or node.name == name]
+    if len(chosen) == 1:
+        return chosen[0]
+    what = " or ".join(kinds)
+    if not chosen:
+        others = f" (there are {', '.join(node.name for node in running)})" if running else ""
+        raise UserError(f"no {what}{f' named {name}' if name else ''} runs in {run_dir()}{others}")
+    raise UserError(f"several run, say which with --node: {', '.join(node.name for node in chosen)}", 2)
+
+
+def _megabytes(size: int) -> int:
+    return max(1, size // 1_000_000)
+
+
+def _parameters(**values: Any) -> list[str]:
+    """Command-line words of a node (JSON is YAML)."""
+    return [word for key, value in values.items() for word in ("-p", f"{key}:={json.dumps(value)}")]

@@ -1,0 +1,40 @@
+"""How far a long command is: a bar in a terminal, a line each tenth elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+_QUIET_S = 5.0  # a command that is done so soon needs no lines
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """Gives a function to call with the share that is done, 0 to 1; shown on the error output."""
+    if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.progress import Progress
+
+        with Progress(console=Console(stderr=True)) as bar:
+            task = bar.add_task(what, total=1.0)
+            shown = [0.0]
+
+            def draw(share: float) -> None:
+                if share >= 1.0 or share - shown[0] >= 0.001:
+                    shown[0] = share
+                    bar.update(task, completed=share)
+
+            yield draw
+        return
+    began_s = time.monotonic()
+    told = [0]
+
+    def tell(share: float) -> None:
+        tenth = int(share * 10)
+        if tenth > told[0] and time.monotonic() - began_s > _QUIET_S:
+            told[0] = tenth
+            print(f"{what}: {10 * tenth} % after {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True)
+
+    yield tell

@@ -1,0 +1,106 @@
+"""Keys and a status line for a command that runs until Ctrl-C; does nothing where there is no terminal."""
+
+from __future__ import annotations
+
+import logging
+import os
+import select
+import sys
+import termios
+import threading
+import tty
+from collections.abc import Callable, Mapping
+from typing import Any, TextIO
+
+ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
+_CLEAR_LINE = "\r\x1b[K"
+
+
+class Terminal:
+    """Reads keys and keeps one line up to date, from a thread of its own.
+
+    Args:
+        keys: key (a character, or ``up``, ``down``, ``left``, ``right``) → what it does.
+        line: text of the status line.
+        period_s: how often it is drawn anew.
+    """
+
+    def __init__(self, keys: Mapping[str, Callable[[], Any]], line: Callable[[], str], period_s: float = 0.2) -> None:
+        self._keys = keys
+        self._line = line
+        self._period_s = period_s
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._before: list[Any] | None = None
+        self._streams: list[tuple[logging.StreamHandler[TextIO], TextIO]] = []
+        self._lock = threading.Lock()
+
+    def start(self) -> None:
+        """Takes the terminal, if standard input and error output are one and this process stands in front."""
+        if not (sys.stdin.isatty() and sys.stderr.isatty()) or not self._in_front():
+            return
+        self._before = termios.tcgetattr(sys.stdin)
+        tty.setcbreak(sys.stdin)  # keys come at once; Ctrl-C stays a signal
+        for handler in logging.getLogger().handlers:
+            if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
+                self._streams.append((handler, handler.stream))
+                handler.setStream(_AboveTheLine(handler.stream, self._lock))
+        self._thread = threading.Thread(target=self._run, name="terminal", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Gives the terminal back."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(2.0)
+        if self._before is not None:
+            termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._before)
+            self._before = None
+            sys.stderr.write(_CLEAR_LINE)
+        for handler, stream in self._streams:
+            handler.setStream(stream)
+
+    def _in_front(self) -> bool:
+        try:
+            return os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+        except OSError:  # no controlling terminal
+            return False
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with self._lock:
+                width = os.get_terminal_size(sys.stderr.fileno()).columns
+                sys.stderr.write(_CLEAR_LINE + self._line()[: max(1, width - 1)])
+                sys.stderr.flush()
+            # A process sent to the background would be stopped by reading.
+            if not self._in_front():
+                self._stop.wait(self._period_s)
+                continue
+            ready, _, _ = select.select([sys.stdin], [], [], self._period_s)
+            if ready:
+                self._on_key(os.read(sys.stdin.fileno(), 8).decode(errors="replace"))
+
+    def _on_key(self, text: str) -> None:
+        key = ARROWS.get(text, text[:1])
+        action = self._keys.get(key)
+        if action is None:
+            return
+        try:
+            action()
+        except ValueError as error:
+            logging.getLogger(__name__).warning("%s", error)
+
+
+class _AboveTheLine:
+    """A stream whose lines take the place of the status line, which comes again below them."""
+
+    def __init__(self, stream: TextIO, lock: threading.Lock) -> None:
+        self._stream = stream
+        self._lock = lock
+
+    def write(self, text: str) -> int:
+        with self._lock:
+            return self._stream.write((_CLEAR_LINE if text.strip() else "") + text)
+
+    def flush(self) -> None:
+        self._stream.flush()
