@@ -80,9 +80,7 @@ class _Output:
 
     def node_line(self, node: str, text: str) -> None:
         """A line that a node has written."""
-        if self._left_out and self._outlet.put(
-            self._screen.event, f"{self._left_out} lines left out: see the logs"
-        ):
+        if self._left_out and self._outlet.put(self._screen.event, f"{self._left_out} lines left out: see the logs"):
             self._left_out = 0
         if not self._outlet.put(self._screen.node_line, node, text):
             self._left_out += 1

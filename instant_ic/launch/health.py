@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bus import RELIABLE, registry
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.node import ERROR, OK, WARN
-from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import deserialize, header, message_type, serialize
@@ -93,7 +93,7 @@ class HealthMonitor:
         self._run_dir = run_dir
         groups = {spec.group: spec.run_dir or run_dir for spec in nodes} | {"": run_dir}
         name = f"launch_{os.getpid()}"
-        self._transports = {group: ZmqTransport(folder, name, time.time_ns) for group, folder in groups.items()}
+        self._transports = {group: LocalTransport(folder, name, time.time_ns) for group, folder in groups.items()}
         self._folders = groups
         self._beats = [(spec_group, beat) for spec_group, beat in self._subscribe_beats()]
         self._vspace = [

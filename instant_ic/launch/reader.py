@@ -251,16 +251,17 @@ class _Actions:
 
     @staticmethod
     def _checked(value: str, argument: LaunchArgument, body: Value) -> str:
-        """The value, if the argument may have it; an empty default may stay empty."""
+        """The value, if the argument may have it; else one that it may have, so that the mistake is told once."""
         if value == "" == argument.default:
             return value
         if argument.choices and value not in argument.choices:
             body.problem(f"argument {argument.name!r} must be one of {', '.join(argument.choices)} (got {value!r})")
-            return value
+            return argument.choices[0]
         try:
             _TYPES[argument.type](value)
         except ValueError:
             body.problem(f"argument {argument.name!r} must be of type {argument.type} (got {value!r})")
+            return argument.default if argument.default not in (None, value) else "0"
         return str(Path(value).expanduser()) if argument.type == "path" else value
 
     def _let(self, body: Value) -> None:

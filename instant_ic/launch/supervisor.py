@@ -294,9 +294,7 @@ class Supervisor:
             if not silence.told:
                 silence.told = True
                 words = f"no heartbeat for {silence.lasts_s:.0f} s, but it computes"
-                self._output.event(
-                    f"{process.spec.label}: {words}: ends at {BUSY_FACTOR * limit_s:.0f} s", bad=True
-                )
+                self._output.event(f"{process.spec.label}: {words}: ends at {BUSY_FACTOR * limit_s:.0f} s", bad=True)
             return
         reason = f"hangs: no heartbeat for {silence.lasts_s:.0f} s"
         self._output.event(f"{process.spec.label} {reason}; its stack goes to {process.log_path}", bad=True)

@@ -269,3 +269,246 @@ def test_problem_is_told_as_file_and_line(tmp_path: Path, monkeypatch: pytest.Mo
     file = write(tmp_path, "launch:\n- node: {exec: warp}\n")
     with pytest.raises(LaunchFileError, match=r"^stack\.yaml:2: unknown exec 'warp'"):
         read_launch_file(file)
+
+
+# -- arguments with types ------------------------------------------------------------------------
+
+TYPED = """launch:
+- arg: {name: port, type: int, default: 80}
+- arg: {name: rate, type: float, default: 1.5}
+- arg: {name: dry, type: bool, default: false}
+- arg: {name: bag, type: path, default: ""}
+- arg: {name: mode, default: fast, choices: [fast, slow]}
+- arg: {name: ros, default: a, choice: [{value: a}, {value: b}]}
+- node: {exec: talker.py, name: t, param: [{name: port, value: $(var port), type: int}]}
+- node: {exec: talker.py, name: dry_one, if: $(var dry)}
+"""
+
+
+def test_arguments_have_types_and_choices(tmp_path: Path, program: Path) -> None:
+    file = write(tmp_path, TYPED)
+    given = {"port": "81", "rate": "2", "dry": "true", "bag": "~/drive", "mode": "slow", "ros": "b"}
+    description = read_launch_file(file, given)
+    assert description.values["bag"] == str(Path("~/drive").expanduser())
+    assert [node.name for node in description.nodes] == ["t", "dry_one"]
+    told = {argument.name: (argument.type, argument.choices) for argument in read_arguments(file)}
+    assert told["port"] == ("int", ()) and told["mode"] == ("str", ("fast", "slow"))
+    assert told["ros"] == ("str", ("a", "b"))
+    assert read_launch_file(file).values["bag"] == ""  # an empty default may stay empty
+
+
+def test_wrong_values_of_arguments_are_told_once_each_at_the_arguments_line(tmp_path: Path, program: Path) -> None:
+    file = write(tmp_path, TYPED)
+    found = problems_of(file, port="x", rate="quick", dry="maybe", mode="medium", ros="c")
+    assert found == [
+        "2: argument 'port' must be of type int (got 'x')",
+        "3: argument 'rate' must be of type float (got 'quick')",
+        "4: argument 'dry' must be of type bool (got 'maybe')",
+        "6: argument 'mode' must be one of fast, slow (got 'medium')",
+        "7: argument 'ros' must be one of a, b (got 'c')",
+    ]
+
+
+def test_arguments_of_an_included_file_are_checked_and_shown(tmp_path: Path, program: Path) -> None:
+    inner = "launch:\n- arg: {name: port, type: int, default: 1}\n- arg: {name: speed, type: float, default: 2}\n"
+    write(tmp_path, inner, "part.yaml")
+    over = write(tmp_path, "launch:\n- include: {file: part.yaml}\n", "over.yaml")
+    assert "part.yaml has one: declare it here" in problems_of(over, speed="3")[0]
+    file = write(
+        tmp_path,
+        "launch:\n- arg: {name: far, default: false}\n"
+        "- include: {file: part.yaml, arg: [{name: port, value: high}], if: $(var far)}\n",
+    )
+    with pytest.raises(LaunchFileError, match=r"part\.yaml:2: argument 'port' must be of type int"):
+        read_launch_file(file, {"far": "true"})
+    assert [argument.name for argument in read_arguments(file, included=True)] == ["speed"]  # whatever its condition
+    told = " ".join(problems_of(file, speed="3"))
+    assert "there is no argument 'speed' (arguments: far)" in told
+
+
+def test_type_of_an_argument_that_does_not_exist(tmp_path: Path) -> None:
+    file = write(tmp_path, "launch:\n- arg: {name: a, type: angle, default: 1}\n")
+    assert problems_of(file) == ["2: unknown type 'angle' (types: str, int, float, bool, path)"]
+
+
+# -- groups with a run directory -----------------------------------------------------------------
+
+
+def test_group_with_a_run_directory_of_its_own(tmp_path: Path, program: Path) -> None:
+    file = write(
+        tmp_path,
+        """launch:
+- node: {exec: talker.py, name: slam}
+- group:
+    run_dir: left
+    launch:
+    - node: {exec: talker.py, name: slam, param: [{name: dev, value: $(run-dir)/dev}]}
+    - group: {run_dir: arm, launch: [{node: {exec: talker.py, name: slam}}]}
+- node: {exec: talker.py, name: after, param: [{name: dev, value: $(run-dir)/dev}]}
+""",
+    )
+    description = read_launch_file(file, {}, Path("/r"))
+    assert [(node.label, node.run_dir) for node in description.nodes] == [
+        ("slam", None),
+        ("left/slam", Path("/r/left")),
+        ("left/arm/slam", Path("/r/left/arm")),
+        ("after", None),
+    ]
+    assert description.nodes[1].command[-1] == "dev:=/r/left/dev"
+    assert description.nodes[3].command[-1] == "dev:=/r/dev"
+    assert description.run_dirs(Path("/r")) == [Path("/r"), Path("/r/left"), Path("/r/left/arm")]
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", "", "log", "nodes"])
+def test_names_that_a_run_directory_cannot_have(tmp_path: Path, name: str) -> None:
+    file = write(tmp_path, f"launch:\n- group: {{run_dir: '{name}', launch: []}}\n")
+    assert "give a name of letters" in problems_of(file)[0]
+
+
+def test_same_name_twice_in_one_run_directory_of_a_group(tmp_path: Path, program: Path) -> None:
+    node = "{node: {exec: talker.py}}"
+    file = write(tmp_path, f"launch:\n- group: {{run_dir: left, launch: [{node}, {node}]}}\n")
+    assert "a node named 'talker' is already started" in problems_of(file)[0]
+
+
+# -- ROS 2's spelling ----------------------------------------------------------------------------
+
+
+def test_a_file_as_ros_2_users_write_it(tmp_path: Path, program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME_PATH", "/a")
+    monkeypatch.setenv("GONE", "1")
+    write(tmp_path, "/**:\n  ros__parameters: {a: 1}\n", "all.yaml")
+    file = write(
+        tmp_path,
+        """
+launch:
+- arg: {name: "robot", default: "left"}
+- set_env: {name: RMW, value: "$(var robot)_rmw"}
+- unset_env: {name: GONE}
+- append_env: {name: HOME_PATH, value: /b}
+- append_env: {name: HOME_PATH, value: /0, prepend: true}
+- set_use_sim_time: {value: true}
+- set_parameter: {name: nice, value: 3}
+- set_parameters_from_file: {filename: all.yaml}
+- set_remap: {from: /scan, to: /front/scan}
+- group:
+  - push_ros_namespace: {namespace: "$(var robot)"}
+  - set_env: {name: RMW, value: inner}
+  - node:
+      pkg: "instant_ic"
+      exec: "grid_slam"
+      exec_name: slam
+      namespace: "front"
+      output: log
+      emulate_tty: true
+      launch-prefix: nice -n 3
+      ros_args: "--ros-args --log-level debug"
+      respawn: true
+      respawn_max_retries: 2
+      sigterm_timeout: "3.5"
+      param:
+      - name: map
+        param:
+        - {name: resolution_m, value: 0.05}
+  - group:
+    - push-ros-namespace: {namespace: /absolute}
+    - node: {pkg: instant_ic, exec: navigator}
+- executable: {cmd: 'echo "two words" end', cwd: /tmp, env: [{name: A, value: "1"}]}
+- executable: {cmd: echo}
+- executable: {cmd: "echo $HOME | cat", shell: true, name: piped}
+- log: {level: INFO, message: "robot $(var robot)"}
+- timer:
+    period: 2.0
+    children:
+    - node: {exec: talker.py}
+    - timer: {period: 1.5, launch: [{shutdown: {reason: over}}, {log: {message: late}}]}
+""",
+    )
+    description = read_launch_file(file)
+    nodes = {node.name: node for node in description.nodes}
+    slam = nodes["grid_slam"]
+    common = ("-p", "use_sim_time:=true", "-p", "nice:=3", "--params-file", str(tmp_path / "all.yaml"))
+    remap = ("-r", "/scan:=/front/scan")
+    start = slam.command.index("--name")
+    assert slam.command[:3] == ("nice", "-n", "3")
+    assert slam.command[start:] == (
+        *("--name", "grid_slam", "--namespace", "left/front", *common, *remap),
+        *("-p", "map.resolution_m:=0.05", "--log-level", "debug"),
+    )
+    assert slam.env == {"RMW": "inner", "GONE": None, "HOME_PATH": "/0:/a:/b"}
+    assert (slam.to_terminal, slam.respawn_max_retries, slam.sigterm_timeout_s) == (False, 2, 3.5)
+    assert nodes["navigator"].namespace == "/absolute"
+    assert nodes["navigator"].env["RMW"] == "inner" and nodes["talker"].env["RMW"] == "left_rmw"
+    assert nodes["echo"].command == ("echo", "two words", "end") and nodes["echo"].cwd == Path("/tmp")
+    assert nodes["echo"].env["A"] == "1" and not nodes["echo"].heartbeat
+    assert nodes["echo_2"].command == ("echo",)
+    assert nodes["piped"].command == ("/bin/sh", "-c", "echo $HOME | cat")
+    assert nodes["talker"].start_delay_s == 2.0 and nodes["echo"].start_delay_s == 0.0
+    assert [(said.text, said.delay_s) for said in description.announcements] == [("robot left", 0.0), ("late", 3.5)]
+    assert description.shutdown is not None
+    assert (description.shutdown.reason, description.shutdown.delay_s) == ("over", 3.5)
+
+
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        ("node: {pkg: nav2_bringup, exec: talker.py}", "pkg 'nav2_bringup': nodes are those of instant_ic"),
+        ("node: {exec: talker.py, shell: true}", "a node is not started by a shell"),
+        ("node: {exec: talker.py, output: {stdout: log}}", "expected a single value, got a mapping"),
+        ("node: {exec: talker.py, output: tty}", "output must be one of both, screen, log (got 'tty')"),
+        ("node: {exec: talker.py, launch-prefix: no_such_tool -x}", "program 'no_such_tool' does not exist"),
+        ("node: {exec: talker.py, cwd: /no/such}", "folder /no/such does not exist"),
+        ("node: {exec: talker.py, respawn_max_retries: many}", "expected a whole number, got 'many'"),
+        ("node: {exec: talker.py, param: [{from: s.yaml, allow_substs: true}]}", "substitutions inside a parameter"),
+        ("executable: {cmd: no_such_program -v}", "program 'no_such_program' does not exist"),
+        ("executable: {cmd: ''}", "cmd is empty"),
+        ('executable: {cmd: "echo \'open"}', "No closing quotation"),
+        ("node_container: {pkg: a}", "'node_container' is ROS 2's, but not here: every node is a process"),
+        ("lifecycle_node: {pkg: a}", "'lifecycle_node' is ROS 2's, but not here"),
+        ("include: {file: other.launch.py}", "only YAML launch files are read"),
+        ("log: {message: $(command whoami)}", "$(command ...) is ROS 2's, but not here: nothing is executed"),
+        ("log: {message: $(find-pkg-share nav2)}", "only instant_ic has a share folder here"),
+        ("log: {message: $(find-exec no_such_program)}", "program 'no_such_program' is not in PATH"),
+        ("timer: {period: soon, launch: []}", "expected a number, got 'soon'"),
+        ("group: {if: true}", "'launch' is missing"),
+    ],
+)
+def test_what_ros_2_has_and_we_have_not_is_told_with_the_reason(
+    tmp_path: Path, program: Path, action: str, expected: str
+) -> None:
+    write(tmp_path, "a:\n  ros__parameters: {b: $(var c)}\n", "s.yaml")
+    write(tmp_path, "", "other.launch.py")
+    file = write(tmp_path, f"launch:\n- {action}\n")
+    assert any(expected in problem for problem in problems_of(file)), problems_of(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('$(eval \'"$(var world)" == "hall"\')', "true"),  # ROS 2 quotes the whole expression
+        ("$(eval '$(var world) == cave')", "false"),
+        ("$(eval '$(var on)')", "true"),
+        ("$(eval 3 < 10 and 10 >= 10)", "true"),  # numbers, not texts
+        ("$(equals $(var world) hall)", "true"),
+        ("$(not-equals '$(var world)' '')", "true"),
+        ("$(not $(var on))", "false"),
+        ("$(and true $(var on))", "true"),
+        ("$(or false 0)", "false"),
+        ("$(if $(var on) 'far away' near)", "far away"),
+        ("$(if false there)", ""),
+        ("$(filename)", "a.yaml"),
+    ],
+)
+def test_substitutions_of_ros_2(context: Context, text: str, expected: str) -> None:
+    result = substitute(text, context)
+    assert Path(result).name == expected if "filename" in text else result == expected
+
+
+def test_share_folder_holds_launch_and_config(context: Context) -> None:
+    share = Path(substitute("$(find-pkg-share instant_ic)", context))
+    assert (share / "launch" / "sim.yaml").is_file() and (share / "config" / "slam.yaml").is_file()
+
+
+def test_anonymous_names_differ(context: Context) -> None:
+    names = {substitute("$(anon view)", context) for _ in range(3)}
+    assert len(names) == 3 and all(name.startswith("view_") for name in names)

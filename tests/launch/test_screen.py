@@ -8,8 +8,8 @@ import pytest
 from rich.console import Console
 
 from instant_ic.bus import RELIABLE
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
-from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.launch import NodeSpec
 from instant_ic.launch.health import HealthMonitor, find_console
 from instant_ic.launch.screen import Row, Screen, View
@@ -100,7 +100,7 @@ def beat(node: str, state: int = 1, pid: int = 1, rate_hz: float = 10.0, age_s: 
 
 def test_heartbeats_become_health(tmp_path: Path) -> None:
     nodes = [NodeSpec("my_slam", "grid_slam", ()), NodeSpec("other", "navigator", ())]
-    transport = ZmqTransport(tmp_path, "test", lambda: 1)
+    transport = LocalTransport(tmp_path, "test", lambda: 1)
     monitor = HealthMonitor(nodes, tmp_path)
     try:
         assert monitor.nodes_missing() == ["my_slam", "other"] and monitor.waiting_for() == ["map"]
@@ -154,7 +154,7 @@ def test_each_group_is_heard_in_its_own_run_directory(tmp_path: Path) -> None:
     nodes = [NodeSpec("slam", "grid_slam", ()), NodeSpec("slam", "grid_slam", (), run_dir=left, group="left")]
     for folder in (tmp_path, left):
         prepare(folder)
-    transport = ZmqTransport(left, "slam", lambda: 1)
+    transport = LocalTransport(left, "slam", lambda: 1)
     monitor = HealthMonitor(nodes, tmp_path)
     try:
         assert monitor.waiting_for() == ["map", "left/map"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,16 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic launch sim console_port:=9000 record:=drive",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, replay")
+    parser.add_argument("file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, fleet, replay")
     parser.add_argument("arguments", nargs="*", metavar="KEY:=VALUE", help="arguments of the launch file")
-    parser.add_argument("--show-args", action="store_true", help="list the file's arguments and end")
+    parser.add_argument(
+        "-s", "--show-args", "--show-arguments", action="store_true", help="list the file's arguments and end"
+    )
     parser.add_argument(
         "--check", action="store_true", help="check file, arguments and every node's parameters, start nothing"
+    )
+    parser.add_argument(
+        "--no-check", action="store_true", help="start without checking the nodes' parameters first; they do it too"
     )
     parser.add_argument("--plain", action="store_true", help="plain lines also in a terminal")
     parser.add_argument("--run-dir", type=Path, default=None, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
@@ -40,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     except FileNotFoundError as error:
         raise UserError(str(error), 2) from None
     if args.show_args:
-        _show(file.name, read_arguments(file))
+        _show(file.name, read_arguments(file), read_arguments(file, included=True))
         return 0
     values: dict[str, str] = {}
     for word in args.arguments:
@@ -48,33 +54,35 @@ def run(args: argparse.Namespace) -> int:
         if not separator or not name:
             raise UserError(f"{word!r}: expected KEY:=VALUE", 2)
         values[name] = value
-    run_dir = args.run_dir or paths.run_dir()
+    run_dir = (args.run_dir or paths.run_dir()).absolute()
     description = read_launch_file(file, values, run_dir)
+    if args.check or not args.no_check:
+        from instant_ic.launch.parameters import check_parameters_quickly
+
+        problems = check_parameters_quickly(description.nodes)
+        for problem in problems:
+            print(f"ic: {problem}", file=sys.stderr)
+        if problems:
+            return 2
     if args.check:
-        return _check(description)
+        print(f"{description.file.name}: {len(description.nodes)} nodes, no mistake found")
+        return 0
     from instant_ic.launch.app import run_stack
 
     return run_stack(description, run_dir, False if args.plain else None)
 
 
-def _show(name: str, arguments: Any) -> None:
+def _show(name: str, arguments: Sequence[Any], included: Sequence[Any]) -> None:
     print(f"arguments of {name}:")
     if not arguments:
         print("  none")
     for argument in arguments:
+        kind = " | ".join(argument.choices) if argument.choices else argument.type
         default = "must be given" if argument.default is None else f"default: {argument.default!r}"
-        print(f"  {argument.name} ({default})")
+        print(f"  {argument.name}: {kind} ({default})")
         if argument.description:
             print(f"      {argument.description}")
-
-
-def _check(description: Any) -> int:
-    """Builds every node's configuration, as the node itself would."""
-    from instant_ic.launch.parameters import check_parameters
-
-    problems = check_parameters(description.nodes)
-    for problem in problems:
-        print(f"ic: {problem}", file=sys.stderr)
-    if not problems:
-        print(f"{description.file.name}: {len(description.nodes)} nodes, no mistake found")
-    return 2 if problems else 0
+    for file in dict.fromkeys(argument.file for argument in included):
+        left = ", ".join(f"{a.name} {a.default!r}" for a in included if a.file == file and a.default is not None)
+        if left:
+            print(f"{file.name}, which it includes, keeps its own defaults of: {left}")
