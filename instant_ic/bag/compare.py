@@ -288,7 +288,7 @@ class _Comparison:
             yield path, (f"{path} is {x!r} and {y!r}", size)
         else:
             many = f"({different.size} of {a.size} entries differ)"
-            yield path, (f"{path}[{index}] is {a[index]!r} and {b[index]!r} {many}", size)
+            yield path, (f"{path}[{index}] is {x!r} and {y!r} {many}", size)
 
 
 def _matches(pattern: str, topic: str, path: str) -> bool:

@@ -94,7 +94,8 @@ class BagReader:
         except BagError:
             raise
         except (ReaderError, OSError) as error:
-            raise BagError(f"bag {path} cannot be read: {error}; if it was cut: ic bag recover {path}") from None
+            hint = "not written by ROS 2; its CDR messages" if "rofile" in str(error) else "if it was cut"
+            raise BagError(f"bag {path} cannot be read: {error}; {hint}: ic bag recover {path}") from None
         except (struct.error, LookupError, TypeError, ValueError, AssertionError, EOFError) as error:
             # A parser on bytes that are no bag.
             raise BagError(

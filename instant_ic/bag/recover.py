@@ -121,7 +121,7 @@ def reindex(folder: Path) -> tuple[int, int]:
         write_metadata(folder, parts, topics, custom)
     except OSError as error:
         raise BagError(f"{folder}/metadata.yaml cannot be written: {error.strerror}") from None
-    return len(parts), sum(part.count for part in parts)
+    return len(parts), sum(part.count - sum(part.repeated.values()) for part in parts)
 
 
 def mcap_files(source: Path) -> list[Path]:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +19,7 @@ from instant_ic import paths
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagMessage, BagReader
 from instant_ic.bag.player import NEVER_PLAYED
+from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.lockstep import LockstepBus, Record
@@ -63,11 +67,17 @@ class ReplayResult:
         fed: messages of the bag that went in, by topic.
         left_out: messages of the bag that did not, because a replayed node makes them.
         made: messages that came out, by topic.
+        bag_s: length of the bag.
+        setup_s: time that the nodes took to start.
+        wall_s: time that feeding took.
     """
 
     fed: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
     made: Counter[str] = field(default_factory=Counter)
+    bag_s: float = 0.0
+    setup_s: float = 0.0
+    wall_s: float = 0.0
 
 
 def find_node_class(name: str) -> type[Node[Any]]:
@@ -133,6 +143,7 @@ def replay(
     output: Path,
     drop_transforms: Iterable[str] = (),
     on_progress: Callable[[float], None] | None = None,
+    compressed: bool = False,
 ) -> ReplayResult:
     """Feeds a bag to nodes message by message and records what they publish.
 
@@ -145,15 +156,18 @@ def replay(
         output: folder of the new bag, which must not exist.
         drop_transforms: further child frames to leave out.
         on_progress: called with the share of the bag that has gone in, 0 to 1.
+        compressed: compress the new bag.
 
     Raises:
         BagError: a bag cannot be read or written.
+        ReplayError: a node reads a type that has another definition in the bag.
     """
     result = ReplayResult()
+    began_s = time.monotonic()
     with BagReader(bag) as reader:
         if not reader.count:
             raise BagError(f"bag {bag} is empty")
-        with BagWriter(output) as writer:
+        with BagWriter(output, compressed) as writer:
             made_frames = {child for node in nodes for child in BROADCASTS.get(node.name, ())}
             made_frames.update(drop_transforms)
 
@@ -164,10 +178,13 @@ def replay(
                     made_frames.update(t.child_frame_id for t in transforms)
                 writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
 
-            with LockstepBus(start_ns=reader.start_ns, keep=False, on_record=record) as bus:
+            with LockstepBus(start_ns=reader.start_ns, keep=False, on_record=record) as bus, ExitStack() as stack:
                 running = [bus.add(node.node_class, node.config, node.name) for node in nodes]
+                _check_types(reader, bus)
                 span_ns = max(1, reader.end_ns - reader.start_ns)
-                for message in reader.messages():
+                result.bag_s, result.setup_s = span_ns / 1e9, time.monotonic() - began_s
+                messages = stack.enter_context(ReadAhead(reader.messages(), threading.Event()))
+                for message in messages:
                     made_topics = {p.topic for node in running for p in node.publishers}
                     payload = _what_to_feed(message, made_topics, made_frames)
                     if payload is None:
@@ -180,10 +197,20 @@ def replay(
                         )
                     if on_progress is not None:
                         on_progress((message.stamp_ns - reader.start_ns) / span_ns)
+                result.wall_s = time.monotonic() - began_s - result.setup_s
                 for node in running:
                     for publisher in node.publishers:
                         writer.add_topic(publisher.topic, publisher.raw.type_name, publisher.raw.qos)
     return result
+
+
+def _check_types(reader: BagReader, bus: LockstepBus) -> None:
+    other = set(reader.differing_types())
+    for topic in reader.topics:
+        if topic.type_name in other and bus.subscriptions.get(topic.topic):
+            raise ReplayError(
+                f"bag {reader.path}: {topic.topic} is of a {topic.type_name} with another definition than ours"
+            )
 
 
 def _what_to_feed(message: BagMessage, made_topics: set[str], made_frames: set[str]) -> bytes | None:

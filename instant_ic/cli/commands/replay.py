@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import logging
-import sys
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli.commands.bag import tolerances, topic_names
 from instant_ic.cli.errors import UserError
 
 
@@ -44,6 +44,11 @@ def add_parser(subparsers: Any) -> None:
         metavar="FRAME",
         help="leave out transforms with this child",
     )
+    parser.add_argument("--compression", action="store_true", help="compress the new bag with zstd")
+    parser.add_argument(
+        "--compare", default="", metavar="BAG", help="then compare with this bag; exit status 1 when a topic differs"
+    )
+    tolerances(parser)
     parser.set_defaults(func=run)
 
 
@@ -64,26 +69,32 @@ def run(args: argparse.Namespace) -> int:
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")
 
-    from rich.console import Console
-    from rich.progress import Progress
+    if args.compare and not Path(args.compare).exists():
+        raise UserError(f"bag {args.compare} does not exist")
 
+    from instant_ic.bag.compare import compare
     from instant_ic.bag.replay import make_node, replay
+    from instant_ic.cli.bag_look import print_differences, tolerance_of
+    from instant_ic.cli.progress import progress
 
+    tolerance = tolerance_of(args)
     logging.basicConfig(level="WARNING", format="%(levelname)-7s %(name)s: %(message)s")
     nodes = [make_node(name, args.params_file, args.param) for name in names]
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task(f"replaying {args.bag}", total=1.0)
-        result = replay(
-            Path(args.bag),
-            nodes,
-            Path(args.output),
-            args.drop_tf,
-            lambda share: progress.update(task, completed=share),
-        )
+    with progress(f"replaying {args.bag}") as step:
+        result = replay(Path(args.bag), nodes, Path(args.output), args.drop_tf, step, args.compression)
     print(f"{args.output}: {result.made.total()} messages from {result.fed.total()} of {args.bag}")
     for topic, count in sorted(result.made.items()):
         print(f"  {topic}: {count}")
     left_out = ", ".join(f"{topic} {count}" for topic, count in sorted(result.left_out.items()))
     if left_out:
         print(f"not fed: {left_out}")
-    return 0
+    speed = result.bag_s / max(result.wall_s, 1e-9)
+    print(
+        f"{result.bag_s:.1f} s of bag in {result.wall_s:.1f} s: {speed:.1f} x real time ({result.setup_s:.1f} s to start)"
+    )
+    if not args.compare:
+        return 0
+    found = compare(Path(args.output), Path(args.compare), tuple(topic_names(args.ignore)), True, tolerance)
+    if not found:
+        raise UserError(f"{args.output} and {args.compare} have no topic in common")
+    return print_differences(found)
