@@ -23,7 +23,21 @@ ActionType = Literal["stop", "slowdown", "limit", "approach"]
 
 @dataclass(frozen=True)
 class PolygonConfig:
-    """A place round the robot, and what happens to the command when something is in it."""
+    """A place round the robot, and what happens to the command when something is in it.
+
+    Attributes:
+        enabled: whether it is looked at.
+        action_type: stop, slowdown, limit or approach.
+        points: "[[x, y], ...]" in base_link, convex; empty: the footprint with padding_m.
+        padding_m: m round the footprint.
+        min_points: points inside that count as something.
+        slowdown_ratio: share of the command that is left; slowdown.
+        linear_limit: m/s; limit.
+        angular_limit: rad/s; limit.
+        time_before_collision: s to contact from which on the command is slowed in proportion; approach.
+        stop_time_s: s to contact at which it becomes zero; approach.
+        simulation_time_step: s between the poses looked at; approach and stop.
+    """
 
     enabled: bool = True
     action_type: ActionType = "approach"
