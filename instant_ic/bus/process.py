@@ -10,8 +10,9 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from .. import paths
 from ..msg import MessageError
@@ -100,8 +101,27 @@ def _stop_on_signals(node: Node[Any]) -> None:
 
 
 def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None:
-    """Runs a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters."""
-    sys.exit(run(node_class, argv))
+    """Runs a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters.
+
+    With the process's own command line (``argv`` None) the process is the node's, and leaves at once.
+    """
+    status = run(node_class, argv)
+    if argv is None:
+        leave(status)
+    sys.exit(status)
+
+
+def leave(status: int) -> NoReturn:
+    """Ends the process at once, without taking the interpreter down.
+
+    That takes 0.7 s of CPU where numba's compiler is loaded, and waits for threads that a library has left behind.
+    What matters (motors, bag, sockets, registry) a node has closed before; the rest is memory.
+    """
+    logging.shutdown()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # nobody reads it any more, or it is closed
+            stream.flush()
+    os._exit(status)
 
 
 def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:

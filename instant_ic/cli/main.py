@@ -25,6 +25,9 @@ _EPILOG = """examples:
   ic launch sim                         everything against simulated devices
   ic launch robot --show-args           what can be set
   ic topic hz /scan                     rate of a topic
+  ic param set depth_estimator max_rate_hz 1
+  ic top                                what every node does, live
+  ic graph -o stack.svg                 a picture of nodes and topics
   ic bag record -o drive                record everything into the folder drive
   ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again
   ic doctor                             check this machine
@@ -35,6 +38,9 @@ def build_parser() -> argparse.ArgumentParser:
     """The command line with every verb."""
     parser = argparse.ArgumentParser(
         prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--run-dir", dest="stack", metavar="DIR", help="run directory of the stack (default: $INSTANT_IC_RUN_DIR)"
     )
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for info in sorted(pkgutil.iter_modules(commands.__path__), key=lambda info: info.name):
@@ -71,12 +77,24 @@ def _quiet_end() -> Iterator[None]:
 
 def _main(argv: Sequence[str] | None) -> int:
     parser = build_parser()
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks what may come next
+        import argcomplete
+
+        argcomplete.autocomplete(parser)
     args = parser.parse_args(argv)
-    function = getattr(args, "func", None)
-    if function is None:
-        parser.error("a command is missing")
+    if args.stack:
+        os.environ["INSTANT_IC_RUN_DIR"] = args.stack
+    status = _call(args)
+    if argv is None and getattr(args, "leaves", False):
+        from instant_ic.bus.process import leave
+
+        leave(status)
+    return status
+
+
+def _call(args: argparse.Namespace) -> int:
     try:
-        return int(function(args) or 0)
+        return int(args.func(args) or 0)
     except UserError as error:
         print(f"ic: {error}", file=sys.stderr)
         return error.status

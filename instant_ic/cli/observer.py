@@ -3,35 +3,53 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
 from instant_ic import paths
 from instant_ic.bus import RELIABLE, registry
-from instant_ic.bus.transport import Received
-from instant_ic.bus.zmq_transport import ZmqSubscription, ZmqTransport
+from instant_ic.bus.clock import Clock, ManualClock, SystemClock
+from instant_ic.bus.transport import RawSubscription, Received
+from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.cli.errors import UserError
+from instant_ic.cli.names import absolute, unknown_topic
+from instant_ic.msg import deserialize, stamp_ns
+
+_CLOCK = "/clock"
 
 
 class Observer:
-    """Listens to one topic; a context manager.
+    """Listens to topics; a context manager.
 
     Args:
-        topic: its name, with or without the leading slash.
+        topics: one name or several, with or without the leading slash.
+        use_sim_time: arrival times and :meth:`now_ns` are those of ``/clock``.
         run_dir: run directory of the stack.
 
     Raises:
-        RegistryError: the run directory cannot be used, or the name is not legal.
+        RegistryError: the run directory cannot be used, or a name is not legal.
     """
 
-    def __init__(self, topic: str, run_dir: Path | None = None) -> None:
-        self.topic = topic if topic.startswith("/") else f"/{topic}"
+    def __init__(self, topics: str | Sequence[str], use_sim_time: bool = False, run_dir: Path | None = None) -> None:
+        names = [topics] if isinstance(topics, str) else list(topics)
+        self.topics = list(dict.fromkeys(absolute(name) for name in names))
+        self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
+        self._run_dir = run_dir or paths.run_dir()
         self._ready = threading.Event()
-        self._transport = ZmqTransport(run_dir or paths.run_dir(), f"ic_{os.getpid()}", time.time_ns)
-        self.subscription: ZmqSubscription = self._transport.subscribe(self.topic, None, RELIABLE, self._ready.set)
+        self.transport = ZmqTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
+        try:
+            self.subscriptions = {topic: self._subscribe(topic) for topic in self.topics}
+            self._sim_clock = self._subscribe(_CLOCK) if use_sim_time else None
+        except registry.RegistryError:
+            self.transport.close()
+            raise
+
+    def _subscribe(self, topic: str) -> RawSubscription:
+        return self.transport.subscribe(topic, None, RELIABLE, self._ready.set)
 
     def __enter__(self) -> Observer:
         """The observer itself."""
@@ -41,7 +59,11 @@ class Observer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Lets go of the bus."""
-        self._transport.close()
+        self.transport.close()
+
+    def lost_by(self, topic: str) -> dict[str, int]:
+        """Publisher → messages of a topic that were lost on the way here."""
+        return self.subscriptions[topic].stats.lost_by
 
     def batches(self, duration_s: float, period_s: float) -> Iterator[list[Received]]:
         """What came, at least every ``period_s`` (then maybe empty), for ``duration_s`` in all."""
@@ -49,11 +71,28 @@ class Observer:
         while (left_s := end_s - time.monotonic()) > 0:
             self._ready.wait(min(period_s, left_s))
             self._ready.clear()
-            yield self.subscription.take()
+            self.follow_clock()
+            yield [received for topic in self.topics for received in self.subscriptions[topic].take()]
 
+    def follow_clock(self) -> None:
+        """Sets the clock to the newest ``/clock``, where simulated time is used."""
+        for received in self._sim_clock.take() if self._sim_clock is not None else ():
+            assert isinstance(self.clock, ManualClock)
+            self.clock.set(stamp_ns(deserialize(received.payload, received.type_name).clock))
 
-def nothing_heard(topic: str, seconds: float, run_dir: Path | None = None) -> UserError:
-    """The error of a command that heard nothing, with what is likely the reason."""
-    known = {info.topic for info in registry.list_topics(run_dir or paths.run_dir())}
-    why = "its publisher is silent" if topic in known else "nobody publishes it: ic topic list"
-    return UserError(f"{topic}: nothing came in {seconds:.0f} s, {why}")
+    def hint(self) -> None:
+        """Says on the error output which of the topics nobody publishes yet."""
+        known = {info.topic for info in registry.list_topics(self._run_dir)}
+        for topic in self.topics:
+            if topic not in known:
+                print(f"ic: {unknown_topic(topic, known)}; waiting for it", file=sys.stderr)
+
+    def nothing_heard(self, seconds: float) -> UserError:
+        """The error of a command that heard nothing, with what is likely the reason."""
+        known = {info.topic for info in registry.list_topics(self._run_dir)}
+        missing = [topic for topic in self.topics if topic not in known]
+        silent = [topic for topic in self.topics if topic in known]
+        why = [unknown_topic(topic, known) for topic in missing]
+        if silent:
+            why.append(f"{', '.join(silent)} has a publisher, but it is silent (ic topic info -v {silent[0]})")
+        return UserError(f"nothing came in {seconds:.0f} s: {'; '.join(why)}")

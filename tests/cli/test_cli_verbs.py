@@ -111,11 +111,24 @@ def test_every_verb_has_help_with_an_example(capsys: pytest.CaptureFixture[str])
     found = list(parsers(build_parser()))
     names = {parser.prog for parser in found}  # type: ignore[attr-defined]
     ours = {
-        "ic": {"run", "launch", "node", "topic", "bag", "replay", "param", "doctor"},
+        "ic": {
+            "run",
+            "launch",
+            "node",
+            "topic",
+            "bag",
+            "replay",
+            "param",
+            "doctor",
+            "completion",
+            "graph",
+            "top",
+            "log",
+        },
         "ic node": {"list", "info"},
-        "ic topic": {"list", "info", "echo", "hz", "bw"},
+        "ic topic": {"list", "info", "echo", "hz", "bw", "delay", "pub", "find", "type"},
         "ic bag": {"record", "play", "info", "diff", "recover"},
-        "ic param": {"list", "get"},
+        "ic param": {"list", "get", "set", "describe", "dump", "load"},
     }
     wanted = {f"{prefix} {verb}" for prefix, verbs in ours.items() for verb in verbs}
     assert wanted <= names
@@ -132,55 +145,6 @@ def test_help_loads_nothing_heavy() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert result.stdout.strip() == "[]"
-
-
-def test_node_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = ic(capsys, "node", "list")
-    assert status == 0 and out.startswith("talker  pid ")
-    status, out, _ = ic(capsys, "node", "info", "talker")
-    assert status == 0 and "  /scan: sensor_msgs/msg/LaserScan" in out and "  /order: std_msgs/msg/Bool" in out
-    status, _, error = ic(capsys, "node", "info", "nobody")
-    assert status == 1 and "node 'nobody' does not run" in error and "running: talker" in error
-
-
-def test_topic_list_and_info(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = ic(capsys, "topic", "list")
-    assert status == 0 and {"/scan", "/flag", "/heartbeat"} <= set(out.split())
-    assert "/scan         sensor_msgs/msg/LaserScan  talker (sensor)" in ic(capsys, "topic", "list", "-v")[1]
-    status, out, _ = ic(capsys, "topic", "info", "scan")
-    assert status == 0 and "type: sensor_msgs/msg/LaserScan\npublishers: 1\n  talker (pid" in out
-    assert "publishers: 0\nsubscribers: 1\n  talker" in ic(capsys, "topic", "info", "/order")[1]
-    status, _, error = ic(capsys, "topic", "info", "/nothing")
-    assert status == 1 and "nobody publishes or subscribes it" in error
-
-
-def test_topic_echo(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = ic(capsys, "topic", "echo", "/flag", "-n", "1", "--timeout", "30")
-    assert (status, out) == (0, "data: true\n---\n")  # latched: sent before we came
-    status, out, _ = ic(capsys, "topic", "echo", "/scan", "-n", "2", "--timeout", "30")
-    assert status == 0 and out.count("---") == 2
-    assert "  frame_id: 'velodyne'" in out and "ranges: [0, 1, 2, 3, 4, 5, ... 40 values]" in out
-    status, out, _ = ic(capsys, "topic", "echo", "/scan", "-n", "1", "--field", "ranges.39", "--timeout", "30")
-    assert (status, out) == (0, "39\n---\n")
-    status, out, _ = ic(capsys, "topic", "echo", "/scan", "-n", "1", "--field", "ranges", "--full", "--timeout", "30")
-    assert "38, 39]" in out
-    status, _, error = ic(capsys, "topic", "echo", "/scan", "-n", "1", "--field", "header.frame", "--timeout", "30")
-    assert status == 2 and "no field 'frame'" in error and "frame_id" in error
-    status, _, error = ic(capsys, "topic", "echo", "/nothing", "--timeout", "0.2")
-    assert status == 1 and "nobody publishes it" in error
-
-
-def test_topic_hz_and_bw(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = ic(capsys, "topic", "hz", "/scan", "--duration", "1.4")
-    last = out.strip().splitlines()[-1]
-    assert status == 0 and last.startswith("all: ") and last.endswith(" lost")
-    assert 5 < float(last.split()[1]) < 60  # 50 Hz on an idle machine, less on a busy one, never more
-    status, out, _ = ic(capsys, "topic", "bw", "/scan", "--duration", "1.4")
-    assert status == 0 and "MB/s" in out.splitlines()[-1]
-    with BagReader(record_scan(capsys)) as reader:
-        size = len(next(reader.messages({"/scan"})).payload)
-    assert out.splitlines()[-1].endswith(f"{size / 1000:.1f} kB a message")
-    assert ic(capsys, "topic", "hz", "/nothing", "--duration", "0.2")[0] == 1
 
 
 def record_scan(capsys: pytest.CaptureFixture[str]) -> Path:
@@ -207,16 +171,6 @@ def ic_process(*words: str, interrupt_after: object = None) -> tuple[int, str, s
 def _interrupt(process: subprocess.Popen[str], condition: object) -> None:
     wait_for(condition, "the moment to interrupt")
     process.send_signal(signal.SIGINT)
-
-
-def test_param_list_and_get(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = ic(capsys, "param", "list", "talker")
-    assert status == 0
-    assert out == "talker:\n  inner.depth: 7\n  label: hello\n  rate_hz: 50.0\n  use_sim_time: false\n"
-    assert ic(capsys, "param", "list")[1] == out
-    assert ic(capsys, "param", "get", "talker", "inner.depth")[:2] == (0, "7\n")
-    status, _, error = ic(capsys, "param", "get", "talker", "inner.dept")
-    assert status == 1 and "did you mean 'inner.depth'?" in error
 
 
 def test_bag_record_play_info_diff_recover(capsys: pytest.CaptureFixture[str], run_dir: Path, tmp_path: Path) -> None:
@@ -343,9 +297,7 @@ def test_launch_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> 
     assert status == 0 and "bag (must be given)" in out
 
 
-def test_run_wants_a_node(capsys: pytest.CaptureFixture[str]) -> None:
-    status, _, error = ic(capsys, "run", "warp_drive")
-    assert status == 2 and "there is no node 'warp_drive'; there are" in error and "bag_player" in error
+def test_run_tells_what_a_node_refuses() -> None:
     status, _, error = ic_process("run", "bag_player", "-p", "bag:=nowhere")
     assert status == 1 and "bag nowhere does not exist" in error and "Traceback" not in error
     status, _, error = ic_process("run", "bag_player", "-p", "rate:=-1", "-p", "bag:=x")

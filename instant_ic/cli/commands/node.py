@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from instant_ic.cli.errors import UserError
+from instant_ic.cli import completion
 
 
 def add_parser(subparsers: Any) -> None:
@@ -17,55 +17,80 @@ def add_parser(subparsers: Any) -> None:
     listing = verbs.add_parser(
         "list",
         help="names of the running nodes",
-        description="Lists the running nodes with process id, time since their start and module.",
-        epilog="example: ic node list",
+        description="Lists the running nodes.",
+        epilog="example: ic node list -v",
     )
+    listing.add_argument("-c", "--count-nodes", action="store_true", help="only how many there are")
+    listing.add_argument("-v", "--verbose", action="store_true", help="with process id, time since the start, module")
     listing.set_defaults(func=list_nodes)
     info = verbs.add_parser(
         "info",
-        help="topics and process of a node",
-        description="Tells what a node publishes and subscribes.",
+        help="state, process and topics of a node",
+        description="Tells what a node does: state, process, what it publishes and subscribes, at which rates.",
         epilog="example: ic node info grid_slam",
     )
-    info.add_argument("node", metavar="NODE")
+    info.add_argument("node", metavar="NODE").completer = completion.nodes
     info.set_defaults(func=show)
 
 
 def list_nodes(args: argparse.Namespace) -> int:
     """Prints a line a node."""
+    import sys
     import time
 
     from instant_ic import paths
     from instant_ic.bus import registry
 
     nodes = registry.list_nodes(paths.run_dir())
+    if args.count_nodes:
+        print(len(nodes))
+        return 0
     width = max([len(node.name) for node in nodes], default=0)
     for node in nodes:
         up_s = max(0.0, time.time() - node.started_ns / 1e9)
-        print(f"{node.name:<{width}}  pid {node.pid:<7}  up {up_s:6.0f} s  {node.module}")
+        print(
+            f"{node.name:<{width}}  pid {node.pid:<7}  up {up_s:6.0f} s  {node.module}" if args.verbose else node.name
+        )
     if not nodes:
-        print(f"no node runs in {paths.run_dir()}")
+        print(f"ic: no node runs in {paths.run_dir()}", file=sys.stderr)
     return 0
-
-
-def find(name: str) -> Any:
-    """A running node by name."""
-    from instant_ic import paths
-    from instant_ic.bus import registry
-
-    nodes = {node.name: node for node in registry.list_nodes(paths.run_dir())}
-    if name.strip("/") not in nodes:
-        running = ", ".join(nodes) or "none"
-        raise UserError(f"node {name!r} does not run in {paths.run_dir()} (running: {running})")
-    return nodes[name.strip("/")]
 
 
 def show(args: argparse.Namespace) -> int:
     """Prints one node."""
-    node = find(args.node)
+    import math
+
+    from instant_ic import paths
+    from instant_ic.bus.control import ControlError, NodeControl
+    from instant_ic.cli.heartbeats import Flow, hear
+    from instant_ic.cli.names import find_node
+
+    node = find_node(args.node)
     print(f"{node.name}: {node.module}, pid {node.pid}")
-    for title, topics in (("publishes", node.publishes), ("subscribes", node.subscribes)):
-        print(f"{title}:")
-        for topic, type_name in sorted(topics.items()):
-            print(f"  {topic}: {type_name}")
+    beat = hear(paths.run_dir(), [node.name]).get(node.name)
+    if beat is None:
+        print("state: silent, no heartbeat within 1.5 s")
+    else:
+        print(f"state: {beat.state}{f', {beat.message}' if beat.message else ''}")
+        print(f"process: {beat.cpu_percent:.0f} % of a core, {beat.rss_mb:.0f} MB")
+    try:
+        status = NodeControl(paths.run_dir(), node.name, 2.0).status()
+        doing = f", in {status['busy']} for {status['busy_s']:.1f} s" if status["busy_s"] > 0.5 else ""
+        print(f"threads: {status['threads']}{doing}")
+    except ControlError as error:
+        print(f"control: {error}")
+
+    def line(topic: str, kind: str, flow: Flow | None) -> str:
+        if flow is None:
+            return f"  {topic}: {kind}"
+        return f"  {topic}: {kind}" + (", no message yet" if math.isinf(flow.age_s) else f", {flow.rate_hz:.2f} Hz")
+
+    print("Publishers:")
+    for topic, kind in sorted(node.publishes.items()):
+        print(line(topic, kind, beat.outputs.get(topic) if beat else None))
+    print("Subscribers:")
+    for topic, kind in sorted(node.subscribes.items()):
+        lost = {p: count for (name, p), count in beat.lost.items() if name == topic} if beat else {}
+        words = f", lost {', '.join(f'{count} of {p}' for p, count in lost.items())}" if lost else ""
+        print(line(topic, kind, beat.inputs.get(topic) if beat else None) + words)
     return 0

@@ -1,82 +1,192 @@
-"""``ic param``: the parameters that running nodes were started with."""
+"""``ic param``: parameters of running nodes, read and changed."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from instant_ic.cli import completion
 from instant_ic.cli.errors import UserError
+
+if TYPE_CHECKING:
+    from instant_ic.bus.control import NodeControl
+    from instant_ic.bus.parameter_info import ParameterInfo
 
 
 def add_parser(subparsers: Any) -> None:
     """Adds the verb."""
     parser = subparsers.add_parser(
         "param",
-        help="parameters of running nodes",
-        description="Tells the parameters that running nodes were started with.",
-        epilog="example: ic param list grid_slam",
+        help="read and change parameters of running nodes",
+        description="Reads and changes parameters of running nodes.",
+        epilog="example: ic param set arbiter switch.yaw_deg 12",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
-    listing = verbs.add_parser(
-        "list",
-        help="all parameters of one node, or of all",
-        description="Lists parameters with their values.",
-        epilog="example: ic param list grid_slam",
-    )
-    listing.add_argument("node", nargs="?", metavar="NODE", help="default: every node")
-    listing.set_defaults(func=list_parameters)
-    get = verbs.add_parser(
-        "get",
-        help="one parameter",
-        description="Prints the value of one parameter.",
-        epilog="example: ic param get grid_slam field.resolution_m",
-    )
-    get.add_argument("node", metavar="NODE")
-    get.add_argument("key", metavar="KEY", help="nested keys with dots")
-    get.set_defaults(func=get_parameter)
+
+    def verb(name: str, words: str, function: Any, example: str) -> argparse.ArgumentParser:
+        added: argparse.ArgumentParser = verbs.add_parser(
+            name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: ic param {example}"
+        )
+        added.set_defaults(func=function)
+        return added
+
+    def argument(added: argparse.ArgumentParser, *names: str, completer: Any = None, **options: Any) -> None:
+        made = added.add_argument(*names, **options)
+        if completer is not None:
+            made.completer = completer  # type: ignore[attr-defined]
+
+    added = verb("list", "names of the parameters of one node, or of all", list_parameters, "list grid_slam")
+    argument(added, "node", nargs="?", metavar="NODE", help="default: every node", completer=completion.nodes)
+    added.add_argument("-v", "--values", action="store_true", help="with their values")
+    added = verb("get", "value of one parameter", get_parameter, "get grid_slam field.resolution_m")
+    argument(added, "node", metavar="NODE", completer=completion.nodes)
+    argument(added, "key", metavar="KEY", help="nested keys with dots", completer=completion.parameters)
+    added = verb("set", "changes parameters while the node runs", set_parameters, "set depth_estimator max_rate_hz 1")
+    argument(added, "node", metavar="NODE", completer=completion.nodes)
+    argument(
+        added, "pairs", metavar="KEY VALUE", nargs="+", completer=completion.parameters,
+        help="several are changed together, or none; values are YAML",
+    )  # fmt: skip
+    added = verb("describe", "type, range, default and meaning", describe, "describe arbiter switch.yaw_deg")
+    argument(added, "node", metavar="NODE", completer=completion.nodes)
+    argument(added, "keys", metavar="KEY", nargs="*", help="default: all", completer=completion.parameters)
+    added = verb("dump", "all parameters of a node as a parameter file", dump, "dump arbiter > arbiter.yaml")
+    argument(added, "node", metavar="NODE", completer=completion.nodes)
+    added.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: the standard output")
+    added = verb("load", "changes parameters to those of a file", load, "load arbiter arbiter.yaml")
+    argument(added, "node", metavar="NODE", completer=completion.nodes)
+    added.add_argument("file", metavar="FILE", type=Path, help="as ic param dump writes it")
+
+
+def _control(node: str) -> NodeControl:
+    from instant_ic import paths
+    from instant_ic.bus.control import NodeControl
+    from instant_ic.cli.names import find_node
+
+    return NodeControl(paths.run_dir(), find_node(node).name)
 
 
 def list_parameters(args: argparse.Namespace) -> int:
-    """Prints parameters by node."""
+    """Prints names (and values) by node, out of the registry: also where a node hangs."""
     from instant_ic import paths
-    from instant_ic.bus import registry
-    from instant_ic.cli.commands.node import find
+    from instant_ic.bus import params, registry
+    from instant_ic.cli.names import find_node
 
-    nodes = [find(args.node)] if args.node else registry.list_nodes(paths.run_dir())
+    nodes = [find_node(args.node)] if args.node else registry.list_nodes(paths.run_dir())
     if not nodes:
         print(f"no node runs in {paths.run_dir()}")
     for node in nodes:
         print(f"{node.name}:")
-        for key, value in sorted(flatten(node.params).items()):
-            print(f"  {key}: {_show(value)}")
+        for key, value in sorted(params.flatten(node.params).items()):
+            print(f"  {key}: {_show(value)}" if args.values else f"  {key}")
     return 0
 
 
 def get_parameter(args: argparse.Namespace) -> int:
-    """Prints one value."""
-    from instant_ic.cli.commands.node import find
+    """Prints one value, or those of a group."""
+    from instant_ic.bus import params
+    from instant_ic.cli.names import find_node
 
-    values = flatten(find(args.node).params)
-    if args.key not in values:
-        import difflib
-
-        close = difflib.get_close_matches(args.key, values, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else f"; ic param list {args.node} shows them"
-        raise UserError(f"node {args.node} has no parameter {args.key!r}{hint}")
-    print(_show(values[args.key]))
+    values = params.flatten(find_node(args.node).params)
+    group = {key: value for key, value in values.items() if key.startswith(f"{args.key}.")}
+    if args.key not in values and not group:
+        raise _no_parameter(args.node, args.key, values)
+    if args.key in values:
+        print(_show(values[args.key]))
+    for key, value in group.items():
+        print(f"{key}: {_show(value)}")
     return 0
 
 
-def flatten(params: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested parameters with dotted keys."""
-    flat: dict[str, Any] = {}
-    for key, value in params.items():
-        if isinstance(value, Mapping) and value:
-            flat.update(flatten(value, f"{prefix}{key}."))
-        else:
-            flat[prefix + key] = value
-    return flat
+def _no_parameter(node: str, key: str, known: Any) -> UserError:
+    from instant_ic.cli.names import near
+
+    return UserError(f"node {node} has no parameter {key!r} ({near(key, known, f'ic param list {node} shows them')})")
+
+
+def set_parameters(args: argparse.Namespace) -> int:
+    """Changes parameters together."""
+    import yaml
+
+    words = args.pairs
+    if len(words) % 2:
+        raise UserError(f"{words[-1]}: a value is missing (ic param set {args.node} KEY VALUE ...)", 2)
+    values = {}
+    for key, text in zip(words[::2], words[1::2], strict=True):
+        try:
+            values[key] = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise UserError(f"{key}: {text!r} is not YAML: {' '.join(str(error).split())}", 2) from None
+    return _change(args.node, values)
+
+
+def _change(node: str, values: dict[str, Any]) -> int:
+    changed = _control(node).set(values)
+    for key, value in changed.items():
+        print(f"{key}: {_show(value)}")
+    if not changed:
+        print("nothing to change: these values hold already")
+    return 0
+
+
+def describe(args: argparse.Namespace) -> int:
+    """Prints what is known of parameters."""
+    infos = {info.name: info for info in _control(args.node).describe()}
+    chosen: list[ParameterInfo] = []
+    for key in args.keys or infos:
+        found = [info for name, info in infos.items() if name == key or name.startswith(f"{key}.")]
+        if not found:
+            raise _no_parameter(args.node, key, infos)
+        chosen += found
+    for info in chosen:
+        print(f"Parameter name: {info.name}")
+        print(f"  Type: {info.type}{f', {info.range}' if info.range else ''}")
+        print(
+            f"  Value: {_show(info.value)}{'' if info.value == info.default else f' (default {_show(info.default)})'}"
+        )
+        print(f"  Live: {'yes' if info.live else 'no, takes effect at start'}")
+        if info.description:
+            print(f"  Description: {info.description}")
+    return 0
+
+
+def dump(args: argparse.Namespace) -> int:
+    """Writes a ROS 2 parameter file."""
+    import yaml
+
+    from instant_ic.cli.names import find_node
+
+    node = find_node(args.node)
+    nested: dict[str, Any] = {}
+    for key, value in _control(node.name).get().items():
+        *groups, last = key.split(".")
+        place = nested
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[last] = value
+    text = yaml.safe_dump({node.name: {"ros__parameters": nested}}, sort_keys=False, default_flow_style=None, width=100)
+    if args.output is None:
+        print(text, end="")
+        return 0
+    try:
+        args.output.write_text(text)
+    except OSError as error:
+        raise UserError(f"{args.output} cannot be written: {error.strerror}") from error
+    print(f"{args.output}: {len(nested)} parameters of {node.name}")
+    return 0
+
+
+def load(args: argparse.Namespace) -> int:
+    """Changes parameters to those of a file; those that are as in the file need not be live."""
+    from instant_ic.bus import params
+    from instant_ic.cli.names import find_node
+
+    name = find_node(args.node).name
+    values = params.load_file(args.file, name)
+    if not values:
+        raise UserError(f"{args.file} has no parameters for {name} (it must have a section {name!r} or '/**')", 2)
+    return _change(name, {key: value.value for key, value in values.items()})
 
 
 def _show(value: Any) -> str:

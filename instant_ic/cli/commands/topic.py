@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import time
 from typing import Any
 
+from instant_ic.cli import completion
+from instant_ic.cli.arguments import not_negative, positive, positive_int
 from instant_ic.cli.errors import UserError
 
 
@@ -13,171 +14,184 @@ def add_parser(subparsers: Any) -> None:
     """Adds the verb."""
     parser = subparsers.add_parser(
         "topic",
-        help="list, watch and measure topics",
-        description="Looks at topics.",
+        help="list, watch, measure and publish topics",
+        description="Looks at topics, and publishes to them.",
         epilog="example: ic topic hz /scan",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
 
-    def verb(name: str, words: str, function: Any, example: str, topic: bool = True) -> argparse.ArgumentParser:
+    def verb(name: str, words: str, function: Any, example: str) -> argparse.ArgumentParser:
         added: argparse.ArgumentParser = verbs.add_parser(
             name, help=words, description=f"{words[0].upper()}{words[1:]}.", epilog=f"example: {example}"
         )
-        if topic:
-            added.add_argument("topic", metavar="TOPIC")
         added.set_defaults(func=function)
         return added
 
-    listing = verb("list", "names of the topics that have a publisher", list_topics, "ic topic list -v", topic=False)
-    listing.add_argument("-v", "--verbose", action="store_true", help="with type, QoS and publishers")
-    verb("info", "type, publishers and subscribers of a topic", info, "ic topic info /scan")
-    echo_parser = verb("echo", "prints messages as they come", echo, "ic topic echo /pose -n 1 --field pose.pose")
-    echo_parser.add_argument("-n", type=_positive_int, default=0, metavar="COUNT", help="end after so many messages")
-    echo_parser.add_argument("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
-    echo_parser.add_argument("--full", action="store_true", help="long arrays and byte strings in full")
-    echo_parser.add_argument(
-        "--timeout", type=_positive, default=float("inf"), metavar="S", help="end after this time without COUNT"
+    def topic(added: argparse.ArgumentParser, nargs: str | None = None) -> None:
+        argument = added.add_argument("topic", metavar="TOPIC", nargs=nargs)
+        argument.completer = completion.topics  # type: ignore[attr-defined]
+
+    added = verb("list", "names of the topics that are published or subscribed", list_topics, "ic topic list -t")
+    added.add_argument("-t", "--show-types", action="store_true", help="with the type of each")
+    added.add_argument("-c", "--count-topics", action="store_true", help="only how many there are")
+    added.add_argument("-v", "--verbose", action="store_true", help="with type, QoS, publishers and readers")
+
+    added = verb("type", "type of a topic", show_type, "ic topic type /scan")
+    topic(added)
+
+    added = verb("find", "topics of a type", find, "ic topic find sensor_msgs/msg/Image")
+    argument = added.add_argument("type", metavar="TYPE", help="full or short name")
+    argument.completer = completion.types  # type: ignore[attr-defined]
+
+    added = verb("info", "type, publishers and subscribers of a topic", info, "ic topic info -v /scan")
+    topic(added)
+    added.add_argument(
+        "-v", "--verbose", action="store_true", help="with QoS, rates, and losses from each publisher to each reader"
     )
+
+    added = verb("echo", "prints messages as they come", echo, "ic topic echo /pose --once --field pose.pose")
+    topic(added)
+    added.add_argument("--once", action="store_true", help="end after the first message")
+    added.add_argument("-n", type=positive_int, default=0, metavar="COUNT", help="end after so many messages")
+    added.add_argument("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
+    added.add_argument("-f", "--full-length", "--full", action="store_true", help="long arrays and strings in full")
+    added.add_argument(
+        "-l", "--truncate-length", type=positive_int, default=12, metavar="N",
+        help="values of an array, or tens of characters, from which on the rest is left out (default: %(default)s)",
+    )  # fmt: skip
+    added.add_argument("--no-arr", action="store_true", help="leave out the values of arrays")
+    added.add_argument("--no-str", action="store_true", help="leave out strings")
+    added.add_argument("--csv", action="store_true", help="one line of comma-separated values for each message")
+    added.add_argument("--json", action="store_true", help="one line of JSON for each message, nothing left out")
+    added.add_argument(
+        "--timeout", type=positive, default=float("inf"), metavar="S", help="end after this time without COUNT"
+    )
+
     for name, words, function in (
-        ("hz", "rate, jitter and losses of a topic, once a second", rate),
-        ("bw", "bytes a second of a topic, once a second", bandwidth),
+        ("hz", "rate, jitter and losses of topics, once a second", rate),
+        ("bw", "bytes a second of topics, once a second", bandwidth),
+        ("delay", "age of messages by their stamp when they come, once a second", delay),
     ):
         added = verb(name, words, function, f"ic topic {name} /scan")
-        added.add_argument("--duration", type=_positive, default=float("inf"), metavar="S", help="default: no end")
+        topic(added, "+")
+        added.add_argument(
+            "-w", "--window", type=positive_int, default=10_000 if name == "hz" else 100, metavar="N",
+            help="messages that count (default: %(default)s)",
+        )  # fmt: skip
+        added.add_argument("--duration", type=positive, default=float("inf"), metavar="S", help="default: no end")
+        if name != "bw":
+            added.add_argument("--use-sim-time", action="store_true", help="by the time of /clock")
 
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"must be > 0 (got {text})")
-    return value
-
-
-def _positive_int(text: str) -> int:
-    value = int(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"must be > 0 (got {text})")
-    return value
+    added = verb("pub", "publishes messages", publish, "ic topic pub --once /flag std_msgs/msg/Bool '{data: true}'")
+    topic(added)
+    argument = added.add_argument("type", metavar="TYPE", help="full or short name, for example TwistStamped")
+    argument.completer = completion.types  # type: ignore[attr-defined]
+    added.add_argument(
+        "values", metavar="YAML", nargs="?", default="{}",
+        help="values of its fields; the others are zero; 'header: auto' and 'stamp: now' take the time",
+    )  # fmt: skip
+    added.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="default: %(default)s")
+    added.add_argument("-1", "--once", action="store_true", help="publish one message")
+    added.add_argument("-n", "--times", type=positive_int, default=0, metavar="N", help="publish so many messages")
+    added.add_argument(
+        "-w", "--wait-matching-subscriptions", type=not_negative, metavar="N", dest="readers",
+        help="wait for so many readers first (default: 1 with --once or -n, else 0)",
+    )  # fmt: skip
+    added.add_argument(
+        "--max-wait-time-secs", type=positive, default=10.0, metavar="S", help="for readers (default: %(default)s)"
+    )
+    added.add_argument("--qos", choices=("sensor", "reliable", "latched"), default="reliable", help="default: reliable")
+    added.add_argument("--use-sim-time", action="store_true", help="stamps by the time of /clock")
+    added.add_argument("-p", "--print", type=positive_int, default=1, metavar="N", help="print every Nth message")
+    added.add_argument("--force", action="store_true", help="also where a node commands the robot on this topic")
 
 
 def list_topics(args: argparse.Namespace) -> int:
     """Prints a line a topic."""
     from instant_ic import paths
     from instant_ic.bus import registry
+    from instant_ic.cli.names import topic_types
 
-    topics = registry.list_topics(paths.run_dir())
-    width = max([len(info.topic) for info in topics], default=0)
-    for info in topics:
-        if not args.verbose:
-            print(info.topic)
-            continue
-        publishers = ", ".join(f"{p.node} ({p.qos})" for p in info.publishers)
-        print(f"{info.topic:<{width}}  {info.type_name}  {publishers}")
+    types = topic_types()
+    if args.count_topics:
+        print(len(types))
+        return 0
+    if not args.verbose:
+        for topic, name in types.items():
+            print(f"{topic} [{name}]" if args.show_types else topic)
+        return 0
+    published = {entry.topic: entry for entry in registry.list_topics(paths.run_dir())}
+    nodes = registry.list_nodes(paths.run_dir())
+    width = max([len(topic) for topic in types], default=0)
+    for topic, name in types.items():
+        publishers = (
+            ", ".join(f"{p.node} ({p.qos})" for p in published[topic].publishers) if topic in published else "-"
+        )
+        readers = ", ".join(node.name for node in nodes if topic in node.subscribes) or "-"
+        print(f"{topic:<{width}}  {name}  {publishers} → {readers}")
+    return 0
+
+
+def show_type(args: argparse.Namespace) -> int:
+    """Prints a type."""
+    from instant_ic.cli.names import absolute, near, topic_types
+
+    types = topic_types()
+    if absolute(args.topic) not in types:
+        raise UserError(f"nobody publishes or subscribes {args.topic} ({near(args.topic, types, 'ic topic list')})")
+    print(types[absolute(args.topic)])
+    return 0
+
+
+def find(args: argparse.Namespace) -> int:
+    """Prints the topics of one type."""
+    from instant_ic.cli.names import topic_types
+
+    package, _, short = args.type.rpartition("/")
+    for topic, name in topic_types().items():
+        parts = name.split("/")
+        if parts[-1] == short and package.split("/")[0] in ("", parts[0]):
+            print(topic)
     return 0
 
 
 def info(args: argparse.Namespace) -> int:
     """Prints one topic."""
-    from instant_ic import paths
-    from instant_ic.bus import registry
+    from instant_ic.cli.topic_info import show
 
-    topic = args.topic if args.topic.startswith("/") else f"/{args.topic}"
-    found = [entry for entry in registry.list_topics(paths.run_dir()) if entry.topic == topic]
-    readers = [node for node in registry.list_nodes(paths.run_dir()) if topic in node.subscribes]
-    if not found and not readers:
-        raise UserError(f"{topic}: nobody publishes or subscribes it: ic topic list")
-    print(f"topic: {topic}")
-    print(f"type: {found[0].type_name if found else readers[0].subscribes[topic]}")
-    publishers = found[0].publishers if found else []
-    print(f"publishers: {len(publishers)}")
-    for publisher in publishers:
-        other = f", type {publisher.type_name}" if publisher.type_name != found[0].type_name else ""
-        print(f"  {publisher.node} (pid {publisher.pid}, QoS {publisher.qos}{other})")
-    print(f"subscribers: {len(readers)}")
-    for node in readers:
-        print(f"  {node.name} (pid {node.pid})")
-    return 0
+    return show(args.topic, args.verbose)
 
 
 def echo(args: argparse.Namespace) -> int:
     """Prints messages."""
-    from instant_ic.cli.messages import describe, field
-    from instant_ic.cli.observer import Observer, nothing_heard
-    from instant_ic.msg import deserialize
+    from instant_ic.cli.topic_watch import echo
 
-    count = 0
-    with Observer(args.topic) as observer:
-        for batch in observer.batches(args.timeout, 0.5):
-            for received in batch:
-                message: Any = deserialize(received.payload, received.type_name)
-                try:
-                    value = field(message, args.field)
-                except AttributeError as error:
-                    raise UserError(f"{received.type_name}: {error}", 2) from None
-                print(describe(value, args.full))
-                print("---", flush=True)
-                count += 1
-                if count == args.n:
-                    return 0
-        if count < args.n or not count:
-            raise nothing_heard(observer.topic, args.timeout)
-    return 0
+    return echo(args)
 
 
 def rate(args: argparse.Namespace) -> int:
-    """Prints the rate over each second."""
-    from instant_ic.cli.observer import Observer, nothing_heard
+    """Prints rates."""
+    from instant_ic.cli.topic_watch import rate
 
-    stamps: list[float] = []
-    next_s = time.monotonic() + 1.0
-    with Observer(args.topic) as observer:
-        for batch in observer.batches(args.duration, 0.1):
-            stamps += [received.received_ns / 1e9 for received in batch]
-            if time.monotonic() >= next_s:
-                next_s += 1.0
-                print(_rate_line(stamps[-1000:], observer.subscription.stats.lost), flush=True)
-        if len(stamps) < 2:
-            raise nothing_heard(observer.topic, args.duration)
-        print(f"all: {_rate_line(stamps, observer.subscription.stats.lost)}")
-    return 0
-
-
-def _rate_line(stamps: list[float], lost: int) -> str:
-    from itertools import pairwise
-    from statistics import fmean, pstdev
-
-    gaps = [later - earlier for earlier, later in pairwise(stamps)]
-    if not gaps:
-        return "no new message"
-    mean = fmean(gaps)
-    hz = 1.0 / mean if mean > 0 else float("inf")
-    return (
-        f"{hz:.2f} Hz, period min {min(gaps) * 1e3:.1f} ms max {max(gaps) * 1e3:.1f} ms "
-        f"std {pstdev(gaps) * 1e3:.1f} ms, {len(stamps)} messages, {lost} lost"
-    )
+    return rate(args)
 
 
 def bandwidth(args: argparse.Namespace) -> int:
     """Prints bytes a second."""
-    from instant_ic.cli.observer import Observer, nothing_heard
+    from instant_ic.cli.topic_watch import bandwidth
 
-    began_s = last_s = time.monotonic()
-    total = messages = since = since_messages = 0
-    with Observer(args.topic) as observer:
-        for batch in observer.batches(args.duration, 0.1):
-            since += sum(len(received.payload) for received in batch)
-            since_messages += len(batch)
-            now_s = time.monotonic()
-            if now_s - last_s >= 1.0:
-                print(_bandwidth_line(since, since_messages, now_s - last_s), flush=True)
-                total, messages, since, since_messages, last_s = total + since, messages + since_messages, 0, 0, now_s
-        total, messages = total + since, messages + since_messages
-        if not messages:
-            raise nothing_heard(observer.topic, args.duration)
-        print(f"all: {_bandwidth_line(total, messages, time.monotonic() - began_s)}")
-    return 0
+    return bandwidth(args)
 
 
-def _bandwidth_line(size: int, messages: int, seconds: float) -> str:
-    mean = f"{size / messages / 1e3:.1f} kB a message" if messages else "no message"
-    return f"{size / seconds / 1e6:.3f} MB/s, {messages} messages, {mean}"
+def delay(args: argparse.Namespace) -> int:
+    """Prints ages."""
+    from instant_ic.cli.topic_watch import delay
+
+    return delay(args)
+
+
+def publish(args: argparse.Namespace) -> int:
+    """Publishes messages."""
+    from instant_ic.cli.topic_pub import publish
+
+    return publish(args)

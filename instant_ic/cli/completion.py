@@ -1,0 +1,82 @@
+"""What the shell completes: topics, nodes, parameters, types, launch files, bags.
+
+Called by argcomplete at each press of TAB: nothing heavy may be imported here, and no error may come out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+
+def _quiet(function: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
+    def complete(prefix: str = "", parsed_args: Any = None, **_: Any) -> list[str]:
+        try:
+            return [word for word in function(parsed_args) if word.startswith(prefix)]
+        except Exception:  # noqa: BLE001 - a trace in the middle of the user's command line helps nobody
+            return []
+
+    return complete
+
+
+@_quiet
+def topics(args: Any) -> Iterable[str]:
+    """Topics that are published or subscribed."""
+    from instant_ic.cli.names import topic_types
+
+    return topic_types()
+
+
+@_quiet
+def nodes(args: Any) -> Iterable[str]:
+    """Nodes that run."""
+    from instant_ic import paths
+    from instant_ic.bus import registry
+
+    return [node.name for node in registry.list_nodes(paths.run_dir())]
+
+
+@_quiet
+def parameters(args: Any) -> Iterable[str]:
+    """Parameters of the node that stands before on the command line."""
+    from instant_ic import paths
+    from instant_ic.bus import params, registry
+
+    for node in registry.list_nodes(paths.run_dir()):
+        if args is not None and node.name == str(args.node).strip("/"):
+            return params.flatten(node.params)
+    return []
+
+
+@_quiet
+def types(args: Any) -> Iterable[str]:
+    """Message types on the bus now, the others of ROS 2 after them by their files."""
+    from instant_ic.cli.names import topic_types
+
+    found = set(topic_types().values()) - {"any"}
+    definitions = Path(__file__).resolve().parents[1] / "msg" / "definitions"
+    return sorted(found | {f"{path.parent.name}/msg/{path.stem}" for path in definitions.glob("*/*.msg")})
+
+
+@_quiet
+def programs(args: Any) -> Iterable[str]:
+    """Nodes that can be started."""
+    folder = Path(__file__).resolve().parents[1] / "nodes"
+    return sorted(path.stem for path in folder.glob("[a-z]*.py"))
+
+
+@_quiet
+def launch_files(args: Any) -> Iterable[str]:
+    """Shipped launch files by name, and those in the working directory."""
+    from instant_ic import paths
+
+    shipped = [path.stem for path in paths.share_dir("launch").glob("*.yaml")]
+    return sorted(shipped) + sorted(str(path) for path in Path().glob("*.yaml"))
+
+
+@_quiet
+def bags(args: Any) -> Iterable[str]:
+    """Bags in the working directory and one folder down."""
+    found = [path.parent for pattern in ("*/metadata.yaml", "*/*/metadata.yaml") for path in Path().glob(pattern)]
+    return sorted(str(path) for path in [*found, *Path().glob("*.mcap"), *Path().glob("*.bag")])

@@ -1,0 +1,160 @@
+"""A message out of YAML as the user types it; every mistake is told with the path of its field."""
+
+from __future__ import annotations
+
+import difflib
+from typing import Any
+
+import numpy as np
+import yaml
+
+from instant_ic.cli.errors import UserError
+from instant_ic.msg import MessageError, message_type, to_time, type_name, typestore
+
+_INTEGERS = {
+    name: (np.iinfo(kind).min, np.iinfo(kind).max)
+    for name, kind in {
+        **{f"{sign}int{bits}": np.dtype(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)},
+        **dict.fromkeys(("byte", "char", "octet"), np.dtype("uint8")),
+    }.items()
+}
+_FLOATS = ("float32", "float64")
+_BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
+
+TIME = "builtin_interfaces/msg/Time"
+HEADER = "std_msgs/msg/Header"
+QUATERNION = "geometry_msgs/msg/Quaternion"  # its w is 1 where nothing is given, as its definition says
+
+
+def parse(text: str, name: str) -> Any:
+    """YAML text as the values of a message.
+
+    Raises:
+        UserError: it is not YAML, or not a mapping.
+    """
+    try:
+        values = yaml.safe_load(text) if text.strip() else {}
+    except yaml.YAMLError as error:
+        raise UserError(f"the values are not YAML: {' '.join(str(error).split())}", 2) from None
+    if not isinstance(values, dict):
+        example = next(iter(fields(name)), ("field", None))[0]
+        raise UserError(f"the values of a {name} must be a mapping such as '{{{example}: ...}}' (got {text!r})", 2)
+    return values
+
+
+def fields(name: str) -> list[tuple[str, Any]]:
+    """Fields of a message type, with rosbags' descriptions of their types.
+
+    Raises:
+        UserError: there is no such type.
+    """
+    try:
+        full = type_name(message_type(name))
+    except MessageError as error:
+        short = [known.rsplit("/", 1)[1] for known in typestore().types]
+        close = difflib.get_close_matches(name.rsplit("/", 1)[-1], short, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise UserError(f"{error}{hint}", 2) from None
+    return list(typestore().get_msgdef(full).fields)
+
+
+def build(name: str, values: Any, now_ns: int, path: str = "") -> Any:
+    """A message with the given values; fields that are not given are zero or empty.
+
+    ``header: auto`` and ``stamp: now`` take the present time.
+
+    Args:
+        name: type of the message, full or short.
+        values: mapping of field → value.
+        now_ns: for ``auto`` and ``now``.
+        path: of this message within the whole, for errors.
+
+    Raises:
+        UserError: a field is unknown, or its value does not fit; the words name its path.
+    """
+    known = dict(fields(name))
+    full = type_name(message_type(name))
+    if full == TIME and values == "now":
+        return to_time(now_ns)
+    if full == HEADER and values == "auto":
+        values = {"stamp": "now"}
+    if not isinstance(values, dict):
+        raise _misfit(path, f"a mapping with the fields of {full}", values)
+    if full == QUATERNION:
+        values = {"w": 1.0, **values}
+    for key in values:
+        if key not in known:
+            close = difflib.get_close_matches(str(key), known, n=1)
+            hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(known)}"
+            raise UserError(f"{full} has no field {_join(path, key)!r} ({hint})", 2)
+    arguments = {
+        key: _value(kind, values[key], now_ns, _join(path, key)) if key in values else _empty(kind, now_ns)
+        for key, kind in known.items()
+    }
+    return message_type(full)(**arguments)
+
+
+def _join(path: str, key: Any) -> str:
+    return f"{path}.{key}" if path else str(key)
+
+
+def _misfit(path: str, wanted: str, value: Any) -> UserError:
+    return UserError(f"{path or 'the message'} must be {wanted} (got {value!r})", 2)
+
+
+def _empty(kind: Any, now_ns: int) -> Any:
+    node, detail = kind
+    if node == _NAME:
+        return build(detail, {}, now_ns)
+    if node == _BASE:
+        return {"string": "", "wstring": "", "bool": False}.get(detail[0], 0.0 if detail[0] in _FLOATS else 0)
+    inner, length = detail
+    if inner[0] == _BASE and inner[1][0] not in ("string", "wstring"):
+        return np.zeros(length if node == _ARRAY else 0, _dtype(inner[1][0]))
+    return [_empty(inner, now_ns) for _ in range(length if node == _ARRAY else 0)]
+
+
+def _dtype(base: str) -> Any:
+    return np.dtype({"byte": "uint8", "char": "uint8", "octet": "uint8", "bool": "bool"}.get(base, base))
+
+
+def _value(kind: Any, value: Any, now_ns: int, path: str) -> Any:
+    node, detail = kind
+    if node == _NAME:
+        return build(detail, value, now_ns, path)
+    if node == _BASE:
+        return _scalar(detail[0], detail[1], value, path)
+    inner, length = detail
+    if not isinstance(value, list):
+        raise _misfit(path, "a list", value)
+    if node == _ARRAY and len(value) != length:
+        raise UserError(f"{path} must have {length} values (got {len(value)})", 2)
+    if node == _SEQUENCE and length and len(value) > length:
+        raise UserError(f"{path} must have at most {length} values (got {len(value)})", 2)
+    parts = [_value(inner, part, now_ns, f"{path}[{index}]") for index, part in enumerate(value)]
+    if inner[0] == _BASE and inner[1][0] not in ("string", "wstring"):
+        return np.array(parts, _dtype(inner[1][0]))
+    return parts
+
+
+def _scalar(base: str, most: int, value: Any, path: str) -> Any:
+    if base == "bool":
+        if isinstance(value, bool):
+            return value
+    elif base in ("string", "wstring"):
+        if isinstance(value, str):
+            if most and len(value) > most:
+                raise UserError(f"{path} must have at most {most} characters (got {len(value)})", 2)
+            return value
+    elif base in _FLOATS:
+        if isinstance(value, (int, float, str)) and not isinstance(value, bool):  # YAML 1.1 takes 1e-3 for a word
+            try:
+                return float(value)
+            except (ValueError, OverflowError):
+                raise _misfit(path, base, value) from None
+    elif isinstance(value, int) and not isinstance(value, bool):
+        low, high = _INTEGERS[base]
+        if low <= value <= high:
+            return value
+        raise _misfit(path, f"{base}, {low}..{high}", value)
+    raise _misfit(path, base, value)

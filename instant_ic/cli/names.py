@@ -1,0 +1,50 @@
+"""Names of topics and nodes that the user types: found in the registry, or told what is near."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+from instant_ic import paths
+from instant_ic.bus import registry
+from instant_ic.cli.errors import UserError
+
+
+def absolute(topic: str) -> str:
+    """A topic's name with its leading slash."""
+    return topic if topic.startswith("/") else f"/{topic}"
+
+
+def near(name: str, known: Iterable[str], otherwise: str) -> str:
+    """``did you mean 'x'?`` where a known name is near, else ``otherwise``."""
+    close = difflib.get_close_matches(name, list(known), n=1)
+    return f"did you mean {close[0]!r}?" if close else otherwise
+
+
+def topic_types() -> dict[str, str]:
+    """Every topic that is published or subscribed → its type (``any`` where only readers of any type know it)."""
+    run_dir = paths.run_dir()
+    types = {info.topic: info.type_name for info in registry.list_topics(run_dir)}
+    for node in registry.list_nodes(run_dir):
+        for topic, name in node.subscribes.items():
+            if types.get(topic, "any") == "any":
+                types[topic] = name
+    return dict(sorted(types.items()))
+
+
+def unknown_topic(topic: str, known: Iterable[str]) -> str:
+    """What is told of a topic that nobody publishes."""
+    return f"nobody publishes {topic} ({near(topic, known, 'ic topic list shows what there is')})"
+
+
+def find_node(name: str) -> registry.NodeInfo:
+    """A running node.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    nodes = {node.name: node for node in registry.list_nodes(paths.run_dir())}
+    if name.strip("/") not in nodes:
+        hint = near(name.strip("/"), nodes, f"running: {', '.join(nodes) or 'none'}")
+        raise UserError(f"node {name!r} does not run in {paths.run_dir()} ({hint})")
+    return nodes[name.strip("/")]

@@ -1,0 +1,104 @@
+"""``ic topic pub``: messages from the command line, checked before the first is sent."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from instant_ic import paths
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, registry
+from instant_ic.bus.node import Publisher
+from instant_ic.cli.errors import UserError
+from instant_ic.cli.message_input import build, fields, parse
+from instant_ic.cli.messages import Style, describe
+from instant_ic.cli.names import absolute
+from instant_ic.cli.observer import Observer
+from instant_ic.msg import message_type, type_name
+
+_QOS = {"sensor": SENSOR, "reliable": RELIABLE, "latched": LATCHED}
+_KEEP_S = 0.2  # the last message is still on its way when the last one is published
+
+
+def publish(args: argparse.Namespace) -> int:
+    """Publishes messages until Ctrl-C, or as many as were asked for.
+
+    Raises:
+        UserError: the type, a value or the topic does not fit; a node commands the robot there; nobody listens.
+    """
+    topic = registry.check_topic(absolute(args.topic))
+    fields(args.type)  # tells of an unknown type
+    full = type_name(message_type(args.type))
+    values = parse(args.values, full)
+    build(full, values, time.time_ns())  # tells of values that do not fit
+    _check_topic(topic, full, args.force)
+    wanted = 1 if args.once else args.times
+    readers = args.readers if args.readers is not None else int(wanted > 0)
+    with Observer([], args.use_sim_time) as observer:
+        transport = observer.transport
+        if args.use_sim_time:
+            _wait_for_clock(observer, args.max_wait_time_secs)
+        publisher = Publisher(transport.advertise(topic, full, _QOS[args.qos]))
+        _wait_for_readers(publisher, readers, args.max_wait_time_secs)
+        count = 0
+        next_s = time.monotonic()
+        while True:
+            observer.follow_clock()
+            message = build(full, values, observer.clock.now_ns())
+            publisher.publish(message)
+            count += 1
+            if count % args.print == 0:
+                print(f"publishing #{count}: {full}\n{describe(message, Style())}\n", flush=True)
+            if count == wanted:
+                break
+            next_s = max(next_s + 1.0 / args.rate, time.monotonic())
+            time.sleep(max(0.0, next_s - time.monotonic()))
+        time.sleep(_KEEP_S)
+    return 0
+
+
+def _check_topic(topic: str, full: str, force: bool) -> None:
+    run_dir = paths.run_dir()
+    nodes = registry.list_nodes(run_dir)
+    found = next((entry for entry in registry.list_topics(run_dir) if entry.topic == topic), None)
+    types = {p.node: p.type_name for p in found.publishers} if found else {}
+    types |= {node.name: node.subscribes[topic] for node in nodes if node.subscribes.get(topic, "any") != "any"}
+    for node, other in types.items():
+        if other != full:
+            raise UserError(f"{topic} is a {other} for {node}: a {full} would be refused there", 2)
+    if not topic.endswith("/cmd_vel"):
+        return
+    writers = ", ".join(p.node for p in found.publishers) if found else ""
+    readers = ", ".join(node.name for node in nodes if topic in node.subscribes) or "whoever reads it"
+    if writers and not force:
+        raise UserError(
+            f"{topic} is written by {writers}, which keeps the robot safe: a second writer would drive it past that. "
+            "Stop that node first, or add --force where nothing can be hit",
+            2,
+        )
+    beside = f" beside {writers}" if writers else ""
+    print(f"ic: {topic} drives the robot ({readers}){beside}: keep the emergency stop at hand", file=sys.stderr)
+
+
+def _wait_for_clock(observer: Observer, seconds: float) -> None:
+    deadline_s = time.monotonic() + seconds
+    while observer.clock.now_ns() == 0:
+        if time.monotonic() > deadline_s:
+            raise UserError(f"no /clock within {seconds:g} s: leave out --use-sim-time, or start what publishes it")
+        time.sleep(0.01)
+        observer.follow_clock()
+
+
+def _wait_for_readers(publisher: Publisher, wanted: int, seconds: float) -> None:
+    deadline_s = time.monotonic() + seconds
+    told = False
+    while publisher.subscriber_count < wanted:
+        if time.monotonic() > deadline_s:
+            raise UserError(
+                f"{publisher.topic}: {publisher.subscriber_count} of {wanted} readers within {seconds:g} s; "
+                "-w 0 publishes without"
+            )
+        if not told and time.monotonic() > deadline_s - seconds + 0.5:
+            told = True
+            print(f"Waiting for at least {wanted} matching subscription(s)...", file=sys.stderr, flush=True)
+        time.sleep(0.01)

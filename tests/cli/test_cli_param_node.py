@@ -1,0 +1,220 @@
+"""``ic param``, ``ic node`` and ``ic log level`` against a node in a process of its own."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+from cli_helpers import TALKER, talking, wait_until
+
+from instant_ic.bus import registry
+from instant_ic.bus.control import NodeControl
+
+
+@pytest.fixture(autouse=True)
+def in_run_dir(talker, monkeypatch):
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(talker))
+
+
+def test_list_and_get(ic):
+    keys = ["drives", "inner.depth", "inner.share", "label", "late_s", "nice", "rate_hz", "use_sim_time"]
+    assert ic("param", "list", "talker")[:2] == (0, "talker:\n" + "".join(f"  {key}\n" for key in keys))
+    assert "  inner.depth: 7\n" in ic("param", "list", "-v")[1]
+    assert ic("param", "get", "talker", "inner.depth")[:2] == (0, "7\n")
+    assert ic("param", "get", "/talker", "inner")[:2] == (0, "inner.depth: 7\ninner.share: 0.5\n")
+    status, _, error = ic("param", "get", "talker", "inner.dept")
+    assert status == 1 and "did you mean 'inner.depth'?" in error
+    status, _, error = ic("param", "get", "talkr", "inner.depth")
+    assert status == 1 and "node 'talkr' does not run" in error and "did you mean 'talker'?" in error
+
+
+def test_describe(ic):
+    status, out, _ = ic("param", "describe", "talker", "inner.share", "rate_hz")
+    assert status == 0
+    assert out == (
+        "Parameter name: inner.share\n  Type: float, 0..1\n  Value: 0.5\n  Live: yes\n  Description: how much of it.\n"
+        "Parameter name: rate_hz\n  Type: float, > 0\n  Value: 50.0\n  Live: no, takes effect at start\n"
+        "  Description: scans a second.\n"
+    )
+    assert "Value: 7 (default 3)" in ic("param", "describe", "talker", "inner")[1]
+    assert ic("param", "describe", "talker")[1].count("Parameter name: ") == 8
+
+
+def test_set_is_seen_in_what_the_node_does_and_tells(ic):
+    assert ic("param", "set", "talker", "label", "bonjour", "inner.share", "0.75")[:2] == (
+        0,
+        "label: bonjour\ninner.share: 0.75\n",
+    )
+    wait_until(lambda: "bonjour" in ic("topic", "echo", "/scan", "--once", "--field", "header.frame_id")[1], "bonjour")
+    wait_until(lambda: ic("param", "get", "talker", "label")[1] == "bonjour\n", "the registry")
+    assert "nothing to change" in ic("param", "set", "talker", "label", "bonjour")[1]
+    ic("param", "set", "talker", "label", "hello", "inner.share", "0.5")
+    for words, told in (
+        (("rate_hz", "20"), "rate_hz takes effect at start: restart the node"),
+        (("inner.share", "2"), "talker: inner.share must lie in 0..1 (got 2)"),
+        (("inner.share", "much"), "inner.share must be float (got 'much')"),
+        (("labell", "x"), "unknown parameter 'labell'; did you mean 'label'?"),
+        (("label",), "label: a value is missing"),
+        (("label", "[a"), "label: '[a' is not YAML"),
+    ):
+        status, out, error = ic("param", "set", "talker", *words)
+        assert status == 2 and told in error and out == "", (words, error)
+    assert NodeControl(registry_dir(), "talker").get()["label"] == "hello"
+
+
+def registry_dir():
+    from instant_ic import paths
+
+    return paths.run_dir()
+
+
+def test_dump_and_load(ic, tmp_path):
+    file = tmp_path / "talker.yaml"
+    status, out, _ = ic("param", "dump", "talker", "-o", str(file))
+    assert status == 0 and str(file) in out
+    content = yaml.safe_load(file.read_text())["talker"]["ros__parameters"]
+    assert content["inner"] == {"depth": 7, "share": 0.5} and content["use_sim_time"] is False
+    assert yaml.safe_load(ic("param", "dump", "talker")[1])["talker"]["ros__parameters"] == content
+    assert "nothing to change" in ic("param", "load", "talker", str(file))[1]
+    file.write_text(file.read_text().replace("share: 0.5", "share: 0.25"))
+    assert ic("param", "load", "talker", str(file))[:2] == (0, "inner.share: 0.25\n")
+    file.write_text("/**:\n  ros__parameters:\n    inner:\n      share: 0.5\n      depth: 8\n")
+    status, _, error = ic("param", "load", "talker", str(file))
+    assert status == 2 and "inner.depth takes effect at start" in error
+    file.write_text("other:\n  ros__parameters: {label: x}\n")
+    status, _, error = ic("param", "load", "talker", str(file))
+    assert status == 2 and "has no parameters for talker" in error
+    assert ic("param", "set", "talker", "inner.share", "0.5")[0] == 0
+    # What was dumped starts a node with the same parameters.
+    assert ic("param", "dump", "talker", "-o", str(file))[0] == 0
+    run_dir = tmp_path / "r"
+    with talking(run_dir, "--params-file", str(file)):
+        assert NodeControl(run_dir, "talker").get() == NodeControl(registry_dir(), "talker").get()
+
+
+def test_node_list_and_info(ic, talker):
+    assert ic("node", "list")[:2] == (0, "talker\n") and ic("node", "list", "-c")[1] == "1\n"
+    assert re.match(r"talker  pid \d+ +up +\d+ s  ", ic("node", "list", "-v")[1])
+    status, out, _ = ic("node", "info", "talker")
+    assert status == 0 and "state: running\n" in out and re.search(r"process: \d+ % of a core, \d+ MB\n", out)
+    assert re.search(r"threads: \d+", out)
+    assert re.search(r"  /scan: sensor_msgs/msg/LaserScan, [\d.]+ Hz\n", out)
+    assert "Subscribers:\n  /order: geometry_msgs/msg/TwistStamped, no message yet" in out
+    status, _, error = ic("node", "info", "nobody")
+    assert status == 1 and "node 'nobody' does not run" in error and "running: talker" in error
+
+
+def test_busy_node_is_told_and_nothing_is_changed(ic, tmp_path_factory, monkeypatch):
+    run_dir = tmp_path_factory.mktemp("r")
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    with talking(run_dir):
+        assert ic("topic", "pub", "--once", "/sleep", "Bool", "{data: true}")[0] == 0
+        wait_until(lambda: NodeControl(run_dir, "talker").status()["busy"] == "callback of /sleep", "the long callback")
+        status, out, error = ic("param", "set", "talker", "label", "x")
+        assert status == 1 and out == "" and re.search(r"talker is busy \(callback of /sleep has been running", error)
+        assert ic("param", "get", "talker", "label")[1] == "hello\n"
+
+
+def test_own_file_runs_and_leaves_at_once(tmp_path_factory):
+    """``ic run my_node.py``: a thread that a library left behind does not keep the process (dora 2152)."""
+    run_dir = tmp_path_factory.mktemp("r")
+    file = run_dir / "my_node.py"
+    text = TALKER.read_text().replace(
+        "    def setup(self) -> None:\n",
+        "    def setup(self) -> None:\n        import threading\n"
+        "        threading.Thread(target=lambda: time.sleep(600)).start()\n",
+    )
+    assert "sleep(600)" in text
+    file.write_text(text)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "instant_ic.cli.main", "run", str(file), "--run-dir", str(run_dir), "-p", "label:=mine"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        wait_until(lambda: any(n.subscribes.get("/sleep") for n in registry.list_nodes(run_dir)), "the node")
+        assert registry.list_nodes(run_dir)[0].params["label"] == "mine"
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=20)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and "stopping" in error
+    assert registry.list_nodes(run_dir) == []
+
+
+def test_run_mistakes(ic, tmp_path):
+    status, _, error = ic("run", "warp_drive")
+    assert status == 2 and "there is no node 'warp_drive'; there are" in error and "bag_player" in error
+    status, _, error = ic("run", "grid_slm")
+    assert status == 2 and "did you mean 'grid_slam'?" in error
+    assert "nowhere.py does not exist" in ic("run", "nowhere.py")[2]
+    file = tmp_path / "none.py"
+    file.write_text("x = 1\n")
+    status, _, error = ic("run", str(file))
+    assert status == 2 and "must define one node class (it has: none)" in error
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("ic topic ec", {"echo "}),
+        ("ic topic echo /sc", {"/scan "}),
+        ("ic param get talker inner.", {"inner.depth", "inner.share"}),
+        ("ic node info t", {"talker "}),
+        ("ic run grid_", {"grid_slam "}),
+    ],
+)
+def test_completion(line, expected):
+    """As the shell asks: argcomplete's protocol, and nothing heavy loaded on the way."""
+    code = (
+        "import sys; from instant_ic.cli.main import main\n"
+        "import os; real = os._exit\n"
+        "def leave(status):\n"
+        "    heavy = [m for m in ('numpy', 'numba', 'torch', 'rosbags', 'zmq', 'rich', 'cv2') if m in sys.modules]\n"
+        "    os.write(2, ('heavy: %s' % heavy).encode()); real(status)\n"
+        "os._exit = leave\nmain()"
+    )
+    environment = {
+        **os.environ,
+        "_ARGCOMPLETE": "1",
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+        "_ARGCOMPLETE_STDOUT_FILENAME": f"/tmp/ic_completion_{os.getpid()}",
+        "IFS": "\v",
+    }
+    result = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
+    with open(environment["_ARGCOMPLETE_STDOUT_FILENAME"]) as file:  # noqa: PTH123
+        found = set(file.read().split("\v"))
+    os.unlink(environment["_ARGCOMPLETE_STDOUT_FILENAME"])  # noqa: PTH108
+    assert found == expected, result.stderr
+    assert "heavy: []" in result.stderr
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_code(ic, shell):
+    status, out, _ = ic("completion", shell)
+    assert (
+        status == 0
+        and "_ARGCOMPLETE" in out
+        and {"bash": "complete", "zsh": "compdef", "fish": "--command ic"}[shell] in out
+    )
+
+
+def test_hanging_process_is_told(ic, tmp_path_factory, monkeypatch):
+    run_dir = tmp_path_factory.mktemp("r")
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    with talking(run_dir) as process:
+        process.send_signal(signal.SIGSTOP)
+        try:
+            began_s = time.monotonic()
+            status, out, _ = ic("node", "info", "talker")
+            assert status == 0 and "state: silent" in out and "did not answer within 2 s" in out
+            assert time.monotonic() - began_s < 30
+        finally:
+            process.send_signal(signal.SIGCONT)

@@ -1,0 +1,266 @@
+"""``ic topic`` against a node in a process of its own."""
+
+import json
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+from cli_helpers import talking
+from hypothesis import given
+from hypothesis import strategies as st
+
+from instant_ic.bus import LATCHED, RELIABLE
+from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.cli.errors import UserError
+from instant_ic.cli.message_input import build, parse
+from instant_ic.cli.messages import Style, csv_line, describe, json_line
+from instant_ic.cli.window import Rate, losses, size_words
+from instant_ic.msg import Bool, Clock, deserialize, message_type, serialize, stamp_ns, to_time, typestore
+
+
+@pytest.fixture(autouse=True)
+def in_run_dir(talker, monkeypatch):
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(talker))
+
+
+def test_list(ic):
+    topics = ic("topic", "list")[1].split()
+    assert {"/scan", "/flag", "/heartbeat", "/order"} <= set(topics) and topics == sorted(topics)
+    assert "/scan [sensor_msgs/msg/LaserScan]\n" in ic("topic", "list", "-t")[1]
+    assert ic("topic", "list", "-c")[1] == f"{len(topics)}\n"
+    out = ic("topic", "list", "-v")[1]
+    assert re.search(r"/scan +sensor_msgs/msg/LaserScan  talker \(sensor\) → -\n", out)
+    assert re.search(r"/order +geometry_msgs/msg/TwistStamped  - → talker\n", out)
+
+
+def test_run_dir_as_an_option(ic, tmp_path, monkeypatch, talker):
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
+    assert ic("topic", "list")[:2] == (0, "")
+    assert "/scan" in ic("--run-dir", str(talker), "topic", "list")[1]
+
+
+def test_type_and_find(ic):
+    assert ic("topic", "type", "scan")[:2] == (0, "sensor_msgs/msg/LaserScan\n")
+    for name in ("sensor_msgs/msg/LaserScan", "sensor_msgs/LaserScan", "LaserScan"):
+        assert ic("topic", "find", name)[:2] == (0, "/scan\n")
+    assert ic("topic", "find", "other_msgs/LaserScan")[:2] == (0, "")
+    status, _, error = ic("topic", "type", "/scam")
+    assert status == 1 and "did you mean '/scan'?" in error
+
+
+def test_info(ic):
+    status, out, _ = ic("topic", "info", "scan")
+    assert status == 0 and "Type: sensor_msgs/msg/LaserScan\nPublisher count: 1\n  talker (pid" in out
+    assert "Publisher count: 0\nSubscription count: 1\n  talker" in ic("topic", "info", "/order")[1]
+    status, _, error = ic("topic", "info", "/scam")
+    assert status == 1 and "nobody publishes or subscribes it (did you mean '/scan'?)" in error
+
+
+def test_info_verbose_tells_rates_of_the_heartbeat(ic, talker):
+    reader = ZmqTransport(talker, "reader", time.time_ns)
+    try:
+        status, out, _ = ic("topic", "info", "-v", "/scan")
+    finally:
+        reader.close()
+    assert status == 0
+    assert "Publisher count: 1 (nominal 10 Hz)\n\nNode name: talker\n  Endpoint type: PUBLISHER\n" in out
+    found = re.search(r"  QoS: sensor\n  Rate: ([\d.]+) Hz, newest ([\d.]+) s ago\n", out)
+    assert found is not None and 10 < float(found[1]) < 60 and float(found[2]) < 2
+    out = ic("topic", "info", "-v", "/order")[1]
+    assert "Endpoint type: SUBSCRIPTION" in out and "Rate: no message yet\n  Lost: 0\n" in out
+
+
+def test_echo(ic):
+    assert ic("topic", "echo", "/flag", "--once", "--timeout", "30")[:2] == (0, "data: true\n---\n")
+    status, out, _ = ic("topic", "echo", "/scan", "-n", "2", "--timeout", "30")
+    assert status == 0 and out.count("---") == 2 and "frame_id: 'hello'" in out
+    assert "ranges: [0, 1, 2, 3, 4, 5, ... 40 values]" in out
+    out = ic("topic", "echo", "/scan", "--once", "--field", "ranges.3")[1]
+    assert out == "3\n---\n"
+    assert "39]" in ic("topic", "echo", "/scan", "--once", "--full")[1]
+    assert "ranges: <40 values>" in ic("topic", "echo", "/scan", "--once", "--no-arr", "--no-str")[1]
+    assert ic("topic", "echo", "/scan", "--once", "--csv", "--field", "ranges")[1].startswith("0,1,2,3,")
+    message = json.loads(ic("topic", "echo", "/scan", "--once", "--json")[1])
+    assert message["header"]["frame_id"] == "hello" and message["ranges"][39] == 39.0
+    status, _, error = ic("topic", "echo", "/scan", "--once", "--field", "range")
+    assert status == 2 and "no field 'range'" in error
+    status, _, error = ic("topic", "echo", "/scam", "--timeout", "0.3")
+    assert status == 1 and "nobody publishes /scam (did you mean '/scan'?); waiting for it" in error
+    status, _, error = ic("topic", "echo", "/heard", "--timeout", "0.3")
+    assert status == 1 and "/heard has a publisher, but it is silent" in error
+
+
+def test_hz_bw_and_delay(ic):
+    status, out, _ = ic("topic", "hz", "/scan", "/heartbeat", "--duration", "2.5")
+    found = re.findall(r"/scan +average rate: ([\d.]+)  min: .*s max: .*s std dev: .*s window: (\d+)  lost: 0", out)
+    assert status == 0 and 10 < float(found[-1][0]) < 60 and int(found[-1][1]) > 20
+    assert re.search(r"/heartbeat +average rate: [\d.]+", out)
+    out = ic("topic", "hz", "/scan", "-w", "5", "--duration", "1.2")[1]
+    assert "window: 5  lost: 0" in out
+    # CDR by hand: 4 + stamp 8 + frame_id 4 + 6, padded to 20, 7 floats 28, ranges 4 + 160, intensities 4, and 4 before.
+    status, out, _ = ic("topic", "bw", "/scan", "--duration", "1.2")
+    sizes = "size mean: 220 B min: 220 B max: 220 B"
+    assert status == 0 and re.search(rf"[\d.]+ kB/s from \d+ messages  {sizes}", out), out
+    status, out, _ = ic("topic", "delay", "/scan", "--duration", "1.2")
+    found = re.findall(r"average delay: ([\d.]+)  min", out)
+    assert status == 0 and 0.24 < float(found[-1]) < 5
+    status, _, error = ic("topic", "delay", "/flag", "--duration", "30")
+    assert status == 2 and "a std_msgs/msg/Bool has no stamp" in error
+    status, _, error = ic("topic", "hz", "/nothing", "--duration", "0.2")
+    assert status == 1 and "nobody publishes /nothing" in error
+
+
+def test_delay_by_simulated_time(ic, talker):
+    """With /clock the age is by its time: the talker's stamps lie 1000 s before it."""
+    transport = ZmqTransport(talker, "clock", time.time_ns)
+    clock = transport.advertise("/clock", "rosgraph_msgs/msg/Clock", LATCHED)
+    now = time.time_ns() + 1000 * 10**9
+    stop = threading.Event()
+
+    def tick():
+        while not stop.wait(0.05):
+            clock.send(serialize(Clock(clock=to_time(now))))
+
+    thread = threading.Thread(target=tick)
+    thread.start()
+    try:
+        out = ic("topic", "delay", "/scan", "--use-sim-time", "--duration", "2.2")[1]
+        pub = ("--use-sim-time", "-1", "--qos", "latched", "-w", "0", "/stamp", "Header", "{stamp: now}")
+        status, printed, error = ic("topic", "pub", *pub)
+    finally:
+        stop.set()
+        thread.join()
+        transport.close()
+    assert 990 < float(re.findall(r"average delay: ([\d.]+)", out)[-1]) < 1010
+    assert status == 0 and f"sec: {now // 10**9}" in printed, error
+
+
+def test_pub_reaches_the_node(ic, talker):
+    heard = []
+    transport = ZmqTransport(talker, "ears", time.time_ns)
+    subscription = transport.subscribe("/heard", "std_msgs/msg/String", RELIABLE, lambda: None)
+    deadline = time.monotonic() + 30
+    try:
+        values = "{header: auto, twist: {linear: {x: 0.25}}}"
+        status, out, error = ic("topic", "pub", "/order", "TwistStamped", values, "-n", "3", "-r", "50")
+        assert status == 0, error
+        assert out.count("publishing #") == 3 and "    x: 0.25" in out
+        while len(heard) < 3 and time.monotonic() < deadline:
+            heard += [deserialize(r.payload, r.type_name).data for r in subscription.take()]
+            time.sleep(0.01)
+    finally:
+        transport.close()
+    assert len(heard) == 3
+    value, stamp = heard[0].split()
+    assert value == "0.25" and abs(int(stamp) - time.time()) < 60
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("/order", "TwistStamped", "{twist: {liner: {x: 1}}}"), "no field 'twist.liner' (did you mean 'linear'?)"),
+        (("/order", "TwistStamped", "{twist: {linear: {x: fast}}}"), "twist.linear.x must be float64 (got 'fast')"),
+        (("/order", "TwistStamped", "{twist: [1"), "the values are not YAML"),
+        (("/order", "Twits", "{}"), "did you mean 'Twist'?"),
+        (("/order", "Bool", "{data: true}"), "/order is a geometry_msgs/msg/TwistStamped for talker"),
+        (("/flag", "Bool", "true"), "must be a mapping such as '{data: ...}' (got 'true')"),
+        (("/a-b", "Bool", "{data: true}"), "topic name '/a-b' is not legal"),
+    ],
+)
+def test_pub_refuses_what_does_not_fit(ic, words, told):
+    status, out, error = ic("topic", "pub", "--once", *words)
+    assert status in (1, 2) and told in error and out == ""
+
+
+def test_pub_waits_for_readers_only_so_long(ic):
+    status, out, error = ic("topic", "pub", "--once", "--max-wait-time-secs", "0.2", "/lonely", "Bool", "{data: true}")
+    assert status == 1 and out == "" and "/lonely: 0 of 1 readers within 0.2 s" in error
+
+
+def test_pub_beside_the_writer_of_cmd_vel_is_refused(ic, tmp_path_factory, monkeypatch):
+    """A second writer of /cmd_vel would drive the robot past the arbiter's checks."""
+    run_dir = tmp_path_factory.mktemp("r")
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    pub = ("topic", "pub", "--once", "-w", "0", "/cmd_vel", "TwistStamped", "{twist: {linear: {x: 0.1}}}")
+    status, out, error = ic(*pub)
+    assert status == 0 and "/cmd_vel drives the robot" in error and "publishing #1" in out
+    with talking(run_dir, "-p", "drives:=true"):
+        status, out, error = ic(*pub)
+        assert status == 2 and "/cmd_vel is written by talker, which keeps the robot safe" in error and out == ""
+        status, out, error = ic(*pub, "--force")
+        assert status == 0 and "beside talker" in error and "publishing #1" in out
+
+
+# -- figures and messages, without a bus -----------------------------------------------------------
+
+
+def test_rate_of_known_arrivals():
+    """Arrivals at 0, 100, 200, 400 ms: mean gap 133.3 ms, so 7.5 Hz; standard deviation 47.14 ms."""
+    rate = Rate(100)
+    assert rate.line({}) == "no message yet  lost: 0"
+    for ms in (0, 100, 200, 400):
+        rate.add(ms * 1_000_000)
+    words = "average rate: 7.500  min: 0.1000s max: 0.2000s std dev: 0.04714s window: 3"
+    assert rate.line({"b": 1, "a": 2}) == f"{words}  lost: 3 (a 2, b 1)"
+    rate.add(1_000_000)  # back in time: a bag that begins anew
+    rate.add(51_000_000)
+    assert rate.line({}).startswith("average rate: 20.000")
+
+
+def test_words_of_sizes_and_losses():
+    assert [size_words(n) for n in (12, 1500, 2_500_000, 3e9)] == ["12 B", "1.50 kB", "2.50 MB", "3.00 GB"]
+    assert losses({}) == "0"
+
+
+def test_every_type_can_be_built_empty_and_sent():
+    names = list(typestore().types)
+    assert len(names) > 150
+    for name in names:
+        payload = serialize(build(name, {}, 5_000_000_007))
+        assert type(deserialize(payload, name)) is message_type(name)
+
+
+def test_auto_and_now():
+    stamped = build("TwistStamped", {"header": "auto"}, 5_000_000_007)
+    assert stamp_ns(stamped) == 5_000_000_007 and stamped.header.frame_id == ""
+    pose = build("PoseStamped", {"header": {"stamp": "now", "frame_id": "map"}}, 7)
+    assert stamp_ns(pose) == 7 and pose.header.frame_id == "map" and pose.pose.orientation.w == 1.0
+
+
+def test_arrays_are_of_the_types_that_the_message_has():
+    scan = build("LaserScan", {"ranges": [1, 2.5, float("inf"), "1e-3"]}, 0)
+    assert scan.ranges.dtype == np.float32 and scan.ranges[3] == np.float32(1e-3)
+    with pytest.raises(UserError, match=r"pose\.covariance must have 36 values"):
+        build("Odometry", {"pose": {"covariance": [1, 2]}}, 0)
+    path = build("Path", {"poses": [{"pose": {"position": {"x": 3}}}]}, 0)
+    assert path.poses[0].pose.position.x == 3.0
+    with pytest.raises(UserError, match=r"poses\[0\].pose.position.x must be float64 \(got \[\]\)"):
+        build("Path", {"poses": [{"pose": {"position": {"x": []}}}]}, 0)
+
+
+@given(st.integers(-(2**70), 2**70))
+def test_integers_are_held_to_their_size(value):
+    fits = 0 <= value <= 255
+    try:
+        assert build("UInt8", {"data": value}, 0).data == value and fits
+    except UserError as error:
+        assert not fits and "data must be uint8, 0..255" in str(error)
+
+
+@given(st.text())
+def test_any_text_as_values_gives_a_message_or_words(text):
+    try:
+        values = parse(text, "Bool")
+        build("Bool", values, 0)
+    except UserError as error:
+        assert str(error)
+
+
+def test_json_and_csv_of_a_message():
+    assert json_line(Bool(data=True)) == '{"data": true}'
+    path = build("Path", {"header": {"frame_id": 'a,"b'}, "poses": [{}]}, 0)
+    assert json.loads(json_line(path))["poses"][0]["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    assert csv_line(path) == '0,0,"a,""b",0,0,,0,0,0,0,0,0,1'
+    assert describe(build("String", {"data": "x" * 30}, 0), Style(length=2)) == f"data: {'x' * 20!r}... 30 characters"
