@@ -246,14 +246,16 @@ class ManagedProcess:
                 continue
             self._budget -= len(data)
             if self._left_out:
-                note = f"\n[launch: {self._left_out} bytes left out: more than {OUTPUT_BYTES_PER_S} a second]\n"
-                data, self._left_out = note.encode() + data, 0
+                data, self._left_out = self._note() + data, 0
             if not self._disk.put(self._log.write, data, size=len(data)):
                 self._left_out += len(data)  # the disk does not keep up
             *lines, self._partial = (self._partial + data).split(b"\n")
             if len(self._partial) >= MAX_LINE_BYTES:
                 lines, self._partial = [*lines, self._partial], b""
             yield from (line.decode(errors="replace").rstrip("\r") for line in lines)
+
+    def _note(self) -> bytes:
+        return f"\n[launch: {self._left_out} bytes left out: more than {OUTPUT_BYTES_PER_S} a second]\n".encode()
 
     def has_ended(self) -> bool:
         """Whether its own process has ended; it stays unreaped, so that its group's number cannot be taken."""
@@ -268,6 +270,9 @@ class ManagedProcess:
         now_s = time.monotonic()
         for _ in range(8):
             yield from self.read_lines(now_s)
+        if self._left_out:
+            self._disk.put(self._log.write, self._note())
+            self._left_out = 0
         if self._partial:
             yield self._partial.decode(errors="replace")
             self._partial = b""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import selectors
 import signal
 import subprocess
@@ -35,7 +34,7 @@ HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
 BUSY_FACTOR = 6.0
 """A node without heartbeat that computes (a compiler at its first picture) is given this many times longer."""
 
-_BUSY_SHARE = 0.5  # of one core
+_BUSY_SHARE = 0.5
 _LOG_BYTES = 32 << 20  # what may wait for the disk
 _REAPER = Path(__file__).with_name("reaper.py")
 
@@ -76,22 +75,22 @@ class _Silence:
         self.beat_s: float | None = None
         self.lasts_s = 0.0
         self.told = False
-        self._cpu_s = 0.0
+        self._active_s = 0.0
 
     def look(self, beat_s: float | None, pid: int, since_last_look_s: float) -> None:
         """Takes note of the newest heartbeat."""
         if beat_s is None or beat_s != self.beat_s:
             self.beat_s, self.lasts_s, self.told = beat_s, 0.0, False
-            self._cpu_s = 0.0
+            self._active_s = 0.0
             return
         if self.lasts_s == 0.0:
-            self._cpu_s = _cpu_s(pid)
+            self._active_s = _active_s(pid)
         # A launcher that was held up itself (stopped, swapped out) must not blame the nodes for it.
         self.lasts_s += min(since_last_look_s, 0.5)
 
     def busy(self, pid: int) -> bool:
-        """Whether it has used the CPU for most of the silence."""
-        return _cpu_s(pid) - self._cpu_s > _BUSY_SHARE * self.lasts_s
+        """Whether it has computed, or waited for its turn to, for most of the silence."""
+        return _active_s(pid) - self._active_s > _BUSY_SHARE * self.lasts_s
 
 
 class Supervisor:
@@ -390,13 +389,13 @@ class Supervisor:
                 return
 
 
-def _cpu_s(pid: int) -> float:
-    """CPU time that a process has used, all its threads together; 0 when it is gone."""
+def _active_s(pid: int) -> float:
+    """How long a process's first thread, the node's own, has computed or waited for a CPU; 0 when it is gone."""
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        computed, waited, _ = Path(f"/proc/{pid}/schedstat").read_text().split()
     except OSError:
         return 0.0
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return (int(computed) + int(waited)) / 1e9
 
 
 def _is_traced(pid: int) -> bool:
