@@ -19,8 +19,11 @@ from ..msg import type_hash
 VERSION = 2
 MAGIC = b"IIC\0"
 
-HEADER = struct.Struct("<4sBBHIIQq")
-"""Magic, version, kind, zero, messages skipped for this reader, bytes of the body, sequence, publish time in ns."""
+HELLO, DATA, SHARED, RETIRED = (int.from_bytes(MAGIC + bytes([VERSION, kind, 0, 0]), "little") for kind in (1, 2, 3, 4))
+"""What a frame is: magic, version and kind in one number, so that one comparison checks all three."""
+
+HEADER = struct.Struct("<QIIQq")
+"""Kind, messages skipped for this reader, bytes of the body, sequence, publish time in ns."""
 
 SHARED_BODY = struct.Struct("<IIQ")
 """Number of the buffer, 1 if its file descriptor comes along, bytes of the message in it."""
@@ -29,8 +32,6 @@ BUFFER_ID = struct.Struct("<I")
 
 GREETING = struct.Struct("<4sB?2xI")
 """Magic, version, whether shared memory is understood, how many messages the reader keeps (1: the newest only)."""
-
-HELLO, DATA, SHARED, RETIRED = 1, 2, 3, 4
 
 MOST_BYTES = 0xFFFFFFFF
 """Largest body."""
@@ -61,7 +62,7 @@ class Hello:
     def pack(self) -> bytes:
         """The whole frame."""
         body = json.dumps(self.__dict__).encode()
-        return HEADER.pack(MAGIC, VERSION, HELLO, 0, 0, len(body), 0, 0) + body
+        return HEADER.pack(HELLO, 0, len(body), 0, 0) + body
 
     @classmethod
     def unpack(cls, body: bytes) -> Hello:
@@ -80,16 +81,13 @@ class Hello:
         return hello
 
 
-def parse_header(data: bytes | bytearray | memoryview, offset: int = 0) -> tuple[int, int, int, int, int]:
-    """``(kind, skipped, bytes of the body, sequence, publish_ns)`` of the header at ``offset``.
-
-    Raises:
-        FrameError: wrong magic, version or kind.
+def check_kind(kind: int) -> None:
+    """Raises:
+    FrameError: not a kind of this version.
     """
-    magic, version, kind, _, skipped, size, sequence, publish_ns = HEADER.unpack_from(data, offset)
-    if magic != MAGIC or version != VERSION or not HELLO <= kind <= RETIRED:
-        raise FrameError(f"not a frame of version {VERSION} (magic {magic!r}, version {version}, kind {kind})")
-    return kind, skipped, size, sequence, publish_ns
+    if kind not in (HELLO, DATA, SHARED, RETIRED):
+        words = kind.to_bytes(8, "little")
+        raise FrameError(f"not a frame of version {VERSION} (magic {words[:4]!r}, version {words[4]}, kind {words[5]})")
 
 
 @functools.cache

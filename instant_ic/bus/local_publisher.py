@@ -15,8 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from . import registry
 from .frame import (
@@ -35,7 +34,7 @@ from .frame import (
 )
 from .qos import QoS
 from .shm import BufferPool, SharedBuffer
-from .transport import Buffer, Payload, PublisherStats, TransportError
+from .transport import Payload, PublisherStats, TransportError
 
 if TYPE_CHECKING:
     from .local_transport import LocalTransport
@@ -56,8 +55,7 @@ _READ_ONLY = select.EPOLLIN | select.EPOLLRDHUP
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class _Outgoing:
+class _Outgoing(NamedTuple):
     """A message on its way to readers: bytes, or a buffer."""
 
     sequence: int
@@ -82,13 +80,16 @@ class _Outgoing:
 class _Reader:
     """One connected reader; every call holds the publisher's lock."""
 
-    def __init__(self, connection: socket.socket) -> None:
+    def __init__(self, connection: socket.socket, rewatch: Callable[[_Reader], None]) -> None:
         self.socket = connection
+        self._rewatch = rewatch
         self.depth = 0  # 0: it has not greeted yet
         self.shared = True
         self.gone = False
         self.deaf = False  # reads no more, but may still hold buffers
+        self.prompt = False  # has got all that was offered: small messages may go straight into its socket
         self.events = _READ_ONLY
+        self._send = connection.send
         self._flying: dict[int, SharedBuffer] = {}
         self._known: set[int] = set()
         self._queue: deque[_Outgoing] = deque()
@@ -111,6 +112,21 @@ class _Reader:
             raise ValueError(f"a reader that does not speak version {VERSION} of the bus (it sent {magic!r} {version})")
         self._incoming = self._incoming[GREETING.size :]
         self.depth = depth
+        self.prompt = True
+        return True
+
+    def send_now(self, frame: bytes) -> bool:
+        """Sends a whole frame to a reader that is :attr:`prompt`; False when the message must be offered instead."""
+        try:
+            sent = self._send(frame)
+        except BlockingIOError:
+            return False
+        except OSError:  # EPIPE, ECONNRESET: it reads no more
+            self._end()
+            return True
+        if sent < len(frame):
+            self._part, self.prompt = memoryview(frame)[sent:], False
+            self._rewatch(self)
         return True
 
     def offer(self, message: _Outgoing) -> None:
@@ -132,6 +148,7 @@ class _Reader:
             message = self._queue.popleft()
             self._queue_bytes -= message.size
             self._start(message)
+        self.prompt = not (self._part is not None or self._queue or self._skipped or self.deaf or self.gone)
 
     def release(self) -> None:
         """Takes back the buffers that the reader has finished with."""
@@ -148,7 +165,7 @@ class _Reader:
         """Tells that a buffer will not come again, so that the reader lets go of its memory."""
         if buffer.number in self._known:
             self._known.discard(buffer.number)
-            frame = HEADER.pack(MAGIC, VERSION, RETIRED, 0, 0, BUFFER_ID.size, 0, 0) + BUFFER_ID.pack(buffer.number)
+            frame = HEADER.pack(RETIRED, 0, BUFFER_ID.size, 0, 0) + BUFFER_ID.pack(buffer.number)
             if self._part is not None:
                 self._part = memoryview(bytes(self._part) + frame)
             else:
@@ -167,12 +184,17 @@ class _Reader:
 
     def close(self) -> None:
         """Lets go of the connection and of all that was lent to it."""
-        self.gone = True
+        self.gone, self.prompt = True, False
         for buffer in self._flying.values():
             buffer.holders.discard(self)
         self._flying.clear()
         self._drop_queue()
         self.socket.close()
+
+    def _end(self) -> None:
+        """It reads no more; what it holds comes back when its connection closes."""
+        self.deaf, self.prompt = True, False
+        self._drop_queue()
 
     def _drop_queue(self) -> None:
         for message in self._queue:
@@ -188,6 +210,7 @@ class _Reader:
         return len(self._flying) < BUFFERS_A_READER
 
     def _enqueue(self, message: _Outgoing) -> None:
+        self.prompt = False
         message = message.kept()
         if self.depth > 1 and len(self._flying) >= BUFFERS_A_READER:
             message = message.inline()
@@ -207,16 +230,16 @@ class _Reader:
         skipped, self._skipped = self._skipped, 0
         buffer = message.buffer
         if buffer is None:
-            head = HEADER.pack(MAGIC, VERSION, DATA, 0, skipped, message.size, message.sequence, message.publish_ns)
+            head = HEADER.pack(DATA, skipped, message.size, message.sequence, message.publish_ns)
             if message.size < 16384:  # one copy is cheaper than a scattered write
                 self._write(head + message.body)
             else:
                 self._write(head, message.body)
             return
         new = buffer.number not in self._known
-        frame = HEADER.pack(
-            MAGIC, VERSION, SHARED, 0, skipped, SHARED_BODY.size, message.sequence, message.publish_ns
-        ) + SHARED_BODY.pack(buffer.number, new, message.size)
+        frame = HEADER.pack(SHARED, skipped, SHARED_BODY.size, message.sequence, message.publish_ns) + SHARED_BODY.pack(
+            buffer.number, new, message.size
+        )
         buffer.holders.add(self)
         self._flying[buffer.number] = buffer
         self._known.add(buffer.number)
@@ -234,8 +257,7 @@ class _Reader:
         except BlockingIOError:
             sent = 0
         except OSError:  # EPIPE, ECONNRESET: it reads no more
-            self.deaf = True
-            self._drop_queue()
+            self._end()
             return
         total = len(head) + (0 if body is None else len(body))
         if sent < total:
@@ -244,10 +266,11 @@ class _Reader:
                 return
             rest = head[sent:] + bytes(body[max(0, sent - len(head)) :] if body is not None else b"")
             self._part = memoryview(rest)
+            self.prompt = False
 
     def _unsent_fd(self, head: bytes, fd: int) -> None:
         """The socket is full: the frame with its descriptor goes out when it has room again."""
-        self._part, self._part_fd = memoryview(head), fd
+        self._part, self._part_fd, self.prompt = memoryview(head), fd, False
 
     _part_fd: int | None = None
 
@@ -265,8 +288,7 @@ class _Reader:
         except BlockingIOError:
             return
         except OSError:
-            self.deaf = True
-            self._drop_queue()
+            self._end()
 
     def _receive(self) -> None:
         try:
@@ -337,24 +359,37 @@ class LocalPublisher:
         Raises:
             TransportError: more than 4 GiB.
         """
-        parts = [_flat(payload)] if isinstance(payload, (bytes, bytearray, memoryview)) else [_flat(p) for p in payload]
-        size = sum(len(part) for part in parts)
+        if not isinstance(payload, (bytes, bytearray, memoryview)):
+            payload = payload[0] if len(payload) == 1 else b"".join(payload)
+        size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
         if size >= SHARED_FROM_BYTES:
+            source = memoryview(payload).cast("B")
 
             def copy(target: memoryview) -> None:
-                at = 0
-                for part in parts:
-                    target[at : at + len(part)] = part
-                    at += len(part)
+                target[:] = source
 
             self.send_filled(size, copy, publish_ns)
             return
-        body = parts[0] if len(parts) == 1 else b"".join(parts)
-        if isinstance(body, bytearray):
-            body = memoryview(body)
         with self._lock:
-            if not self._closed:
-                self._distribute(*self._next(publish_ns), size, body, None)
+            if self._closed:
+                return
+            self._sequence = sequence = self._sequence + 1
+            stamp = self._transport.now_ns() if publish_ns is None else publish_ns
+            # Every microsecond between here and the readers is latency; what is not needed for it comes after.
+            frame = HEADER.pack(DATA, 0, size, sequence, stamp) + payload
+            late = None
+            for reader in self._readers.values():
+                if reader.prompt:
+                    if reader.send_now(frame):
+                        continue
+                elif not reader.depth or reader.deaf:
+                    continue
+                late = late or _Outgoing(sequence, stamp, size, frame[HEADER.size :])
+                reader.offer(late)
+                self._rewatch(reader)
+            if self.qos.latched:
+                self._keep(_Outgoing(sequence, stamp, size, frame[HEADER.size :]))
+        self.stats.add(time.monotonic_ns(), size)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
         """Sends ``size`` bytes that ``fill`` writes where they are to be, without a further copy; never waits.
@@ -364,10 +399,15 @@ class LocalPublisher:
         """
         if size > MOST_BYTES:
             raise TransportError(f"{self.topic}: a message of {size} bytes; the bus carries at most {MOST_BYTES}")
+        if size < SHARED_FROM_BYTES:
+            data = bytearray(size)
+            fill(memoryview(data))
+            self.send(data, publish_ns)
+            return
         with self._lock:
             if self._closed:
                 return
-            buffer = self._buffer(size) if size >= SHARED_FROM_BYTES else None
+            buffer = self._buffer(size)
             if buffer is None:
                 body = memoryview(bytearray(size))
                 fill(body)
@@ -414,17 +454,21 @@ class LocalPublisher:
         self, sequence: int, publish_ns: int, size: int, body: bytes | memoryview, buffer: SharedBuffer | None
     ) -> None:
         message = _Outgoing(sequence, publish_ns, size, body, buffer)
-        if self.qos.latched:
-            if self._last is not None and self._last.buffer is not None:
-                self._last.buffer.holders.discard(self)
-            self._last = message = message.kept()
-            if buffer is not None:
-                buffer.holders.add(self)
         for reader in self._readers.values():
             if reader.depth:
                 reader.offer(message)
                 self._rewatch(reader)
+        if self.qos.latched:
+            self._keep(message)
         self.stats.add(time.monotonic_ns(), size)
+
+    def _keep(self, message: _Outgoing) -> None:
+        """Keeps the last value for whoever comes later."""
+        if self._last is not None and self._last.buffer is not None:
+            self._last.buffer.holders.discard(self)
+        self._last = message.kept()
+        if message.buffer is not None:
+            message.buffer.holders.add(self)
 
     def _buffer(self, size: int) -> SharedBuffer | None:
         """A free buffer, or None when this message must go through the sockets."""
@@ -483,7 +527,7 @@ class LocalPublisher:
                     return
                 connection.setblocking(False)
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
-                reader = _Reader(connection)
+                reader = _Reader(connection, self._rewatch)
                 self._readers[connection.fileno()] = reader
                 self._transport.watch(connection.fileno(), reader.events, functools.partial(self._on_reader, reader))
                 self._on_reader(reader, select.EPOLLIN)  # its greeting is there already, as a rule
@@ -510,10 +554,3 @@ class LocalPublisher:
                 reader.release()
                 reader.flush()
             self._rewatch(reader)
-
-
-def _flat(part: Buffer) -> bytes | bytearray | memoryview:
-    """A buffer whose items are bytes, so that its length is its size."""
-    if isinstance(part, memoryview) and (part.format != "B" or part.ndim != 1):
-        return part.cast("B")
-    return part

@@ -30,7 +30,7 @@ from .frame import (
     VERSION,
     FrameError,
     Hello,
-    parse_header,
+    check_kind,
     type_digest,
 )
 from .qos import QoS
@@ -45,7 +45,7 @@ VIEWS_HELD = 4
 collects messages cannot take the publisher's buffers away."""
 
 SCRATCH_BYTES = 1 << 19
-_FDS_AT_ONCE = 8
+_FDS_SPACE = socket.CMSG_SPACE(4 * 8)
 _FULL_LOOK_S = 1.0
 
 log = logging.getLogger(__name__)
@@ -59,8 +59,10 @@ class Inlet:
         self.hello: Hello | None = None
         self.refused = False
         self._scratch = scratch
+        self._whole_scratch = [scratch]
+        self._deliver = subscription.deliver
         self._rest = b""  # the start of a frame whose end has not come yet
-        self._header: tuple[int, int, int, int, int] | None = None
+        self._header = (0, 0, 0, 0, 0)
         self._body: memoryview | None = None  # a large body that comes in pieces
         self._got = 0
         self._fds: deque[int] = deque()
@@ -82,58 +84,73 @@ class Inlet:
             FrameError: what comes is not of this version of the bus.
         """
         while True:
-            try:
-                if self._body is not None:
+            if self._body is not None:
+                try:
                     count = self.socket.recv_into(self._body[self._got :])
-                    if count == 0:
-                        return False
-                    self._got += count
-                    if self._got == len(self._body):
-                        assert self._header is not None
-                        body, self._body = self._body, None
-                        self._frame(self._header, body.toreadonly())
-                    continue
-                start = len(self._rest)
+                except BlockingIOError:
+                    return True
+                except OSError:
+                    return False
+                self._got += count
+                if self._got == len(self._body):
+                    body, self._body = self._body.toreadonly(), None
+                    self._frame(*self._header, body)
+                elif not count:
+                    return False
+                continue
+            start = len(self._rest)
+            if start:
                 self._scratch[:start] = self._rest
-                space = len(self._scratch) - start
-                count, ancillary, flags, _ = self.socket.recvmsg_into(
-                    [self._scratch[start:]], socket.CMSG_SPACE(4 * _FDS_AT_ONCE), socket.MSG_CMSG_CLOEXEC
-                )
+                self._rest = b""
+                buffers = [self._scratch[start:]]
+            else:
+                buffers = self._whole_scratch
+            try:
+                count, ancillary, flags, _ = self.socket.recvmsg_into(buffers, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
             except BlockingIOError:
+                self._rest = bytes(self._scratch[:start])
                 return True
             except OSError:  # ECONNRESET: it died with data of ours unread
                 return False
-            for _level, _kind, data in ancillary:
-                self._fds.extend(fd for (fd,) in struct.iter_unpack("@i", data[: len(data) // 4 * 4]))
-            if flags & socket.MSG_CTRUNC:
-                self._without_shared_memory("too many open files")
-            if count == 0:
+            if ancillary:
+                for _level, _kind, data in ancillary:
+                    self._fds.extend(fd for (fd,) in struct.iter_unpack("@i", data[: len(data) // 4 * 4]))
+                if flags & socket.MSG_CTRUNC:
+                    self._without_shared_memory("too many open files")
+            if not count:
                 return False
-            self._rest = b""
-            self._parse(start + count)
-            if count < space and self._body is None and not ancillary:
-                return True
+            end = start + count
+            self._parse(end)
+            if end < SCRATCH_BYTES and self._body is None and not ancillary:
+                return True  # it was all there was
 
     def _parse(self, end: int) -> None:
         at = 0
         scratch = self._scratch
         while end - at >= HEADER.size:
-            header = parse_header(scratch, at)
-            size = header[2]
+            kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(scratch, at)
             body_at = at + HEADER.size
-            if body_at + size > end:
-                if size > len(scratch) // 2:  # comes in pieces straight to where it stays
-                    self._header, self._got = header, end - body_at
-                    self._body = memoryview(np.empty(size, np.uint8).data)
-                    self._body[: self._got] = scratch[body_at:end]
-                    return
-                break
-            self._frame(header, bytes(scratch[body_at : body_at + size]))
             at = body_at + size
-        self._rest = bytes(scratch[at:end])
+            if at <= end:
+                body = bytes(scratch[body_at:at])
+                if kind == DATA:
+                    self._deliver(self, sequence, skipped, publish_ns, body)
+                else:
+                    self._frame(kind, skipped, size, sequence, publish_ns, body)
+                continue
+            check_kind(kind)
+            at = body_at - HEADER.size
+            if size > SCRATCH_BYTES // 2:  # comes in pieces, straight to where it stays
+                self._header = (kind, skipped, size, sequence, publish_ns)
+                self._body, self._got = memoryview(np.empty(size, np.uint8).data), end - body_at
+                self._body[: self._got] = scratch[body_at:end]
+                return
+            break
+        if at < end:
+            self._rest = bytes(scratch[at:end])
 
-    def _frame(self, header: tuple[int, int, int, int, int], body: bytes | memoryview) -> None:
-        kind, skipped, _, sequence, publish_ns = header
+    def _frame(self, kind: int, skipped: int, _: int, sequence: int, publish_ns: int, body: bytes | memoryview) -> None:
+        check_kind(kind)
         if kind == DATA:
             self.subscription.deliver(self, sequence, skipped, publish_ns, body)
         elif kind == SHARED:

@@ -8,7 +8,6 @@ an old one in a queue. The bus thread also lets readers in, sends on what a slow
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import itertools
 import logging
 import os
@@ -26,34 +25,11 @@ from .qos import QoS
 
 _DISCOVERY_S = 0.1
 _IDLE_S = 5.0
-_BUSY_NS = 15_000_000  # a callback that lasts longer has the bus thread read in its place
+_BUSY_S = 0.015  # a callback that lasts longer has the bus thread read in its place
+_SLOW_FOR_S = 10.0  # for so long after a slow callback the bus thread looks that often
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
-
-
-class _OneShot:
-    """A timer in the kernel that makes a file descriptor readable; set for each callback, so it must cost little."""
-
-    def __init__(self, delay_ns: int) -> None:
-        libc = ctypes.PyDLL(None, use_errno=True)
-        self.fd = libc.timerfd_create(time.CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
-        if self.fd < 0:
-            raise OSError(ctypes.get_errno(), "timerfd_create")
-        self._settime = libc.timerfd_settime
-        timespec = ctypes.c_long * 4  # interval s, ns; value s, ns
-        self._on = (ctypes.c_int(self.fd), ctypes.c_int(0), timespec(0, 0, 0, delay_ns), None)
-        self._off = (ctypes.c_int(self.fd), ctypes.c_int(0), timespec(0, 0, 0, 0), None)
-
-    def start(self) -> None:
-        self._settime(*self._on)
-
-    def stop(self) -> None:
-        self._settime(*self._off)
-
-    def consume(self) -> None:
-        with contextlib.suppress(BlockingIOError):  # it was stopped in this moment
-            os.read(self.fd, 8)
 
 
 class Waker:
@@ -118,8 +94,9 @@ class LocalTransport:
         self._handlers: dict[int, Callable[[int], None]] = {}
         self._poke = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._events.register(self._poke, select.EPOLLIN)
-        self._busy = _OneShot(_BUSY_NS)
         self._waiting = False
+        self._left_s = time.monotonic()
+        self._slow_until_s = 0.0
         self._bus_reads = True
         self._events.register(self._inputs.fileno(), select.EPOLLIN)
         self._waker: Waker | None = None
@@ -185,7 +162,7 @@ class LocalTransport:
         with self._read_lock:
             self._inputs.close()
             self._events.close()
-            for fd in (self._poke, self._busy.fd, *([self._waker.fd] if self._waker else [])):
+            for fd in (self._poke, *([self._waker.fd] if self._waker else [])):
                 os.close(fd)
 
     # -- for publishers: sockets that the bus thread serves ------------------------------------------
@@ -231,17 +208,18 @@ class LocalTransport:
     def wait(self, timeout: float) -> None:
         """Reads the node's sockets until something came or the time is over; on the node's thread."""
         self._waiting = True
-        self._busy.stop()
         if self._bus_reads:
             self._bus_reads = False
             self._events.modify(self._inputs.fileno(), 0)
-        if self.driver is None:
-            self._events.register(self._busy.fd, select.EPOLLIN)
         self.driver = threading.get_ident()
-        events = self._inputs.poll(timeout, 16)
-        self._drain(events)
+        now = time.monotonic()
+        if now - self._left_s > _BUSY_S:
+            if now > self._slow_until_s:
+                os.eventfd_write(self._poke, 1)
+            self._slow_until_s = now + _SLOW_FOR_S
+        self._drain(self._inputs.poll(timeout, 16))
+        self._left_s = time.monotonic()
         self._waiting = False
-        self._busy.start()
 
     def _drain(self, events: list[tuple[int, int]]) -> None:
         ready: list[LocalSubscription] = []
@@ -264,17 +242,17 @@ class LocalTransport:
             if self._look_now or now >= next_look:
                 self._look_now = False
                 next_look = now + (_DISCOVERY_S if self._look() else 1.0)
+            if not self._waiting and not self._bus_reads and now - self._left_s > _BUSY_S:
+                self._bus_reads = True
+                self._events.modify(inputs, select.EPOLLIN)
             timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
+            if now < self._slow_until_s:
+                timeout = min(timeout, _BUSY_S)
             for fd, events in self._events.poll(max(0.0, timeout), 64):
                 if fd == inputs:
                     self._drain(self._inputs.poll(0, 64))
                 elif fd == self._poke:
                     os.eventfd_read(fd)
-                elif fd == self._busy.fd:
-                    self._busy.consume()
-                    if not self._waiting:
-                        self._bus_reads = True
-                        self._events.modify(inputs, select.EPOLLIN)
                 elif (handler := self._handlers.get(fd)) is not None:
                     handler(events)
 
