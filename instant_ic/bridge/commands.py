@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ..ranges import Positive, check_ranges
+
 
 class CommandRefused(ValueError):
     """A command that must not reach the robot; the message says why."""
@@ -21,16 +23,14 @@ class CommandLimits:
         max_angular_rps: rad/s, the same.
     """
 
-    max_age_s: float = 0.3
-    lease_s: float = 2.0
-    max_linear_mps: float = 2.0
-    max_angular_rps: float = 4.0
+    max_age_s: Positive = 0.3
+    lease_s: Positive = 2.0
+    max_linear_mps: Positive = 2.0
+    max_angular_rps: Positive = 4.0
 
     def __post_init__(self) -> None:
         """Checks the values."""
-        for name in ("max_age_s", "lease_s", "max_linear_mps", "max_angular_rps"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} must be > 0 (got {getattr(self, name)})")
+        check_ranges(self)
 
 
 class CommandGate:

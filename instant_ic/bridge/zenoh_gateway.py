@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -77,6 +78,26 @@ def takes(patterns: Sequence[str], topic: str) -> bool:
     return any(fnmatch.fnmatchcase(topic, pattern) for pattern in patterns)
 
 
+def parse_publish(entries: Sequence[str]) -> dict[str, int]:
+    """Least time between messages in ns by pattern, of lines like ``/lidar/points rate_hz=3``; 0 sends all.
+
+    Raises:
+        ValueError: something else stands there.
+    """
+    periods = {}
+    for entry in entries:
+        pattern, _, option = entry.partition(" ")
+        key, _, value = option.strip().partition("=")
+        try:
+            rate_hz = float(value) if option else math.inf
+        except ValueError:
+            rate_hz = 0.0
+        if not pattern.startswith("/") or (option and key != "rate_hz") or not rate_hz > 0:
+            raise ValueError(f"publish: {entry!r} must be /TOPIC, a pattern, or one of them with rate_hz=N behind it")
+        periods[pattern] = int(1e9 / rate_hz)
+    return periods
+
+
 def known_hash(type_name: str) -> str | None:
     """RIHS01 hash of a type; None for one that is not in ROS 2 Jazzy or among our own."""
     try:
@@ -89,9 +110,11 @@ def known_hash(type_name: str) -> str | None:
 class _Out:
     """A topic that goes out: one subscription here, a publisher there for each of its publishers."""
 
+    period_ns: int
     subscription: Subscription | None = None
     publishers: dict[str, RosPublisher] = field(default_factory=dict)
     gone_s: dict[str, float] = field(default_factory=dict)
+    due_ns: dict[str, int] = field(default_factory=dict)
 
 
 class Outgoing:
@@ -105,17 +128,21 @@ class Outgoing:
         node: the gateway's node.
         session: the Zenoh session.
         namespace: where the topics stand there.
-        publish: names or patterns of topics.
+        publish: see :func:`parse_publish`; of several patterns that match, the first holds.
+
+    Raises:
+        ValueError: a line of ``publish`` is wrong.
     """
 
     def __init__(self, node: Node[Any], session: RosSession, namespace: Namespace, publish: Sequence[str]) -> None:
         self._node = node
         self._session = session
         self._namespace = namespace
-        self._publish = tuple(publish)
+        self._periods = parse_publish(publish)
         self._topics: dict[str, _Out] = {}
         self._nodes: dict[str, RosNode] = {}
         self.count = 0
+        self.thinned = 0
 
     @property
     def topics(self) -> list[str]:
@@ -128,10 +155,12 @@ class Outgoing:
         live: dict[str, list[PublisherInfo]] = {}
         for info in present:
             publishers = [p for p in info.publishers if p.node != self._node.node_name]
-            if publishers and takes(self._publish, info.topic):
+            if publishers and takes(tuple(self._periods), info.topic):
                 live[info.topic] = publishers
         for topic, publishers in live.items():
-            out = self._topics.setdefault(topic, _Out())
+            if (out := self._topics.get(topic)) is None:
+                period = next(p for pattern, p in self._periods.items() if takes((pattern,), topic))
+                out = self._topics[topic] = _Out(period)
             for publisher in publishers:
                 self._mirror(topic, publisher.node, publisher.type_name, PRESETS.get(publisher.qos, RELIABLE))
             if out.subscription is None:
@@ -174,9 +203,23 @@ class Outgoing:
         publisher = out.publishers.get(received.publisher)
         if publisher is None and out.subscription is not None:  # heard before the next look at the registry
             publisher = self._mirror(received.topic, received.publisher, received.type_name, out.subscription.raw.qos)
-        if publisher is not None:
-            publisher.put(received.payload, received.publish_ns)
-            self.count += 1
+        if publisher is None or self._early(out, received):
+            return
+        publisher.put(received.payload, received.publish_ns)
+        self.count += 1
+
+    def _early(self, out: _Out, received: Received) -> bool:
+        """Whether the rate limit leaves a message out; each publisher has its own."""
+        if not out.period_ns:
+            return False
+        due_ns = out.due_ns.get(received.publisher, 0)
+        if received.received_ns < due_ns:
+            self.thinned += 1
+            return True
+        # On the grid of periods, so that a limit of 3 Hz gives 3 Hz of a topic of 10 Hz; no burst after a pause.
+        start_ns = due_ns if received.received_ns - due_ns < out.period_ns else received.received_ns
+        out.due_ns[received.publisher] = start_ns + out.period_ns
+        return False
 
 
 class StaticTransforms:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from instant_ic.bridge.commands import CommandGate, CommandLimits
-from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing
+from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing, parse_publish
 from instant_ic.bridge.zenoh_session import RosSession, ZenohError, config_path, load_config
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.msg import MessageError
+from instant_ic.ranges import Range, check_ranges
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class ZenohGatewayConfig:
         domain: ROS domain (``ROS_DOMAIN_ID``).
         connect: routers to connect to; empty: those of the session file.
         session_file: Zenoh configuration (JSON5), path or file of config/; empty: as rmw_zenoh, router on localhost.
-        publish: topics that go out, names or patterns.
+        publish: topics that go out: NAME or PATTERN, with rate_hz=N behind it for at most N messages a second.
         subscribe: topics that come in: NAME, PATTERN, or "NAME TYPE" to have it before anybody publishes it.
         commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop.
         limits: what commands have to pass.
@@ -28,27 +30,25 @@ class ZenohGatewayConfig:
     """
 
     namespace: str = ""
-    domain: int = 0
+    domain: Annotated[int, Range(0, 232)] = 0
     connect: tuple[str, ...] = ()
     session_file: str = ""
     publish: tuple[str, ...] = ()
     subscribe: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
     limits: CommandLimits = field(default_factory=CommandLimits)
-    discovery_period_s: float = 0.2
+    discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.2
 
     def __post_init__(self) -> None:
         """Checks the values."""
+        check_ranges(self)
+        parse_publish(self.publish)
         try:
             Namespace(self.namespace)
         except registry.RegistryError:
             raise ValueError(f"namespace {self.namespace!r} must look like robot1 or fleet/robot1") from None
-        if not 0 <= self.domain <= 232:
-            raise ValueError(f"domain must lie in 0..232 (got {self.domain})")
         if unknown := set(self.commands) - set(COMMANDS):
             raise ValueError(f"commands may only hold {', '.join(COMMANDS)} (got {', '.join(sorted(unknown))})")
-        if not 0.05 <= self.discovery_period_s <= 10:
-            raise ValueError(f"discovery_period_s must be 0.05 to 10 s (got {self.discovery_period_s})")
 
 
 class ZenohGatewayNode(Node[ZenohGatewayConfig]):
@@ -106,7 +106,15 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         level = WARN if lost > self._lost else OK
         self._lost = lost
         refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
-        self.diagnose("topics", level, words, malformed=self.incoming.malformed(), **losses, **refused)
+        self.diagnose(
+            "topics",
+            level,
+            words,
+            thinned=self.outgoing.thinned,
+            malformed=self.incoming.malformed(),
+            **losses,
+            **refused,
+        )
 
     def teardown(self) -> None:
         """Leaves the ROS graph."""

@@ -427,6 +427,9 @@ def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path
         ({"domain": 300}, "domain must lie in 0..232"),
         ({"commands": ("/cmd_vel",)}, r"commands may only hold /operator/cmd_vel, /operator/estop \(got /cmd_vel\)"),
         ({"discovery_period_s": 0.0}, "discovery_period_s"),
+        ({"publish": ("/scan every=2",)}, "'/scan every=2' must be /TOPIC"),
+        ({"publish": ("/scan rate_hz=0",)}, "rate_hz=N"),
+        ({"publish": ("scan",)}, "'scan' must be /TOPIC"),
     ],
 )
 def test_wrong_parameters_are_named(parameters, words):
@@ -458,6 +461,26 @@ def test_nothing_of_a_gateway_is_left_running(world):
     gateway.close()
     wait_for(lambda: threading.active_count() <= before, "the end of its threads")
     assert world.topics("robot") == set()
+
+
+def test_rate_limit_thins_and_counts_what_it_leaves_out(world):
+    gateway = world.gateway("robot", publish=("/fast rate_hz=5", "/*"))
+    talker = world.neighbour("robot")
+    fast, all_of_it = talker.publisher("/fast", String), talker.publisher("/all", String)
+    samples = []
+    world.session().zenoh.declare_subscriber("0/*/**", lambda s: samples.append(str(s.key_expr).split("/")[1]))
+    publish_until(fast, String("x"), lambda: samples, "the link")
+    time.sleep(0.3)
+    samples.clear()
+    started = time.monotonic()
+    for _ in range(40):
+        fast.publish(String("x"))
+        all_of_it.publish(String("x"))
+        time.sleep(0.025)
+    took_s = time.monotonic() - started
+    wait_for(lambda: samples.count("all") == 40, "everything of the other topic")
+    assert samples.count("fast") == pytest.approx(5 * took_s, abs=1.5)
+    assert gateway.node.outgoing.thinned >= 40 - samples.count("fast")
 
 
 def test_reliable_topics_lose_nothing_on_the_way_through_two_gateways(world):

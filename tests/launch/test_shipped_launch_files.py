@@ -10,13 +10,16 @@ from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 from instant_ic.launch.parameters import check_parameters
 
 NAMES = sorted(file.stem for file in paths.share_dir("launch").glob("*.yaml"))
-NEEDED = {"replay": {"bag": "drive"}}
+NEEDED = {"replay": {"bag": "drive"}, "fleet_robot": {"robot_name": "robot4"}}
 EVERYTHING = {
     "replay": {"bag": "drive", "record": "again", "nerf": "true"},
     "sim": {"panorama": "photo.jpg", "pcap": "drive.pcap", "record": "drive", "trust_depth": "true"},
-    "robot": {"camera_url": "http://10.0.0.9", "lidar_port": "3000", "serial_port": "/dev/ttyUSB1", "record": "x"},
+    "robot": {"camera_url": "http://10.0.0.9", "lidar_port": "3000", "serial_port": "/dev/ttyUSB1", "record": "x"}
+    | {"robot_name": "robot1", "foxglove": "true", "foxglove_port": "9999"},
     "full": {"serial_port": "/dev/ttyUSB1", "console_port": "9000", "record": "x"},
-    "station": {"console_port": "9000"},
+    "station": {"console_port": "9000", "robot_name": "robot1", "router": "tcp/10.0.0.1:7447", "foxglove": "true"},
+    "fleet_robot": {"robot_name": "robot4", "address": "127.0.0.5", "router": "tcp/10.0.0.1:7447"},
+    "fleet": {"robot": "robot3", "vspace": "true", "router_port": "7448"},
 }
 PERCEPTION = {"grid_slam", "depth_estimator", "depth_scaler"}
 ROBOT = {"theta_camera", "vlp16_driver", "crawler_base", "grid_slam", "virtual_robot", "navigator", "arbiter"}
