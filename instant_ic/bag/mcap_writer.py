@@ -65,20 +65,21 @@ class McapWriter:
 
     Args:
         path: the file, which must not exist.
-        compressed: chunks are compressed with zstd, level 1.
+        compressed: chunks are compressed with zstd.
+        level: from 1, for what must keep pace, to 19, for what must be small.
 
     Raises:
         OSError: the file cannot be made.
     """
 
-    def __init__(self, path: Path, compressed: bool = False) -> None:
+    def __init__(self, path: Path, compressed: bool = False, level: int = 3) -> None:
         self.path = path
         self.compressed = compressed
         self._compressor: Any = None
         if compressed:
             import zstandard
 
-            self._compressor = zstandard.ZstdCompressor(level=1)
+            self._compressor = zstandard.ZstdCompressor(level=level)
         self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         self._offset = 0
         self._schemas: dict[int, bytes] = {}

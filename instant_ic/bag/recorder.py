@@ -31,6 +31,7 @@ FOREIGN_CLOCK_NS = 10_000_000_000
 
 RECORDING, PAUSED, DISK_FULL, FAILED, ENDED = "recording", "paused", "disk full", "failed", "ended"
 
+_LEVEL = 1  # of zstd: it must keep pace
 _FLUSH_S = 1.0
 _KEEP_CUSTOM_S = 10.0
 _SPACE_S = 1.0
@@ -211,7 +212,9 @@ class Recorder:
                 raise BagError(f"folder {path} for snapshots cannot be made: {error.strerror}") from None
             self._cache = SnapshotCache(self.options.snapshot_s, self.options.cache_bytes)
         else:
-            self._writer = BagWriter(path, self.options.compressed, self.options.max_bytes, self.options.max_duration_s)
+            self._writer = BagWriter(
+                path, self.options.compressed, self.options.max_bytes, self.options.max_duration_s, _LEVEL
+            )
         self._queue = _Queue(self.options.queue_bytes)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
@@ -489,7 +492,7 @@ class Recorder:
         try:
             if not content:
                 raise BagError(f"snapshot {snapshot.path}: no message has come yet")
-            with BagWriter(snapshot.path, self.options.compressed) as writer:
+            with BagWriter(snapshot.path, self.options.compressed, level=_LEVEL) as writer:
                 for entry in content:
                     writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
                 self._tell(writer)

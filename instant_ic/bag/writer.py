@@ -40,6 +40,7 @@ class BagWriter:
     Args:
         path: the folder, which must not exist yet.
         compressed: chunks are compressed by zstd, for bags to keep or send: half the size for point packets.
+        level: of the compression; 1 keeps pace with raw pictures, 3 is smaller.
         max_bytes: a file that has grown so large is followed by the next; 0 does not look at the size.
         max_duration_s: the same by the stamps of its messages.
 
@@ -47,9 +48,17 @@ class BagWriter:
         BagError: it exists, or cannot be made.
     """
 
-    def __init__(self, path: Path, compressed: bool = False, max_bytes: int = 0, max_duration_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        path: Path,
+        compressed: bool = False,
+        max_bytes: int = 0,
+        max_duration_s: float = 0.0,
+        level: int = 3,
+    ) -> None:
         self.path = path
         self.compressed = compressed
+        self._level = level
         self.max_bytes = max_bytes
         self.max_duration_ns = int(max_duration_s * 1e9)
         self.bytes = 0
@@ -232,7 +241,7 @@ class BagWriter:
         numbered = number > 0 or self.max_bytes > 0 or self.max_duration_ns > 0
         name = f"{self.path.name}_{number}.mcap" if numbered else f"{self.path.name}.mcap"
         try:
-            file = McapWriter(self.path / name, self.compressed)
+            file = McapWriter(self.path / name, self.compressed, self._level)
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise DiskFullError(f"bag {self.path}: {error.strerror}") from error

@@ -89,9 +89,8 @@ def run(args: argparse.Namespace) -> int:
     if left_out:
         print(f"not fed: {left_out}")
     speed = result.bag_s / max(result.wall_s, 1e-9)
-    print(
-        f"{result.bag_s:.1f} s of bag in {result.wall_s:.1f} s: {speed:.1f} x real time ({result.setup_s:.1f} s to start)"
-    )
+    took = f"{result.wall_s:.1f} s, {speed:.1f} x real time, after {result.setup_s:.1f} s to start"
+    print(f"{result.bag_s:.1f} s of bag in {took}")
     if not args.compare:
         return 0
     found = compare(Path(args.output), Path(args.compare), tuple(topic_names(args.ignore)), True, tolerance)
