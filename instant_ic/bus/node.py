@@ -44,6 +44,7 @@ ConfigT = TypeVar("ConfigT")
 _HEARTBEAT_S = 0.5
 _DIAGNOSTICS_S = 1.0
 _WENT_BACK_NS = 100_000_000  # a simulated clock that goes back farther begins anew; less is jitter
+_START_GRACE_S = 15.0  # so long after its start a node may wait for the others without complaining in the log
 _NO_CLOCK_S = 5.0
 _IDLE_S = 0.5  # longest sleep of the loop, so that a stop flag set by a signal is seen
 
@@ -255,6 +256,8 @@ class Node(Generic[ConfigT]):
         goes back as JSON, its ``ValueError`` or :class:`NodeError` as the reason of a refusal."""
         self._clock_in: Subscription | None = None
         self._began_s = time.monotonic()
+        self._well: set[str] = set()  # diagnoses that have been OK
+        self._waiting: set[str] = set()  # not yet, and told as information only
         self._running: tuple[str, float] | None = None
         self._parameter_events: Publisher | None = None
         self.on_registry_change: Callable[[], None] | None = None
@@ -378,9 +381,28 @@ class Node(Generic[ConfigT]):
         before = self._diagnoses.get(name)
         self._diagnoses[name] = (level, message, values)
         if level >= WARN and (before is None or before[0] != level):
-            self.log.log(logging.WARNING if level == WARN else logging.ERROR, "%s: %s", name, message)
-        elif level == OK and before is not None and before[0] >= WARN:
-            self.log.info("%s: %s", name, message)
+            self._log_diagnosis(name, level, message)
+        elif level == OK:
+            self._well.add(name)
+            self._waiting.discard(name)
+            if before is not None and before[0] >= WARN:
+                self.log.info("%s: %s", name, message)
+
+    def _log_diagnosis(self, name: str, level: int, message: str) -> None:
+        """What was never well yet is no fault while the others still start: a line of information, once."""
+        if not self.lockstep and name not in self._well and time.monotonic() < self._began_s + _START_GRACE_S:
+            if name not in self._waiting:
+                self._waiting.add(name)
+                self.log.info("%s: %s", name, message)
+            return
+        self.log.log(logging.WARNING if level == WARN else logging.ERROR, "%s: %s", name, message)
+
+    def _end_start_grace(self) -> None:
+        """What is still not well when the others have had their time is told for what it is."""
+        for name in sorted(self._waiting) if time.monotonic() >= self._began_s + _START_GRACE_S else ():
+            self._waiting.discard(name)
+            level, message, _ = self._diagnoses[name]
+            self._log_diagnosis(name, level, message)
 
     def stop(self) -> None:
         """Ends the loop; may be called from any thread and from a signal handler."""
@@ -539,6 +561,7 @@ class Node(Generic[ConfigT]):
             if now >= next_diagnostics:
                 next_diagnostics = now + _DIAGNOSTICS_S
                 self._publish_diagnostics()
+                self._end_start_grace()
             wait = min(_IDLE_S, next_beat - now, next_diagnostics - now)
             if self._timers:
                 due = (self._timers[0][0] - self.clock.steady_ns()) / 1e9
@@ -611,7 +634,11 @@ class Node(Generic[ConfigT]):
         self._state = "STOPPING"
         self._stop.set()
         try:
-            self.teardown()
+            try:
+                if hasattr(self, "_heartbeat"):
+                    self._beat()  # so that nobody takes it for dead
+            finally:
+                self.teardown()
         finally:
             for worker in self._workers:
                 worker.stop()
