@@ -12,7 +12,7 @@ from typing import Any
 
 from ..bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, Node, Publisher, QoS, Subscription
 from ..bus.qos import PRESETS
-from ..bus.registry import PublisherInfo, TopicInfo, check_topic
+from ..bus.registry import PublisherInfo, RegistryError, TopicInfo, check_topic
 from ..bus.transport import Received
 from ..msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
 from .commands import CommandGate, CommandRefused
@@ -121,26 +121,34 @@ class Outgoing:
     """Topics of the run directory, byte for byte, under the names of the nodes that publish them.
 
     Each publisher here has its own publisher there, so latched values of several nodes (``/tf_static``) are all kept
-    for late joiners, and ``ros2 node list`` shows the nodes themselves. What the gateway itself brought in does not go
-    out again.
+    for late joiners, and ``ros2 node list`` shows the nodes themselves.
 
     Args:
         node: the gateway's node.
         session: the Zenoh session.
         namespace: where the topics stand there.
+        own: the gateway itself in the ROS graph.
         publish: see :func:`parse_publish`; of several patterns that match, the first holds.
+
+    Attributes:
+        brought_in: tells whether a topic may come in by the same gateway; what it hands on does not go out again.
+        count, thinned: messages that went out, and that a rate limit left out.
 
     Raises:
         ValueError: a line of ``publish`` is wrong.
     """
 
-    def __init__(self, node: Node[Any], session: RosSession, namespace: Namespace, publish: Sequence[str]) -> None:
+    def __init__(
+        self, node: Node[Any], session: RosSession, namespace: Namespace, own: RosNode, publish: Sequence[str]
+    ) -> None:
         self._node = node
         self._session = session
+        self._own = own
         self._namespace = namespace
         self._periods = parse_publish(publish)
         self._topics: dict[str, _Out] = {}
         self._nodes: dict[str, RosNode] = {}
+        self.brought_in: Callable[[str], bool] = lambda topic: False
         self.count = 0
         self.thinned = 0
 
@@ -154,7 +162,7 @@ class Outgoing:
         now = time.monotonic()
         live: dict[str, list[PublisherInfo]] = {}
         for info in present:
-            publishers = [p for p in info.publishers if p.node != self._node.node_name]
+            publishers = [p for p in info.publishers if not self._came_in(info.topic, p.node)]
             if publishers and takes(tuple(self._periods), info.topic):
                 live[info.topic] = publishers
         for topic, publishers in live.items():
@@ -189,16 +197,21 @@ class Outgoing:
             if (hash_ := known_hash(type_name)) is None:
                 self._node.diagnose(f"out {topic}", ERROR, f"{type_name} is not known here: it cannot go out")
                 return None
-            if node not in self._nodes:
-                self._nodes[node] = RosNode(self._session, self._namespace.ros, node)
+            there = self._own if node == self._own.name else self._nodes.get(node)
+            if there is None:
+                there = self._nodes[node] = RosNode(self._session, self._namespace.ros, node)
             name = self._namespace.to_ros(topic)
-            out.publishers[node] = RosPublisher(self._nodes[node], name, type_name, hash_, ros_qos(qos))
+            out.publishers[node] = RosPublisher(there, name, type_name, hash_, ros_qos(qos))
             self._node.log.info("%s of %s goes out as %s", topic, node, name)
         return out.publishers[node]
 
+    def _came_in(self, topic: str, publisher: str) -> bool:
+        """Whether a publisher here only hands on what came from there: that must not go out again."""
+        return publisher == self._node.node_name and self.brought_in(topic)
+
     def _forward(self, received: Received) -> None:
         out = self._topics.get(received.topic)
-        if out is None or received.publisher == self._node.node_name:
+        if out is None or self._came_in(received.topic, received.publisher):
             return
         publisher = out.publishers.get(received.publisher)
         if publisher is None and out.subscription is not None:  # heard before the next look at the registry
@@ -246,6 +259,7 @@ class _In:
     type_name: str
     qos: TopicQoS
     publisher: Publisher
+    own_publisher: bool
     always: bool
     subscription: RosSubscription | None = None
     sources: set[tuple[str, int]] = field(default_factory=set)
@@ -257,8 +271,8 @@ class Incoming:
 
     Args:
         node: the gateway's node.
-        session: the Zenoh session.
         namespace: where the topics stand there.
+        own: the gateway itself in the ROS graph.
         subscribe: ``TOPIC``, ``PATTERN`` or ``TOPIC TYPE`` by the names here. With a type the topic is there at once;
             else when a publisher of it appears.
         commands: which of :data:`COMMANDS` may come in.
@@ -271,8 +285,8 @@ class Incoming:
     def __init__(
         self,
         node: Node[Any],
-        session: RosSession,
         namespace: Namespace,
+        own: RosNode,
         subscribe: Sequence[str],
         commands: Sequence[str],
         gate: CommandGate,
@@ -293,7 +307,7 @@ class Incoming:
             self._patterns.append(topic)
         self._types.update({topic: COMMANDS[topic] for topic in commands})
         self._commands = set(commands)
-        self._own = RosNode(session, namespace.ros, node.node_name)
+        self._own = own
         for topic, name in self._types.items():
             self._open(topic, name, TopicQoS(latched=topic == "/operator/estop", depth=1), always=True)
 
@@ -318,7 +332,7 @@ class Incoming:
 
     def _follow(self, token: Token, alive: bool) -> None:
         topic = self._namespace.to_local(token.topic)
-        if topic is None or not self._wants(topic):
+        if topic is None or not self.wants(topic):
             return
         source = (token.session, token.entity_id)
         entry = self._topics.get(topic)
@@ -331,11 +345,16 @@ class Incoming:
         if not self._same_type(topic, token, entry):
             return
         if entry is None or (token.qos.latched and not entry.qos.latched):
-            entry = self._open(topic, token.type_name, token.qos, entry is not None and entry.always)
+            try:
+                entry = self._open(topic, token.type_name, token.qos, entry is not None and entry.always)
+            except RegistryError as error:
+                self._node.diagnose(f"in {topic}", ERROR, str(error))
+                return
         entry.sources.add(source)
         entry.gone_s = None
 
-    def _wants(self, topic: str) -> bool:
+    def wants(self, topic: str) -> bool:
+        """Whether a topic comes in as soon as somebody there publishes it."""
         if topic in self._commands:
             return True
         return takes(self._patterns, topic) and not takes(_ACTED_ON, topic)
@@ -364,8 +383,12 @@ class Incoming:
             sources = old.sources
             self._shut(old)
         name = message_type(type_name).__msgtype__
-        publisher = self._node.publisher_raw(topic, name, bus_qos(qos))
-        entry = self._topics[topic] = _In(name, qos, publisher, always, sources=sources)
+        # /heartbeat and its like the gateway sends itself; others' go out by the same publisher.
+        publisher = next((p for p in self._node.publishers if p.topic == topic), None)
+        own = publisher is not None
+        if publisher is None:
+            publisher = self._node.publisher_raw(topic, name, bus_qos(qos))
+        entry = self._topics[topic] = _In(name, qos, publisher, own, always, sources=sources)
         handle = self._handler(topic, entry)
         there = self._namespace.to_ros(topic)
         entry.subscription = RosSubscription(self._own, there, name, type_hash(name), qos, handle)
@@ -437,4 +460,5 @@ class Incoming:
     def _shut(self, entry: _In) -> None:
         if entry.subscription is not None:
             entry.subscription.close()
-        self._node.drop(entry.publisher)
+        if not entry.own_publisher:
+            self._node.drop(entry.publisher)

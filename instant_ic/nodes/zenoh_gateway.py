@@ -7,7 +7,7 @@ from typing import Annotated
 
 from instant_ic.bridge.commands import CommandGate, CommandLimits
 from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing, parse_publish
-from instant_ic.bridge.zenoh_session import RosSession, ZenohError, config_path, load_config
+from instant_ic.bridge.zenoh_session import RosNode, RosSession, ZenohError, config_path, load_config
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.msg import MessageError
 from instant_ic.ranges import Range, check_ranges
@@ -69,10 +69,12 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         try:
             zenoh_config = load_config(config_path(config.session_file), config.connect)
             self.session = RosSession(zenoh_config, config.domain)
-            self.outgoing = Outgoing(self, self.session, namespace, config.publish)
-            self.incoming = Incoming(self, self.session, namespace, config.subscribe, config.commands, self.gate)
+            own = RosNode(self.session, namespace.ros, self.node_name)
+            self.outgoing = Outgoing(self, self.session, namespace, own, config.publish)
+            self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate)
         except (ZenohError, MessageError, ValueError, FileNotFoundError, registry.RegistryError) as error:
             raise NodeError(str(error)) from None
+        self.outgoing.brought_in = self.incoming.wants
         self.session.watch(self.incoming.on_token)
         self._lost = 0
         self.look()

@@ -22,9 +22,12 @@ from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
 from instant_ic.evaluation.stack import free_port
 from instant_ic.msg import (
     Bool,
+    DiagnosticArray,
+    DiagnosticStatus,
     String,
     TFMessage,
     deserialize,
+    header,
     transform_message,
     twist_stamped,
     twist_values,
@@ -258,6 +261,35 @@ def test_what_came_in_does_not_go_out_again(world):
     own = world.neighbour("robot", "talker").publisher("/chatter", String)
     publish_until(own, String("out"), lambda: samples, "our own message outside")
     assert {s.payload.to_bytes() for s in samples} == {cdr(String("out"))}
+
+
+def test_diagnostics_of_the_robot_and_its_gateway_come_beside_those_of_the_stations_gateway(world):
+    """The gateways publish on /diagnostics themselves, and a node has one publisher a topic."""
+    tokens = {}
+    world.session().watch(lambda token, alive: tokens.update({token: alive}))
+    world.gateway("robot", namespace="robot1", publish=("/diagnostics",))
+    world.gateway("station", namespace="robot1", subscribe=("/diagnostics",), publish=("/*",))
+    out = world.neighbour("robot", "arbiter").publisher("/diagnostics", DiagnosticArray)
+    listener = world.neighbour("station", "listener")
+    heard = listener.listen("/diagnostics")
+    found = DiagnosticArray(header("", 1), [DiagnosticStatus(0, "arbiter: all", "well", "", [])])
+
+    def words():
+        out.publish(found)
+        time.sleep(0.05)
+        return {(s.name, s.message) for m in heard for s in deserialize(m.payload, m.type_name).status}
+
+    robots = ("zenoh_gateway: topics", "messages out on 1 topics")
+    stations = ("zenoh_gateway: topics", "0 messages out")
+    listener.wait(lambda: ("arbiter: all", "well") in words(), "the arbiter's diagnosis")
+    for name, part in (robots, stations):
+        listener.wait(lambda n=name, p=part: any(w[0] == n and p in w[1] for w in words()), part)
+    # The station's own stays in its place, although its gateway would publish everything.
+    assert {t.node for t in tokens if t.topic == "/robot1/diagnostics" and t.kind == "MP"} == {
+        "arbiter",
+        "zenoh_gateway",
+    }
+    assert len({t.session for t in tokens if t.topic == "/robot1/diagnostics" and t.kind == "MP"}) == 1
 
 
 def test_another_definition_of_a_type_is_told_and_kept_out(world):
