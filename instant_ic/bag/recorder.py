@@ -529,7 +529,8 @@ class Recorder:
             if self._state != FAILED:
                 self._state = ENDED
         except BagError as error:
-            self._stop(FAILED, str(error))
+            if self._state != FAILED:  # else the first reason is the one to tell
+                self._stop(FAILED, str(error))
 
 
 def _slug(text: str) -> str:

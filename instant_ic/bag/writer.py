@@ -14,6 +14,8 @@ from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
 
+_FULL = (errno.ENOSPC, errno.EDQUOT)
+
 CUSTOM_RECORD = "instant_ic"
 """Name of the metadata record in which a file keeps ``custom_data`` while the bag is being written."""
 
@@ -243,7 +245,7 @@ class BagWriter:
         try:
             file = McapWriter(self.path / name, self.compressed, self._level)
         except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno in _FULL:
                 raise DiskFullError(f"bag {self.path}: {error.strerror}") from error
             raise BagError(f"bag {self.path} cannot be made: {error.strerror or error}") from None
         self._part = _Part(file, PartInfo(name))
@@ -285,7 +287,7 @@ class BagWriter:
             pass
         except BagError as worse:
             words = str(worse)
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        if error.errno in _FULL:
             return DiskFullError(f"{words}: the disk is full; the bag is complete up to here")
         return BagError(words)
 
@@ -306,7 +308,5 @@ class BagWriter:
         try:
             write_metadata(self.path, self._done, self._topics, self._custom)
         except OSError as error:
-            raise BagError(
-                f"bag {self.path}: metadata.yaml cannot be written: {error.strerror}; make room, then ic bag reindex "
-                f"{self.path}"
-            ) from error
+            hint = f"; make room, then ic bag reindex {self.path}" if error.errno in _FULL else ""
+            raise BagError(f"bag {self.path}: metadata.yaml cannot be written: {error.strerror}{hint}") from error

@@ -1,0 +1,329 @@
+"""The recording without a bus: it never waits for the disk, tells what it left out, survives a full one."""
+
+import errno
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, RECORDING, Recorder, RecordOptions
+from instant_ic.bag.snapshot import Entry, SnapshotCache
+from instant_ic.bus import LATCHED, SENSOR
+from instant_ic.bus.qos import QoS
+from instant_ic.bus.registry import PublisherInfo, TopicInfo
+from instant_ic.msg import Bool, serialize
+
+BOOL = "std_msgs/msg/Bool"
+S = 1_000_000_000
+YES, NO = bytes(serialize(Bool(data=True))), bytes(serialize(Bool(data=False)))
+
+
+class Losses:
+    def __init__(self) -> None:
+        self.lost = 0
+        self.lost_by: dict[str, int] = {}
+
+
+def topic_info(topic: str, *presets: QoS) -> TopicInfo:
+    publishers = [PublisherInfo(f"n{i}", 1, qos.name, Path("s"), BOOL, "00", 0) for i, qos in enumerate(presets)]
+    return TopicInfo(topic, BOOL, publishers)
+
+
+def make(path: Path, free: Callable[[Path], int] = lambda path: 10**12, **options: object) -> Recorder:
+    recorder = Recorder(
+        path,
+        TopicChoice(),
+        lambda topic, take: Losses(),
+        None,
+        RecordOptions(**options),
+        free,  # type: ignore[arg-type]
+    )
+    recorder.discover([topic_info("/scan", SENSOR), topic_info("/estop", LATCHED)])
+    return recorder
+
+
+def wait_for(condition: Callable[[], object], what: str) -> None:
+    deadline_s = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline_s, f"waited 20 s for {what}"
+        time.sleep(0.01)
+
+
+def read(path: Path) -> list[tuple[str, int, bytes]]:
+    with BagReader(path) as reader:
+        return [(m.topic, m.stamp_ns, m.payload) for m in reader.messages()]
+
+
+def custom(path: Path, key: str) -> object:
+    with BagReader(path) as reader:
+        return json.loads(reader.custom.get(f"instant_ic.{key}", "null"))
+
+
+class SlowDisk:
+    """Every write waits until it is let go."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go = threading.Event()
+        writev = os.writev
+
+        def wait_and_write(fd: int, parts: list[memoryview]) -> int:
+            assert self.go.wait(60)
+            return writev(fd, parts)
+
+        self._begin = lambda: monkeypatch.setattr(os, "writev", wait_and_write)
+
+    def hang(self) -> None:
+        self._begin()
+
+
+def test_taking_never_waits_for_the_disk_and_what_is_left_out_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder, disk = make(tmp_path / "bag", queue_bytes=3_000_000), SlowDisk(monkeypatch)
+    recorder.take("/scan", BOOL, b"first", 1 * S)
+    disk.hang()
+    # Twenty times 1 MB while the disk takes nothing: three find a place in the queue, some are in the writer's hands.
+    for index in range(20):
+        recorder.take("/scan", BOOL, bytes([index]) * 1_000_000, 2 * S + index)
+    recorder.take("/estop", BOOL, YES, 3 * S)  # latched values always find a place
+    assert not disk.go.is_set()  # and all that time nothing was written
+    left_out = recorder.told.overflow["/scan"]
+    assert 10 <= left_out <= 18
+    disk.go.set()
+    recorder.close()
+    got = read(tmp_path / "bag")
+    assert len([m for m in got if m[0] == "/scan"]) == 21 - left_out
+    assert ("/estop", 3 * S, YES) in got
+    assert custom(tmp_path / "bag", "overflow") == {"/scan": left_out}
+
+
+def test_a_disk_that_hangs_for_good_does_not_hang_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recorder, disk = make(tmp_path / "bag"), SlowDisk(monkeypatch)
+    disk.hang()
+    recorder.take("/scan", BOOL, b"x" * 2_000_000, 1 * S)
+    with pytest.raises(BagError, match=r"did not take the last 2\.0 MB within 0\.3 s; ic bag recover"):
+        recorder.close(timeout_s=0.3)
+    disk.go.set()  # lets the thread go
+
+
+def test_payload_may_be_overwritten_once_it_was_taken(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag")
+    slot = bytearray(b"aaaa")  # as in shared memory
+    recorder.take("/scan", BOOL, memoryview(slot), 1 * S)
+    slot[:] = b"bbbb"
+    recorder.close()
+    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"aaaa")]
+
+
+def test_pause_keeps_latched_values_for_its_end(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag")
+    recorder.take("/scan", BOOL, b"1", 1 * S)
+    recorder.pause()
+    assert recorder.state == PAUSED
+    recorder.take("/scan", BOOL, b"2", 2 * S)
+    recorder.take("/estop", BOOL, NO, 2 * S)
+    recorder.take("/estop", BOOL, YES, 3 * S)
+    recorder.resume()
+    recorder.take("/scan", BOOL, b"4", 4 * S)
+    recorder.close()
+    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1"), ("/estop", 3 * S, YES), ("/scan", 4 * S, b"4")]
+    assert custom(tmp_path / "bag", "paused") == {"/scan": 1, "/estop": 2}
+
+
+def test_reserve_of_the_disk_ends_the_file_and_recording_goes_on_when_there_is_room(tmp_path: Path) -> None:
+    free = [10**12]
+    recorder = make(tmp_path / "bag", lambda path: free[0], reserve_bytes=1_000_000_000)
+    recorder.take("/scan", BOOL, b"1", 1 * S)
+    wait_for(lambda: recorder.count == 1, "the first message")
+    free[0] = 900_000_000
+    wait_for(lambda: recorder.state == DISK_FULL, "the full disk")
+    assert "only 900 MB are free" in recorder.error and recorder.failed
+    # The bag is complete and opens although the recorder still runs.
+    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1")]
+    recorder.take("/scan", BOOL, b"2", 2 * S)
+    recorder.take("/estop", BOOL, YES, 3 * S)
+    free[0] = 1_063_000_000  # a little above the reserve: not yet, or it would come and go
+    time.sleep(1.2)
+    assert recorder.state == DISK_FULL
+    free[0] = 2_000_000_000
+    wait_for(lambda: recorder.state == RECORDING, "room")
+    recorder.tick()
+    recorder.take("/scan", BOOL, b"4", 4 * S)
+    recorder.close()
+    assert read(tmp_path / "bag") == [("/scan", 1 * S, b"1"), ("/estop", 3 * S, YES), ("/scan", 4 * S, b"4")]
+    assert custom(tmp_path / "bag", "disk_full") == {"/scan": 1, "/estop": 1}
+
+
+def test_full_disk_leaves_a_valid_bag_and_a_recorder_that_lives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = make(tmp_path / "bag")
+    full = threading.Event()
+    writev = os.writev
+
+    def write(fd: int, parts: list[memoryview]) -> int:
+        if full.is_set() and sum(len(part) for part in parts) > 50_000:  # the index still finds room
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return writev(fd, parts)
+
+    monkeypatch.setattr(os, "writev", write)
+    recorder.take("/estop", BOOL, NO, 1 * S)
+    recorder.take("/scan", BOOL, b"1" * 100_000, 1 * S)
+    wait_for(lambda: (tmp_path / "bag" / "bag.mcap").stat().st_size > 100_000, "the flush")
+    full.set()
+    recorder.take("/estop", BOOL, YES, 2 * S)
+    recorder.take("/scan", BOOL, b"2" * 2_000_000, 2 * S)
+    wait_for(lambda: recorder.error, "the full disk")
+    assert "No space left on device" in recorder.error and "complete up to here" in recorder.error
+    full.clear()
+    wait_for(lambda: recorder.state == RECORDING, "room")
+    recorder.tick()
+    recorder.take("/scan", BOOL, b"3", 3 * S)
+    recorder.close()
+    got = [(topic, stamp_ns, payload[:1]) for topic, stamp_ns, payload in read(tmp_path / "bag")]
+    # The emergency stop that went down with the full disk stands at the beginning of the next file.
+    assert got == [("/estop", S, NO[:1]), ("/scan", S, b"1"), ("/estop", 3 * S, YES[:1]), ("/scan", 3 * S, b"3")]
+    assert read(tmp_path / "bag")[2][2] == YES
+
+
+def test_folder_taken_away_is_told(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag", free=lambda path: shutil.disk_usage(path).free)
+    recorder.take("/scan", BOOL, b"1", 1 * S)
+    shutil.rmtree(tmp_path / "bag")
+    wait_for(lambda: recorder.state == FAILED, "the failure")
+    assert "its folder was taken away" in recorder.error
+    with pytest.raises(BagError, match="taken away"):
+        recorder.close()
+
+
+def test_files_by_time_and_on_demand(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag", max_duration_s=10.0)
+    recorder.take("/estop", BOOL, NO, 1 * S, "console")
+    for stamp_s in (1, 5, 12):
+        recorder.take("/scan", BOOL, bytes([stamp_s]), stamp_s * S)
+    recorder.split()
+    recorder.take("/scan", BOOL, b"x", 13 * S)
+    recorder.close()
+    with BagReader(tmp_path / "bag") as reader:
+        assert [(part.path.name, part.count) for part in reader.parts] == [
+            ("bag_0.mcap", 3), ("bag_1.mcap", 1), ("bag_2.mcap", 1),
+        ]  # fmt: skip
+    with BagReader(tmp_path / "bag" / "bag_2.mcap") as part:
+        assert [(m.topic, m.payload) for m in part.messages()] == [("/estop", NO), ("/scan", b"x")]
+
+
+def test_message_without_a_type_is_told(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag")
+    recorder.take("/scan", "", b"?", 1 * S)
+    recorder.take("/odd", "their_msgs/msg/Odd", b"!", 1 * S)
+    recorder.close()
+    assert recorder.unknown_types() == {"their_msgs/msg/Odd": "/odd"}
+    assert read(tmp_path / "bag") == [("/odd", 1 * S, b"!")]
+    assert custom(tmp_path / "bag", "no_type") == {"/scan": 1}
+
+
+def test_losses_by_publisher_are_in_the_metadata(tmp_path: Path) -> None:
+    losses = Losses()
+    recorder = Recorder(tmp_path / "bag", TopicChoice(), lambda topic, take: losses)
+    recorder.discover([topic_info("/scan", SENSOR)])
+    recorder.take("/scan", BOOL, b"x", 1 * S)
+    losses.lost, losses.lost_by = 5, {"left": 2, "right": 3}
+    recorder.close()
+    assert custom(tmp_path / "bag", "lost") == {"/scan": 5}
+    assert custom(tmp_path / "bag", "lost_by") == {"/scan": {"left": 2, "right": 3}}
+
+
+def test_clock_set_back_while_recording(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag")
+    for stamp_s in (100, 101, 40, 41):
+        recorder.take("/scan", BOOL, bytes([stamp_s]), stamp_s * S)
+    recorder.close()
+    assert [m[2][0] for m in read(tmp_path / "bag")] == [40, 41, 100, 101]
+
+
+def entry(value: int, size: int = 10, latched: bool = False, publisher: str = "") -> Entry:
+    qos = LATCHED if latched else SENSOR
+    return Entry("/estop" if latched else "/scan", BOOL, bytes([value]) * size, value * S, qos, publisher)
+
+
+def test_snapshot_cache_keeps_the_last_seconds_and_what_was_latched_before() -> None:
+    cache = SnapshotCache(3.0, 10_000)
+    cache.add(entry(1, latched=True, publisher="a"), 1.0)
+    cache.add(entry(2, latched=True, publisher="a"), 2.0)
+    cache.add(entry(3, latched=True, publisher="b"), 2.5)
+    for second in range(3, 11):
+        cache.add(entry(second), second)
+    content = cache.content()
+    # The window is 7 s to 10 s; the values that held at its beginning come first, with its stamp.
+    assert [(e.topic, e.stamp_ns // S, e.payload[0]) for e in content] == [
+        ("/estop", 7, 2), ("/estop", 7, 3), ("/scan", 7, 7), ("/scan", 8, 8), ("/scan", 9, 9), ("/scan", 10, 10),
+    ]  # fmt: skip
+    assert cache.span_s == 3.0
+
+
+def test_snapshot_cache_is_bounded_by_bytes() -> None:
+    cache = SnapshotCache(1000.0, 5_000)
+    for second in range(20):
+        cache.add(entry(second, size=1_000), second)
+        assert cache.bytes <= 5_000
+    assert [e.payload[0] for e in cache.content()] == [15, 16, 17, 18, 19]
+
+
+def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "snaps", snapshot_s=60.0)
+    recorder.take("/estop", BOOL, NO, 1 * S)
+    recorder.take("/scan", BOOL, b"1", 2 * S)
+    assert list((tmp_path / "snaps").iterdir()) == []  # nothing is written until asked
+    first = recorder.snapshot("door / stuck!")
+    wait_for(lambda: first.state == "done", "the snapshot")
+    recorder.take("/scan", BOOL, b"2", 3 * S)
+    second = recorder.snapshot("door / stuck!", after_s=0.05)
+    assert recorder.snapshot("again") is second  # what waits will hold this moment too
+    recorder.take("/estop", BOOL, YES, 4 * S)
+    recorder.close()  # also ends the wait
+    assert first.path != second.path and "door___stuck" in first.path.name
+    assert [(m[0], m[2]) for m in read(first.path)] == [("/estop", NO), ("/scan", b"1")]
+    assert [(m[0], m[2]) for m in read(second.path)][-1] == ("/estop", YES)
+    assert [m[2] for m in read(second.path) if m[0] == "/scan"] == [b"1", b"2"]
+    assert second.state == "done" and second.words == "4 messages, 2.0 s"
+
+
+def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "snaps", snapshot_s=60.0)
+    empty = recorder.snapshot("early")
+    wait_for(lambda: empty.state == "failed", "the failure")
+    assert "no message has come yet" in empty.words
+    recorder.take("/scan", BOOL, b"1", 2 * S)
+    good = recorder.snapshot("late")
+    wait_for(lambda: good.state == "done", "the snapshot")
+    with pytest.raises(ValueError, match="no file to split"):
+        recorder.split()
+    recorder.close()
+
+
+def test_recorder_that_writes_at_once_keeps_no_snapshots(tmp_path: Path) -> None:
+    recorder = make(tmp_path / "bag")
+    with pytest.raises(ValueError, match="start it with --snapshot"):
+        recorder.snapshot()
+    recorder.close()
+
+
+@pytest.mark.parametrize(
+    "bad", [{"max_bytes": -1}, {"max_duration_s": -1.0}, {"queue_bytes": 10}, {"cache_bytes": 0}, {"snapshot_s": -1.0}]
+)
+def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):
+        RecordOptions(**bad)  # type: ignore[arg-type]
+
+
+def test_bag_that_exists_is_not_overwritten(tmp_path: Path) -> None:
+    BagWriter(tmp_path / "bag").close()
+    with pytest.raises(BagError, match="exists already"):
+        make(tmp_path / "bag")
