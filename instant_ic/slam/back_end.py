@@ -207,11 +207,10 @@ class BackEnd:
 
     def _good(self, found: Found) -> bool:
         loop = self.config.loop
-        return (
-            found.score >= loop.min_score
-            and found.shape >= loop.min_shape
-            and found.runner_up <= loop.unique * found.score
-        )
+        # Two walls of a corridor are enough for a middling score anywhere along it. What counts is how much of the
+        # rest, which the second best place cannot explain, the best one does.
+        gain = (found.score - found.runner_up) / max(1.0 - found.runner_up, 1e-6)
+        return found.score >= loop.min_score and found.shape >= loop.min_shape and gain >= loop.min_gain
 
     def _edge(self, there: int, here: int, found: Found) -> Edge:
         loop = self.config.loop

@@ -79,7 +79,7 @@ class MatchConfig:
     coarse_rotation_step_rad: float = 0.02
     fine_rotation_step_rad: float = 0.005
     residual_sigma: float = 0.6
-    odometry_cutoff: float = 2.0
+    odometry_cutoff: float = 4.0
     refine_iterations: int = 20
     recovery_score: float = 0.6
     recovery_translation_m: float = 1.2
@@ -146,7 +146,7 @@ class LoopConfig:
     max_reach_rad: float = 0.8
     min_score: float = 0.6
     min_shape: float = 0.05
-    unique: float = 0.92
+    min_gain: float = 0.35
     confirmations: int = 3
     sure_m: float = 0.25
     sure_rad: float = 0.06
@@ -163,7 +163,7 @@ class LoopConfig:
         for key in ("query_keyframes", "chain_keyframes", "min_chain_keyframes", "chains", "confirmations"):
             _require(self, key, getattr(self, key) >= 1, ">= 1")
         _require(self, "max_points", self.max_points >= 20, ">= 20")
-        for key in ("min_score", "unique"):
+        for key in ("min_score", "min_gain"):
             _require(self, key, 0 < getattr(self, key) < 1, "between 0 and 1")
         _require(self, "min_shape", 0 <= self.min_shape < 1, "between 0 and 1")
 

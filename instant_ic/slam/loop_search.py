@@ -153,7 +153,7 @@ class LoopSearch:
     def find(
         self, field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
     ) -> Found | None:
-        """Best pose of ``points`` (n, 2) within ``reach_m`` and ``reach_rad`` of ``centre`` (3,); None: nothing fits."""
+        """Best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,); None: nothing fits."""
         resolution = field.resolution
         coarse = POOL * resolution
         cells = max(1, math.ceil(reach_m / coarse))

@@ -82,8 +82,8 @@ def optimise(
     try:
         a = np.array([index[edge.a] for edge in edges], dtype=np.intp)
         b = np.array([index[edge.b] for edge in edges], dtype=np.intp)
-    except KeyError as error:
-        raise ValueError(f"an edge leads to node {error}, which is not in the graph") from None
+    except KeyError as missing:
+        raise ValueError(f"an edge leads to node {missing}, which is not in the graph") from None
     poses = poses.copy()
     if len(edges) == 0 or len(poses) < 2:
         return Solution(poses, np.zeros(len(edges)), np.ones(len(edges)))
