@@ -268,8 +268,10 @@ class LocalSubscription:
         wanted = {info.id: str(info.socket) for info in self.publishers}
         for identity in [i for i in self._inlets if i not in wanted]:
             # Its registration went before its socket: what it sent last may still be on the way.
-            self._transport.read_inlet(self._inlets[identity][1])
-            self.lose_inlet(self._inlets[identity][1])
+            inlet = self._inlets[identity][1]
+            self._transport.read_inlet(inlet)
+            if identity in self._inlets:  # reading has not found its end and let go of it already
+                self.lose_inlet(inlet)
         for identity, path in wanted.items():
             if identity not in self._inlets:
                 try:
