@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..bus import LATCHED, RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, Subscription, registry
+from ..bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
 from ..bus.qos import PRESETS
 from ..bus.transport import Received
 from .host_link import HostLink
+from .host_protocol import Announce
 from .host_session import Arrived
 from .host_topics import TopicRule
 
@@ -29,52 +31,36 @@ class ExportedTopics:
 
     def __init__(self, node: Node[Any], rules: dict[str, TopicRule], link: HostLink) -> None:
         self._node, self._rules, self._link = node, rules, link
-        self._subscriptions: dict[str, tuple[Subscription, QoS]] = {}
-        self._offered: dict[str, dict[str, QoS]] = {}
-        self._origins: set[tuple[str, str]] = set()
         self._bridges: set[str] = {node.node_name}
-        self._nodes: set[str] = set()
+        self._offered: dict[tuple[str, str], QoS] = {}
+        for name in rules:
+            # Every message is handed to the link, which knows what of it is to wait, be replaced, or go at once.
+            node.subscribe_received(name, functools.partial(self._export, name), RELIABLE)
 
     def look(self) -> None:
         """Finds publishers that came, went, or offer another QoS than before."""
         run_dir = self._node.run_dir
         assert run_dir is not None
         nodes = registry.list_nodes(run_dir)
-        self._nodes = {info.name for info in nodes}
         self._bridges = {self._node.node_name, *(info.name for info in nodes if info.module == BRIDGE_MODULE)}
-        live: set[tuple[str, str]] = set()
+        before, self._offered = self._offered, {}
         for name in self._rules:
-            publishers = registry.topic_publishers(run_dir, self._node.resolve(name))
-            offered = {p.node: PRESETS.get(p.qos, SENSOR) for p in publishers if p.node not in self._bridges}
-            self._offered[name] = offered
-            live |= {(name, origin) for origin in offered}
-            if offered:
-                self._listen(name, max(offered.values(), key=lambda qos: (qos.latched, qos.reliable)))
-        for name, origin in self._origins - live:
+            for publisher in registry.topic_publishers(run_dir, self._node.resolve(name)):
+                qos = PRESETS.get(publisher.qos, SENSOR)
+                self._offered[name, publisher.node] = qos
+                if publisher.node not in self._bridges and (name, publisher.node) not in before:
+                    self._link.open(name, publisher.node, publisher.type_name, (qos.name, qos.latched, qos.reliable))
+        for name, origin in before.keys() - self._offered.keys():
             self._link.forget(name, origin)
-        self._origins = live
-
-    def _listen(self, name: str, qos: QoS) -> None:
-        # A queue where every message counts; the newest of each publisher elsewhere.
-        wanted = LATCHED if qos.latched else RELIABLE if qos.reliable else SENSOR
-        present = self._subscriptions.get(name)
-        if present is not None and present[1] == wanted:
-            return
-        if present is not None:
-            self._node.drop(present[0])
-
-        def export(received: Received) -> None:
-            self._export(name, received)
-
-        self._subscriptions[name] = self._node.subscribe_received(name, export, wanted), wanted
 
     def _export(self, name: str, received: Received) -> None:
         origin = received.publisher
-        if origin not in self._nodes:  # it started this moment: is it a bridge?
+        if (name, origin) not in self._offered:  # it started this moment: what does it offer, and is it a bridge?
             self.look()
+            self._offered.setdefault((name, origin), SENSOR)  # gone again already
         if origin in self._bridges:
             return
-        qos = self._offered.get(name, {}).get(origin, self._subscriptions[name][1])
+        qos = self._offered[name, origin]
         self._link.offer(
             name,
             origin,
@@ -84,11 +70,6 @@ class ExportedTopics:
             received.publish_ns,
             wall_time=not self._node.use_sim_time,
         )
-
-    @property
-    def topics(self) -> list[str]:
-        """Topics of the list that somebody publishes here."""
-        return sorted(self._subscriptions)
 
 
 @dataclass
@@ -114,14 +95,19 @@ class ImportedTopics:
         self._node, self._on_trouble = node, on_trouble
         self._topics: dict[str, _Imported] = {}
 
-    def take(self, arrived: Arrived) -> None:
-        """Publishes a message; called on the link's thread, so that a command does not wait for the node's."""
-        announce = arrived.announce
+    def open(self, announce: Announce) -> _Imported:
+        """Makes the publisher, so that readers find it before the first message; called on the link's thread."""
         topic = self._topics.get(announce.topic)
         if topic is None:
             topic = _Imported(announce.type_name, PRESETS.get(announce.qos, SENSOR))
             self._topics[announce.topic] = topic
             self._node.call_soon(self._advertise, announce.topic, topic)
+        return topic
+
+    def take(self, arrived: Arrived) -> None:
+        """Publishes a message; called on the link's thread, so that a command does not wait for the node's."""
+        announce = arrived.announce
+        topic = self.open(announce)
         if topic.type_name != announce.type_name:
             self._on_trouble(
                 announce.topic,
@@ -163,8 +149,3 @@ class ImportedTopics:
                 with topic.lock:
                     for arrived in topic.last.values():
                         topic.publisher.publish_bytes(arrived.payload, arrived.publish_ns)
-
-    @property
-    def topics(self) -> list[str]:
-        """Topics that came."""
-        return sorted(self._topics)

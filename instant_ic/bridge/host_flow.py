@@ -164,6 +164,7 @@ class Outbox:
         self.counts: dict[str, TopicCounts] = {}
         self._sequences = {} if sequences is None else sequences
         self._channels: dict[int, _Outgoing] = {}
+        self._new: deque[_Outgoing] = deque()
         self._current: list[tuple[_Outgoing, Item, int] | None] = [None] * len(LANES)
         self._turns = itertools.count(1)
         self.sent = [0] * len(LANES)
@@ -197,6 +198,10 @@ class Outbox:
             out.waiting.clear()
         out.waiting.append(item)
 
+    def open(self, channel: Channel) -> None:
+        """Tells the other host of a channel before it has a message: its readers shall be there in time."""
+        self._outgoing(channel)
+
     def _outgoing(self, channel: Channel) -> _Outgoing | None:
         topic = channel.rule.topic
         if topic not in self.wants:
@@ -206,6 +211,7 @@ class Outbox:
             rates = [rate for rate in (channel.rule.rate_hz, self.wants[topic]) if rate > 0]
             out = _Outgoing(channel, int(1e9 / min(rates)) if rates else 0)
             self._channels[channel.number] = out
+            self._new.append(out)
             self.counts.setdefault(topic, TopicCounts())
         return out
 
@@ -235,15 +241,14 @@ class Outbox:
 
     def next(self, now_ns: int) -> Data | Announce | None:
         """What leaves next; None when nothing waits or the link has no room."""
+        if self._new:
+            out = self._new.popleft()
+            out.announced = True
+            return out.channel.announce()
         for lane in range(len(LANES)):
             if not self._room(lane):
                 continue
-            if self._current[lane] is None:
-                begun = self._begin(lane, now_ns)
-                if isinstance(begun, Announce):
-                    return begun
-                self._current[lane] = begun
-            current = self._current[lane]
+            current = self._current[lane] or self._begin(lane, now_ns)
             if current is not None:
                 return self._chunk(lane, *current, now_ns)
         return None
@@ -262,7 +267,7 @@ class Outbox:
         filled = self._in_flight(_STATE) + self._in_flight(_BULK)
         return filled < self.window.size + (_STATE_EXTRA if lane == _STATE else 0)
 
-    def _begin(self, lane: int, now_ns: int) -> tuple[_Outgoing, Item, int] | Announce | None:
+    def _begin(self, lane: int, now_ns: int) -> tuple[_Outgoing, Item, int] | None:
         """The message of the lane that has waited for its turn the longest."""
         name = LANES[lane]
         for out in sorted(self._ready(name, now_ns), key=lambda out: out.turn):
@@ -273,9 +278,6 @@ class Outbox:
                 out.waiting.popleft()
             if not out.waiting:
                 continue
-            if not out.announced:
-                out.announced = True
-                return out.channel.announce()
             item = out.waiting.popleft()
             out.turn = next(self._turns)
             if out.period_ns and out.channel.latched:

@@ -195,8 +195,6 @@ class HostLink(ABC):
         """
         with self._lock:
             channel = self._channel(topic, origin, type_name, qos)
-            if channel is None:
-                return
             channel.sequence += 1
             item = Item(payload, publish_ns, time.monotonic_ns(), channel.sequence, wall_time)
             if channel.latched:
@@ -205,14 +203,20 @@ class HostLink(ABC):
                 connection.session.offer(channel, item)
             self._wake()
 
-    def forget(self, topic: str, origin: str) -> None:
-        """A publisher has gone: its latched value is not given to hosts that come later."""
+    def open(self, topic: str, origin: str, type_name: str, qos: tuple[str, bool, bool]) -> None:
+        """Tells the other hosts of a publisher before its first message; see :meth:`offer`."""
         with self._lock:
-            channel = self._channels.get((topic, origin))
-            if channel is not None:
-                channel.last = None
+            channel = self._channel(topic, origin, type_name, qos)
+            for connection in self._connections():
+                connection.session.open(channel)
+            self._wake()
 
-    def _channel(self, topic: str, origin: str, type_name: str, qos: tuple[str, bool, bool]) -> Channel | None:
+    def forget(self, topic: str, origin: str) -> None:
+        """A publisher has gone: hosts that come later are told nothing of it, nor given its latched value."""
+        with self._lock:
+            self._channels.pop((topic, origin), None)
+
+    def _channel(self, topic: str, origin: str, type_name: str, qos: tuple[str, bool, bool]) -> Channel:
         rule = self.exports[topic]
         name, latched, reliable = qos
         channel = self._channels.get((topic, origin))
@@ -316,7 +320,9 @@ class HostLink(ABC):
         return Session(self.side, connecting, memory, None, self.times, may_send)
 
     def _give_latched(self, session: Session) -> None:
-        """The last values for a host that has just come."""
+        """The topics and the last values for a host that has just come."""
+        for channel in self._channels.values():
+            session.open(channel)
         for channel in self._channels.values():
             if channel.last is not None:
                 session.offer(channel, channel.last)

@@ -76,7 +76,6 @@ class Hello(_Json):
         name: what the host calls itself.
         instance: new with every start of the bridge.
         wants: topic → most messages a second that it takes (0: all), of what the other sends.
-        mono_ns: its monotonic clock.
     """
 
     KIND: ClassVar[int] = 1
@@ -84,25 +83,17 @@ class Hello(_Json):
     name: str
     instance: str
     wants: dict[str, Any]
-    mono_ns: int
 
 
 @dataclass(frozen=True)
 class Welcome(_Json):
-    """Answer to :class:`Hello`; the fields are the same, and ``echo_ns`` is the Hello's ``mono_ns``.
-
-    Attributes:
-        arrived_ns: when the Hello came, by the answering host's monotonic clock.
-    """
+    """Answer to :class:`Hello`; the fields are the same."""
 
     KIND: ClassVar[int] = 2
     version: int
     name: str
     instance: str
     wants: dict[str, Any]
-    echo_ns: int
-    arrived_ns: int
-    mono_ns: int
 
 
 @dataclass(frozen=True)
@@ -171,16 +162,22 @@ class Notice(_Json):
 
 @dataclass(frozen=True)
 class Ping:
-    """Sign of life and question for the time; ``mono_ns`` and ``wall_ns`` are the sender's clocks."""
+    """Sign of life and question for the time.
+
+    Attributes:
+        number: grows by one.
+        mono_ns: the sender's monotonic clock.
+        epoch_ns: time of day at which that clock was zero.
+    """
 
     KIND: ClassVar[int] = 16
     number: int
     mono_ns: int
-    wall_ns: int
+    epoch_ns: int
 
     def encode(self) -> bytes:
         """Bytes of the message."""
-        return _PING.pack(self.KIND, self.number & 0xFFFFFFFF, self.mono_ns, self.wall_ns)
+        return _PING.pack(self.KIND, self.number & 0xFFFFFFFF, self.mono_ns, self.epoch_ns)
 
     @classmethod
     def decode(cls, data: memoryview) -> Ping:
@@ -190,19 +187,19 @@ class Ping:
 
 @dataclass(frozen=True)
 class Pong:
-    """Answer to a ping: its number and ``mono_ns``, when it came, and when this leaves, by the answerer's clocks."""
+    """Answer to a ping: its number and ``mono_ns``, when it came, and when this leaves, by the answerer's clock."""
 
     KIND: ClassVar[int] = 17
     number: int
     echo_ns: int
     arrived_ns: int
     mono_ns: int
-    wall_ns: int
+    epoch_ns: int
 
     def encode(self) -> bytes:
         """Bytes of the message."""
         number = self.number & 0xFFFFFFFF
-        return _PONG.pack(self.KIND, number, self.echo_ns, self.arrived_ns, self.mono_ns, self.wall_ns)
+        return _PONG.pack(self.KIND, number, self.echo_ns, self.arrived_ns, self.mono_ns, self.epoch_ns)
 
     @classmethod
     def decode(cls, data: memoryview) -> Pong:

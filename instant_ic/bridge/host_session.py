@@ -49,6 +49,14 @@ class Clocks:
         """Nanoseconds since the epoch."""
         return time.time_ns()
 
+    def epoch_ns(self) -> int:
+        """The time of day at which the monotonic clock was zero; changes only when the time of day is set."""
+        reads = []
+        for _ in range(3):  # a busy machine may stop us between two clocks: the reading that took least counts
+            before, wall, after = self.mono_ns(), self.wall_ns(), self.mono_ns()
+            reads.append((after - before, wall - (before + after) // 2))
+        return min(reads)[1]
+
 
 @dataclass(frozen=True)
 class LinkTimes:
@@ -107,6 +115,13 @@ class Ended:
 
 
 @dataclass(frozen=True)
+class Announced:
+    """A topic is coming, and is taken."""
+
+    announce: Announce
+
+
+@dataclass(frozen=True)
 class Arrived:
     """A whole message of a topic.
 
@@ -139,7 +154,7 @@ class ClockStepped:
     step_ns: int
 
 
-Event = Up | Ended | Arrived | Refused | ClockStepped
+Event = Up | Ended | Announced | Arrived | Refused | ClockStepped
 
 
 @dataclass
@@ -213,7 +228,7 @@ class Session:
         self._pings = 0
         self._next_ping_ns = now
         if connecting:
-            self._replies.append(Hello(VERSION, side.name, side.instance, self._wants(), now))
+            self._replies.append(Hello(VERSION, side.name, side.instance, self._wants()))
 
     def _wants(self) -> dict[str, Any]:
         return {topic: rule.rate_hz for topic, rule in self.side.imports.items()}
@@ -224,6 +239,11 @@ class Session:
         """A message for the other host."""
         if self.up:
             self.outbox.offer(channel, item, self.clocks.mono_ns())
+
+    def open(self, channel: Channel) -> None:
+        """A topic that will have messages for the other host."""
+        if self.up:
+            self.outbox.open(channel)
 
     def outgoing(self) -> Iterator[bytes]:
         """What is to be sent now."""
@@ -239,7 +259,7 @@ class Session:
             self._pings += 1
             period_s = _FIRST_PING_S if self._pings < _FIRST_PINGS else self.times.ping_s
             self._next_ping_ns = now + int(period_s * 1e9)
-            yield Ping(self._pings, now, self.clocks.wall_ns()).encode()
+            yield Ping(self._pings, self.clocks.mono_ns(), self.clocks.epoch_ns()).encode()
         while self.up and (message := self.outbox.next(self.clocks.mono_ns())) is not None:
             yield message.encode()
 
@@ -299,13 +319,12 @@ class Session:
         """The other's time of day minus ours; None before the first exchange."""
         if self._peer_epoch_ns is None or not self.clock.ready:
             return None
-        return self._peer_epoch_ns - (self.clocks.wall_ns() - self.clocks.mono_ns()) + self.clock.offset_ns
+        return self._peer_epoch_ns - self.clocks.epoch_ns() + self.clock.offset_ns
 
-    def _heard_clock(self, mono_ns: int, wall_ns: int) -> list[Event]:
-        epoch, before = wall_ns - mono_ns, self._peer_epoch_ns
-        self._peer_epoch_ns = epoch
-        if before is not None and abs(epoch - before) > _CLOCK_STEP_NS:
-            return [ClockStepped(epoch - before)]
+    def _heard_clock(self, epoch_ns: int) -> list[Event]:
+        before, self._peer_epoch_ns = self._peer_epoch_ns, epoch_ns
+        if before is not None and abs(epoch_ns - before) > _CLOCK_STEP_NS:
+            return [ClockStepped(epoch_ns - before)]
         return []
 
     # -- in ---------------------------------------------------------------------------------------
@@ -328,30 +347,24 @@ class Session:
             case Hello() if not self._connecting and not self.up:
                 if message.version != VERSION:
                     return self._wrong_version(message)
-                self._replies.append(
-                    Welcome(
-                        VERSION, self.side.name, self.side.instance, self._wants(), message.mono_ns, now,
-                        self.clocks.mono_ns(),
-                    )
-                )  # fmt: skip
+                self._replies.append(Welcome(VERSION, self.side.name, self.side.instance, self._wants()))
                 return self._begin(message)
             case Welcome() if self._connecting and not self.up:
                 if message.version != VERSION:
                     return self._wrong_version(message)
-                self.clock.add(message.echo_ns, message.arrived_ns, message.mono_ns, now)
                 return self._begin(message)
             case _ if not self.up:
                 raise ProtocolError(f"{type(message).__name__} before the greeting")
             case Ping():
                 self._replies.append(
-                    Pong(message.number, message.mono_ns, now, self.clocks.mono_ns(), self.clocks.wall_ns())
+                    Pong(message.number, message.mono_ns, now, self.clocks.mono_ns(), self.clocks.epoch_ns())
                 )
-                return self._heard_clock(message.mono_ns, message.wall_ns)
+                return self._heard_clock(message.epoch_ns)
             case Pong():
                 sample = self.clock.add(message.echo_ns, message.arrived_ns, message.mono_ns, now)
                 if sample is not None:
                     self.outbox.window.observe(sample.rtt_ns, now)
-                return self._heard_clock(message.mono_ns, message.wall_ns)
+                return self._heard_clock(message.epoch_ns)
             case Ack():
                 if not self.outbox.acked(message.taken, now - message.echo_ns, now):
                     raise ProtocolError(f"{message} acknowledges what was not sent")
@@ -413,7 +426,7 @@ class Session:
         counts = self.memory.counts_in.setdefault(topic, TopicCounts()) if rule is not None else TopicCounts()
         self._incoming[announce.channel] = _Incoming(announce, rule or TopicRule("/none"), counts, reason)
         if not reason:
-            return []
+            return [Announced(announce)]
         return self.refuse(announce, reason)
 
     def refuse(self, announce: Announce, reason: str) -> list[Event]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from dataclasses import dataclass, field
@@ -23,7 +24,7 @@ from instant_ic.bridge.host_link import (
     Stranger,
     check_endpoint,
 )
-from instant_ic.bridge.host_session import Arrived, ClockStepped, Ended, LinkTimes, Refused, Side, Up
+from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Side, Up
 from instant_ic.bridge.host_topics import TopicCounts, parse_rules
 from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main
 from instant_ic.msg import type_hash
@@ -123,6 +124,8 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         """Publishes what came at once, on the link's thread; everything else goes to the node's."""
         if isinstance(event.event, Arrived):
             self.incoming.take(event.event)
+        elif isinstance(event.event, Announced):
+            self.incoming.open(event.event.announce)
         else:
             self.call_soon(self.on_change, event.peer, event.event)
 
@@ -168,7 +171,8 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         peers = self.link.peers()
         self.tell_link(peers)
         for peer in peers:
-            self.tell_clock(peer)
+            if not math.isnan(peer.offset_ms):  # right after the greeting
+                self.tell_clock(peer)
         for name in self.clock_told - {peer.name for peer in peers}:
             self.diagnose(f"clock of {name}", OK, "no link, not measured")
         self.clock_told = {peer.name for peer in peers}
@@ -200,20 +204,18 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.diagnose("link", WARN if notices else OK, "; ".join([f"linked with {words}", *notices]), **values)
 
     def tell_clock(self, peer: PeerStatus) -> None:
-        """How far the other host's clock is from ours: stamps in messages are not changed on the way."""
-        limit = self.config.max_offset_ms + peer.rtt_ms / 2  # so much is not certain
-        wrong = abs(peer.offset_ms) > limit
-        text = f"{abs(peer.offset_ms):.1f} ms {'ahead of' if peer.offset_ms > 0 else 'behind'} this one"
-        if wrong:
-            text += f", more than {self.config.max_offset_ms:g} ms: run chrony on both (sudo apt install chrony)"
-        self.diagnose(
-            f"clock of {peer.name}",
-            WARN if wrong else OK,
-            text,
-            offset_ms=round(peer.offset_ms, 3),
-            rtt_ms=round(peer.rtt_ms, 3),
-            jitter_ms=round(peer.jitter_ms, 3),
-        )
+        """How far the other host's clock is from ours."""
+        level, text = judge_clock(peer.offset_ms, peer.rtt_ms, self.config.max_offset_ms)
+        values = {"offset_ms": peer.offset_ms, "rtt_ms": peer.rtt_ms, "jitter_ms": peer.jitter_ms}
+        self.diagnose(f"clock of {peer.name}", level, text, **{key: round(value, 3) for key, value in values.items()})
+
+
+def judge_clock(offset_ms: float, rtt_ms: float, max_offset_ms: float) -> tuple[int, str]:
+    """Level and words for a clock that is ``offset_ms`` ahead: stamps in messages are not changed on the way."""
+    text = f"{abs(offset_ms):.1f} ms {'ahead of' if offset_ms > 0 else 'behind'} this one"
+    if abs(offset_ms) <= max_offset_ms + rtt_ms / 2:  # half of the way there and back is not certain
+        return OK, text
+    return WARN, f"{text}, more than {max_offset_ms:g} ms: run chrony on both (sudo apt install chrony)"
 
 
 def _values(peer: PeerStatus) -> dict[str, Any]:

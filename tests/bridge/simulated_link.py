@@ -24,6 +24,9 @@ class SimulatedClocks:
     def wall_ns(self):
         return self.world.now + self.wall_ahead
 
+    def epoch_ns(self):
+        return self.wall_ahead - self.mono_ahead
+
 
 class Way:
     """One direction: first in, first out, ``rate`` bytes a second, then ``delay_ns`` and up to ``jitter_ns`` more."""

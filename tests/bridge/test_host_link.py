@@ -317,10 +317,10 @@ def test_stalled_link_brings_no_old_pictures_and_no_old_commands(ends, keys):
                 if isinstance(event.event, Arrived) and at > stall_end + 0.05:
                     born = int.from_bytes(event.event.payload[:8], "little") / 1e9
                     late[event.event.announce.topic].append(at - born)
-        assert len(late["/camera"]) > 10 and max(late["/camera"][5:]) < 0.5
+        assert len(late["/camera"]) > 6 and max(late["/camera"][5:]) < 0.5
         assert max(late["/operator/cmd_vel"]) < 0.5  # its limit is 0.25; the test's own thread may be late
         assert a.link.counts()[1]["/operator/cmd_vel"].expired > 0
-        assert a.link.counts()[0]["/camera"].superseded > 20
+        assert a.link.counts()[0]["/camera"].superseded > 5
 
 
 def test_two_stations_one_drives_and_the_other_is_told(ends, keys):

@@ -44,8 +44,8 @@ def data_messages(draw):
 
 
 MESSAGES = st.one_of(
-    st.builds(Hello, st.just(protocol.VERSION), TEXT, TEXT, WANTS, INT),
-    st.builds(Welcome, st.just(protocol.VERSION), TEXT, TEXT, WANTS, INT, INT, INT),
+    st.builds(Hello, st.just(protocol.VERSION), TEXT, TEXT, WANTS),
+    st.builds(Welcome, st.just(protocol.VERSION), TEXT, TEXT, WANTS),
     st.builds(Bye, TEXT, TEXT),
     st.builds(Announce, INT, TEXT, TEXT, TEXT, TEXT, TEXT),
     st.builds(Refuse, INT, TEXT),

@@ -288,7 +288,7 @@ def test_idle_link_stays_up():
 def test_other_version_is_told_to_both():
     world = World([STATE])
     session = world.sessions["robot"]
-    hello = Hello(VERSION + 1, "station", "s", {}, 0)
+    hello = Hello(VERSION + 1, "station", "s", {})
     (ended,) = session.receive(hello.encode())
     assert ended.code == "version" and "install the same" in ended.reason
     (data,) = session.outgoing()

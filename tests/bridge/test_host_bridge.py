@@ -1,0 +1,342 @@
+"""The bridge's node between two run directories of one machine: two hosts, as far as the bus can tell."""
+
+import time
+
+import pytest
+from live_nodes import LiveNode, Neighbour, wait_for
+
+from instant_ic.bridge.host_keys import KeyStore, Peer
+from instant_ic.bridge.host_session import LinkTimes
+from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, NodeError, ParameterError, params, registry
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.msg import Bool, String, TFMessage, TwistStamped, deserialize, serialize, twist_stamped
+from instant_ic.nodes.host_bridge import HostBridgeConfig, HostBridgeNode, judge_clock
+
+TO_STATION = ("/picture lane=bulk", "/state", "/tf_static", "/log shared=true", "/queue")
+TO_ROBOT = (
+    "/operator/cmd_vel lane=command max_age_s=0.25",
+    "/operator/estop lane=command shared=true",
+    "/log shared=true",
+)
+TIMES = LinkTimes(ping_s=0.1, timeout_s=2.0)
+
+
+class Hosts:
+    """Run directories and key folders of some hosts, and what runs on them."""
+
+    def __init__(self, make):
+        self.folder = make("r")
+        self.running = []
+        self.stores = {}
+        self.port = 0
+
+    def host(self, name, role="driver"):
+        store = self.stores[name] = KeyStore(self.folder / f"k_{name}")
+        public = store.create(name).public_key
+        if name != "robot":
+            self.stores["robot"].allow(Peer(name, role, public))
+            store.allow(Peer("robot", "driver", self.stores["robot"].identity().public_key))
+        return self.folder / name[0]
+
+    def bridge(self, host, name="host_bridge", **config):
+        ends = {"listen": "tcp://127.0.0.1:0"} if host == "robot" else {"connect": f"tcp://127.0.0.1:{self.port}"}
+        config = {
+            **ends, "keys": str(self.stores[host].folder), "to_station": TO_STATION, "to_robot": TO_ROBOT,
+            "link": TIMES, **config,
+        }  # fmt: skip
+        run_dir = self.folder / host[0]
+        live = LiveNode(run_dir, HostBridgeNode, HostBridgeConfig(**config), name)
+        claim = registry.Claim(run_dir / "nodes" / name, name)
+        claim.write({**live.node.describe(), "started_ns": time.time_ns()})
+        self.running += [live, _Released(claim)]
+        if host == "robot" and "connect" not in config:
+            self.port = live.node.link.port
+        return live
+
+    def neighbour(self, host, name):
+        neighbour = Neighbour(self.folder / host[0], name)
+        self.running.append(neighbour)
+        return neighbour
+
+
+class _Released:
+    def __init__(self, claim):
+        self.close = claim.release
+
+
+@pytest.fixture
+def hosts(tmp_path_factory):
+    hosts = Hosts(tmp_path_factory.mktemp)
+    yield hosts
+    for each in reversed(hosts.running):
+        each.close()
+
+
+def pair(hosts, **station):
+    hosts.host("robot")
+    hosts.host("station")
+    a = hosts.bridge("robot")
+    b = hosts.bridge("station", **station)
+    wait_for(lambda: a.told("link").startswith("linked") and b.told("link").startswith("linked"), "link")
+    return a, b
+
+
+def texts(messages):
+    return [deserialize(m.payload, m.type_name).data for m in messages]
+
+
+def test_type_qos_and_publication_time_travel_with_a_topic(hosts):
+    _, b = pair(hosts)
+    near, far = hosts.neighbour("robot", "talker"), hosts.neighbour("station", "listener")
+    got = {topic: far.listen(topic) for topic in ("/picture", "/state", "/queue")}
+    outs = {
+        "/picture": near.publisher("/picture", String, SENSOR),
+        "/state": near.publisher("/state", Bool, LATCHED),
+        "/queue": near.publisher("/queue", String, RELIABLE),
+    }
+    outs["/state"].publish(Bool(data=True))
+    far.wait(lambda: got["/state"], "latched value")
+    # A reader finds a new publisher within 0.1 s: here each has two, the bridge's and the one behind it.
+    far_outs = wait_for(
+        lambda: len(found := [p for p in b.node.publishers if p.topic in got]) == 3 and found,
+        "publishers at the station",
+    )
+    wait_for(lambda: all(p.subscriber_count for p in (*outs.values(), *far_outs)), "readers")
+    stamp = time.time_ns() - 300_000_000
+    for index in range(500):
+        outs["/queue"].publish_bytes(serialize(String(data=str(index))), stamp + index)
+    outs["/picture"].publish(String(data="p" * 700_000))
+    far.wait(lambda: got["/picture"] and len(got["/queue"]) == 500, "messages")
+    assert texts(got["/queue"]) == [str(index) for index in range(500)]
+    # One machine has one clock; half of a round trip over loopback is what may be wrong.
+    assert all(abs(m.publish_ns - stamp - i) < 5_000_000 for i, m in enumerate(got["/queue"]))
+    assert {m.publisher for m in got["/queue"]} == {"host_bridge"}
+    topics = {info.topic: info for info in registry.list_topics(hosts.folder / "s")}
+    told = {name: (topics[name].type_name, topics[name].publishers[0].qos) for name in outs}
+    assert told == {
+        "/picture": ("std_msgs/msg/String", "sensor"),
+        "/state": ("std_msgs/msg/Bool", "latched"),
+        "/queue": ("std_msgs/msg/String", "reliable"),
+    }
+
+
+def test_late_reader_gets_the_latched_values_of_every_publisher(hosts):
+    """Two drivers send their mounts on /tf_static; a node that starts later must know both."""
+    pair(hosts)
+    early = hosts.neighbour("station", "early")
+    heard = early.listen("/tf_static", LATCHED)
+    for name in ("camera", "lidar"):
+        near = hosts.neighbour("robot", name)
+        near.publisher("/tf_static", TFMessage, LATCHED).publish(TFMessage([_mount(name)]))
+    early.wait(lambda: len(heard) >= 2, "both at the early reader")
+    late = hosts.neighbour("station", "late")
+    seen = late.listen("/tf_static", LATCHED)
+
+    def children():
+        return {t.child_frame_id for m in seen for t in deserialize(m.payload, m.type_name).transforms}
+
+    late.wait(lambda: children() == {"camera", "lidar"}, "both at the late reader")
+
+
+def _mount(child):
+    from instant_ic.geometry.poses import matrix_from_pose2
+    from instant_ic.msg import transform_message
+
+    return transform_message(matrix_from_pose2((0.0, 0.0, 0.0)), "base_link", child, 1)
+
+
+def test_no_echo_with_a_topic_both_ways_and_two_bridges_on_a_host(hosts):
+    hosts.host("robot")
+    hosts.host("station")
+    hosts.host("tablet")
+    a = hosts.bridge("robot")
+    bridges = [hosts.bridge("station"), hosts.bridge("tablet")]
+    wait_for(lambda: len(a.node.link.peers()) == 2, "both stations")
+    # A second pair of bridges between the same two run directories closes the ring.
+    hosts.host("ring")
+    ring = hosts.bridge("station", name="second_bridge", keys=str(hosts.stores["ring"].folder))
+    wait_for(lambda: ring.told("link").startswith("linked"), "ring")
+    ears = {host: hosts.neighbour(host, f"ear_{host}") for host in ("robot", "station", "tablet")}
+    heard = {host: ear.listen("/log") for host, ear in ears.items()}
+    outs = {host: ear.publisher("/log", String, RELIABLE) for host, ear in ears.items() if host != "tablet"}
+
+    def alive():
+        for ear in ears.values():
+            ear.node.spin_once()
+        return any("tick" in t for t in texts(heard["robot"])) and any("tock" in t for t in texts(heard["station"]))
+
+    deadline = time.monotonic() + 30
+    while not alive():
+        outs["robot"].publish(String(data="tick 0"))
+        outs["station"].publish(String(data="tock 0"))
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    for messages in heard.values():
+        messages.clear()
+    for index in range(1, 4):
+        outs["robot"].publish(String(data=f"tick {index}"))
+        outs["station"].publish(String(data=f"tock {index}"))
+
+    def everybody_heard():
+        alive()
+        return all(
+            f"{word} {index}" in texts(heard[host])
+            for host in ("robot", "station")
+            for word in ("tick", "tock")
+            for index in (1, 2, 3)
+        )
+
+    wait_for(everybody_heard, "words")
+    deadline = time.monotonic() + 0.7
+    while time.monotonic() < deadline:
+        alive()
+        time.sleep(0.01)
+    # The ring has two links from station to robot, so each host may hear the other's words twice; an echo never ends.
+    for host, own, other in (("robot", "tick", "tock"), ("station", "tock", "tick")):
+        said = [text for text in texts(heard[host]) if not text.endswith(" 0")]
+        for index in range(1, 4):
+            assert said.count(f"{own} {index}") == 1, said
+            assert 1 <= said.count(f"{other} {index}") <= 2, said
+    assert bridges
+
+
+def test_command_reaches_the_robot_and_an_old_one_does_not(hosts):
+    a, _ = pair(hosts)
+    wheel, hand = hosts.neighbour("robot", "wheel"), hosts.neighbour("station", "hand")
+    commands = wheel.listen("/operator/cmd_vel")
+    out = hand.publisher("/operator/cmd_vel", TwistStamped, SENSOR)
+
+    def drive():
+        out.publish(twist_stamped(0.3, 0.0, time.time_ns()))
+        time.sleep(0.02)
+        return commands
+
+    wheel.wait(drive, "command")
+    assert a.node.link.driver == "station"
+
+
+def test_other_type_on_a_topic_is_refused_and_told(hosts, monkeypatch):
+    from instant_ic.nodes import host_bridge
+
+    hosts.host("robot")
+    hosts.host("station")
+    a = hosts.bridge("robot")
+    monkeypatch.setattr(host_bridge, "type_hash", lambda name: "RIHS01_of_another_release")
+    b = hosts.bridge("station")
+    wait_for(lambda: a.told("link").startswith("linked"), "link")
+    near, far = hosts.neighbour("robot", "talker"), hosts.neighbour("station", "listener")
+    got = far.listen("/state")
+    near.publisher("/state", Bool, LATCHED).publish(Bool(data=True))
+    wait_for(lambda: "other fields" in a.told("topic /state") and "other fields" in b.told("topic /state"), "words")
+    assert a.node.diagnoses()["topic /state"][0] == ERROR
+    far.spin(0.2)
+    assert got == []
+
+
+def test_diagnoses_tell_link_clock_topics_and_door(hosts):
+    a, b = pair(hosts, max_offset_ms=0.0001)
+    wait_for(lambda: "of this one" in b.told("clock of robot") or "this one" in b.told("clock of robot"), "clock")
+    _, _, values = b.node.diagnoses()["clock of robot"]
+    assert set(values) == {"offset_ms", "rtt_ms", "jitter_ms"} and abs(values["offset_ms"]) < 5
+    assert a.told("link").startswith("linked with station (127.0.0.1, ") and a.told("link").endswith("; station drives")
+    assert a.told("door") == "nobody turned away lately"
+    hand = hosts.neighbour("station", "hand")
+    out = hand.publisher("/operator/estop", Bool, LATCHED)
+    out.publish(Bool(data=True))
+    wait_for(lambda: a.node.diagnoses()["topics"][2].get("in /operator/estop", "").startswith("1 messages"), "numbers")
+    b.close()
+    wait_for(lambda: "station ends" in a.told("link"), "words of the end")
+    assert a.node.diagnoses()["link"][0] == WARN
+
+
+@pytest.mark.parametrize(
+    ("offset_ms", "rtt_ms", "level", "text"),
+    [
+        (-340.0, 20.0, WARN, "340.0 ms behind this one, more than 50 ms: run chrony on both (sudo apt install chrony)"),
+        (61.0, 20.0, WARN, "61.0 ms ahead of this one, more than 50 ms: run chrony on both (sudo apt install chrony)"),
+        (59.0, 20.0, OK, "59.0 ms ahead of this one"),  # 10 ms of it are not certain
+        (-0.2, 0.3, OK, "0.2 ms behind this one"),
+    ],
+)
+def test_clock_that_is_wrong_is_a_warning_with_what_to_do(offset_ms, rtt_ms, level, text):
+    assert judge_clock(offset_ms, rtt_ms, 50.0) == (level, text)
+
+
+def test_driver_is_handed_over_by_a_live_parameter(hosts):
+    a, _ = pair(hosts)
+    wait_for(lambda: a.node.link.driver == "station", "driver")
+    a.node.call_soon(a.node.set_parameters, {"driver": "tablet"})
+    wait_for(lambda: a.node.link.driver == "", "nobody drives until the tablet comes")
+    hosts.host("tablet")
+    hosts.bridge("tablet")
+    wait_for(lambda: a.node.link.driver == "tablet", "hand-over")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({}, "one of listen"),
+        ({"listen": "tcp://0.0.0.0:1", "connect": "tcp://a:1"}, "not both"),
+        ({"listen": "0.0.0.0:7450"}, "listen: .* must look like tcp://0.0.0.0:7450"),
+        ({"connect": "tcp://robot"}, "connect: .* must look like tcp://192.168.1.20:7450"),
+        ({"listen": "tcp://0.0.0.0:1"}, "to_station and to_robot are empty"),
+        ({"listen": "tcp://0.0.0.0:1", "to_robot": ["/scan rat=3"]}, "to_robot: /scan: 'rat=3' is not one of"),
+        ({"listen": "tcp://0.0.0.0:1", "link.ping_s": 9.0}, "ping_s must be in 0.02..5"),
+        ({"listen": "tcp://0.0.0.0:1", "max_offset_ms": -1.0}, "max_offset_ms must be > 0"),
+    ],
+)
+def test_wrong_parameters_say_what_to_do(values, words):
+    with pytest.raises(ParameterError, match=words):
+        params.build(HostBridgeConfig, {key: params.Value(value, "-p") for key, value in values.items()})
+
+
+def test_missing_keys_end_the_start_with_words(hosts):
+    hosts.host("robot")
+    with pytest.raises(NodeError, match="ic keys new"):
+        hosts.bridge("robot", keys=str(hosts.folder / "nothing"))
+    hosts.stores["lonely"] = KeyStore(hosts.folder / "k_lonely")
+    hosts.stores["lonely"].create("lonely")
+    with pytest.raises(NodeError, match="ic keys allow NAME KEY"):
+        hosts.bridge("lonely", connect="tcp://127.0.0.1:1")
+
+
+def test_lockstep_is_refused():
+    with LockstepBus() as bus, pytest.raises(NodeError, match="needs the real bus"):
+        bus.add(HostBridgeNode, HostBridgeConfig(listen="tcp://127.0.0.1:0", to_robot=TO_ROBOT))
+
+
+def test_shipped_lists_are_whole():
+    """Every topic that a node of one side reads and a node of the other writes is on the list."""
+    import re
+
+    from instant_ic import paths
+    from instant_ic.bridge.host_topics import parse_rules
+
+    values = params.load_file(paths.shipped_file("config", "bridge.yaml"), "host_bridge")
+    config = params.build(HostBridgeConfig, {**values, "listen": params.Value("tcp://0.0.0.0:7450", "test")})
+    text = (paths.share_dir("launch").parent / "docs" / "reference.md").read_text()
+    takes, gives = {}, {}
+    for part in text.split("\n## ")[1:]:
+        name = part.split("\n")[0]
+        for found, word in ((takes, "Takes"), (gives, "Gives")):
+            line = re.search(rf"^{word}: (.*)$", part, re.M)
+            found[name] = set(re.findall(r"`(/[\w/]+)`", line[1])) if line else set()
+    sides = {
+        side: set(re.findall(r"exec: (\w+)", paths.shipped_file("launch", f"{side}.yaml").read_text()))
+        - {"host_bridge", "bag_recorder"}
+        for side in ("robot", "station")
+    }
+    assert {"arbiter", "crawler_base"} <= sides["robot"] and {"console", "nerf"} <= sides["station"]
+    for giver, taker, listed in (
+        ("robot", "station", parse_rules(config.to_station)),
+        ("station", "robot", parse_rules(config.to_robot)),
+    ):
+        given = set().union(*(gives.get(node, set()) for node in sides[giver]))
+        taken = set().union(*(takes.get(node, set()) for node in sides[taker]))
+        missing = {
+            t
+            for t in given & taken - set().union(*(gives.get(node, set()) for node in sides[taker]))
+            if t not in listed
+        }
+        assert not missing, f"{giver} gives and {taker} takes {missing}"
+    assert "/cmd_vel" not in parse_rules(config.to_robot)
