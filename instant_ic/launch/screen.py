@@ -22,6 +22,7 @@ _STATE_STYLES = {
     "stopping": ("◌", "dim"),
     "ended": ("○", "dim"),
 }
+_LINE_STYLES = {" WARNING ": "yellow", " ERROR ": "red", " CRITICAL ": "bold red"}
 _BAD_STYLE = ("●", "bold red")
 
 
@@ -120,8 +121,9 @@ class Screen:
 
     def node_line(self, node: str, text: str) -> None:
         """A line that a node has written."""
-        line = Text(f"{node:>{self._width}} │ ", style=self._colours.get(node, "white"))
-        self._console.print(line + Text.from_ansi(text))
+        prefix = (f"{node:>{self._width}} │ ", self._colours.get(node, "white"))
+        style = next((style for word, style in _LINE_STYLES.items() if word in text), "")
+        self._console.print(Text.assemble(prefix, Text.from_ansi(text, style=style)))
 
     def event(self, text: str, bad: bool = False) -> None:
         """Something that the supervisor has done or seen."""
