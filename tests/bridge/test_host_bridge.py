@@ -163,7 +163,9 @@ def test_no_echo_with_a_topic_both_ways_and_two_bridges_on_a_host(hosts):
     def alive():
         for ear in ears.values():
             ear.node.spin_once()
-        return any("tick" in t for t in texts(heard["robot"])) and any("tock" in t for t in texts(heard["station"]))
+        said = {host: texts(messages) for host, messages in heard.items()}
+        own = "tick 0" in said["robot"] and "tock 0" in said["station"]
+        return own and "tock 0" in said["robot"] and said["station"].count("tick 0") > 1 and "tick 0" in said["tablet"]
 
     deadline = time.monotonic() + 30
     while not alive():
