@@ -1,5 +1,7 @@
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -108,3 +110,136 @@ def test_nothing_to_play_is_told(bag: Path, options: PlayOptions, message: str) 
 def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):
         PlayOptions(**bad)  # type: ignore[arg-type]
+
+
+class Steered:
+    """Plays on a clock of its own; ``at`` lets controls act at times of it."""
+
+    def __init__(self, bag: Path, options: PlayOptions, at: dict[float, Callable[[BagPlayer], None]]) -> None:
+        self.player = BagPlayer(bag, options)
+        self.sent: list[tuple[float, int]] = []
+        self.clock: list[tuple[float, float]] = []
+        self.now_s = 50.0
+        self._at = sorted((50.0 + when, number, act) for number, (when, act) in enumerate(at.items()))
+        self._end_s = 50.0 + 30.0
+        self.finished = self.player.play(self._send, self, lambda: self.now_s, self._tick)  # type: ignore[arg-type]
+        self.player.close()
+
+    def wait(self, seconds: float) -> bool:
+        until_s = self.now_s + seconds
+        while self._at and self._at[0][0] <= until_s:
+            self.now_s, _, act = self._at.pop(0)
+            act(self.player)
+        self.now_s = max(self.now_s, until_s)
+        return self.is_set()
+
+    def is_set(self) -> bool:
+        return self.now_s >= self._end_s
+
+    def _send(self, message: BagMessage) -> None:
+        self.sent.append((round(self.now_s - 50.0, 2), message.payload[0]))
+
+    def _tick(self, stamp_ns: int) -> None:
+        self.clock.append((round(self.now_s - 50.0, 3), round(stamp_ns / 1e9 - 1.0, 3)))
+
+
+SCANS = TopicChoice(("/scan",))  # at 0, 0.5, 1, 1.5, 2 s
+
+
+def steered(bag: Path, at: dict[float, Callable[[BagPlayer], None]], **options: Any) -> Steered:
+    return Steered(bag, PlayOptions(choice=SCANS, clock_hz=20.0, **options), at)
+
+
+def near(sent: list[tuple[float, int]]) -> list[tuple[float, int]]:
+    """Times on the grid of the player's looks at its controls, 0.05 s."""
+    return [(round(round(at_s / 0.05) * 0.05, 2), value) for at_s, value in sent]
+
+
+def test_pause_and_resume_shift_what_follows(bag: Path) -> None:
+    run = steered(bag, {0.7: BagPlayer.pause, 3.0: BagPlayer.resume})
+    # Paused for 2.3 s after 0.7 s of the bag: 1.0 s of the bag comes at 3.3 s.
+    assert near(run.sent) == [(0.0, 0), (0.5, 1), (3.3, 2), (3.8, 3), (4.3, 4)] and run.finished
+
+
+def test_clock_goes_on_in_gaps_and_is_repeated_in_a_pause(bag: Path) -> None:
+    run = steered(bag, {0.7: BagPlayer.pause, 3.0: BagPlayer.resume})
+    assert run.clock[0] == (0.0, 0.0)  # before anything else
+    bag_s = [stamp_s for _, stamp_s in run.clock]
+    assert bag_s == sorted(bag_s)
+    gap = [stamp_s for at_s, stamp_s in run.clock if 0.01 < at_s < 0.49]
+    assert len(gap) == 9 and gap == pytest.approx([0.05 * i for i in range(1, 10)], abs=0.01)
+    paused = [stamp_s for at_s, stamp_s in run.clock if 0.8 < at_s < 2.9]
+    assert len(paused) > 35 and set(paused) == {paused[0]} and paused[0] == pytest.approx(0.7, abs=0.06)
+
+
+def test_step_sends_the_next_messages_and_stands_still(bag: Path) -> None:
+    steps: dict[float, Callable[[BagPlayer], None]] = {
+        0.98: BagPlayer.step, 1.98: lambda player: player.step(2), 4.98: BagPlayer.resume,
+    }  # fmt: skip
+    run = steered(bag, steps, start_paused=True)
+    # The fourth message is of 1.5 s of the bag: half a second after the pause, which ended at 1.0 s of the bag.
+    assert near(run.sent) == [(1.0, 0), (2.0, 1), (2.0, 2), (5.5, 3), (6.0, 4)]
+    with pytest.raises(ValueError, match="count must be >= 1"):
+        run.player.step(0)
+
+
+def test_rate_changes_while_it_plays(bag: Path) -> None:
+    run = steered(bag, {1.0: lambda player: player.set_rate(0.5)})
+    assert near(run.sent) == [(0.0, 0), (0.5, 1), (1.0, 2), (2.0, 3), (3.0, 4)]
+    for bad in (0.0, -1.0, 1000.0, float("nan")):
+        with pytest.raises(ValueError, match=r"rate must lie in 0\.01\.\.100"):
+            run.player.set_rate(bad)
+
+
+def test_seek_forward_and_back(bag: Path) -> None:
+    jumps: dict[float, Callable[[BagPlayer], None]] = {
+        0.2: lambda player: player.seek(1.5), 0.6: lambda player: player.seek(0.0),
+    }  # fmt: skip
+    run = steered(bag, jumps)
+    assert [value for _, value in run.sent] == [0, 3, 0, 1, 2, 3, 4] and run.finished
+    with pytest.raises(ValueError, match=r"offset_s must lie in 0\.\.2\.000 \(got 9"):
+        run.player.seek(9.0)
+
+
+def test_late_messages_are_told(bag: Path) -> None:
+    clock = FakeTime()
+
+    def slow(message: BagMessage) -> None:
+        clock.now_s += 0.8 if message.topic == "/scan" else 0.0
+
+    player = BagPlayer(bag, PlayOptions(choice=SCANS))
+    player.play(slow, clock, lambda: clock.now_s)  # type: ignore[arg-type]
+    player.close()
+    # Each takes 0.8 s where the bag has 0.5 s: the fifth is 4 * 0.3 s late.
+    assert player.latest_s == pytest.approx(1.2)
+
+
+def test_of_a_topic_with_two_types_one_is_played(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/a", TF, b"tf", 1, SENSOR)
+        for stamp_ns in (2, 3):
+            writer.write("/a", BOOL, b"b", stamp_ns, SENSOR)
+    player = BagPlayer(tmp_path / "bag", PlayOptions())
+    assert [(t.topic, t.type_name) for t in player.topics] == [("/a", BOOL)]
+    assert [(t.topic, t.type_name, t.count) for t in player.left_out] == [("/a", TF, 1)]
+    sent: list[bytes] = []
+    player.play(lambda message: sent.append(message.payload), threading.Event())
+    player.close()
+    assert sent == [b"b", b"b"]
+
+
+def test_damage_found_while_playing_is_told(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        for index in range(6):
+            writer.write("/scan", BOOL, bytes([index]) * 1000, index, SENSOR)
+            writer.flush()
+    file = tmp_path / "bag" / "bag.mcap"
+    data = bytearray(file.read_bytes())
+    data[data.find(bytes([4]) * 1000) + 10] ^= 0xFF
+    file.write_bytes(data)
+    player = BagPlayer(tmp_path / "bag", PlayOptions())
+    sent: list[int] = []
+    with pytest.raises(BagError, match=r"is damaged.*ic bag recover"):
+        player.play(lambda message: sent.append(message.payload[0]), threading.Event())
+    player.close()
+    assert sent == [0, 1, 2, 3]
