@@ -389,7 +389,7 @@ class LocalPublisher:
                 self._rewatch(reader)
             if self.qos.latched:
                 self._keep(_Outgoing(sequence, stamp, size, frame[HEADER.size :]))
-        self.stats.add(time.monotonic_ns(), size)
+        self.stats.add(self._transport.steady_ns(), size)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
         """Sends ``size`` bytes that ``fill`` writes where they are to be, without a further copy; never waits.
@@ -460,7 +460,7 @@ class LocalPublisher:
                 self._rewatch(reader)
         if self.qos.latched:
             self._keep(message)
-        self.stats.add(time.monotonic_ns(), size)
+        self.stats.add(self._transport.steady_ns(), size)
 
     def _keep(self, message: _Outgoing) -> None:
         """Keeps the last value for whoever comes later."""

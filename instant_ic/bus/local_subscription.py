@@ -58,6 +58,8 @@ class Inlet:
         self.subscription = subscription
         self.hello: Hello | None = None
         self.refused = False
+        self.node = self.type_name = ""
+        self.expected = 0  # sequence of the next message; 0 before the first
         self._scratch = scratch
         self._whole_scratch = [scratch]
         self._deliver = subscription.deliver
@@ -120,6 +122,11 @@ class Inlet:
             if not count:
                 return False
             end = start + count
+            if end >= HEADER.size:
+                kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(self._scratch)
+                if kind == DATA and size + HEADER.size == end:  # one whole message: the usual case
+                    self._deliver(self, sequence, skipped, publish_ns, bytes(self._scratch[HEADER.size : end]))
+                    return True
             self._parse(end)
             if end < SCRATCH_BYTES and self._body is None and not ancillary:
                 return True  # it was all there was
@@ -236,15 +243,18 @@ class LocalSubscription:
         self.qos = qos
         self.stats = Stats()
         self.on_ready = on_ready
+        self.waker: object = None  # whose `set` on_ready is: it need not be called by whoever waits on it
         self.fresh = False
         self.shared = True  # until this process turns out not to be able to map memory
         self.publishers: list[registry.PublisherInfo] = []
         self._transport = transport
         self._digest = type_digest(type_name) if type_name else None
-        self._sequences: dict[str, int] = {}
+        self._expected: dict[str, int] = {}  # next sequence of publishers whose connection was lost
         self._told: set[str] = set()
         self._lock = threading.Lock()
-        self._queue: deque[tuple[str, Received]] = deque()
+        self._queue: deque[Received] = deque()
+        self._depth = qos.depth
+        self._now_ns, self._steady_ns, self._next_order = transport.now_ns, transport.steady_ns, transport.next_order
         self._folder = registry.topic_dir(transport.run_dir, topic)
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._seen_mtime = -1
@@ -287,6 +297,7 @@ class LocalSubscription:
         for identity, (_, other) in list(self._inlets.items()):
             if other is inlet:
                 del self._inlets[identity]
+                self._expected[identity] = inlet.expected
         self._next_full_look = 0.0
         self._transport.remove_inlet(inlet)
         inlet.close()
@@ -298,46 +309,43 @@ class LocalSubscription:
         if hello.topic != self.topic:
             raise FrameError(f"a publisher of {hello.topic}")
         inlet.refused = self._digest is not None and hello.digest != self._digest
+        inlet.node, inlet.type_name = hello.node, self.type_name or hello.type_name
+        inlet.expected = self._expected.get(hello.publisher, 0)
 
     def deliver(
         self, inlet: Inlet, sequence: int, skipped: int, publish_ns: int, payload: bytes | memoryview | None
     ) -> None:
         """Takes one message."""
-        hello = inlet.hello
-        if hello is None:
-            raise FrameError("a message before the publisher's greeting")
-        if inlet.refused:
-            same = hello.type_name == self.type_name
-            why = f"{hello.type_name} with other fields" if same else f"{hello.type_name}, {self.type_name} expected"
-            self._reject(hello, f"{self.topic}: node {hello.node} sends {why}")
-            return
-        last = self._sequences.get(hello.publisher)
-        if last is not None:
-            if sequence <= last:  # a latched value that comes again with a new connection
+        node = inlet.node
+        if sequence != inlet.expected + skipped:
+            if not inlet.expected:
+                if inlet.hello is None:
+                    raise FrameError("a message before the publisher's greeting")
+            elif sequence < inlet.expected:  # a latched value that comes again with a new connection
                 return
-            self.stats.lose(hello.node, sequence - last - 1 - skipped)
-        self._sequences[hello.publisher] = sequence
-        if payload is None:
-            self.stats.lose(hello.node, 1)
-            self.tell_torn(inlet)
+            else:
+                self.stats.lose(node, sequence - inlet.expected - skipped)
+        inlet.expected = sequence + 1
+        if payload is None or inlet.refused:
+            self._refuse(inlet)
             return
-        now, steady = self._transport.now_ns(), time.monotonic_ns()
-        type_name = self.type_name or hello.type_name
+        steady = self._steady_ns()
         message = Received(
-            self.topic, type_name, payload, publish_ns, now, self._transport.next_order(), hello.node, steady
+            self.topic, inlet.type_name, payload, publish_ns, self._now_ns(), self._next_order(), node, steady
         )
-        self.stats.add(steady, len(payload))
-        self.fresh = True
         with self._lock:
             queue = self._queue
-            if self.qos.depth == 1:
-                for index, (publisher, _) in enumerate(queue):
-                    if publisher == hello.publisher:
-                        del queue[index]
-                        break
-            elif len(queue) >= self.qos.depth:
-                self.stats.lose(self._node_of(queue.popleft()[0]), 1)
-            queue.append((hello.publisher, message))
+            if queue:
+                if self._depth == 1:
+                    for index, other in enumerate(queue):
+                        if other.publisher == node:
+                            del queue[index]
+                            break
+                elif len(queue) >= self._depth:
+                    self.stats.lose(queue.popleft().publisher, 1)
+            queue.append(message)
+        self.stats.add(steady, len(payload))
+        self.fresh = True
 
     def tell_torn(self, inlet: Inlet) -> None:
         """A buffer was written over while it was lent: a fault of the publisher, counted and told."""
@@ -345,14 +353,19 @@ class LocalSubscription:
         node = inlet.hello.node if inlet.hello else "?"
         log.error("%s: %s wrote over a message that was still being read", self.topic, node)
 
-    def _node_of(self, publisher: str) -> str:
-        return next((info.node for info in self.publishers if info.id == publisher), publisher)
-
-    def _reject(self, hello: Hello, why: str) -> None:
+    def _refuse(self, inlet: Inlet) -> None:
+        hello = inlet.hello
+        assert hello is not None
+        if not inlet.refused:
+            self.stats.lose(hello.node, 1)
+            self.tell_torn(inlet)
+            return
         self.stats.rejected += 1
         if hello.publisher not in self._told:
             self._told.add(hello.publisher)
-            log.error("%s; its messages are refused and counted", why)
+            same = hello.type_name == self.type_name
+            why = f"{hello.type_name} with other fields" if same else f"{hello.type_name}, {self.type_name} expected"
+            log.error("%s: node %s sends %s; its messages are refused and counted", self.topic, hello.node, why)
 
     def shut(self) -> None:
         """Closes every connection."""
@@ -366,7 +379,7 @@ class LocalSubscription:
         if not self._queue:
             return []
         with self._lock:
-            messages = [message for _, message in self._queue]
+            messages = list(self._queue)
             self._queue.clear()
         return messages
 

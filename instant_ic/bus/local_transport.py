@@ -58,6 +58,11 @@ class Waker:
             with contextlib.suppress(BlockingIOError):  # who set it has not written yet: one wait ends for nothing
                 os.eventfd_read(self.fd)
 
+    def close(self) -> None:
+        """Nothing wakes any more."""
+        self._set = True
+        os.close(self.fd)
+
     def wait(self, timeout: float) -> None:
         """Reads the node's sockets until something came, it was set, or the time is over."""
         if not self._set:
@@ -70,16 +75,24 @@ class LocalTransport:
     Args:
         run_dir: the run directory, made if missing.
         node: the node's name; names the publishers' sockets.
-        now_ns: the node's clock.
+        now_ns: the node's clock, for stamps.
+        steady_ns: the node's clock that never jumps, for rates and ages.
 
     Raises:
         RegistryError: the run directory cannot be used.
     """
 
-    def __init__(self, run_dir: Path, node: str, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        run_dir: Path,
+        node: str,
+        now_ns: Callable[[], int],
+        steady_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self.run_dir = registry.prepare(run_dir)
         self.node = registry.check_node_name(node)
         self.now_ns = now_ns
+        self.steady_ns = steady_ns
         self.driver: int | None = None
         self.scratch = memoryview(bytearray(SCRATCH_BYTES))
         self._orders = itertools.count()
@@ -129,6 +142,8 @@ class LocalTransport:
     def subscribe(self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> LocalSubscription:
         """A subscription to all present and coming publishers; ``type_name`` None takes any type."""
         subscription = LocalSubscription(self, topic, type_name, qos, on_ready)
+        if self._waker is not None and on_ready == self._waker.set:
+            subscription.waker = self._waker
         with self._lock:
             self._subscriptions.append(subscription)
             self._look_now = True
@@ -160,10 +175,11 @@ class LocalTransport:
         for subscription in list(self._subscriptions):
             subscription.close()
         with self._read_lock:
+            if self._waker is not None:
+                self._waker.close()
             self._inputs.close()
             self._events.close()
-            for fd in (self._poke, *([self._waker.fd] if self._waker else [])):
-                os.close(fd)
+            os.close(self._poke)
 
     # -- for publishers: sockets that the bus thread serves ------------------------------------------
 
@@ -217,21 +233,24 @@ class LocalTransport:
             if now > self._slow_until_s:
                 os.eventfd_write(self._poke, 1)
             self._slow_until_s = now + _SLOW_FOR_S
-        self._drain(self._inputs.poll(timeout, 16))
+        self._drain(self._inputs.poll(timeout, 16), self._waker)
         self._left_s = time.monotonic()
         self._waiting = False
 
-    def _drain(self, events: list[tuple[int, int]]) -> None:
-        ready: list[LocalSubscription] = []
+    def _drain(self, events: list[tuple[int, int]], reader: Waker | None) -> None:
+        """Reads what waits; whoever is not ``reader`` is told."""
+        others: list[LocalSubscription] = []
         with self._read_lock:
             for fd, _ in events:
                 inlet = self._inlets.get(fd)
                 if inlet is not None:
                     self.read_inlet(inlet)
-                    if inlet.subscription.fresh:
-                        inlet.subscription.fresh = False
-                        ready.append(inlet.subscription)
-        for subscription in ready:
+                    subscription = inlet.subscription
+                    if subscription.fresh:
+                        subscription.fresh = False
+                        if reader is None or subscription.waker is not reader:
+                            others.append(subscription)
+        for subscription in others:
             subscription.on_ready()
 
     def _run(self) -> None:
@@ -248,13 +267,17 @@ class LocalTransport:
             timeout = min(_IDLE_S, next_look - now) if self._subscriptions else _IDLE_S
             if now < self._slow_until_s:
                 timeout = min(timeout, _BUSY_S)
-            for fd, events in self._events.poll(max(0.0, timeout), 64):
-                if fd == inputs:
-                    self._drain(self._inputs.poll(0, 64))
-                elif fd == self._poke:
-                    os.eventfd_read(fd)
-                elif (handler := self._handlers.get(fd)) is not None:
-                    handler(events)
+            try:
+                for fd, events in self._events.poll(max(0.0, timeout), 64):
+                    if fd == inputs:
+                        self._drain(self._inputs.poll(0, 64), None)
+                    elif fd == self._poke:
+                        os.eventfd_read(fd)
+                    elif (handler := self._handlers.get(fd)) is not None:
+                        handler(events)
+            except Exception:  # a bus that stands still would be worse than one bad event
+                log.exception("%s: fault on the bus thread", self.node)
+                self._stop.wait(_BUSY_S)
 
     def _look(self) -> bool:
         """Looks for publishers; False when the run directory is gone."""

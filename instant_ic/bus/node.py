@@ -106,10 +106,9 @@ class Latest:
         self._message: Any = None
         self._received_ns = 0  # of the steady clock: setting the machine's clock makes nothing older or younger
 
-    def put(self, message: Any, received_ns: int) -> None:
-        """Takes a newer message."""
-        waited_ns = max(0, self._clock.now_ns() - received_ns)
-        self._message, self._received_ns = message, self._clock.steady_ns() - waited_ns
+    def put(self, message: Any, steady_ns: int) -> None:
+        """Takes a newer message, and when it came by the steady clock."""
+        self._message, self._received_ns = message, steady_ns
 
     @property
     def message(self) -> Any:
@@ -350,7 +349,7 @@ class Node(Generic[ConfigT]):
         name = type_name(message_class)
 
         def keep(received: Received) -> None:
-            latest.put(deserialize(received.payload, name), received.received_ns)
+            latest.put(deserialize(received.payload, name), received.steady_ns)
 
         self._subscribe(topic, name, keep, qos)
         return latest
@@ -660,7 +659,7 @@ class Node(Generic[ConfigT]):
         return dict(self._diagnoses)
 
     def _beat(self) -> None:
-        now = self.clock.now_ns()
+        now = self.clock.steady_ns()
         status = message_type("NodeStatus")
         state = "DEGRADED" if self._state == "RUNNING" and self.level >= ERROR else self._state
         worst = max(self._diagnoses.values(), default=(OK, "", {}), key=lambda d: d[0])
@@ -702,25 +701,37 @@ class Node(Generic[ConfigT]):
             )
             for name, (level, message, values) in self._diagnoses.items()
         ]
-        now = self.clock.now_ns()
+        now = self.clock.steady_ns()
         for subscription in self.subscriptions:
-            raw = subscription.raw
-            if raw.stats.lost or raw.stats.rejected:
+            stats = subscription.raw.stats
+            if not (stats.lost or stats.rejected or stats.torn):
+                continue
+            values = {
+                "lost": stats.lost,
+                **{f"lost from {node}": n for node, n in sorted(stats.lost_by.items())},
+                "refused": stats.rejected,
+                "torn": stats.torn,
+                "rate_hz": round(stats.rate_hz(now), 2),
+                "age_s": round(stats.age_s(now), 3),
+            }
+            entries.append(
+                status(
+                    level=ERROR if stats.rejected or stats.torn else WARN,
+                    name=f"{self.node_name}: input {subscription.raw.topic}",
+                    message=f"{stats.lost} messages lost, {stats.rejected} refused",
+                    hardware_id="",
+                    values=_key_values(values),
+                )
+            )
+        for publisher in self.publishers:
+            if count := publisher.raw.stats.not_shared:
                 entries.append(
                     status(
-                        level=ERROR if raw.stats.rejected else WARN,
-                        name=f"{self.node_name}: input {raw.topic}",
-                        message=f"{raw.stats.lost} messages lost, {raw.stats.rejected} refused",
+                        level=WARN,
+                        name=f"{self.node_name}: output {publisher.topic}",
+                        message=f"{count} large messages without shared memory: {publisher.raw.stats.not_shared_why}",
                         hardware_id="",
-                        values=_key_values(
-                            {
-                                "lost": raw.stats.lost,
-                                **{f"lost from {node}": n for node, n in sorted(raw.stats.lost_by.items())},
-                                "refused": raw.stats.rejected,
-                                "rate_hz": round(raw.stats.rate_hz(now), 2),
-                                "age_s": round(raw.stats.age_s(now), 3),
-                            }
-                        ),
+                        values=_key_values({"not_shared": count, "sent": publisher.raw.stats.count}),
                     )
                 )
         self._diagnostics.publish(array(header=header("", time.time_ns()), status=entries))

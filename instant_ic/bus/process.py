@@ -19,8 +19,8 @@ from ..msg import MessageError
 from . import params, registry
 from .clock import Clock, ManualClock, SystemClock
 from .control import ControlServer
+from .local_transport import LocalTransport
 from .node import Node, NodeError
-from .zmq_transport import ZmqTransport
 
 
 def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
@@ -146,7 +146,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
     run_dir = args.run_dir or paths.run_dir()
     try:
-        transport = ZmqTransport(run_dir, args.name, clock.now_ns)
+        transport = LocalTransport(run_dir, args.name, clock.now_ns, clock.steady_ns)
         claim = registry.Claim(run_dir / "nodes" / args.name, f"node {args.name}")
     except registry.RegistryError as error:
         log.error("%s", error)

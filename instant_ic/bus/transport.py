@@ -36,13 +36,16 @@ class Received(NamedTuple):
     publisher: str = ""
     """Name of the node that published it."""
     steady_ns: int = 0
-    """When it came, on a clock that never jumps; for ages."""
+    """When it came, by the node's steady clock; for ages."""
+
+
+_TOLERANCE_S = 0.1  # simulated time may go back a little
 
 
 class Stats:
     """Counts, rate, age and losses of one direction of a topic.
 
-    Times are of a clock that never jumps: :func:`time.monotonic_ns` between processes, the bus's own in lockstep.
+    Times are of the node's steady clock: setting the machine's clock changes no rate and no age.
     """
 
     def __init__(self) -> None:
@@ -73,7 +76,7 @@ class Stats:
 
     def rate_hz(self, now_ns: int) -> float:
         """Messages a second over the last 50 or 5 s, whichever is shorter."""
-        recent = [t for t in list(self._arrivals) if now_ns - t < 5_000_000_000]
+        recent = [t for t in list(self._arrivals) if 0 <= now_ns - t < 5_000_000_000]
         if len(recent) < 2 or recent[-1] <= recent[0]:
             return 0.0
         # The silence since the last message counts too: a topic that stopped must not keep its old rate.
@@ -81,8 +84,9 @@ class Stats:
         return (len(recent) - 1) * 1e9 / span
 
     def age_s(self, now_ns: int) -> float:
-        """Seconds since the newest message; inf before the first."""
-        return (now_ns - self.newest_ns) / 1e9 if self.count else float("inf")
+        """Seconds since the newest message; inf before the first, and when simulated time went back since."""
+        age = (now_ns - self.newest_ns) / 1e9
+        return age if self.count and age >= -_TOLERANCE_S else float("inf")
 
 
 class PublisherStats(Stats):
