@@ -202,7 +202,7 @@ class Outgoing:
                 there = self._nodes[node] = RosNode(self._session, self._namespace.ros, node)
             name = self._namespace.to_ros(topic)
             out.publishers[node] = RosPublisher(there, name, type_name, hash_, ros_qos(qos))
-            self._node.log.info("%s of %s goes out as %s", topic, node, name)
+            self._node.log.debug("%s of %s goes out as %s", topic, node, name)
         return out.publishers[node]
 
     def _came_in(self, topic: str, publisher: str) -> bool:
@@ -392,7 +392,7 @@ class Incoming:
         handle = self._handler(topic, entry)
         there = self._namespace.to_ros(topic)
         entry.subscription = RosSubscription(self._own, there, name, type_hash(name), qos, handle)
-        self._node.log.info("%s comes in as %s", there, topic)
+        self._node.log.debug("%s comes in as %s", there, topic)
         return entry
 
     def _handler(self, topic: str, entry: _In) -> Callable[[bytes, Attachment], None]:

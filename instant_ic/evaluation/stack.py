@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +17,7 @@ from typing import Any, Self, TypeVar
 
 from ..bus import SENSOR, Node, QoS
 from ..bus.clock import SystemClock
-from ..bus.zmq_transport import ZmqTransport
+from ..bus.local_transport import LocalTransport
 
 T = TypeVar("T")
 
@@ -54,6 +55,21 @@ class Observer(Node[_NoParameters]):
     name = "observer"
 
 
+def _observer(run_dir: Path) -> Observer:
+    clock = SystemClock()
+    return Observer(_NoParameters(), LocalTransport(run_dir, Observer.name, clock.now_ns), clock)
+
+
+@contextlib.contextmanager
+def observer(run_dir: Path) -> Iterator[Observer]:
+    """An observer of another run directory, as those of a fleet's robots."""
+    watching = _observer(run_dir)
+    try:
+        yield watching
+    finally:
+        watching.close()
+
+
 class Stack:
     """Starts a launch file in a run directory of its own.
 
@@ -79,7 +95,6 @@ class Stack:
         self.log_path = log_path or run_dir / "launch.log"
         self.process: subprocess.Popen[bytes] | None = None
         self.observer: Observer
-        self._transport: ZmqTransport
 
     def __enter__(self) -> Self:
         """Starts the launcher and the observer."""
@@ -95,9 +110,7 @@ class Stack:
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
             )
-        clock = SystemClock()
-        self._transport = ZmqTransport(self.run_dir, Observer.name, clock.now_ns)
-        self.observer = Observer(_NoParameters(), self._transport, clock)
+        self.observer = _observer(self.run_dir)
         return self
 
     def __exit__(

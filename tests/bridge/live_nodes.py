@@ -11,7 +11,7 @@ from typing import Any
 
 from instant_ic.bus import RELIABLE, Node
 from instant_ic.bus.clock import ManualClock, SystemClock
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.msg import serialize, type_name
 
 
@@ -28,7 +28,7 @@ class LiveNode:
 
     def __init__(self, run_dir: Path, node_class: type[Node[Any]], config: Any, name: str, sim_time: bool = False):
         clock = ManualClock() if sim_time else SystemClock()
-        transport = ZmqTransport(run_dir, name, clock.now_ns)
+        transport = LocalTransport(run_dir, name, clock.now_ns)
         self.node = node_class(config, transport, clock, name, use_sim_time=sim_time)
         try:
             self.node.start()
@@ -61,7 +61,7 @@ class Neighbour:
     """Another node of the run directory, for publishing and listening."""
 
     def __init__(self, run_dir: Path, name: str):
-        self.node = _Plain(_Nothing(), ZmqTransport(run_dir, name, time.time_ns), SystemClock(), name)
+        self.node = _Plain(_Nothing(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name)
         self.received: dict[str, list[Any]] = {}
 
     def publisher(self, topic: str, message_class: Any, qos=RELIABLE):
