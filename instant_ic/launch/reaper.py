@@ -1,14 +1,13 @@
 """Outlives a launcher by a moment and kills what its nodes have left behind; run as a script, never imported.
 
-``python -I -S reaper.py MARK``, with the launcher at the other end of its standard input. When the launcher is gone,
-however it went, every process that carries MARK in its environment is killed: the nodes, their children, and those
-that have left the node's process group for a session of their own, which no signal to a group and no parent-death
-signal reaches. It writes ``PID COMMAND`` for each, and ends.
+``python -I -S reaper.py``, with the launcher at the other end of its standard input, who writes MARK first. When the
+launcher is gone, however it went, every process that carries MARK in its environment is killed: the nodes, their
+children, and those that have left the node's process group for a session of their own, which no signal to a group and
+no parent-death signal reaches. It writes ``PID COMMAND`` for each, and ends.
 """
 
 import os
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -67,9 +66,11 @@ def main() -> None:
     """Waits for the launcher's end."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it goes when the launcher has gone
-    while os.read(0, 4096):
-        pass
-    killed = kill_marked(sys.argv[1])
+    told = b""
+    while piece := os.read(0, 4096):
+        told += piece
+    mark = told.decode().strip()
+    killed = kill_marked(mark) if mark else {}
     try:
         for pid, command in killed.items():
             os.write(1, f"{pid} {command}\n".encode())

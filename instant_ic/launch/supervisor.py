@@ -187,11 +187,14 @@ class Supervisor:
     def _reaper(self) -> Iterator[None]:
         """Somebody who kills what is left when this process is gone, even by SIGKILL."""
         process = subprocess.Popen(
-            (sys.executable, "-I", "-S", str(_REAPER), self._mark),
+            (sys.executable, "-I", "-S", str(_REAPER)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
+        assert process.stdin is not None
+        process.stdin.write(self._mark.encode())
+        process.stdin.flush()
         try:
             yield
         finally:

@@ -95,3 +95,17 @@ def test_a_check_that_does_not_end_is_told(stack: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(parameters, "_CHECK_TIMEOUT_S", 0.01)
     with pytest.raises(ParameterCheckError, match="could not be checked within"):
         check_parameters_quickly(read_launch_file(stack).nodes)
+
+
+@pytest.mark.parametrize(
+    "words", [["F", "--check", "n:=one"], ["F", "n:=one", "--check"], ["--check", "F", "n:=one"], ["F", "--check"]]
+)
+def test_options_and_arguments_stand_in_any_order(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    file = tmp_path / "stack.yaml"
+    file.write_text(
+        "launch:\n- arg: {name: n, default: two}\n- executable: {cmd: echo, unless: $(equals $(var n) one)}\n"
+    )
+    assert main(["launch", *(str(file) if word == "F" else word for word in words)]) == 0
+    assert f"{0 if 'n:=one' in words else 1} nodes, no mistake found" in capsys.readouterr().out

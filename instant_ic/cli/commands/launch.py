@@ -34,6 +34,17 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--plain", action="store_true", help="plain lines also in a terminal")
     parser.add_argument("--run-dir", type=Path, default=None, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
     parser.set_defaults(func=run)
+    parse = parser.parse_known_args
+
+    def pairs_beside_the_file(words: Any = None, namespace: Any = None) -> Any:
+        """``sim --check a:=b`` too: argparse takes positional words only where they stand together."""
+        first, rest = list(words or [])[:1], list(words or [])[1:]
+        if first and not first[0].startswith("-"):
+            pairs = [word for word in rest if ":=" in word and not word.startswith("-")]
+            words = [*first, *pairs, *(word for word in rest if word not in pairs)]
+        return parse(words, namespace)
+
+    parser.parse_known_args = pairs_beside_the_file
 
 
 def run(args: argparse.Namespace) -> int:
