@@ -49,7 +49,7 @@ class _Publisher:
 
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
         data = bytes(joined(payload))
-        self.stats.add(self._bus.clock.now_ns(), len(data))
+        self.stats.add(self._bus.clock.steady_ns(), len(data))
         self._bus.route(self.topic, self.type_name, data, self._node, self.qos, publish_ns)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
@@ -221,7 +221,8 @@ class LockstepBus:
             )
             return
         now = self.clock.now_ns()
-        subscription.stats.add(now, len(record.payload))
+        steady = self.clock.steady_ns()
+        subscription.stats.add(steady, len(record.payload))
         subscription.queue.append(
             Received(
                 record.topic,
@@ -231,7 +232,7 @@ class LockstepBus:
                 now,
                 next(self._orders),
                 record.node,
-                now,
+                steady,
             )
         )
 

@@ -1,0 +1,381 @@
+#!/usr/bin/env python3
+"""The bus beside other middlewares: latency, throughput and fan-out, each transport between processes, in one run.
+
+    python benchmarks/bus.py --json bus.json --plot docs/images/bus_latency.png      (about 12 minutes)
+    python benchmarks/bus.py --quick                                                 (about 2 minutes)
+
+Every transport sends the same frames at the same pace, in turns within one run, so that whatever else the machine does
+disturbs all of them alike. Latency is from before the call that sends to after the receiver has read a byte of every
+4096. A transport whose package is missing is «not measured».
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import shutil
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+PEER = Path(__file__).with_name("bus_peer.py")
+SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_500_000}
+LABELS = {"b100": "100 B", "k20": "20 kB", "k200": "200 kB", "m1": "1.2 MB", "m5": "5.5 MB"}
+PERIOD_S = {"b100": 0.01, "k20": 0.01, "k200": 0.02, "m1": 0.035, "m5": 0.07}
+FANOUT = 4
+DEBIAN_PYTHON = "/usr/bin/python3"
+
+NAMES = {
+    "ours": "Instant IC, bytes",
+    "image": "Instant IC, Image to array",
+    "zmq": "ZeroMQ ipc (raw)",
+    "zenoh_shm": "Zenoh, shared memory",
+    "zenoh_tcp": "Zenoh, tcp",
+    "lcm": "LCM udpm",
+    "rospy": "rospy",
+    "zmq_tcp": "ZeroMQ tcp (raw)",
+    "zmq_curve": "ZeroMQ tcp with CURVE",
+}
+
+
+class Peer:
+    """A process of benchmarks/bus_peer.py."""
+
+    def __init__(self, transport: str, role: str, topics: dict[str, int], address: str) -> None:
+        python = DEBIAN_PYTHON if transport == "rospy" else sys.executable
+        wanted = ",".join(f"{name}={size}" for name, size in topics.items())
+        environment = {**os.environ, "ROS_MASTER_URI": address, "ROS_IP": "127.0.0.1"}
+        self.process = subprocess.Popen(
+            [python, str(PEER), transport, role, wanted, address],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+        )  # fmt: skip
+        self._os_stderr = self.process.stderr
+
+    def answer(self) -> Any:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            self.process.kill()
+            assert self._os_stderr is not None
+            raise RuntimeError(self._os_stderr.read().strip().splitlines()[-1:] or ["ended without a word"])
+        return json.loads(line)
+
+    def ask(self, command: dict[str, Any] | None = None) -> Any:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(command or {}) + "\n")
+        self.process.stdin.flush()
+        return self.answer()
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(10)
+        for stream in (self.process.stdin, self.process.stdout, self.process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+@dataclass
+class Pair:
+    """Both sides of one transport."""
+
+    pub: Peer
+    subs: list[Peer]
+    address: str
+
+    def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[dict[str, Any], list[Any]]:
+        """Sends and waits until everything that will come has come."""
+        sent = self.pub.ask({"topic": topic, "count": count, "period_s": period_s, "seconds": seconds})
+        got: list[dict[str, Any]] = [sub.ask() for sub in self.subs]
+        deadline = time.monotonic() + 2.0
+        while min(g["count"] for g in got) < sent["sent"] and time.monotonic() < deadline:
+            time.sleep(0.1)
+            more = [sub.ask() for sub in self.subs]
+            if not any(m["count"] for m in more):
+                break
+            got = [joined(g, m) for g, m in zip(got, more, strict=True)]
+        return sent, got
+
+    def warm_up(self, topic: str) -> None:
+        """Until every reader hears the publisher.
+
+        Raises:
+            RuntimeError: one never does.
+        """
+        heard = [False] * len(self.subs)
+        deadline = time.monotonic() + 20.0
+        while not all(heard):
+            if time.monotonic() > deadline:
+                raise RuntimeError(f"nothing came on {topic}")
+            _, got = self.send(topic, 5, 0.03)
+            heard = [h or g["count"] > 0 for h, g in zip(heard, got, strict=True)]
+
+    def close(self) -> None:
+        for peer in (self.pub, *self.subs):
+            peer.close()
+
+
+def joined(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
+    """Two collections of one receiver as one."""
+    seconds = a["seconds"] + b["seconds"] if a["count"] and b["count"] else a["seconds"] or b["seconds"]
+    return {
+        "latencies_us": a["latencies_us"] + b["latencies_us"],
+        "count": a["count"] + b["count"],
+        "bytes": a["bytes"] + b["bytes"],
+        "seconds": seconds,
+        "cpu_s": b["cpu_s"],
+    }
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def addresses(transports: list[str], folder: Path) -> Iterator[dict[str, str]]:
+    """Where each transport meets; runs the ROS master while the block lasts."""
+    found = {
+        "ours": str(folder / "ours"),
+        "image": str(folder / "image"),
+        "zmq": f"ipc://{folder}/zmq",
+        "zmq_tcp": f"tcp://127.0.0.1:{free_port()}",
+        "zmq_curve": f"tcp://127.0.0.1:{free_port()}",
+        "zenoh_tcp": f"tcp/127.0.0.1:{free_port()}",
+        "zenoh_shm": f"tcp/127.0.0.1:{free_port()}",
+        "lcm": f"udpm://239.255.76.67:{free_port()}?ttl=0&recv_buf_size=4194304",
+        "rospy": f"http://127.0.0.1:{free_port()}",
+    }
+    master = None
+    if "rospy" in transports and shutil.which("rosmaster"):
+        port = found["rospy"].rsplit(":", 1)[1]
+        environment = {**os.environ, "ROS_MASTER_URI": found["rospy"], "ROS_IP": "127.0.0.1"}
+        master = subprocess.Popen(
+            ["rosmaster", "--core", "-p", port], env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        time.sleep(2.0)
+    try:
+        yield found
+    finally:
+        if master is not None:
+            master.terminate()
+            master.wait(10)
+
+
+def open_pair(transport: str, address: str, topics: dict[str, int], readers: int) -> Pair:
+    """Starts both sides.
+
+    Raises:
+        RuntimeError: the transport is not there or does not work.
+    """
+    peers: list[Peer] = []
+    try:
+        pub = Peer(transport, "pub", topics, address)
+        peers.append(pub)
+        pub.answer()
+        for _ in range(readers):
+            peers.append(Peer(transport, "sub", topics, address))
+            peers[-1].answer()
+        pair = Pair(pub, peers[1:], address)
+        for topic in topics:
+            pair.warm_up(topic)
+        return pair
+    except Exception:
+        for peer in peers:
+            peer.close()
+        raise
+
+
+def summary(latencies: list[float], sent: int) -> dict[str, Any]:
+    """Figures of one cell of the table."""
+    if not latencies:
+        return {"p50_us": None, "p99_us": None, "received": 0, "sent": sent}
+    ordered = sorted(latencies)
+    return {
+        "p50_us": round(statistics.median(ordered), 1),
+        "p99_us": round(ordered[min(len(ordered) - 1, int(len(ordered) * 0.99))], 1),
+        "received": len(ordered),
+        "sent": sent,
+    }
+
+
+def measure(transports: list[str], rounds: int, count: int, flood_s: float, note: Any) -> dict[str, Any]:
+    """All figures by transport."""
+    latency: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    sent: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+    result: dict[str, Any] = {"not_measured": {}, "latency": {}, "throughput": {}, "fanout": {}}
+    topics = dict(SIZES)
+    with tempfile.TemporaryDirectory(prefix="ic") as folder, addresses(transports, Path(folder)) as address:
+        pairs: dict[str, Pair] = {}
+        try:
+            for transport in transports:
+                try:
+                    pairs[transport] = open_pair(transport, address[transport], topics, 1)
+                except RuntimeError as error:
+                    result["not_measured"][transport] = str(error)
+                    note(f"{transport}: not measured: {error}")
+            for turn in range(rounds):
+                for topic in topics:
+                    for transport, pair in pairs.items():
+                        told, got = pair.send(topic, count, PERIOD_S[topic])
+                        latency[transport][topic] += got[0]["latencies_us"]
+                        sent[transport][topic] += told["sent"]
+                note(f"latency, round {turn + 1} of {rounds}")
+        finally:
+            for pair in pairs.values():
+                pair.close()
+        for transport in pairs:
+            result["latency"][transport] = {t: summary(latency[transport][t], sent[transport][t]) for t in topics}
+        for transport in [t for t in pairs if t not in ("zmq_tcp", "zmq_curve")]:
+            with contextlib.suppress(RuntimeError):
+                result["throughput"][transport] = flood(transport, address[transport], flood_s)
+                note(f"throughput, {transport}")
+        fan = [t for t in pairs if t not in ("zmq_tcp", "zmq_curve")]
+        gathered: dict[str, list[float]] = defaultdict(list)
+        fan_sent: dict[str, int] = defaultdict(int)
+        for _ in range(max(1, rounds // 2)):
+            for transport in fan:
+                try:
+                    pair = open_pair(transport, address[transport], {"m5": SIZES["m5"]}, FANOUT)
+                except RuntimeError as error:
+                    note(f"{transport}: fan-out not measured: {error}")
+                    continue
+                try:
+                    told, got = pair.send("m5", count, PERIOD_S["m5"])
+                finally:
+                    pair.close()
+                gathered[transport] += [value for g in got for value in g["latencies_us"]]
+                fan_sent[transport] += told["sent"] * FANOUT
+            note("fan-out")
+        result["fanout"] = {t: summary(gathered[t], fan_sent[t]) for t in fan if t in gathered}
+    return result
+
+
+def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
+    """What arrives when the sender never waits, by size."""
+    topics = {f"flood_{name}": size for name, size in SIZES.items()}
+    pair = open_pair(transport, address, topics, 1)
+    try:
+        cells = {}
+        for topic in topics:
+            told, got = pair.send(topic, 10**9, 0.0, seconds)
+            took = max(told["seconds"], got[0]["seconds"])
+            cells[topic.removeprefix("flood_")] = {
+                "mb_per_s": round(got[0]["bytes"] / took / 1e6, 1),
+                "messages_per_s": round(got[0]["count"] / took),
+                "delivered": round(got[0]["count"] / max(1, told["sent"]), 4),
+            }
+        return cells
+    finally:
+        pair.close()
+
+
+def verdicts(result: dict[str, Any]) -> dict[str, Any]:
+    """The targets, each with its figure."""
+    latency = result["latency"]
+
+    def p50(transport: str, topic: str) -> float | None:
+        return latency.get(transport, {}).get(topic, {}).get("p50_us")
+
+    others = [t for t in ("zenoh_tcp", "zenoh_shm", "lcm", "rospy", "zmq") if t in latency]
+    ratios = {}
+    for topic in SIZES:
+        rivals = [value for t in others if (value := p50(t, topic))]
+        own = p50("ours", topic)
+        if rivals and own:
+            ratios[topic] = round(own / min(rivals), 2)
+    told: dict[str, Any] = {"p50 over that of the best other": ratios}
+    for rival in ("zenoh_shm", "rospy"):
+        if (value := p50(rival, "m5")) and (own := p50("ours", "m5")):
+            told[f"{rival} over ours at 5.5 MB"] = round(value / own, 1)
+    return told
+
+
+def table(result: dict[str, Any]) -> str:
+    """The figures as Markdown."""
+    lines = ["| p50 / p99 in µs | " + " | ".join(LABELS.values()) + " | 5.5 MB to four |", "|---" * 7 + "|"]
+    for transport, name in NAMES.items():
+        if transport not in result["latency"]:
+            if transport in result["not_measured"]:
+                lines.append(f"| {name} | " + " | ".join(["not measured"] * 6) + " |")
+            continue
+        cells = [result["latency"][transport][t] for t in SIZES] + [result["fanout"].get(transport, {})]
+        words = [f"{c['p50_us']:.0f} / {c['p99_us']:.0f}" if c.get("p50_us") else "not measured" for c in cells]
+        lines.append(f"| {name} | " + " | ".join(words) + " |")
+    lines += ["", "| Flat out, MB/s (share delivered) | " + " | ".join(LABELS.values()) + " |", "|---" * 6 + "|"]
+    for transport, cells in result["throughput"].items():
+        words = [f"{c['mb_per_s']:.0f} ({c['delivered']:.0%})" for c in cells.values()]
+        lines.append(f"| {NAMES[transport]} | " + " | ".join(words) + " |")
+    return "\n".join(lines)
+
+
+def plot(result: dict[str, Any], path: Path) -> None:
+    """Latency over size, p50 with p99 above it."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
+    sizes = list(SIZES.values())
+    for transport, cells in result["latency"].items():
+        if transport in ("zmq_tcp", "zmq_curve"):
+            continue
+        own = transport in ("ours", "image")
+        median = [cells[t]["p50_us"] or float("nan") for t in SIZES]
+        (line,) = axes.loglog(sizes, median, "o-", label=NAMES[transport], lw=2.5 if own else 1.2, zorder=3 + own)
+        high = [cells[t]["p99_us"] or float("nan") for t in SIZES]
+        axes.loglog(sizes, high, ":", color=line.get_color(), lw=0.8)
+    axes.set_xticks(sizes, list(LABELS.values()))
+    axes.minorticks_off()
+    axes.set_xlabel("message")
+    axes.set_ylabel("µs from sending to read (line p50, dots p99)")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw latency over size")
+    parser.add_argument("--quick", action="store_true", help="fewer messages")
+    parser.add_argument("--only", nargs="+", choices=list(NAMES), default=list(NAMES), metavar="TRANSPORT")
+    args = parser.parse_args()
+    started = time.monotonic()
+
+    def note(text: str) -> None:
+        print(f"{time.monotonic() - started:5.0f} s  {text}", file=sys.stderr, flush=True)
+
+    rounds, count, flood_s = (2, 40, 0.5) if args.quick else (6, 100, 2.0)
+    result = {
+        "cores": os.cpu_count(),
+        "load_before": os.getloadavg()[0],
+        **measure(args.only, rounds, count, flood_s, note),
+        "load_after": os.getloadavg()[0],
+    }
+    result["targets"] = verdicts(result)
+    text = json.dumps(result, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    if args.plot:
+        plot(result, args.plot)
+    print(text)
+    print(table(result), file=sys.stderr)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
