@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
-from instant_ic.slam.config import FieldConfig, SlamConfig
+from instant_ic.slam.config import FieldConfig, LoopConfig, SlamConfig
 from instant_ic.slam.keyframes import Keyframe, grown_drift
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_search import Found, LoopSearch, spread
 from instant_ic.slam.occupancy import OccupancyMap
 from instant_ic.slam.pose_graph import Edge, optimise, residuals
-from instant_ic.slam.scan import FloatArray
+from instant_ic.slam.scan import FloatArray, ScanPoints
 
 OVERLAP_M = 3.0
 """An older keyframe this near, beyond the uncertainty of the place, is worth comparing with."""
@@ -111,6 +111,25 @@ class BackEnd:
         redrawn = self._redraw(last) if changed or last else None
         return Outcome(len(self), self.poses.copy() if changed else None, drift, redrawn)
 
+    def load(self, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
+        """Begin with a saved graph; its first keyframe stays where it is."""
+        for keyframe in keyframes:
+            self._add(keyframe)
+        self.edges = list(edges)
+        self._poses[: len(self)] = [keyframe.map_from_base for keyframe in keyframes]
+        self._drifts = [keyframe.drift for keyframe in keyframes]
+        self._drawn = self.poses.copy()
+
+    def tie(self, here: int, pose: FloatArray, covariance: FloatArray) -> None:
+        """Tie keyframe ``here``, added next, to the keyframes already there, at ``pose`` (3,) in their map."""
+        near = int(np.argmin(((self.poses[:, :2] - pose[:2]) ** 2).sum(axis=1)))
+        yaw = float(self._poses[near, 2])
+        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+        turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
+        loop = self.config.loop
+        floor = np.diag(np.square([loop.loop_sigma_m, loop.loop_sigma_m, loop.loop_sigma_rad]))
+        self.edges.append(Edge(near, here, relative2(self._poses[near], pose), turn @ covariance @ turn.T + floor))
+
     # -- keyframes --------------------------------------------------------------------------------
 
     def _add(self, keyframe: Keyframe) -> None:
@@ -195,15 +214,8 @@ class BackEnd:
 
     def _query(self, first: int, here: int) -> FloatArray:
         """Points of the last keyframes in the frame of the newest, (n, 2)."""
-        loop = self.config.loop
-        parts = []
-        for k in range(first, here + 1):
-            x, y, yaw = relative2(self._poses[here], self._poses[k])
-            points = self._keyframes[k].scan.points
-            points = points[(points**2).sum(axis=1) <= loop.max_range_m**2]
-            cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-            parts.append(points @ np.array([[cos_yaw, sin_yaw], [-sin_yaw, cos_yaw]]) + (x, y))
-        return spread(np.concatenate(parts), 0.1, loop.max_points)
+        members = range(first, here + 1)
+        return gather([self._poses[k] for k in members], [self._keyframes[k].scan for k in members], self.config.loop)
 
     def _good(self, found: Found) -> bool:
         loop = self.config.loop
@@ -292,6 +304,17 @@ class BackEnd:
             drawing.insert(pose, keyframe.scan)
         self._drawn = self.poses.copy()
         return drawing
+
+
+def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints], loop: LoopConfig) -> FloatArray:
+    """Points of scans at poses (3,) in the frame of the last pose, spread out evenly, (n, 2)."""
+    parts = []
+    for pose, scan in zip(poses, scans, strict=True):
+        x, y, yaw = relative2(poses[-1], pose)
+        points = scan.points[(scan.points**2).sum(axis=1) <= loop.max_range_m**2]
+        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+        parts.append(points @ np.array([[cos_yaw, sin_yaw], [-sin_yaw, cos_yaw]]) + (x, y))
+    return spread(np.concatenate(parts), 0.1, loop.max_points)
 
 
 def correction(before: FloatArray, after: FloatArray) -> FloatArray:

@@ -19,6 +19,10 @@ RECOVERY_MARGIN = 0.1
 """By so much must the score of the wide search exceed that of the first one."""
 
 
+KNOWN_MAP_STEP_M = 2.0
+"""In a known map the local map is drawn anew each time the robot has moved so far."""
+
+
 class TrackStatus(enum.StrEnum):
     """How a scan was placed."""
 
@@ -71,6 +75,19 @@ class FrontEnd:
         )
         self._lost_scans = 0
         self._covariance = np.zeros((3, 3))
+        self._known: FloatArray | None = None
+        self._drawn_at = np.zeros(2)
+
+    @property
+    def in_known_map(self) -> bool:
+        """Whether scans are matched against a known map, and nothing is added to it."""
+        return self._known is not None
+
+    def use_known_map(self, points: FloatArray, pose: FloatArray) -> None:
+        """From now on match against the surfaces (n, 2) of a known map, beginning at ``pose`` (3,)."""
+        self._known = points
+        self._lost_scans = 0
+        self._draw_known(pose)
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
         """Guess at ``pose`` after odometry moved by ``step`` (3,) in the base's own frame."""
@@ -123,7 +140,10 @@ class FrontEnd:
         self._lost_scans = 0
         self._covariance = match.covariance
         added: Keyframe | None = None
-        if self._moved(match.pose):
+        if self.in_known_map:
+            if math.hypot(*(match.pose[:2] - self._drawn_at)) > KNOWN_MAP_STEP_M:
+                self._draw_known(match.pose)
+        elif self._moved(match.pose):
             added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
         return Track(match.pose, match.covariance, match.score, status, added)
 
@@ -149,6 +169,7 @@ class FrontEnd:
         if self._lost_scans < self.config.match.restart_after_lost_scans:
             return Track(guess.pose, covariance, score, TrackStatus.LOST, None)
         self._lost_scans = 0
+        self._known = None
         keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
         return Track(guess.pose, covariance, score, TrackStatus.RESTARTED, keyframe)
 
@@ -191,9 +212,18 @@ class FrontEnd:
 
     def redraw(self) -> None:
         """Draw the local map anew from the recent keyframes, for instance after their poses were optimised."""
+        if self._known is not None:
+            self._draw_known(self._drawn_at)
+            return
         recent = self.trajectory.recent(self.config.field.keyframes)
         surfaces = [Surface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
         self._field.draw(recent[-1].map_from_base, surfaces)
+
+    def _draw_known(self, centre: FloatArray) -> None:
+        assert self._known is not None
+        self._drawn_at = np.array(centre[:2])
+        alone = np.zeros(len(self._known), dtype=np.bool_)
+        self._field.draw(self._drawn_at, [Surface(np.zeros(3), self._known, alone)])
 
 
 def constant_velocity(pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:

@@ -6,17 +6,22 @@ import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2
-from instant_ic.slam.back_end import BackEnd, correction
+from instant_ic.slam.back_end import BackEnd, correction, gather
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, Track, TrackStatus, constant_velocity
-from instant_ic.slam.keyframes import grown_drift
+from instant_ic.slam.keyframes import Keyframe, grown_drift
+from instant_ic.slam.localization import Localizer
+from instant_ic.slam.loop_search import Found
+from instant_ic.slam.map_files import save_graph, save_grid
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
+from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray, Scan, scan_points
 
 MAX_ODOMETRY_GAP_S = 5.0
@@ -64,6 +69,8 @@ class SlamResult:
         score: 0..1, mean likelihood field value over the points.
         status: what became of the scan.
         keyframe_added: whether the map has changed.
+        localized: False while the robot's place in a saved map is still looked for; the pose is then in a frame of
+            its own.
         anchor: what carries this scan when the map is corrected later; None before the first keyframe.
     """
 
@@ -73,6 +80,22 @@ class SlamResult:
     status: SlamStatus
     keyframe_added: bool
     anchor: Anchor | None = None
+    localized: bool = True
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Outcome of a search in the saved map.
+
+    Attributes:
+        keyframe: whose place was looked for.
+        found: its place; None: not found.
+        map: drawn from the saved keyframes, where there are any.
+    """
+
+    keyframe: Keyframe
+    found: Found | None
+    map: OccupancyMap | None
 
 
 class GridSlam:
@@ -80,10 +103,29 @@ class GridSlam:
 
     The first scan's pose is odometry's, or the origin without odometry. `map_from_odom` takes up all corrections;
     `odom_from_base` is the odometry as given, or, for scans without one, LiDAR odometry that goes on from it.
+
+    Args:
+        config: defaults when None.
+        known: a saved map to drive in, or to go on with.
+        graph: its keyframes and edges: the map is continued. None: it stays as it is, and the robot only finds its
+            way in it. Until the place is found, the robot maps in a frame of its own.
+
+    Attributes:
+        localized: whether the place in the saved map is known; True without one.
     """
 
-    def __init__(self, config: SlamConfig | None = None) -> None:
+    def __init__(
+        self,
+        config: SlamConfig | None = None,
+        known: OccupancyGrid | None = None,
+        graph: tuple[list[Keyframe], list[Edge]] | None = None,
+    ) -> None:
         self.config = config or SlamConfig()
+        self._known = known
+        self._graph = graph
+        self._localizer = None if known is None else Localizer(known, self.config)
+        self.localized = known is None
+        self._tried_keyframe: Keyframe | None = None
         self.front_end = FrontEnd(self.config)
         self.back_end = BackEnd(self.config)
         self.map = OccupancyMap(self.config.map)
@@ -131,17 +173,58 @@ class GridSlam:
             self.map.insert(track.keyframe.map_from_base, track.keyframe.scan)
         self._follow(track, odometry, scan.stamp_ns)
         anchor = self.front_end.trajectory.keyframes[-1]
+        if status is SlamStatus.RESTARTED and self._localizer is not None and self._graph is None:
+            self.localized = False
         covariance = track.covariance + anchor.drift
-        return SlamResult(track.pose, covariance, track.score, status, track.keyframe is not None, anchor)
+        added = track.keyframe is not None
+        return SlamResult(track.pose, covariance, track.score, status, added, anchor, self.localized)
 
     def grid(self) -> OccupancyGrid:
         """The map: int8 array (H, W) of −1, 0..100, resolution, origin (2,)."""
+        if self._known is not None and (self._graph is None or not self.localized):
+            return self._known
         return self.map.grid()
+
+    def save(self, stem: Path) -> list[Path]:
+        """Write the map as ``stem.yaml``, ``stem.pgm`` and ``stem.graph.npz``; returns the files.
+
+        Raises:
+            MapError: there is nothing to save, or it cannot be written.
+        """
+        files = save_grid(stem, self.grid())
+        if self._known is not None and not (self._graph is not None and self.localized):
+            return files  # driven in, not made here: its graph, if any, is where it came from
+        keyframes = self.front_end.trajectory.keyframes
+        edges = [edge for edge in self.back_end.edges if max(edge.a, edge.b) < len(keyframes)]
+        for k in range(len(self.back_end), len(keyframes)):  # those that the back end has not taken in yet
+            edges.append(Edge(k - 1, k, keyframes[k].step, keyframes[k].step_covariance))
+        return [*files, save_graph(stem, keyframes, edges)]
+
+    def set_pose(self, map_from_base: ArrayLike) -> None:
+        """Say where in the saved map the robot is (3,): within 1 m and 60° suffices, scans do the rest.
+
+        Raises:
+            ValueError: no saved map, no scan yet, or a pose that is not finite.
+        """
+        pose = np.asarray(map_from_base, dtype=np.float64)
+        if not np.isfinite(pose).all():
+            raise ValueError(f"the pose is not finite: {pose}")
+        if self._localizer is None:
+            raise ValueError("there is no saved map in which the robot could be somewhere")
+        if self._stamp_ns is None:
+            raise ValueError("no scan has come yet")
+        if not self.localized:
+            self._settle_in(correction(self.map_from_base, pose), np.diag([0.25, 0.25, 0.1]), None)
+        elif self.front_end.in_known_map:
+            self._move(correction(self.map_from_base, pose))
+            self.front_end.use_known_map(self._localizer.points, self.map_from_base)
 
     def background_job(self) -> Callable[[], Any] | None:
         """Loop closing and optimisation over the keyframes since the last job; None: none are new, or one is out."""
+        if not self.localized:
+            return self._search_job()
         new = self.front_end.trajectory.keyframes[self._handed_over :]
-        if self._busy or not new or not self.config.loop.enabled:
+        if self._busy or not new or not self.config.loop.enabled or self.front_end.in_known_map:
             return None
         self._busy, self._handed_over = True, self._handed_over + len(new)
         return lambda: self.back_end.update(new)
@@ -155,6 +238,11 @@ class GridSlam:
         self._busy = False
         if outcome is None:
             return
+        if isinstance(outcome, _Place):
+            if outcome.found is not None and not self.localized:
+                moved = correction(outcome.keyframe.map_from_base, outcome.found.pose)
+                self._settle_in(moved, outcome.found.covariance, outcome.map)
+            return
         keyframes = self.front_end.trajectory.keyframes
         if outcome.poses is not None:
             moved = correction(keyframes[outcome.count - 1].map_from_base, outcome.poses[-1])
@@ -163,9 +251,7 @@ class GridSlam:
             for keyframe in keyframes[outcome.count :]:
                 keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
             self.front_end.redraw()
-            self.map_from_base = compose2(moved, self.map_from_base)
-            self.map_from_odom = compose2(moved, self.map_from_odom)
-            self._pose_at_odometry = compose2(moved, self._pose_at_odometry)
+            self._move(moved)
         if outcome.map is not None:
             outcome.map.version = self.map.version + 1
             self.map = outcome.map
@@ -177,8 +263,70 @@ class GridSlam:
             drift = grown_drift(drift, way, float(before.map_from_base[2]), keyframe.step_covariance)
         keyframes[-1].drift = drift
 
+    def _move(self, moved: FloatArray) -> None:
+        """Move the present pose in the map; odometry stays."""
+        self.map_from_base = compose2(moved, self.map_from_base)
+        self.map_from_odom = compose2(moved, self.map_from_odom)
+        self._pose_at_odometry = compose2(moved, self._pose_at_odometry)
+
+    def _search_job(self) -> Callable[[], Any] | None:
+        """Look for the last keyframes in the saved map, once for each new one."""
+        keyframes = self.front_end.trajectory.recent(self.config.loop.query_keyframes)
+        localizer, graph = self._localizer, self._graph
+        if self._busy or localizer is None or not keyframes or keyframes[-1] is self._tried_keyframe:
+            return None
+        self._busy, last = True, keyframes[-1]
+        self._tried_keyframe = last
+        query = gather([k.map_from_base for k in keyframes], [k.scan for k in keyframes], self.config.loop)
+
+        def search() -> _Place:
+            found = localizer.find(query)
+            drawn = None
+            if found is not None and graph is not None:
+                drawn = OccupancyMap(self.config.map)
+                for keyframe in graph[0]:
+                    drawn.insert(keyframe.map_from_base, keyframe.scan)
+            return _Place(last, found, drawn)
+
+        return search
+
+    def _settle_in(self, moved: FloatArray, covariance: FloatArray, drawn: OccupancyMap | None) -> None:
+        """The place in the saved map is known: ``moved`` brings what was mapped so far to it."""
+        assert self._localizer is not None
+        own = self.front_end.trajectory.keyframes
+        for keyframe in own:
+            keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
+        self._move(moved)
+        self.localized = True
+        if self._graph is None:
+            own[-1].drift = covariance
+            self.front_end.use_known_map(self._localizer.points, self.map_from_base)
+            return
+        saved, edges = self._graph
+        first = own[0]
+        # The way from the last saved keyframe is unknown; what ties the first new one is its place in the map.
+        first.step = relative2(saved[-1].map_from_base, first.map_from_base)
+        first.step_covariance = np.diag([100.0, 100.0, 10.0])
+        self.front_end.trajectory.keyframes = [*saved, *own]
+        self.back_end = BackEnd(self.config)
+        self.back_end.load(saved, edges)
+        self.back_end.tie(len(saved), first.map_from_base, covariance)
+        self._handed_over = len(saved)
+        if drawn is None:
+            drawn = OccupancyMap(self.config.map)
+            for keyframe in saved:
+                drawn.insert(keyframe.map_from_base, keyframe.scan)
+        drawn.version = self.map.version + 1
+        self.map = drawn
+        for keyframe in own:
+            keyframe.drift = covariance
+            self.map.insert(keyframe.map_from_base, keyframe.scan)
+        self.front_end.redraw()
+
     def finish(self) -> None:
         """After the last scan: optimise with all loops, and draw the map from the outcome."""
+        if not self.localized or self.front_end.in_known_map:
+            return
         new = self.front_end.trajectory.keyframes[self._handed_over :]
         if self.config.loop.enabled and self.front_end.trajectory.keyframes:
             self._handed_over += len(new)

@@ -183,7 +183,7 @@ class LoopSearch:
         if not close:
             return None
         score, pose, hessian, squares = close[0]
-        others = [entry[0] for entry in close[1:] if self._apart(entry[1], pose)]
+        others = [entry[0] for entry in close[1:] if self.apart(entry[1], pose)]
         try:
             covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
             # What translation is known of when the heading is not: the Schur complement.
@@ -195,7 +195,8 @@ class LoopSearch:
         pose = np.array([pose[0], pose[1], wrap_angle(float(pose[2]))])
         return Found(pose, 0.5 * (covariance + covariance.T), score, shape, max(others, default=0.0))
 
-    def _apart(self, a: FloatArray, b: FloatArray) -> bool:
+    def apart(self, a: FloatArray, b: FloatArray) -> bool:
+        """Whether two poses (3,) are different places."""
         turn = abs(wrap_angle(float(a[2] - b[2])))
         return math.hypot(a[0] - b[0], a[1] - b[1]) >= self.apart_m or turn >= self.apart_rad
 

@@ -1,0 +1,207 @@
+"""Maps on disk: ``NAME.yaml`` with ``NAME.pgm`` as ROS has them, and ``NAME.graph.npz``, from which a map goes on.
+
+The picture follows map_saver and map_server (nav2): 0 occupied, 254 free, 205 unknown; the top row has the largest y.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.slam.keyframes import Keyframe
+from instant_ic.slam.occupancy import OccupancyGrid
+from instant_ic.slam.pose_graph import Edge
+from instant_ic.slam.scan import FloatArray, ScanPoints
+
+OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.25
+WRITTEN_FREE_THRESH = 0.196
+"""Grey 205 is 0.1961 occupied: a reader that compares with this keeps it unknown."""
+_GRAPH_VERSION = 1
+
+
+class MapError(ValueError):
+    """A map that cannot be written or read; says which file and why."""
+
+
+def graph_file(stem: Path) -> Path:
+    """The pose graph's file beside ``stem.yaml``."""
+    return stem.with_name(stem.name + ".graph.npz")
+
+
+def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
+    """Write ``stem.pgm`` and ``stem.yaml``; returns them.
+
+    Raises:
+        MapError: an empty map, or a folder that cannot be written.
+    """
+    values = grid.values
+    if values.size == 0:
+        raise MapError("the map is empty: nothing to save")
+    picture = np.full(values.shape, 205, dtype=np.uint8)
+    picture[values >= round(100 * OCCUPIED_THRESH)] = 0
+    picture[(values >= 0) & (values <= round(100 * FREE_THRESH))] = 254
+    height, width = values.shape
+    image, text = stem.with_name(stem.name + ".pgm"), stem.with_name(stem.name + ".yaml")
+    try:
+        stem.parent.mkdir(parents=True, exist_ok=True)
+        image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture[::-1].tobytes())
+        text.write_text(
+            f"image: {image.name}\nmode: trinary\nresolution: {grid.resolution:.9g}\n"
+            f"origin: [{grid.origin[0]:.9g}, {grid.origin[1]:.9g}, 0]\nnegate: 0\n"
+            f"occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {WRITTEN_FREE_THRESH}\n"
+        )
+    except OSError as error:
+        raise MapError(f"the map cannot be written: {error}") from None
+    return [text, image]
+
+
+def load_grid(path: Path) -> OccupancyGrid:
+    """Read a ROS map: the YAML file, with or without its ending.
+
+    Modes ``trinary``, ``scale`` and ``raw`` as map_server has them; PGM or any picture that OpenCV reads.
+
+    Raises:
+        MapError: a file is missing, or something in it is wrong.
+    """
+    import cv2
+    import yaml
+
+    path = path if path.suffix in (".yaml", ".yml") else path.with_name(path.name + ".yaml")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MapError(f"map {path} cannot be read: {error}") from None
+    if not isinstance(content, dict):
+        raise MapError(f"{path}: keys image, resolution, origin expected")
+    resolution = _number(path, content, "resolution", None)
+    occupied = _number(path, content, "occupied_thresh", OCCUPIED_THRESH)
+    free = _number(path, content, "free_thresh", FREE_THRESH)
+    if not resolution > 0:
+        raise MapError(f"{path}: resolution must be > 0 (got {resolution})")
+    if not 0 <= free < occupied <= 1:
+        raise MapError(f"{path}: need 0 <= free_thresh < occupied_thresh <= 1 (got {free}, {occupied})")
+    origin = content.get("origin")
+    if not (isinstance(origin, list) and len(origin) >= 2 and all(isinstance(v, int | float) for v in origin)):
+        raise MapError(f"{path}: origin must be [x, y, yaw] (got {origin!r})")
+    if len(origin) > 2 and abs(origin[2]) > 1e-6:
+        raise MapError(f"{path}: a turned map (origin yaw {origin[2]}) is not supported: turn the picture instead")
+    mode = content.get("mode", "trinary")
+    if mode not in ("trinary", "scale", "raw"):
+        raise MapError(f"{path}: mode must be trinary, scale or raw (got {mode!r})")
+    image = path.parent / str(content.get("image", ""))
+    if not image.is_file():
+        raise MapError(f"{path}: image {image} does not exist")
+    picture: Any = cv2.imread(str(image), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise MapError(f"{image} is no picture that can be read")
+    grey = picture[::-1].astype(np.float64)
+    values = np.full(grey.shape, -1, dtype=np.int8)
+    if mode == "raw":
+        known = grey <= 100
+        values[known] = grey[known].astype(np.int8)
+        return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
+    share = grey / 255 if content.get("negate") else (255 - grey) / 255
+    # Our own grey of what is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
+    unknown = (grey == 205) & (not content.get("negate"))
+    values[(share < free) & ~unknown] = 0
+    values[share > occupied] = 100
+    if mode == "scale":
+        between = (share >= free) & (share <= occupied) & ~unknown
+        values[between] = np.rint(99 * (share[between] - free) / (occupied - free)).astype(np.int8)
+    return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
+
+
+def _number(path: Path, content: dict[str, Any], key: str, default: float | None) -> float:
+    value = content.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise MapError(f"{path}: {key} must be a number (got {value!r})")
+    return float(value)
+
+
+def occupied_points(grid: OccupancyGrid, threshold: int = 65) -> FloatArray:
+    """Centres of the occupied cells in the map, (n, 2)."""
+    rows, columns = np.nonzero(grid.values >= threshold)
+    points: FloatArray = grid.origin + grid.resolution * (np.column_stack([columns, rows]) + 0.5)
+    return points
+
+
+def save_graph(stem: Path, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Path:
+    """Write keyframes and edges to ``stem.graph.npz``; returns it.
+
+    Raises:
+        MapError: it cannot be written.
+    """
+    path = graph_file(stem)
+    arrays: dict[str, Any] = {
+        "version": np.array(_GRAPH_VERSION),
+        "stamps": np.array([k.stamp_ns for k in keyframes], dtype=np.int64),
+        "dead_reckoned": np.array([k.dead_reckoned for k in keyframes], dtype=np.bool_),
+        "points": np.concatenate([np.zeros((0, 2)), *(k.scan.points for k in keyframes)]).astype(np.float32),
+        "joined": np.concatenate([np.zeros(0, dtype=np.bool_), *(k.scan.joined for k in keyframes)]),
+        "point_counts": np.array([len(k.scan.points) for k in keyframes], dtype=np.int64),
+        "clear_ends": np.concatenate([np.zeros((0, 2)), *(k.scan.clear_ends for k in keyframes)]).astype(np.float32),
+        "clear_counts": np.array([len(k.scan.clear_ends) for k in keyframes], dtype=np.int64),
+        "origins": np.array([k.scan.origin for k in keyframes]).reshape(-1, 2),
+        "edge_ends": np.array([(e.a, e.b) for e in edges], dtype=np.int64).reshape(-1, 2),
+        "edge_poses": np.array([e.a_from_b for e in edges]).reshape(-1, 3),
+        "edge_covariances": np.array([e.covariance for e in edges]).reshape(-1, 3, 3),
+        "edge_robust": np.array([e.robust for e in edges], dtype=np.bool_),
+    }
+    for name, shape in (("map_from_base", (-1, 3)), ("step", (-1, 3)), *((n, (-1, 3, 3)) for n in _MATRICES)):
+        arrays[name] = np.array([getattr(k, name) for k in keyframes]).reshape(shape)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as file:
+            np.savez_compressed(file, **arrays)
+    except OSError as error:
+        raise MapError(f"the pose graph cannot be written: {error}") from None
+    return path
+
+
+_MATRICES = ("covariance", "step_covariance", "drift")
+
+
+def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
+    """Read what `save_graph` wrote.
+
+    Raises:
+        MapError: no such file, or not one of these.
+    """
+    path = graph_file(stem)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data: dict[str, NDArray[Any]] = dict(file)
+        if int(data["version"]) != _GRAPH_VERSION:
+            raise MapError(f"{path} is of version {int(data['version'])}; this program reads {_GRAPH_VERSION}")
+        cuts = np.cumsum(data["point_counts"])[:-1]
+        points = np.split(data["points"].astype(np.float64), cuts)
+        joined = np.split(data["joined"], cuts)
+        clear = np.split(data["clear_ends"].astype(np.float64), np.cumsum(data["clear_counts"])[:-1])
+        keyframes = [
+            Keyframe(
+                int(data["stamps"][k]), data["map_from_base"][k], data["covariance"][k],
+                ScanPoints(points[k], joined[k], data["origins"][k], clear[k]), bool(data["dead_reckoned"][k]),
+                data["step"][k], data["step_covariance"][k], data["drift"][k],
+            )
+            for k in range(len(data["stamps"]))
+        ]  # fmt: skip
+        edges = [
+            Edge(int(a), int(b), data["edge_poses"][k], data["edge_covariances"][k], bool(data["edge_robust"][k]))
+            for k, (a, b) in enumerate(data["edge_ends"])
+        ]
+    except FileNotFoundError:
+        raise MapError(f"there is no pose graph {path}: a map without it can be driven in, but not continued") from None
+    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
+        if isinstance(error, MapError):
+            raise
+        raise MapError(f"{path} is no pose graph, or damaged: {error}") from None
+    if not keyframes:
+        raise MapError(f"{path} holds no keyframe")
+    if any(not 0 <= end < len(keyframes) for edge in edges for end in (edge.a, edge.b)):
+        raise MapError(f"{path} is damaged: an edge leads to a keyframe that is not there")
+    return keyframes, edges
