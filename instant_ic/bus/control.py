@@ -171,6 +171,8 @@ class ControlServer:
     def _call(self, request: dict[str, Any]) -> dict[str, Any]:
         name, arguments = str(request.get("command")), request.get("arguments", {})
         command = self._node.commands.get(name)
+        if command is None and self._node.starting:
+            raise NodeBusyError(f"{self._node.node_name} is just starting")
         if command is None:
             known = ", ".join(self._node.commands) or "none"
             raise _RequestError(f"{self._node.node_name} has no command {name!r} (there are: {known})")

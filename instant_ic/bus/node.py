@@ -409,6 +409,11 @@ class Node(Generic[ConfigT]):
         self._wake.set()
 
     @property
+    def starting(self) -> bool:
+        """Whether ``setup`` has not come to its end."""
+        return self._state == "STARTING"
+
+    @property
     def stopping(self) -> bool:
         """Whether the loop is to end."""
         return self._stop.is_set()

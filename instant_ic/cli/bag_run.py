@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bus.control import ControlError, NodeControl
+from instant_ic.bus.control import ControlError, NodeBusyError, NodeControl
 from instant_ic.bus.process import run as run_node
 from instant_ic.bus.registry import NodeInfo, list_nodes
 from instant_ic.cli.commands.bag import argument_of, topic_names
@@ -19,6 +19,7 @@ from instant_ic.nodes.bag_player import BagPlayerNode
 from instant_ic.nodes.bag_recorder import BagRecorderNode
 from instant_ic.paths import run_dir
 
+_STARTING_S = 10.0  # a node that is just starting gets so much time
 _STEERED = ("bag_recorder", "bag_player")
 
 
@@ -164,10 +165,16 @@ def control(args: argparse.Namespace) -> int:
 
 
 def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
-    try:
-        return node.call(command, **arguments)
-    except ControlError as error:
-        raise UserError(str(error)) from None
+    deadline_s = time.monotonic() + _STARTING_S
+    while True:
+        try:
+            return node.call(command, **arguments)
+        except NodeBusyError as error:
+            if time.monotonic() > deadline_s:
+                raise UserError(str(error)) from None
+            time.sleep(0.1)
+        except ControlError as error:
+            raise UserError(str(error)) from None
 
 
 def _node(kinds: tuple[str, ...], name: str) -> NodeInfo:
