@@ -241,8 +241,12 @@ class RollingCostmap:
         static: StaticMap | None,
         scan: ScanRays | None,
         points: SortedPoints | None = None,
+        map_from_points: NDArray[np.float64] | None = None,
     ) -> Costmap:
-        """Moves the window over the robot (x, y, yaw), takes in a scan and a sweep of points, and gives the costs."""
+        """Moves the window over the robot (x, y, yaw), takes in a scan and a sweep of points, and gives the costs.
+
+        ``map_from_points`` (x, y, yaw) places the frame of the points in the map; None: it is the map's own.
+        """
         resolution = self.config.resolution
         self._move_to(float(robot_pose[0]), float(robot_pose[1]))
         assert self._corner is not None
@@ -252,7 +256,7 @@ class RollingCostmap:
             ends = np.ascontiguousarray((scan.ends - origin) / resolution)
             _clear_and_mark(self._observed, float(start[0]), float(start[1]), ends, scan.hits)
         if points is not None:
-            self.heights.update(points, origin)
+            self.heights.update(points, np.zeros(3) if map_from_points is None else map_from_points, origin)
         if self.config.footprint_clearing_enabled:
             self._clear_footprint(robot_pose, origin)
         master = self._master(static, origin)

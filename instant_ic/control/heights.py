@@ -19,8 +19,12 @@ from ..ranges import NotNegative, Positive, Range, check_ranges
 
 Cell = TypeVar("Cell", bound=np.generic)
 
-GROUND, OBSTACLE, OVERHEAD = 0, 1, 2
-"""Kinds of points: driven over, stands in the way, passed under."""
+GROUND, OBSTACLE, OVERHEAD, NEAR = 0, 1, 2, 3
+"""Kinds of points: driven over, stands in the way, passed under, on the robot's own body."""
+AZIMUTHS = 720
+"""Directions in which beams are told apart."""
+INSTANTS = 65
+"""Poses of the sensor over a sweep: at 1 rad/s, within 1 mrad of where it was."""
 
 
 @dataclass(frozen=True)
@@ -47,41 +51,17 @@ class HeightConfig:
 class SortedPoints:
     """The points of one sweep in a level frame, told apart by height; what is no measurement is left out."""
 
-    points: NDArray[np.float32]
-    """(N, 3) metres, z above the ground."""
-    kind: NDArray[np.uint8]
-    """(N,) GROUND, OBSTACLE or OVERHEAD."""
+    obstacles: NDArray[np.float32]
+    """(N, 3) those that stand in the way: metres, z above the ground."""
+    nearest: NDArray[np.float64]
+    """(M, 2) the nearest of them in each direction from the sensor that has one: what a flat scan would say."""
+    ends: NDArray[np.float32]
+    """(E, AZIMUTHS) nearest end of the beams of each elevation (from straight down) and azimuth (from -pi), metres
+    over ground; inf where no beam came back."""
     origin: NDArray[np.float64]
     """(3,) where the sensor was at the end of the sweep."""
-    near: int
-    """Points left out because they were nearer than ``obstacle_min_range``: the robot's own body."""
-
-    def obstacles(self) -> NDArray[np.float64]:
-        """Places (M, 2) of the points that stand in the way."""
-        return self.points[self.kind == OBSTACLE, :2].astype(np.float64)
-
-    def nearest(self, directions: int = 720) -> NDArray[np.float64]:
-        """The nearest obstacle in each direction from the sensor that has one, (M, 2): what a flat scan would say."""
-        return _nearest(self.points, self.kind, self.origin, directions)
-
-    def counts(self) -> dict[str, int]:
-        """How many points of each kind: what the height filter took, and what it dropped."""
-        number = np.bincount(self.kind, minlength=3)
-        return {
-            "obstacle": int(number[OBSTACLE]),
-            "ground": int(number[GROUND]),
-            "overhead": int(number[OVERHEAD]),
-            "near": self.near,
-        }
-
-    def moved(self, pose: NDArray[np.float64]) -> SortedPoints:
-        """The same points in a frame in which this one stands at ``pose`` (x, y, yaw)."""
-        c, s = math.cos(pose[2]), math.sin(pose[2])
-        turn, shift = np.array([[c, s], [-s, c]]), np.asarray(pose, np.float64)[:2]
-        points, origin = self.points.copy(), self.origin.copy()
-        points[:, :2] = points[:, :2] @ turn.astype(np.float32) + shift.astype(np.float32)
-        origin[:2] = origin[:2] @ turn + shift
-        return SortedPoints(points, self.kind, origin, self.near)
+    counts: dict[str, int]
+    """How many points of each kind: what the height filter took (obstacle), and what it dropped."""
 
 
 def sort_points(
@@ -101,17 +81,24 @@ def sort_points(
         duration_s: of the sweep.
         config: the heights that count.
     """
-    placed, kind, near = _sort(
+    poses = np.ascontiguousarray(level_from_lidar, dtype=np.float64).reshape(-1, 4, 4)
+    rows = math.ceil(180.0 / config.vertical_resolution_deg)
+    obstacles, nearest, ends, counts = _sort(
         np.ascontiguousarray(points, dtype=np.float32),
         np.ascontiguousarray(time_s, dtype=np.float32),
-        np.ascontiguousarray(level_from_lidar, dtype=np.float64).reshape(-1, 4, 4),
+        poses,
         float(duration_s),
         config.min_obstacle_height,
         config.max_obstacle_height,
         math.tan(math.radians(config.ground_tilt_deg)),
         config.obstacle_min_range,
+        math.radians(config.vertical_resolution_deg),
+        rows,
     )
-    return SortedPoints(placed, kind, np.array(level_from_lidar, np.float64).reshape(-1, 4, 4)[-1, :3, 3], int(near))
+    names = ("ground", "obstacle", "overhead", "near")
+    return SortedPoints(
+        obstacles, nearest, ends, poses[-1, :3, 3].copy(), {n: int(c) for n, c in zip(names, counts, strict=True)}
+    )
 
 
 class HeightLayer:
@@ -121,8 +108,6 @@ class HeightLayer:
     cleared when a beam at one of those heights is seen to end well behind it, and none ends at it.
     """
 
-    AZIMUTHS = 720
-
     def __init__(self, config: HeightConfig, size: int, resolution: float) -> None:
         self.config = config
         self.size = size
@@ -131,8 +116,6 @@ class HeightLayer:
         """(H, W) points that fell into a cell; from ``mark_threshold`` on it is occupied."""
         self.low = np.zeros((size, size), dtype=np.float32)
         self.high = np.zeros((size, size), dtype=np.float32)
-        self._rows = math.ceil(180.0 / config.vertical_resolution_deg)
-        self._seen = np.empty((self._rows, self.AZIMUTHS), dtype=np.float32)
 
     def reset(self) -> None:
         """Forgets everything."""
@@ -144,23 +127,25 @@ class HeightLayer:
         self.low = shifted(self.low, columns, rows, 0.0)
         self.high = shifted(self.high, columns, rows, 0.0)
 
-    def update(self, sweep: SortedPoints, origin: NDArray[np.float64]) -> None:
-        """Takes in a sweep given in the frame of the window, whose outer corner is ``origin`` (2,)."""
-        _see_and_mark(
-            sweep.points,
-            sweep.kind,
+    def update(self, sweep: SortedPoints, placed: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
+        """Takes in a sweep whose frame stands at ``placed`` (x, y, yaw) in that of the window.
+
+        ``origin`` (2,) is the window's outer corner.
+        """
+        _clear_and_mark(
+            sweep.obstacles,
+            sweep.ends,
             sweep.origin,
+            np.asarray(placed, dtype=np.float64),
             float(origin[0]),
             float(origin[1]),
             self.resolution,
             self.config.obstacle_max_range,
-            self.config.mark_threshold,
             math.radians(self.config.vertical_resolution_deg),
             self.config.clear_margin_m,
             self.hits,
             self.low,
             self.high,
-            self._seen,
         )
 
     def occupied(self) -> NDArray[np.bool_]:
@@ -180,6 +165,22 @@ def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArr
 
 
 @njit(cache=True)
+def _angle(y: float, x: float) -> float:
+    """atan2 to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
+    ax, ay = abs(x), abs(y)
+    if ax == 0.0 and ay == 0.0:
+        return 0.0
+    z = min(ax, ay) / max(ax, ay)
+    q = z * z
+    angle = z * (0.9998660 - q * (0.3302995 - q * (0.1801410 - q * (0.0851330 - 0.0208351 * q))))
+    if ay > ax:
+        angle = 0.5 * math.pi - angle
+    if x < 0.0:
+        angle = math.pi - angle
+    return -angle if y < 0.0 else angle
+
+
+@njit(cache=True)
 def _sort(
     points: NDArray[np.float32],
     time_s: NDArray[np.float32],
@@ -189,125 +190,118 @@ def _sort(
     high: float,
     slope: float,
     range_min: float,
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], int]:
-    count = points.shape[0]
-    placed = np.empty((count, 3), dtype=np.float32)
-    kind = np.empty(count, dtype=np.uint8)
+    per_row: float,
+    rows: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float32], NDArray[np.int64]]:
     last = poses.shape[0] - 1
-    kept, near = 0, 0
-    for i in range(count):
+    sensor = poses[last, :3, 3]
+    between = np.empty((INSTANTS, 4, 4))
+    for i in range(INSTANTS):
+        at = last * i / (INSTANTS - 1) if duration_s > 0.0 else float(last)
+        k = min(int(at), max(last - 1, 0))
+        between[i] = poses[k] + (at - k) * (poses[min(k + 1, last)] - poses[k])
+    obstacles = np.empty((points.shape[0], 3), dtype=np.float32)
+    ends = np.full((rows, AZIMUTHS), np.inf, dtype=np.float32)
+    near_m = np.full(AZIMUTHS, np.inf)
+    near_at = np.full(AZIMUTHS, -1, dtype=np.int64)
+    counts = np.zeros(4, dtype=np.int64)
+    kept = 0
+    for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         if not (np.isfinite(px) and np.isfinite(py) and np.isfinite(pz)):
             continue
-        at = min(max(time_s[i] / duration_s, 0.0), 1.0) * last if duration_s > 0.0 else float(last)
-        k = min(int(at), max(last - 1, 0))
-        after = min(k + 1, last)
-        a = at - k
-        b = 1.0 - a
-        m, n = poses[k], poses[after]
-        dx = (b * m[0, 0] + a * n[0, 0]) * px + (b * m[0, 1] + a * n[0, 1]) * py + (b * m[0, 2] + a * n[0, 2]) * pz
-        dy = (b * m[1, 0] + a * n[1, 0]) * px + (b * m[1, 1] + a * n[1, 1]) * py + (b * m[1, 2] + a * n[1, 2]) * pz
-        dz = (b * m[2, 0] + a * n[2, 0]) * px + (b * m[2, 1] + a * n[2, 1]) * py + (b * m[2, 2] + a * n[2, 2]) * pz
+        m = between[0]
+        if duration_s > 0.0:
+            m = between[int(min(max(time_s[i] / duration_s, 0.0), 1.0) * (INSTANTS - 1) + 0.5)]
+        dx = m[0, 0] * px + m[0, 1] * py + m[0, 2] * pz
+        dy = m[1, 0] * px + m[1, 1] * py + m[1, 2] * pz
+        dz = m[2, 0] * px + m[2, 1] * py + m[2, 2] * pz
         distance = math.sqrt(dx * dx + dy * dy)
         if distance < range_min:
-            near += 1
+            counts[3] += 1
             continue
-        z = dz + b * m[2, 3] + a * n[2, 3]
-        placed[kept, 0] = dx + b * m[0, 3] + a * n[0, 3]
-        placed[kept, 1] = dy + b * m[1, 3] + a * n[1, 3]
-        placed[kept, 2] = z
+        x, y, z = dx + m[0, 3], dy + m[1, 3], dz + m[2, 3]
+        # Seen from where the sensor is at the end.
+        dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
+        distance = math.sqrt(dx * dx + dy * dy)
+        column = int((_angle(dy, dx) + math.pi) * AZIMUTHS / (2.0 * math.pi)) % AZIMUTHS
+        row = min(int((_angle(dz, distance) + 0.5 * math.pi) / per_row), rows - 1)
+        if distance < ends[row, column]:
+            ends[row, column] = distance
         # The robot pitches a little: far off, a given tilt lifts the ground by its share of the distance.
-        kind[kept] = 0 if z < low + slope * distance else (2 if z > high else 1)
-        kept += 1
-    return placed[:kept], kind[:kept], near
+        if z < low + slope * distance:
+            counts[0] += 1
+        elif z > high:
+            counts[2] += 1
+        else:
+            counts[1] += 1
+            obstacles[kept, 0], obstacles[kept, 1], obstacles[kept, 2] = x, y, z
+            if distance < near_m[column]:
+                near_m[column], near_at[column] = distance, kept
+            kept += 1
+    nearest = np.empty((AZIMUTHS, 2))
+    found = 0
+    for j in near_at:
+        if j >= 0:
+            nearest[found, 0], nearest[found, 1] = obstacles[j, 0], obstacles[j, 1]
+            found += 1
+    return obstacles[:kept].copy(), nearest[:found].copy(), ends, counts
 
 
 @njit(cache=True)
-def _nearest(
-    points: NDArray[np.float32], kind: NDArray[np.uint8], sensor: NDArray[np.float64], directions: int
-) -> NDArray[np.float64]:
-    best = np.full(directions, np.inf)
-    which = np.full(directions, -1, dtype=np.int64)
-    for i in range(points.shape[0]):
-        if kind[i] != 1:
-            continue
-        dx, dy = points[i, 0] - sensor[0], points[i, 1] - sensor[1]
-        column = int((math.atan2(dy, dx) + math.pi) * directions / (2.0 * math.pi)) % directions
-        distance = dx * dx + dy * dy
-        if distance < best[column]:
-            best[column], which[column] = distance, i
-    found = np.empty((directions, 2))
-    count = 0
-    for nearest in which:
-        if nearest >= 0:
-            found[count, 0], found[count, 1] = points[nearest, 0], points[nearest, 1]
-            count += 1
-    return found[:count]
-
-
-@njit(cache=True)
-def _see_and_mark(
-    points: NDArray[np.float32],
-    kind: NDArray[np.uint8],
+def _clear_and_mark(
+    obstacles: NDArray[np.float32],
+    ends: NDArray[np.float32],
     sensor: NDArray[np.float64],
+    placed: NDArray[np.float64],
     origin_x: float,
     origin_y: float,
     resolution: float,
     range_max: float,
-    threshold: int,
     per_row: float,
     margin: float,
     hits: NDArray[np.uint8],
     low: NDArray[np.float32],
     high: NDArray[np.float32],
-    seen: NDArray[np.float32],
 ) -> None:
-    """Clears what beams pass through, then marks. ``seen`` (E, A): nearest end of the beams of each direction, m."""
-    rows, azimuths = seen.shape
+    """Clears what beams pass through, then marks."""
+    rows, azimuths = ends.shape
     size_y, size_x = hits.shape
-    per_azimuth = 2.0 * math.pi / azimuths
-    seen[:] = np.inf
-    for i in range(points.shape[0]):
-        dx, dy, dz = points[i, 0] - sensor[0], points[i, 1] - sensor[1], points[i, 2] - sensor[2]
-        distance = math.sqrt(dx * dx + dy * dy)
-        row = int((math.atan2(dz, distance) + 0.5 * math.pi) / per_row)
-        column = int((math.atan2(dy, dx) + math.pi) / per_azimuth) % azimuths
-        if 0 <= row < rows and distance < seen[row, column]:
-            seen[row, column] = distance
+    cos, sin = math.cos(placed[2]), math.sin(placed[2])
+    sensor_x = cos * sensor[0] - sin * sensor[1] + placed[0]
+    sensor_y = sin * sensor[0] + cos * sensor[1] + placed[1]
     for r in range(size_y):
         for c in range(size_x):
             if hits[r, c] == 0:
                 continue
-            dx = origin_x + (c + 0.5) * resolution - sensor[0]
-            dy = origin_y + (r + 0.5) * resolution - sensor[1]
+            dx = origin_x + (c + 0.5) * resolution - sensor_x
+            dy = origin_y + (r + 0.5) * resolution - sensor_y
             distance = math.sqrt(dx * dx + dy * dy)
             if distance < resolution:
                 continue
-            column = int((math.atan2(dy, dx) + math.pi) / per_azimuth) % azimuths
+            azimuth = _angle(cos * dy - sin * dx, cos * dx + sin * dy)
+            column = int((azimuth + math.pi) * azimuths / (2.0 * math.pi)) % azimuths
             # Half a cell more each way: the points of a surface scatter by that much.
-            first = math.atan2(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi
-            last = math.atan2(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi
+            first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
+            last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
             passed, stands = False, False
-            for row in range(max(0, int(first / per_row)), min(rows - 1, int(last / per_row)) + 1):
-                middle = (row + 0.5) * per_row
-                end = seen[row, column]
+            for row in range(max(0, int(first)), min(rows - 1, int(last)) + 1):
+                end = ends[row, column]
                 if not np.isfinite(end):
                     continue
                 if abs(end - distance) <= margin:
                     stands = True
-                elif end > distance and first <= middle <= last:
+                elif end > distance and first <= row + 0.5 <= last:
                     passed = True
             if passed and not stands:
                 hits[r, c] = 0
-    for i in range(points.shape[0]):
-        if kind[i] != 1:
-            continue
-        x, y = points[i, 0], points[i, 1]
-        if (x - sensor[0]) ** 2 + (y - sensor[1]) ** 2 > range_max * range_max:
+    for i in range(obstacles.shape[0]):
+        px, py, z = obstacles[i, 0], obstacles[i, 1], obstacles[i, 2]
+        x, y = cos * px - sin * py + placed[0], sin * px + cos * py + placed[1]
+        if (x - sensor_x) ** 2 + (y - sensor_y) ** 2 > range_max * range_max:
             continue
         c, r = math.floor((x - origin_x) / resolution), math.floor((y - origin_y) / resolution)
         if 0 <= r < size_y and 0 <= c < size_x:
-            z = points[i, 2]
             if hits[r, c] == 0:
                 low[r, c], high[r, c] = z, z
             else:

@@ -53,7 +53,7 @@ class PlannerConfig:
     footprint_padding: NotNegative = 0.03
     escape_radius_m: NotNegative = 0.6
     tolerance: NotNegative = 0.5
-    max_iterations: PositiveInt = 12000
+    max_iterations: PositiveInt = 8000
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -208,6 +208,7 @@ class _Grid:
         )
         # The body in cells, at each heading and all over: posts inside the outline count too.
         body = planner.footprint.points(0.9 * costmap.resolution, config.footprint_padding) / costmap.resolution
+        body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
         yaw = 2.0 * math.pi * np.arange(self.bins) / self.bins
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         self.body = np.ascontiguousarray(body)
@@ -395,11 +396,19 @@ def _cost_to_go(
 
 
 @njit(cache=True)
-def _overlap(costs: NDArray[np.uint8], x: float, y: float, body: NDArray[np.float64]) -> int:
-    """How many of the body's points, already turned, lie in lethal cells; the centre at (x, y) in cells."""
+def _overlap(
+    costs: NDArray[np.uint8], clearance: NDArray[np.float32], x: float, y: float, body: NDArray[np.float64]
+) -> int:
+    """How many of the body's points, already turned, lie in lethal cells; the centre at (x, y) in cells.
+
+    The points come farthest first: those nearer than the nearest lethal cell need no look.
+    """
     height, width = costs.shape
+    nearest = max(clearance[math.floor(y), math.floor(x)] - 1.5, 0.0)
     count = 0
     for j in range(body.shape[0]):
+        if body[j, 0] * body[j, 0] + body[j, 1] * body[j, 1] < nearest * nearest:
+            break
         c, r = math.floor(x + body[j, 0]), math.floor(y + body[j, 1])
         if 0 <= r < height and 0 <= c < width and costs[r, c] == 254:
             count += 1
@@ -451,7 +460,7 @@ def _line_cost(
             if not is_turned:
                 turned = _turned(body, yaw)
                 is_turned = True
-            if _overlap(costs, x, y, turned) > 0:
+            if _overlap(costs, clearance, x, y, turned) > 0:
                 return np.inf
         if k > 0:
             total += weights[r, c] * length / count
@@ -474,7 +483,7 @@ def _turn_is_free(
         return True
     count = max(1, math.ceil(abs(turn) / 0.15))
     for k in range(count + 1):  # noqa: SIM110 (numba knows no generators in all())
-        if _overlap(costs, x, y, _turned(body, yaw + turn * k / count)) > 0:
+        if _overlap(costs, clearance, x, y, _turned(body, yaw + turn * k / count)) > 0:
             return False
     return True
 
@@ -526,7 +535,7 @@ def _search(
     first = math.floor(start_yaw / per_bin + 0.5) % bins
     place[0, 0], place[0, 1] = start_x, start_y
     heading[0], parent[0], back[0], price[0] = first, -1, 2, 0.0
-    overlap[0] = _overlap(costs, start_x, start_y, bodies[first])
+    overlap[0] = _overlap(costs, clearance, start_x, start_y, bodies[first])
     count, opened = 1, 0
     start_row, start_column = math.floor(start_y), math.floor(start_x)
     best[(first * height + start_row) * width + start_column] = 0.0
@@ -607,7 +616,7 @@ def _search(
                 continue
             touching = 0
             if clearance[r, c] <= reach:
-                touching = _overlap(costs, new_x, new_y, bodies[other])
+                touching = _overlap(costs, clearance, new_x, new_y, bodies[other])
                 if touching > 0:
                     # Only a robot that stands on something already, and only to leave it.
                     near = math.hypot(new_x - start_x, new_y - start_y) <= escape
@@ -617,7 +626,7 @@ def _search(
                 elif length != 0.0 and overlap[node] == 0:
                     # Half way too: a primitive is three cells long.
                     half_x, half_y = 0.5 * (x + new_x), 0.5 * (y + new_y)
-                    if _overlap(costs, half_x, half_y, bodies[b]) > 0:
+                    if _overlap(costs, clearance, half_x, half_y, bodies[b]) > 0:
                         continue
             best[key] = new
             if count == room:

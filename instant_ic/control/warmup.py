@@ -24,7 +24,6 @@ def warm_up() -> None:
     mount = np.eye(4)
     mount[2, 3] = 0.6
     sweep = sort_points(points, np.zeros(6, dtype=np.float32), mount[None], 0.0, config.points)
-    sweep.moved(np.zeros(3)).nearest()
     costmap = RollingCostmap(config, footprint).update(np.zeros(3), None, rays, sweep)
     Predictor(PredictionConfig(), MotionLimits(), footprint).predict(np.zeros(3), (0.0, 0.0), (0.4, 0.0), costmap)
     HybridPlanner(PlannerConfig(), footprint).plan(costmap, np.zeros(3), np.array([0.5, 0.5, 0.0]))

@@ -202,7 +202,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if self.sweep is None:
             return placed
         base_from_odom = np.linalg.inv(self.tf.lookup("odom", "base_link"))
-        near = self.sweep.nearest() @ base_from_odom[:2, :2].T + base_from_odom[:2, 3]
+        near = self.sweep.nearest @ base_from_odom[:2, :2].T + base_from_odom[:2, 3]
         return np.concatenate([placed, near])
 
     # -- 3D points
@@ -226,7 +226,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.diagnose("points", WARN, f"3D points cannot be used: {error}")
             return -1
         self.sweep_error = ""
-        counts = self.sweep.counts()
+        counts = self.sweep.counts
         self.diagnose("points", OK, f"{counts['obstacle']} points in the way", **counts)
         return stamp_ns(message)
 
@@ -274,8 +274,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.config.costmap,
         )
         new_points = self.sweep if points_ns not in (-1, self.taken[1]) else None
-        placed = None if new_points is None else new_points.moved(pose2_from_matrix(map_from_odom))
-        self.costmap = self.costmaps.update(pose, self.static, rays, placed)
+        self.costmap = self.costmaps.update(pose, self.static, rays, new_points, pose2_from_matrix(map_from_odom))
         self.taken = (stamp_ns(scan), points_ns)
         self.diagnose("costmap", OK, "up to date", static_map=self.static is not None)
         self.publish_costmap(stamp_ns(scan))
