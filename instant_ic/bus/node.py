@@ -530,14 +530,16 @@ class Node(Generic[ConfigT]):
         assert isinstance(self.clock, ManualClock)
         before_ns, now_ns = self.clock.now_ns(), stamp_ns(message.clock)
         self.clock.set(now_ns)
-        if now_ns < before_ns - _WENT_BACK_NS:
+        went_back = now_ns < before_ns - _WENT_BACK_NS
+        if went_back:
             self.log.warning("time went back %.1f s: timers and transforms begin anew", (before_ns - now_ns) / 1e9)
+        if went_back or before_ns == 0:
             for entry in self._timers:
                 entry[2].due_ns = now_ns + entry[2].period_ns
             self._timers = [(timer.due_ns, order, timer) for _, order, timer in self._timers]
             heapq.heapify(self._timers)
-            if self._tf is not None:
-                self._tf.forget_moving()
+        if went_back and self._tf is not None:
+            self._tf.forget_moving()
 
     def _inputs(self) -> list[Subscription]:
         """Subscriptions to read now: none but ``/clock`` while simulated time has not begun, the others wait for it."""
