@@ -39,3 +39,8 @@ def run_dir() -> Path:
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "instant_ic"
     return Path(f"/tmp/instant_ic-{os.getuid()}")
+
+
+def cache_dir() -> Path:
+    """What can be made again: ``XDG_CACHE_HOME/instant_ic``, else ``~/.cache/instant_ic``; may not be there yet."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "instant_ic"

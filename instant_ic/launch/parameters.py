@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from instant_ic import paths
 from instant_ic.launch.description import NodeSpec
 
 _CHECK_TIMEOUT_S = 120.0
@@ -67,7 +68,7 @@ def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = Non
     Raises:
         ParameterCheckError: the check did not come to an end.
     """
-    cache = cache or _cache_file()
+    cache = cache or paths.cache_dir() / "launch_check.json"
     package = _package_state()
     keys = {node: _key(node, package) for node in map(_frozen, _checkable(nodes))}
     known = _remembered(cache)
@@ -104,11 +105,6 @@ def _package_state() -> str:
             if name.endswith(".py"):
                 newest, count = max(newest, os.stat(f"{folder}/{name}").st_mtime_ns), count + 1  # noqa: PTH116 - hundreds
     return f"{root} {newest} {count} {sys.version}"
-
-
-def _cache_file() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "instant_ic" / "launch_check.json"
 
 
 def _remembered(cache: Path) -> list[str]:

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from instant_ic.sim import kernels
+from instant_ic.sim.kept import kept
 from instant_ic.sim.world import World
 
 F32 = npt.NDArray[np.float32]
@@ -186,6 +187,12 @@ def bake(world: World, rays: int = 48, level: float = 0.72) -> None:
         rays: rays a texel for bounce and occlusion.
         level: median light of upright surfaces after baking (the exposure).
     """
+    fields: list[npt.NDArray[np.generic]] = [value for value in vars(world).values() if isinstance(value, np.ndarray)]
+    parts: list[str | npt.NDArray[np.generic]] = [*fields, world.textures.mean, f"{rays} {level} {world.two_sided}"]
+    world.light[:] = kept("light", parts, lambda: {"light": _baked(world, rays, level)})["light"]
+
+
+def _baked(world: World, rays: int, level: float) -> F32:
     points, owner = _texel_points(world)
     normals = world.normal[owner]
     direct = _direct(world, points, normals)
@@ -195,7 +202,7 @@ def bake(world: World, rays: int = 48, level: float = 0.72) -> None:
     _smooth(light, valid, world)
     upright = np.abs(normals[:, 2]) < 0.5
     reference = np.median(light[upright & valid].mean(axis=1)) if (upright & valid).any() else light.mean()
-    world.light[:] = light * np.float32(level / max(float(reference), 1e-6))
+    return np.asarray(light * np.float32(level / max(float(reference), 1e-6)), np.float32)
 
 
 def bake_mesh(world: World, rays: int = 24) -> None:

@@ -11,6 +11,8 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.sim.kept import Arrays, kept
+
 FloatArray = npt.NDArray[np.floating]
 
 MAX_LEVELS = 12
@@ -76,7 +78,14 @@ def _pack(image: FloatArray) -> npt.NDArray[np.uint32]:
 
 @cache
 def _packed_named(name: str) -> tuple[list[npt.NDArray[np.uint32]], list[tuple[int, int]], tuple[float, ...]]:
-    return _packed(make_texture(name))
+    def make() -> Arrays:
+        levels, sizes, mean = _packed(make_texture(name))
+        return {"texels": np.concatenate(levels), "sizes": np.asarray(sizes), "mean": np.asarray(mean)}
+
+    arrays = kept("texture", [name], make)
+    sizes = [(int(width), int(height)) for width, height in arrays["sizes"]]
+    ends = np.cumsum([width * height for width, height in sizes])
+    return np.split(arrays["texels"], ends[:-1]), sizes, tuple(arrays["mean"].tolist())
 
 
 def _packed(

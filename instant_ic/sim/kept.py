@@ -1,0 +1,79 @@
+"""Arrays that are dear to make and always come out the same, kept on disk between runs (textures, baked light)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic import paths
+
+Arrays = dict[str, npt.NDArray[np.generic]]
+
+MOST_BYTES = 256 << 20
+"""What is kept in all; beyond it the files that were used least recently go."""
+
+
+def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callable[[], Arrays]) -> Arrays:
+    """The arrays that ``make`` gives, from disk where they have been made before.
+
+    Args:
+        kind: what they are; part of the file's name.
+        parts: everything that they depend on; the code of this package is added.
+        make: makes them.
+
+    Returns:
+        Arrays by name, equal to the last bit to what ``make`` gives. A folder that cannot be used, and a file that is
+        broken, cost time and nothing else.
+    """
+    digest = hashlib.sha256(_code())
+    for part in parts:
+        if isinstance(part, str):
+            digest.update(f"{len(part)} {part}".encode())
+        else:
+            digest.update(f"{part.dtype} {part.shape}".encode() + np.ascontiguousarray(part).tobytes())
+    file = paths.cache_dir() / "sim" / f"{kind}-{digest.hexdigest()[:32]}.npz"
+    try:
+        with np.load(file, allow_pickle=False) as found:
+            arrays = {name: found[name] for name in found.files}
+        os.utime(file)
+        return arrays
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+        pass
+    arrays = make()
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        scratch = file.with_suffix(f".{os.getpid()}")
+        with scratch.open("wb") as out:
+            np.savez(out, allow_pickle=False, **arrays)
+        scratch.replace(file)
+        _make_room(file.parent)
+    return arrays
+
+
+@cache
+def _code() -> bytes:
+    """Changes whenever the code that makes such arrays may."""
+    files = sorted(Path(__file__).parent.glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files) + np.__version__.encode()).digest()
+
+
+def _make_room(folder: Path) -> None:
+    files = []
+    for file in folder.iterdir():
+        with suppress(FileNotFoundError):  # another process makes room too
+            status = file.stat()
+            files.append((status.st_mtime, status.st_size, file))
+    total = sum(size for _, size, _ in files)
+    for _, size, file in sorted(files):
+        if total <= MOST_BYTES:
+            return
+        file.unlink(missing_ok=True)
+        total -= size
