@@ -13,8 +13,8 @@ from types import TracebackType
 from instant_ic import paths
 from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.clock import Clock, ManualClock, SystemClock
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.transport import RawSubscription, Received
-from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.names import absolute, unknown_topic
 from instant_ic.msg import deserialize, stamp_ns
@@ -40,7 +40,7 @@ class Observer:
         self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
         self._run_dir = run_dir or paths.run_dir()
         self._ready = threading.Event()
-        self.transport = ZmqTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
+        self.transport = LocalTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
         try:
             self.subscriptions = {topic: self._subscribe(topic) for topic in self.topics}
             self._sim_clock = self._subscribe(_CLOCK) if use_sim_time else None

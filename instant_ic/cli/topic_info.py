@@ -44,13 +44,13 @@ def _show_verbose(
     topic: str, kind: str, publishers: list[registry.PublisherInfo], readers: list[registry.NodeInfo]
 ) -> None:
     from instant_ic.cli.heartbeats import hear
-    from instant_ic.launch.topics import nominal_rate
+    from instant_ic.cli.top import expected_rate
 
     run_dir = paths.run_dir()
     nodes = {node.name: node for node in registry.list_nodes(run_dir)}
     # Commands such as ic topic pub publish, too, but have no heartbeat.
     beats = hear(run_dir, {p.node for p in publishers if p.node in nodes} | {node.name for node in readers})
-    nominal = nominal_rate(topic)
+    nominal = expected_rate(topic)
     expected = f" (nominal {nominal.rate_hz:g} Hz{f', {nominal.when}' if nominal.when else ''})" if nominal else ""
     print(f"Publisher count: {len(publishers)}{expected}")
     for publisher in publishers:

@@ -18,8 +18,8 @@ import pytest
 from instant_ic.bus import Node, ParameterError, control
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.control import ControlError, ControlServer, NodeBusyError, NodeControl
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.msg import deserialize
 from instant_ic.ranges import Positive, Range, check_ranges
 
@@ -82,7 +82,7 @@ def tuned(tmp_path_factory):
     """A node with its control channel, spinning on a thread of its own."""
     run_dir = tmp_path_factory.mktemp("r")
     clock = SystemClock()
-    node = Tuned(TunedConfig(), ZmqTransport(run_dir, "tuned", clock.now_ns), clock)
+    node = Tuned(TunedConfig(), LocalTransport(run_dir, "tuned", clock.now_ns), clock)
     server = ControlServer(node, run_dir / "nodes" / "tuned.sock")
     node.start()
     node.thread = threading.Thread(target=node.spin)

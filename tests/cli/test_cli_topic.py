@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from instant_ic.bus import LATCHED, RELIABLE
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.message_input import build, parse
 from instant_ic.cli.messages import Style, csv_line, describe, json_line
@@ -59,7 +59,7 @@ def test_info(ic):
 
 
 def test_info_verbose_tells_rates_of_the_heartbeat(ic, talker):
-    reader = ZmqTransport(talker, "reader", time.time_ns)
+    reader = LocalTransport(talker, "reader", time.time_ns)
     try:
         status, out, _ = ic("topic", "info", "-v", "/scan")
     finally:
@@ -114,7 +114,7 @@ def test_hz_bw_and_delay(ic):
 
 def test_delay_by_simulated_time(ic, talker):
     """With /clock the age is by its time: the talker's stamps lie 1000 s before it."""
-    transport = ZmqTransport(talker, "clock", time.time_ns)
+    transport = LocalTransport(talker, "clock", time.time_ns)
     clock = transport.advertise("/clock", "rosgraph_msgs/msg/Clock", LATCHED)
     now = time.time_ns() + 1000 * 10**9
     stop = threading.Event()
@@ -139,7 +139,7 @@ def test_delay_by_simulated_time(ic, talker):
 
 def test_pub_reaches_the_node(ic, talker):
     heard = []
-    transport = ZmqTransport(talker, "ears", time.time_ns)
+    transport = LocalTransport(talker, "ears", time.time_ns)
     subscription = transport.subscribe("/heard", "std_msgs/msg/String", RELIABLE, lambda: None)
     deadline = time.monotonic() + 30
     try:

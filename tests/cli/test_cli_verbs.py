@@ -292,7 +292,7 @@ def test_launch_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> 
     assert ic(capsys, "launch", "bad.yaml", "x=1")[0] == 2
     Path("player.yaml").write_text("launch:\n- node: {exec: bag_player, param: [{name: rat, value: 1}]}\n")
     status, _, error = ic(capsys, "launch", "player.yaml", "--check")
-    assert status == 2 and "player.yaml:2: node bag_player: -p rat:=1: unknown parameter 'rat'" in error
+    assert status == 2 and "player.yaml:2: unknown parameter 'rat'; did you mean 'rate'?" in error
     status, out, _ = ic(capsys, "launch", "replay", "--show-args")
     assert status == 0 and "bag (must be given)" in out
 

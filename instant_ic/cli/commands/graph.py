@@ -1,0 +1,62 @@
+"""``ic graph``: nodes and topics of the running stack as a picture."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from instant_ic.cli import completion
+from instant_ic.cli.errors import UserError
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the verb."""
+    parser = subparsers.add_parser(
+        "graph",
+        help="picture of nodes and topics",
+        description="Shows who publishes what to whom, as a tree, or as a picture with -o.",
+        epilog="example: ic graph -o stack.svg",
+    )
+    parser.add_argument(
+        "nodes", metavar="NODE", nargs="*", help="only these and their partners (default: all)"
+    ).completer = completion.nodes
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help=".svg, .png, .pdf, .dot (graphviz), .mmd (mermaid)"
+    )
+    parser.add_argument(
+        "-a",
+        "--all",
+        action="store_true",
+        help="also topics that all nodes have, and those without a reader or publisher",
+    )
+    parser.add_argument("--tf", action="store_true", help="also /tf and /tf_static")
+    parser.set_defaults(func=show)
+
+
+def show(args: argparse.Namespace) -> int:
+    """Prints the tree, or writes the picture."""
+    from instant_ic import paths
+    from instant_ic.bus import registry
+    from instant_ic.cli.graph import make_graph, tree, write
+    from instant_ic.cli.heartbeats import hear
+    from instant_ic.cli.names import find_node
+
+    only = [find_node(name).name for name in args.nodes]
+    infos = registry.list_nodes(paths.run_dir())
+    if not infos:
+        raise UserError(f"no node runs in {paths.run_dir()}")
+    graph = make_graph(infos, hear(paths.run_dir(), [info.name for info in infos]), only, args.all, args.tf)
+    if args.output is None:
+        print(tree(graph))
+        if graph.hidden:
+            print(f"\nnot shown: {', '.join(graph.hidden)} (--all shows them)")
+        return 0
+    try:
+        write(graph, args.output)
+    except ValueError as error:
+        raise UserError(str(error), 2) from error
+    except OSError as error:
+        raise UserError(f"{args.output} cannot be written: {error.strerror}") from error
+    print(f"{args.output}: {len(graph.nodes)} nodes, {len(graph.topics)} topics")
+    return 0

@@ -1,0 +1,119 @@
+"""``ic log``: what the nodes say, and how much of it."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from instant_ic.cli import completion
+from instant_ic.cli.arguments import not_negative, seconds
+from instant_ic.cli.errors import UserError
+
+_POLL_S = 0.2
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the verb."""
+    parser = subparsers.add_parser(
+        "log",
+        help="log lines of the nodes; their log level",
+        description="Shows log lines of the nodes, in the order of time.\n"
+        "ic log level NODE [LEVEL] tells or sets how much a running node says: debug, info, warning, error.",
+        epilog="example: ic log arbiter navigator --level warning -f",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("nodes", metavar="NODE", nargs="*", help="default: all").completer = completion.nodes
+    parser.add_argument(
+        "-l", "--level", default="debug", metavar="LEVEL", help="this and worse: debug, info, warn, error"
+    )
+    parser.add_argument("-f", "--follow", action="store_true", help="go on with what comes")
+    parser.add_argument(
+        "-n", "--lines", type=not_negative, metavar="N", help="the last N (default: 30, or all since --since)"
+    )
+    parser.add_argument("--since", type=seconds, metavar="TIME", help="of the last 30s, 10m, 2h, 1d")
+    parser.add_argument("--color", choices=("auto", "always", "never"), default="auto", help="default: auto")
+    parser.set_defaults(func=show)
+
+
+def show(args: argparse.Namespace) -> int:
+    """Prints lines, or a node's log level."""
+    import sys
+    import time
+
+    from instant_ic import paths
+    from instant_ic.bus import registry
+    from instant_ic.cli.logs import LogFolder, chosen, level_number
+    from instant_ic.cli.logs import show as line_words
+
+    if args.nodes[:1] == ["level"]:
+        return _level(args.nodes[1:])
+    try:
+        level = level_number(args.level)
+    except ValueError as error:
+        raise UserError(str(error), 2) from error
+    run_dir = paths.run_dir()
+    running = {node.name: node.started_ns / 1e9 for node in registry.list_nodes(run_dir)}
+    _check_names(args.nodes, run_dir, running)
+    colour = args.color == "always" or (args.color == "auto" and sys.stdout.isatty())
+    folder = LogFolder(run_dir / "log", args.nodes)
+    lines = list(chosen(folder.new_lines(), level, time.time() - args.since if args.since else 0.0))
+    count = args.lines if args.lines is not None else len(lines) if args.since else 30
+    for line in lines[max(0, len(lines) - count) :]:
+        print(line_words(line, colour))
+    silent = [name for name, started in running.items() if not folder.has(name, started)]
+    silent = [name for name in silent if not args.nodes or name in args.nodes]
+    if not args.follow:
+        if silent:
+            print(
+                f"ic: {', '.join(silent)}: no log file, as ic launch did not start it; -f shows what it says now",
+                file=sys.stderr,
+            )
+        return 0
+    sys.stdout.flush()
+    return _follow(folder, set(args.nodes), level, colour)
+
+
+def _check_names(names: list[str], run_dir: Any, running: dict[str, float]) -> None:
+    from instant_ic.cli.names import near
+
+    known = {*running, *(path.stem for path in (run_dir / "log").glob("*.log"))}
+    for name in names:
+        if name not in known:
+            raise UserError(f"{name}: no such node, nor a log of it in {run_dir} ({near(name, known, 'ic node list')})")
+
+
+def _follow(folder: Any, nodes: set[str], level: int, colour: bool) -> int:
+    from instant_ic import paths
+    from instant_ic.bus import registry
+    from instant_ic.cli.logs import chosen, from_rosout
+    from instant_ic.cli.logs import show as line_words
+    from instant_ic.cli.observer import Observer
+    from instant_ic.msg import deserialize
+
+    run_dir = paths.run_dir()
+    topics = {info.topic for info in registry.list_topics(run_dir) if info.type_name == "rcl_interfaces/msg/Log"}
+    with Observer(sorted(topics | {"/rosout"})) as observer:
+        for batch in observer.batches(float("inf"), _POLL_S):
+            said = [from_rosout(deserialize(received.payload, received.type_name)) for received in batch]
+            started = {node.name: node.started_ns / 1e9 for node in registry.list_nodes(run_dir)} if said else {}
+            live = [
+                line
+                for line in said
+                if (not nodes or line.node in nodes) and not folder.has(line.node, started.get(line.node, float("inf")))
+            ]
+            for line in chosen(sorted([*folder.new_lines(), *live], key=lambda one: one.stamp_s), level):
+                print(line_words(line, colour), flush=True)
+    return 0
+
+
+def _level(words: list[str]) -> int:
+    from instant_ic import paths
+    from instant_ic.bus.control import NodeControl
+    from instant_ic.cli.names import find_node
+
+    if len(words) not in (1, 2):
+        raise UserError("usage: ic log level NODE [debug|info|warning|error]", 2)
+    control = NodeControl(paths.run_dir(), find_node(words[0]).name)
+    wanted = {"warn": "warning"}.get(words[1].lower(), words[1].lower()) if len(words) == 2 else None
+    print(control.log_level(wanted))
+    return 0

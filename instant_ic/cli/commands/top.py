@@ -1,0 +1,63 @@
+"""``ic top``: CPU, memory, rates and losses of every node."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from instant_ic.cli.arguments import positive
+
+_SORT = ("cpu", "memory", "name", "lost")
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds the verb."""
+    parser = subparsers.add_parser(
+        "top",
+        help="CPU, memory, rates and losses of every node, live",
+        description="Shows CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
+        epilog="example: ic top --once",
+    )
+    parser.add_argument("--once", action="store_true", help="print one table and end (as where there is no terminal)")
+    parser.add_argument("--json", action="store_true", help="print one table as JSON and end")
+    parser.add_argument("--sort", choices=_SORT, default="cpu", help="default: %(default)s")
+    parser.add_argument(
+        "-d", "--delay", type=positive, default=1.0, metavar="S", help="between two tables (default: 1)"
+    )
+    parser.set_defaults(func=show)
+
+
+def show(args: argparse.Namespace) -> int:
+    """Prints the table, or shows it until it is left."""
+    import json
+    import sys
+    import time
+
+    from instant_ic import paths
+    from instant_ic.bus import registry
+    from instant_ic.cli.errors import UserError
+    from instant_ic.cli.heartbeats import Heartbeats
+    from instant_ic.cli.top import SORT_KEYS, NodeRow, Processes, as_json, expected_rate, make_rows, plain_table
+
+    run_dir = paths.run_dir()
+    processes = Processes()
+    if not registry.list_nodes(run_dir):
+        raise UserError(f"no node runs in {run_dir}")
+    with Heartbeats(run_dir) as heartbeats:
+
+        def rows(seconds: float, until_all: bool = False) -> list[NodeRow]:
+            infos = registry.list_nodes(run_dir)
+            for info in infos:
+                processes.begin(info.pid)
+            beats = heartbeats.listen(seconds, [info.name for info in infos] if until_all else ())
+            return make_rows(infos, beats, processes.look, expected_rate, time.time_ns())
+
+        live = sys.stdin.isatty() and sys.stdout.isatty() and not (args.once or args.json)
+        if live:
+            from instant_ic.cli.top_screen import run
+
+            return run(rows, args.delay, args.sort)
+        rows(0.3)
+        newest = sorted(rows(1.5, until_all=True), key=SORT_KEYS[args.sort])
+        print(json.dumps(as_json(newest)) if args.json else plain_table(newest))
+    return 0

@@ -1,0 +1,169 @@
+"""Nodes and topics as a picture (SVG, PNG), as text for graphviz and mermaid, and as a tree for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events", "/clock")
+"""Topics of every node, which say nothing of how the stack hangs together."""
+TRANSFORMS = ("/tf", "/tf_static")
+
+_FORMATS = ("svg", "png", "pdf", "dot", "mmd")
+
+
+@dataclass
+class StackGraph:
+    """Who publishes and who reads what.
+
+    Attributes:
+        nodes: name → state (``running``, ...; empty where nothing is known).
+        topics: topic → type.
+        publishes: (node, topic) → rate, or None where it is not known.
+        subscribes: (topic, node) → messages lost on the way.
+        hidden: topics that were left out.
+    """
+
+    nodes: dict[str, str] = field(default_factory=dict)
+    topics: dict[str, str] = field(default_factory=dict)
+    publishes: dict[tuple[str, str], float | None] = field(default_factory=dict)
+    subscribes: dict[tuple[str, str], int] = field(default_factory=dict)
+    hidden: list[str] = field(default_factory=list)
+
+    def readers(self, topic: str) -> list[str]:
+        """Nodes that read a topic."""
+        return [node for name, node in self.subscribes if name == topic]
+
+
+def make_graph(
+    infos: Iterable[Any],
+    beats: dict[str, Any],
+    only: Collection[str] = (),
+    show_all: bool = False,
+    transforms: bool = False,
+) -> StackGraph:
+    """Graph of the running nodes.
+
+    Args:
+        infos: nodes as the registry has them.
+        beats: node → its newest heartbeat, where there is one.
+        only: nodes to show with what they share with others; empty shows all.
+        show_all: also what every node has, and topics without a publisher or a reader.
+        transforms: also /tf and /tf_static.
+    """
+    graph = StackGraph()
+    published: dict[str, list[str]] = {}
+    read: dict[str, list[str]] = {}
+    types: dict[str, str] = {}
+    for info in infos:
+        beat = beats.get(info.name)
+        graph.nodes[info.name] = "" if beat is None else "silent" if beat.silent else beat.state
+        for topic, kind in info.publishes.items():
+            published.setdefault(topic, []).append(info.name)
+            types[topic] = kind
+        for topic, kind in info.subscribes.items():
+            read.setdefault(topic, []).append(info.name)
+            types.setdefault(topic, kind)
+    for topic, kind in sorted(types.items()):
+        partners = {*published.get(topic, ()), *read.get(topic, ())}
+        if only and partners.isdisjoint(only):
+            continue
+        dead = topic not in published or topic not in read
+        common = topic.endswith(EVERYBODYS) or (topic.endswith(TRANSFORMS) and not transforms)
+        if not show_all and (dead or common):
+            graph.hidden.append(topic)
+            continue
+        graph.topics[topic] = kind
+        for node in published.get(topic, ()):
+            flow = beats[node].outputs.get(topic) if node in beats else None
+            graph.publishes[node, topic] = None if flow is None else flow.rate_hz
+        for node in read.get(topic, ()):
+            lost = beats[node].lost if node in beats else {}
+            graph.subscribes[topic, node] = sum(count for (name, _), count in lost.items() if name == topic)
+    if only:
+        linked = {node for node, _ in graph.publishes} | {node for _, node in graph.subscribes} | set(only)
+        graph.nodes = {node: state for node, state in graph.nodes.items() if node in linked}
+    return graph
+
+
+def write(graph: StackGraph, path: Path) -> None:
+    """Writes a picture or a text, by the ending of the file's name.
+
+    Raises:
+        ValueError: of another ending.
+        OSError: the file cannot be written.
+    """
+    kind = path.suffix.lstrip(".").lower()
+    if kind not in _FORMATS:
+        raise ValueError(f"{path}: the name must end in one of {', '.join('.' + known for known in _FORMATS)}")
+    if kind == "dot":
+        path.write_text(dot(graph))
+    elif kind == "mmd":
+        path.write_text(mermaid(graph))
+    else:
+        from instant_ic.cli.graph_picture import draw
+
+        draw(graph, path)
+
+
+def rate_words(rate_hz: float | None) -> str:
+    """``10 Hz``, ``0.5 Hz``; empty where nothing flows, or nothing is known of it."""
+    if not rate_hz:
+        return ""
+    return f"{rate_hz:.0f} Hz" if rate_hz >= 9.5 else f"{rate_hz:.1f} Hz"
+
+
+def tree(graph: StackGraph) -> str:
+    """Each node with what it publishes, and to whom."""
+    lines: list[str] = []
+    for node, state in graph.nodes.items():
+        lines.append(node + (f"  ({state})" if state not in ("", "running") else ""))
+        topics = [topic for name, topic in graph.publishes if name == node]
+        for topic in topics:
+            flow = rate_words(graph.publishes[node, topic])
+            kind = graph.topics[topic].rsplit("/", 1)[-1]
+            readers = [
+                reader + (f" (lost {graph.subscribes[topic, reader]})" if graph.subscribes[topic, reader] else "")
+                for reader in graph.readers(topic)
+            ]
+            branch = "└─" if topic == topics[-1] else "├─"
+            lines.append(f"  {branch} {topic} [{kind}]{' ' + flow if flow else ''} → {', '.join(readers) or 'nobody'}")
+    unfed = [topic for topic in graph.topics if not any(name == topic for _, name in graph.publishes)]
+    lines += [
+        f"{topic} [{graph.topics[topic]}] has no publisher → {', '.join(graph.readers(topic))}" for topic in unfed
+    ]
+    return "\n".join(lines)
+
+
+def dot(graph: StackGraph) -> str:
+    """Text for graphviz."""
+    lines = [
+        "digraph stack {",
+        "  rankdir=LR; node [fontname=Helvetica, fontsize=10]; edge [fontname=Helvetica, fontsize=8];",
+    ]
+    lines += [f'  "{node}" [shape=box, style="rounded,filled", fillcolor="#dce8f7"];' for node in graph.nodes]
+    lines += [
+        f'  "{topic}" [shape=plain, label="{topic}\\n{kind.rsplit("/", 1)[-1]}"];'
+        for topic, kind in graph.topics.items()
+    ]
+    lines += [f'  "{n}" -> "{t}" [label="{rate_words(rate)}"];' for (n, t), rate in graph.publishes.items()]
+    for (topic, node), lost in graph.subscribes.items():
+        label = f' [label="lost {lost}", color=red]' if lost else ""
+        lines.append(f'  "{topic}" -> "{node}"{label};')
+    return "\n".join([*lines, "}", ""])
+
+
+def mermaid(graph: StackGraph) -> str:
+    """Text for mermaid, as Markdown pages show it."""
+    keys = {name: f"v{number}" for number, name in enumerate([*graph.nodes, *graph.topics])}
+    lines = ["flowchart LR"]
+    lines += [f'  {keys[node]}["{node}"]' for node in graph.nodes]
+    lines += [f'  {keys[topic]}(["{topic}"])' for topic in graph.topics]
+    for (node, topic), rate in graph.publishes.items():
+        label = f'|"{rate_words(rate)}"|' if rate_words(rate) else ""
+        lines.append(f"  {keys[node]} -->{label} {keys[topic]}")
+    for (topic, node), lost in graph.subscribes.items():
+        lines.append(f"  {keys[topic]} -->" + (f'|"lost {lost}"| ' if lost else " ") + keys[node])
+    return "\n".join([*lines, ""])

@@ -1,0 +1,163 @@
+"""Log lines of the nodes: out of the launcher's files, and live from ``/rosout`` where there is no file."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+_ALIASES = {"warn": "WARNING", "fatal": "CRITICAL"}
+_LINE = re.compile(r"(\d\d):(\d\d):(\d\d)\.(\d{3}) (DEBUG|INFO|WARNING|ERROR|CRITICAL) +([^\s:]+): (.*)")
+_COLOURS = {"DEBUG": "2", "WARNING": "33", "ERROR": "31", "CRITICAL": "1;31"}
+
+
+@dataclass
+class LogLine:
+    """One entry of a log; a trace belongs to the line before it.
+
+    Attributes:
+        stamp_s: seconds since the epoch.
+        level: a word of ``LEVELS``.
+        node: who said it.
+        text: what was said; several lines for a trace.
+    """
+
+    stamp_s: float
+    level: str
+    node: str
+    text: str
+
+
+def level_number(word: str) -> int:
+    """Place of a level in ``LEVELS``.
+
+    Raises:
+        ValueError: there is no such level.
+    """
+    name = _ALIASES.get(word.lower(), word.upper())
+    if name not in LEVELS:
+        raise ValueError(f"level must be one of {', '.join(level.lower() for level in LEVELS)} (got {word!r})")
+    return LEVELS.index(name)
+
+
+def parse(text: str, node: str, end_s: float) -> list[LogLine]:
+    """Lines of a node's log file.
+
+    The lines carry the time of day alone. The last one was written just before ``end_s``; where the time of day of a
+    line is later than that of the next, midnight lies between them.
+
+    Args:
+        text: of the file.
+        node: whose it is: what does not look like a log line (a library's own output) is taken for this node's.
+        end_s: when the file was last written, seconds since the epoch.
+    """
+    lines: list[LogLine] = []
+    for raw in text.splitlines():
+        match = _LINE.match(raw)
+        if match:
+            hour, minute, second, ms = (int(part) for part in match.groups()[:4])
+            day_s = hour * 3600 + minute * 60 + second + ms / 1000
+            lines.append(LogLine(day_s, match[5], match[6], match[7]))
+        elif lines and lines[-1].level != "":
+            lines[-1].text += f"\n{raw}"
+        else:
+            lines.append(LogLine(-1.0, "", node, raw))
+    later_s = None
+    day = datetime.fromtimestamp(end_s).replace(hour=0, minute=0, second=0, microsecond=0)
+    end_day_s = end_s - day.timestamp()
+    for line in reversed(lines):
+        if line.level == "":  # before the first line with a time
+            line.level, line.stamp_s = "INFO", end_s if later_s is None else later_s + day.timestamp()
+            continue
+        limit_s = end_day_s + 60.0 if later_s is None else later_s + 1.0  # threads may swap two lines
+        if line.stamp_s > limit_s:
+            day -= timedelta(days=1)
+        later_s = line.stamp_s
+        line.stamp_s += day.timestamp()
+    return lines
+
+
+def show(line: LogLine, colour: bool) -> str:
+    """A line for the terminal."""
+    stamp = datetime.fromtimestamp(line.stamp_s).strftime("%H:%M:%S.%f")[:-3]
+    if not colour:
+        return f"{stamp} {line.level:<7} {line.node}: {line.text}"
+    code = _COLOURS.get(line.level, "")
+    start, end = (f"\x1b[{code}m", "\x1b[0m") if code else ("", "")
+    return f"\x1b[2m{stamp}\x1b[0m {start}{line.level:<7}{end} \x1b[1m{line.node}\x1b[0m: {start}{line.text}{end}"
+
+
+class LogFile:
+    """A log file that grows, and that a new start of its node replaces."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.node = path.stem
+        self._inode = -1
+        self._offset = 0
+        self._partial = b""
+
+    def new_lines(self) -> list[LogLine]:
+        """What has been written since the last call; at first all of it."""
+        try:
+            with self.path.open("rb") as file:
+                status = os.fstat(file.fileno())
+                if status.st_ino != self._inode or status.st_size < self._offset:
+                    self._inode, self._offset, self._partial = status.st_ino, 0, b""
+                file.seek(self._offset)
+                data = file.read()
+        except FileNotFoundError:
+            return []
+        self._offset += len(data)
+        # A line that is not complete yet is shown with its rest.
+        whole, separator, rest = (self._partial + data).rpartition(b"\n")
+        self._partial = rest
+        return parse((whole + separator).decode(errors="replace"), self.node, status.st_mtime)
+
+
+class LogFolder:
+    """All log files of a run directory.
+
+    Args:
+        folder: ``RUN_DIR/log``.
+        nodes: only these; empty takes all.
+    """
+
+    def __init__(self, folder: Path, nodes: Collection[str] = ()) -> None:
+        self._folder = folder
+        self._nodes = set(nodes)
+        self._files: dict[Path, LogFile] = {}
+
+    def new_lines(self) -> list[LogLine]:
+        """What has been written since the last call, in the order of time."""
+        for path in sorted(self._folder.glob("*.log")):
+            if not self._nodes or path.stem in self._nodes:
+                self._files.setdefault(path, LogFile(path))
+        lines = [line for file in self._files.values() for line in file.new_lines()]
+        return sorted(lines, key=lambda line: line.stamp_s)
+
+    def has(self, node: str, since_s: float) -> bool:
+        """Whether a node that was started at ``since_s`` writes into a file here."""
+        try:
+            return (self._folder / f"{node}.log").stat().st_mtime >= since_s
+        except FileNotFoundError:
+            return False
+
+
+def chosen(lines: Iterable[LogLine], level: int, since_s: float = 0.0) -> Iterator[LogLine]:
+    """Lines of at least a level and an age."""
+    return (line for line in lines if LEVELS.index(line.level) >= level and line.stamp_s >= since_s)
+
+
+def from_rosout(message: object, now_s: float | None = None) -> LogLine:
+    """A line of ``/rosout`` (rcl_interfaces/Log)."""
+    from instant_ic.msg import stamp_ns
+
+    level = min(max(int(message.level) // 10 - 1, 0), len(LEVELS) - 1)  # type: ignore[attr-defined]
+    stamp_s = stamp_ns(message) / 1e9 or (time.time() if now_s is None else now_s)
+    return LogLine(stamp_s, LEVELS[level], message.name.strip("/"), message.msg)  # type: ignore[attr-defined]

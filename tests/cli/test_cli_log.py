@@ -1,0 +1,135 @@
+"""``ic log``: files of the launcher, live lines of nodes without one, levels."""
+
+import os
+import subprocess
+import sys
+import threading
+from datetime import datetime
+
+import pytest
+from cli_helpers import talking, wait_until
+from hypothesis import given
+from hypothesis import strategies as st
+
+from instant_ic.cli.logs import LEVELS, LogFile, LogFolder, chosen, level_number, parse, show
+
+NOON = datetime(2026, 3, 4, 12, 0, 0).timestamp()
+
+
+def test_lines_and_traces():
+    text = (
+        "a library says hello\n"
+        "11:59:58.250 INFO    arbiter: running\n"
+        "11:59:59.500 ERROR   arbiter: tick: ValueError: no\n"
+        "Traceback (most recent call last):\n"
+        '  File "x.py", line 3\n'
+        "11:59:59.900 WARNING instant_ic.bus: 3: lost\n"
+    )
+    lines = parse(text, "arbiter", NOON)
+    assert [(line.stamp_s - NOON, line.level, line.node) for line in lines] == [
+        (-1.75, "INFO", "arbiter"),  # what comes before the first time is as old as that
+        (-1.75, "INFO", "arbiter"),
+        (-0.5, "ERROR", "arbiter"),
+        (pytest.approx(-0.1), "WARNING", "instant_ic.bus"),
+    ]
+    assert lines[2].text.count("\n") == 2 and lines[3].text == "3: lost"
+    assert [line.level for line in chosen(lines, level_number("warn"))] == ["ERROR", "WARNING"]
+    assert [line.level for line in chosen(lines, 0, NOON - 0.2)] == ["WARNING"]
+    assert show(lines[1], False) == "11:59:58.250 INFO    arbiter: running"
+    assert show(lines[2], True).startswith("\x1b[2m11:59:59.500\x1b[0m \x1b[31mERROR  \x1b[0m \x1b[1marbiter")
+
+
+def test_midnight_lies_between_lines_whose_time_goes_back():
+    end = datetime(2026, 3, 4, 0, 10).timestamp()
+    text = "23:50:00.000 INFO a: before\n23:59:59.999 INFO a: just before\n00:00:00.001 INFO a: after\n"
+    stamps = [datetime.fromtimestamp(line.stamp_s) for line in parse(text, "a", end)]
+    assert [(s.day, s.hour, s.minute) for s in stamps] == [(3, 23, 50), (3, 23, 59), (4, 0, 0)]
+    # Written before midnight, looked at after it.
+    assert datetime.fromtimestamp(parse("23:00:00.000 INFO a: x\n", "a", end)[0].stamp_s).day == 3
+
+
+@given(st.text(), st.floats(0, 4e9))
+def test_any_text_is_shown_whole(text, end_s):
+    lines = parse(text, "n", end_s)
+    assert "\n".join(line.text for line in lines) == "\n".join(text.splitlines()) or any(
+        line.level in LEVELS for line in lines
+    )
+    assert all(line.level in LEVELS for line in lines)
+
+
+def test_file_that_grows_is_cut_in_a_line_and_is_replaced(tmp_path):
+    path = tmp_path / "arbiter.log"
+    file = LogFile(path)
+    assert file.new_lines() == []
+    path.write_text("10:00:00.000 INFO    arbiter: one\n10:00:00.100 INFO    arb")
+    assert [line.text for line in file.new_lines()] == ["one"]
+    with path.open("a") as out:
+        out.write("iter: two\n")
+    assert [line.text for line in file.new_lines()] == ["two"]
+    path.rename(tmp_path / "arbiter.log.1")
+    path.write_text("10:00:01.000 INFO    arbiter: new start\n")
+    assert [line.text for line in file.new_lines()] == ["new start"]
+
+
+def test_files_are_merged_by_time(tmp_path):
+    (tmp_path / "a.log").write_text("10:00:00.000 INFO    a: 1\n10:00:02.000 INFO    a: 3\n")
+    (tmp_path / "b.log").write_text("10:00:01.000 INFO    b: 2\n")
+    for name in "ab":
+        os.utime(tmp_path / f"{name}.log", (NOON, NOON))
+    assert [line.text for line in LogFolder(tmp_path).new_lines()] == ["1", "2", "3"]
+    assert [line.text for line in LogFolder(tmp_path, ["b"]).new_lines()] == ["2"]
+    assert LogFolder(tmp_path).has("a", NOON - 1) and not LogFolder(tmp_path).has("a", NOON + 1)
+    assert not LogFolder(tmp_path).has("c", 0)
+
+
+def test_verb_reads_files(ic, tmp_path, monkeypatch):
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
+    (tmp_path / "log").mkdir()
+    now = datetime.now().strftime("%H:%M:%S.000")
+    lines = [f"{now} INFO    nav: {i}\n" for i in range(40)] + [f"{now} ERROR   nav: bad\nTrace\n"]
+    (tmp_path / "log" / "nav.log").write_text("".join(lines))
+    out = ic("log")[1].splitlines()
+    assert len(out) == 31 and out[0].endswith("nav: 11") and out[-2:] == [f"{now} ERROR   nav: bad", "Trace"]
+    assert ic("log", "nav", "-n", "2")[1].count("\n") == 3
+    assert ic("log", "-l", "error")[1].splitlines() == [f"{now} ERROR   nav: bad", "Trace"]
+    assert len(ic("log", "--since", "1h")[1].splitlines()) == 42
+    assert ic("log", "--since", "soon")[0] == 2
+    assert "level must be one of debug, info" in ic("log", "-l", "loud")[2]
+    status, _, error = ic("log", "nva")
+    assert status == 1 and "did you mean 'nav'?" in error
+
+
+def test_follow_shows_a_file_and_a_node_without_one(ic, tmp_path_factory, monkeypatch):
+    """Lines of a file as it grows, and those of a node that ic run started; debug lines once its level is debug."""
+    run_dir = tmp_path_factory.mktemp("r")
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    with talking(run_dir):
+        (run_dir / "log" / "nav.log").write_text("")
+        status, _, error = ic("log")
+        assert status == 0 and "ic: talker: no log file" in error
+        command = [sys.executable, "-u", "-m", "instant_ic.cli.main", "log", "-f", "-n", "0"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        try:
+            assert process.stdout is not None
+            heard: list[str] = []
+            reader = threading.Thread(target=lambda: heard.extend(iter(process.stdout.readline, "")), daemon=True)
+            reader.start()
+            assert ic("log", "level", "talker")[1] == "info\n" and ic("log", "level", "talker", "DEBUG")[1] == "debug\n"
+            assert ic("log", "level", "talker", "loud")[0] == 1 and ic("log", "level")[0] == 2
+
+            def order() -> None:
+                ic("topic", "pub", "--once", "/order", "TwistStamped", "{twist: {linear: {x: 7}}}")
+
+            def both() -> bool:
+                order()
+                return any("WARNING talker: ordered 7.0" in line for line in heard)
+
+            wait_until(both, "the warning on /rosout")
+            wait_until(lambda: any("DEBUG   talker: order" in line for line in heard), "the debug line")
+            with (run_dir / "log" / "nav.log").open("a") as file:
+                file.write("10:00:00.000 ERROR   nav: lost\n")
+            wait_until(lambda: any("ERROR   nav: lost" in line for line in heard), "the line of the file")
+        finally:
+            process.kill()
+            process.wait()
+            process.stdout.close()
