@@ -17,7 +17,8 @@ from .host_protocol import Announce
 from .host_session import Arrived
 from .host_topics import TopicRule
 
-BRIDGE_MODULE = "instant_ic.nodes.host_bridge"
+BRIDGES = ("instant_ic.nodes.host_bridge", "instant_ic.nodes.zenoh_gateway")
+"""Nodes that publish here what was published elsewhere: it is not sent on, or it would come back."""
 
 
 class ExportedTopics:
@@ -42,7 +43,7 @@ class ExportedTopics:
         run_dir = self._node.run_dir
         assert run_dir is not None
         nodes = registry.list_nodes(run_dir)
-        self._bridges = {self._node.node_name, *(info.name for info in nodes if info.module == BRIDGE_MODULE)}
+        self._bridges = {self._node.node_name, *(info.name for info in nodes if info.module in BRIDGES)}
         before, self._offered = self._offered, {}
         for name in self._rules:
             for publisher in registry.topic_publishers(run_dir, self._node.resolve(name)):

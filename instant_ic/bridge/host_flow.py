@@ -92,6 +92,7 @@ class Window:
         self.size = float(start)
         self.queue_ns = 0
         self._base: deque[tuple[int, int]] = deque([(0, 1 << 62)], maxlen=4)
+        self._newest: deque[int] = deque(maxlen=2)
         self._next_cut_ns = 0
 
     @property
@@ -110,7 +111,9 @@ class Window:
     def acked(self, taken: int, rtt_ns: int, in_flight: int, now_ns: int) -> None:
         """Takes an answer: ``taken`` more bytes have arrived, of ``in_flight``."""
         self.observe(rtt_ns, now_ns)
-        self.queue_ns = rtt_ns - self.base_ns
+        # A queue lasts; a process that had to wait for its turn delays one answer, and that must not cost pictures.
+        self._newest.append(rtt_ns)
+        self.queue_ns = min(self._newest) - self.base_ns
         if self.queue_ns > self.target_ns:
             if now_ns >= self._next_cut_ns:  # once a round trip: the next answers still tell of the same queue
                 self._next_cut_ns = now_ns + rtt_ns

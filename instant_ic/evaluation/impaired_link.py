@@ -11,6 +11,7 @@ import socket
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
@@ -57,17 +58,22 @@ class ImpairedLink:
     Args:
         target: host and port.
         impairment: of both directions; may be exchanged while it runs.
-        host: address to listen on.
+        host, port: address to listen on; port 0 takes a free one.
         seed: of jitter and stalls.
     """
 
     def __init__(
-        self, target: tuple[str, int], impairment: Impairment | None = None, host: str = "127.0.0.1", seed: int = 1
+        self,
+        target: tuple[str, int],
+        impairment: Impairment | None = None,
+        host: str = "127.0.0.1",
+        seed: int = 1,
+        port: int = 0,
     ) -> None:
         self.target = target
         self.impairment = impairment or Impairment()
         self._random = random.Random(seed)
-        self._listener = socket.create_server((host, 0))
+        self._listener = socket.create_server((host, port))
         self.port: int = self._listener.getsockname()[1]
         self._ways: list[_Way] = []
         self._lock = threading.Lock()
@@ -120,7 +126,7 @@ class ImpairedLink:
             near.close()
             return
         try:
-            far = socket.create_connection(self.target, timeout=2)
+            far = socket.create_connection(self.target, timeout=0.5)  # everybody else waits meanwhile
         except OSError:
             near.close()
             return
@@ -204,3 +210,26 @@ class ImpairedLink:
                 self._ways = [w for w in self._ways if w.source not in (way.source, way.sink)]
             way.source.close()
             way.sink.close()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one until it is ended: ``python -m instant_ic.evaluation.impaired_link 7451 10.0.0.1 7450``."""
+    import argparse
+
+    parser = argparse.ArgumentParser(description="TCP proxy that behaves as a bad network.")
+    parser.add_argument("port", type=int, help="port of 127.0.0.1 to listen on")
+    parser.add_argument("target_host")
+    parser.add_argument("target_port", type=int)
+    parser.add_argument("--delay-ms", type=float, default=0.0, help="one way")
+    parser.add_argument("--jitter-ms", type=float, default=0.0, help="added, uniform in plus and minus")
+    parser.add_argument("--rate-mbit", type=float, default=0.0, help="0: unlimited")
+    parser.add_argument("--stall-share", type=float, default=0.0, help="share of segments that wait, as after a loss")
+    args = parser.parse_args(argv)
+    impairment = Impairment(args.delay_ms / 1e3, args.jitter_ms / 1e3, args.rate_mbit * 1e6 / 8, args.stall_share)
+    with ImpairedLink((args.target_host, args.target_port), impairment, port=args.port):
+        threading.Event().wait()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

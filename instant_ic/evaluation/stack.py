@@ -78,6 +78,7 @@ class Stack:
         run_dir: run directory; its path must be short (sockets).
         arguments: launch arguments.
         log_path: where the launcher's output goes (default: ``RUN_DIR/launch.log``).
+        prefix: command that starts the launcher, as ``ip netns exec NAME``.
 
     Example::
 
@@ -87,12 +88,18 @@ class Stack:
     """
 
     def __init__(
-        self, launch_file: str, run_dir: Path, arguments: dict[str, Any], log_path: Path | None = None
+        self,
+        launch_file: str,
+        run_dir: Path,
+        arguments: dict[str, Any],
+        log_path: Path | None = None,
+        prefix: Sequence[str] = (),
     ) -> None:
         self.launch_file = launch_file
         self.run_dir = run_dir
         self.arguments = dict(arguments)
         self.log_path = log_path or run_dir / "launch.log"
+        self.prefix = list(prefix)
         self.process: subprocess.Popen[bytes] | None = None
         self.observer: Observer
 
@@ -103,7 +110,7 @@ class Stack:
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)}
         with self.log_path.open("wb") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "instant_ic.cli.main", "launch", self.launch_file, *words],
+                [*self.prefix, sys.executable, "-m", "instant_ic.cli.main", "launch", self.launch_file, *words],
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,

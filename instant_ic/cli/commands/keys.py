@@ -105,10 +105,10 @@ def show(args: argparse.Namespace) -> int:
 
 def let_in(args: argparse.Namespace) -> int:
     """Allows a host; makes this host's own key where there is none, for it is needed next."""
-    from instant_ic.bridge.host_keys import Peer, key_text, parse_key
+    from instant_ic.bridge.host_keys import Peer, check_name, key_text, parse_key
 
     store = _store(args)
-    peer = Peer(args.name, args.role, parse_key(args.key))
+    peer = Peer(check_name(args.name), args.role, parse_key(args.key))
     if store.identity_path.exists() and store.identity().public_key == peer.public_key:
         from instant_ic.cli.errors import UserError
 
