@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import select
 import sys
 import termios
@@ -13,6 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, TextIO
 
 ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
+_KEY = re.compile(r"\x1b\[[0-9;]*[A-Za-z~]|.", re.DOTALL)
 _CLEAR_LINE = "\r\x1b[K"
 
 
@@ -69,7 +71,7 @@ class Terminal:
     def _run(self) -> None:
         while not self._stop.is_set():
             with self._lock:
-                width = os.get_terminal_size(sys.stderr.fileno()).columns
+                width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
                 sys.stderr.write(_CLEAR_LINE + self._line()[: max(1, width - 1)])
                 sys.stderr.flush()
             # A process sent to the background would be stopped by reading.
@@ -78,17 +80,14 @@ class Terminal:
                 continue
             ready, _, _ = select.select([sys.stdin], [], [], self._period_s)
             if ready:
-                self._on_key(os.read(sys.stdin.fileno(), 8).decode(errors="replace"))
+                self._on_keys(os.read(sys.stdin.fileno(), 64).decode(errors="replace"))
 
-    def _on_key(self, text: str) -> None:
-        key = ARROWS.get(text, text[:1])
-        action = self._keys.get(key)
-        if action is None:
-            return
-        try:
-            action()
-        except ValueError as error:
-            logging.getLogger(__name__).warning("%s", error)
+    def _on_keys(self, text: str) -> None:
+        for key in _KEY.findall(text):  # several, when they were pressed quickly
+            try:
+                self._keys.get(ARROWS.get(key, key), lambda: None)()
+            except ValueError as error:
+                logging.getLogger(__name__).warning("%s", error)
 
 
 class _AboveTheLine:
