@@ -45,9 +45,10 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
             locks.enter_context(StackLock(folder, description.file.name))
             registry.sweep(folder)
         output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
+        status = 1
         try:
             output.event(f"{len(description.nodes)} nodes of {description.file}, run directory {run_dir}")
-            return Supervisor(
+            status = Supervisor(
                 description.nodes,
                 run_dir,
                 output,
@@ -56,7 +57,8 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
                 shutdown=description.shutdown,
             ).run()
         finally:
-            output.close()
+            output.close(status)
+        return status
 
 
 class _Output:
@@ -118,13 +120,13 @@ class _Output:
             ending=self._ending,
         )
 
-    def close(self) -> None:
-        """Shows what is left and takes the table away."""
+    def close(self, status: int) -> None:
+        """Shows the rest and takes the table away; where a terminal takes nothing, the process ends with ``status``."""
         self._outlet.put(self._screen.stop, always=True)
         if not self._outlet.close(timeout_s=3.0):
-            # The terminal takes nothing (Ctrl-S): its thread holds standard output, and the interpreter would wait for
-            # it for ever. The nodes have ended, the logs are written.
-            os._exit(1)
+            # Its thread holds standard output, and the interpreter would wait for it for ever. The nodes have ended,
+            # the logs are written.
+            os._exit(status)
 
 
 def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequence[TopicFault]) -> Row:

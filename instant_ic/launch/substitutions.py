@@ -67,7 +67,7 @@ class Context:
 
 
 def substitute(text: str, context: Context) -> str:
-    """``text`` with every ``$(...)`` replaced.
+    r"""``text`` with every ``$(...)`` replaced; ``\$(`` stands for ``$(`` itself.
 
     Raises:
         SubstitutionError: unknown substitution or variable, unset environment variable without default, a
@@ -76,6 +76,10 @@ def substitute(text: str, context: Context) -> str:
     parts: list[str] = []
     position = 0
     while (start := text.find("$(", position)) >= 0:
+        if start > position and text[start - 1] == "\\":  # a program's own $(...)
+            parts.append(text[position : start - 1] + "$(")
+            position = start + 2
+            continue
         parts.append(text[position:start])
         end = _matching_parenthesis(text, start + 2)
         parts.append(_evaluate(text[start + 2 : end], context))

@@ -317,6 +317,33 @@ def test_a_terminal_that_takes_nothing_does_not_hold_up_the_launcher() -> None:
     assert outlet.close(timeout_s=30) and done.is_set()
 
 
+def test_a_stack_whose_terminal_takes_nothing_runs_on_and_ends_when_it_is_asked_to(tmp_path: Path) -> None:
+    flood = "while :; do echo xxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxxx; done"
+    file = launch_file(
+        tmp_path,
+        f"""launch:
+- executable: {{cmd: "{flood}", shell: true, name: flood}}
+- executable: {{cmd: "i=0; while :; do i=\\\\$((i+1)); echo line $i; sleep 0.05; done", shell: true, name: talker}}
+""",
+    )
+    log = tmp_path / "r" / "log" / "talker.log"
+    command = [sys.executable, "-m", "instant_ic.cli.main", "launch", file, "--run-dir", str(tmp_path / "r"), "--plain"]
+    launched = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    try:
+        assert launched.stdout is not None
+        assert launched.stdout.read(1000)  # it has begun; from now on nobody reads
+        limit_s = time.monotonic() + 60
+        while not log.exists() or "line 60" not in log.read_text():  # 3 s after the pipe to the terminal is full
+            assert time.monotonic() < limit_s
+            time.sleep(0.05)
+        launched.send_signal(signal.SIGINT)
+        assert launched.wait(30) == 0
+    finally:
+        launched.kill()
+        launched.wait()
+        launched.stdout.close()
+
+
 def test_output_whose_reader_has_gone_is_given_up_and_the_stack_goes_on() -> None:
     def broken() -> None:
         raise BrokenPipeError(32, "Broken pipe")
@@ -422,3 +449,25 @@ def test_states_of_a_stack_that_has_ended(run_dir: Path) -> None:
     assert supervise(run_dir, nodes, output) == 1
     assert output.supervisor is not None
     assert [(p.state, p.exit_status) for p in output.supervisor.processes] == [(State.ENDED, 0), (State.FAILED, 3)]
+
+
+def test_show_args_tells_types_choices_and_what_included_files_keep(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "part.yaml").write_text("launch:\n- arg: {name: speed, default: 3}\n")
+    file = launch_file(
+        tmp_path,
+        """launch:
+- arg: {name: port, type: int, default: 80, description: of the page}
+- arg: {name: mode, choices: [fast, slow]}
+- include: {file: part.yaml}
+""",
+    )
+    assert main(["launch", file, "--show-args"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "arguments of stack.yaml:",
+        "  port: int (default: '80')",
+        "      of the page",
+        "  mode: fast | slow (must be given)",
+        "part.yaml, which it includes, keeps its own defaults of: speed '3'",
+    ]

@@ -497,6 +497,7 @@ def test_what_ros_2_has_and_we_have_not_is_told_with_the_reason(
         ("$(if $(var on) 'far away' near)", "far away"),
         ("$(if false there)", ""),
         ("$(filename)", "a.yaml"),
+        ("i=\\$((i+1)) $(var world)", "i=$((i+1)) hall"),  # a shell's own
     ],
 )
 def test_substitutions_of_ros_2(context: Context, text: str, expected: str) -> None:
