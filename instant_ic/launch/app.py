@@ -11,7 +11,7 @@ from pathlib import Path
 
 from instant_ic.bus import registry
 from instant_ic.launch.description import LaunchDescription
-from instant_ic.launch.health import HealthMonitor, TopicFault
+from instant_ic.launch.health import EVERY_NODES, HealthMonitor, TopicFault
 from instant_ic.launch.outlet import Outlet
 from instant_ic.launch.process import ManagedProcess, State
 from instant_ic.launch.rundir import StackLock
@@ -21,7 +21,6 @@ from instant_ic.launch.topics import nominal_rate
 
 _VIEW_PERIOD_S = 0.5
 _WAITING_LINES = 2000  # lines that a terminal may be behind
-_NOT_SHOWN = ("heartbeat", "diagnostics", "rosout", "parameter_events")  # every node's
 
 
 def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None = None) -> int:
@@ -148,7 +147,7 @@ def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequenc
     sends = tuple(
         (topic, rate_hz, topic not in own)
         for topic, rate_hz in health.rates_hz.items()
-        if rate_hz > 0 and topic.rpartition("/")[2] not in _NOT_SHOWN
+        if rate_hz > 0 and topic.rpartition("/")[2] not in EVERY_NODES
     )
     # Wrong ones first, then those with a known rate: what does not fit into the line matters least.
     order = sorted(sends, key=lambda send: (send[2], nominal_rate(send[0], process.spec.namespace) is None))

@@ -22,6 +22,9 @@ SILENT_AFTER_S = 3.0
 FAULT_HOLDS_S = 3.0
 """A wrong rate counts once it has been wrong for this long."""
 
+EVERY_NODES = ("heartbeat", "diagnostics", "rosout", "parameter_events")
+"""What every node sends, by the last part of the name; a node that no longer does is silent, not slow."""
+
 _STATES = ("starting", "running", "degraded", "failed", "stopping")
 _UP = ("running", "degraded")
 _VSPACE_READY = 2
@@ -180,7 +183,7 @@ class HealthMonitor:
                 continue
             for topic, rate_hz in health.rates_hz.items():
                 expected = nominal_rate(topic, spec.namespace)
-                if expected is None:
+                if expected is None or topic.rpartition("/")[2] in EVERY_NODES:
                     continue
                 key, age_s = (spec.label, topic), health.ages_s.get(topic, float("inf"))
                 words = expected.fault(rate_hz, age_s)

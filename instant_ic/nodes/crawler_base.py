@@ -85,7 +85,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.linked = False  # since the start, once
         self.dropped = self.retries_told = self.rejected_told = 0
         self.drops, self.repeats, self.jumps = (RecentCount(self.config.recent_s) for _ in range(3))
-        self.diagnose("link", OK, f"connecting to {self.config.roboclaw.port}")
+        self.diagnose("link", WARN, f"connecting to {self.config.roboclaw.port}")
         self.timer(1.0, self.tell_recent)
         if self.lockstep:
             self.timer(1.0 / self.config.rate_hz, lambda: self.on_state(self.controller.step()))
@@ -109,9 +109,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         v, w = twist_values(message)
         age_s = (now_ns - stamp) * 1e-9
         if not (math.isfinite(v) and math.isfinite(w)):
-            self.drop(f"command is not finite (v={v}, w={w})")
+            self.refuse(f"command is not finite (v={v}, w={w})")
         elif abs(age_s) > self.config.command_timeout_s:
-            self.drop(
+            self.refuse(
                 f"command is {age_s:.2f} s old"
                 if age_s > 0
                 else f"command's stamp is {-age_s:.2f} s ahead: set the clocks"
@@ -121,7 +121,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             if not self.drops.count(now_ns):
                 self.diagnose("command", OK, "driving by /cmd_vel", dropped=self.dropped)
 
-    def drop(self, reason: str) -> None:
+    def refuse(self, reason: str) -> None:
         """Tell of a command that is not obeyed."""
         self.dropped += 1
         self.drops.add(1, self.clock.now_ns())

@@ -300,6 +300,8 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         }
         if silent_s > self.config.silence_s:
             self.diagnose("packets", ERROR, self.silence(silent_s), **values)
+        elif not counters.packets:
+            self.diagnose("packets", WARN, "no packet yet", **values)
         elif any(new):
             text = (
                 f"in the last second {new[0]} packets missing, {new[1]} no VLP-16 packets, {new[2]} revolutions skipped"
