@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from instant_ic.base.protocol import ADDRESSES, BAUD_RATES
 
+from ..ranges import NotNegative, Positive, check_ranges
+
 
 def _require(ok: bool, key: str, value: object, rule: str) -> None:
     if not ok:
@@ -63,16 +65,14 @@ class LimitsConfig:
         max_w_acceleration: change of the turn rate, rad/s^2.
     """
 
-    max_v: float = 0.5
-    max_w: float = 1.0
-    max_v_acceleration: float = 0.8
-    max_w_acceleration: float = 2.0
+    max_v: Positive = 0.5
+    max_w: Positive = 1.0
+    max_v_acceleration: Positive = 0.8
+    max_w_acceleration: Positive = 2.0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for key in ("max_v", "max_w", "max_v_acceleration", "max_w_acceleration"):
-            value = getattr(self, key)
-            _require(math.isfinite(value) and value > 0.0, key, value, "> 0")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -87,17 +87,15 @@ class OdometryNoiseConfig:
         w_floor: standard deviation of the turn rate at rest, rad/s.
     """
 
-    position_per_metre: float = 0.0004
-    yaw_per_metre: float = 0.0004
-    yaw_per_radian: float = 0.01
-    v_floor: float = 0.005
-    w_floor: float = 0.01
+    position_per_metre: NotNegative = 0.0004
+    yaw_per_metre: NotNegative = 0.0004
+    yaw_per_radian: NotNegative = 0.01
+    v_floor: NotNegative = 0.005
+    w_floor: NotNegative = 0.01
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for key in ("position_per_metre", "yaw_per_metre", "yaw_per_radian", "v_floor", "w_floor"):
-            value = getattr(self, key)
-            _require(math.isfinite(value) and value >= 0.0, key, value, ">= 0")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,14 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawConfig, SkidSteerConfig
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry
 from instant_ic.base.roboclaw import LinkError, Roboclaw, SerialPort, Status, open_serial
+
+from ..ranges import Positive, Range, check_ranges
 
 
 @dataclass(frozen=True)
@@ -28,15 +31,12 @@ class ControllerConfig:
     geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
-    command_timeout_s: float = 0.3
-    health_period_s: float = 1.0
+    command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.3
+    health_period_s: Positive = 1.0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not 0.0 < self.command_timeout_s <= 2.0:
-            raise ValueError(f"command_timeout_s must be in 0..2 s (got {self.command_timeout_s})")
-        if self.health_period_s <= 0.0:
-            raise ValueError(f"health_period_s must be > 0 s (got {self.health_period_s})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)

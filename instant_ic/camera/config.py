@@ -2,13 +2,10 @@
 
 from dataclasses import dataclass
 
+from ..ranges import NotNegative, NotNegativeInt, Percent, Positive, check_ranges
+
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 """(width, height, frames/s) that the Theta Z1 offers."""
-
-
-def _positive(key: str, value: float) -> None:
-    if not value > 0.0:
-        raise ValueError(f"{key} must be > 0 (got {value})")
 
 
 @dataclass(frozen=True)
@@ -30,12 +27,12 @@ class ThetaConfig:
     width: int = 1024
     height: int = 512
     rate_hz: int = 30
-    latency_s: float = 0.20
-    read_timeout_s: float = 2.0
-    connect_timeout_s: float = 5.0
-    settle_s: float = 1.0
-    busy_retries: int = 5
-    busy_wait_s: float = 0.25
+    latency_s: NotNegative = 0.20
+    read_timeout_s: Positive = 2.0
+    connect_timeout_s: Positive = 5.0
+    settle_s: NotNegative = 1.0
+    busy_retries: NotNegativeInt = 5
+    busy_wait_s: Positive = 0.25
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -43,14 +40,7 @@ class ThetaConfig:
         if wanted not in PREVIEW_FORMATS:
             known = ", ".join(f"{w}x{h}@{r}" for w, h, r in PREVIEW_FORMATS)
             raise ValueError(f"width, height, rate_hz must be one of {known} (got {wanted})")
-        if self.latency_s < 0.0:
-            raise ValueError(f"latency_s must be >= 0 (got {self.latency_s})")
-        for key in ("read_timeout_s", "connect_timeout_s", "busy_wait_s"):
-            _positive(key, getattr(self, key))
-        if self.settle_s < 0.0:
-            raise ValueError(f"settle_s must be >= 0 (got {self.settle_s})")
-        if self.busy_retries < 0:
-            raise ValueError(f"busy_retries must be >= 0 (got {self.busy_retries})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -65,21 +55,15 @@ class VideoConfig:
         height: wanted from a device, pixels; 0 leaves it as it is.
     """
 
-    latency_s: float = 0.25
-    read_timeout_s: float = 2.0
-    quality: int = 90
-    width: int = 0
-    height: int = 0
+    latency_s: NotNegative = 0.25
+    read_timeout_s: Positive = 2.0
+    quality: Percent = 90
+    width: NotNegativeInt = 0
+    height: NotNegativeInt = 0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.latency_s < 0.0:
-            raise ValueError(f"latency_s must be >= 0 (got {self.latency_s})")
-        _positive("read_timeout_s", self.read_timeout_s)
-        if not 1 <= self.quality <= 100:
-            raise ValueError(f"quality must be in 1..100 (got {self.quality})")
-        if self.width < 0 or self.height < 0:
-            raise ValueError(f"width and height must be >= 0 (got {self.width}, {self.height})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -93,15 +77,11 @@ class FilesConfig:
         latency_s: taken off the stamps.
     """
 
-    rate_hz: float = 5.0
+    rate_hz: Positive = 5.0
     loop: bool = True
-    quality: int = 90
-    latency_s: float = 0.0
+    quality: Percent = 90
+    latency_s: NotNegative = 0.0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        _positive("rate_hz", self.rate_hz)
-        if not 1 <= self.quality <= 100:
-            raise ValueError(f"quality must be in 1..100 (got {self.quality})")
-        if self.latency_s < 0.0:
-            raise ValueError(f"latency_s must be >= 0 (got {self.latency_s})")
+        check_ranges(self)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from instant_ic.camera.source import Camera, CameraError, Frame
 
+from ..ranges import Positive, check_ranges
+
 
 @dataclass(frozen=True)
 class ReconnectConfig:
@@ -16,13 +18,14 @@ class ReconnectConfig:
         max_s: the longest; waits double up to it.
     """
 
-    min_s: float = 0.5
-    max_s: float = 5.0
+    min_s: Positive = 0.5
+    max_s: Positive = 5.0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not 0.0 < self.min_s <= self.max_s:
-            raise ValueError(f"min_s must be > 0 and at most max_s (got {self.min_s}, {self.max_s})")
+        check_ranges(self)
+        if not self.min_s <= self.max_s:
+            raise ValueError(f"min_s must be at most max_s (got {self.min_s}, {self.max_s})")
 
 
 class CameraLoop(threading.Thread):

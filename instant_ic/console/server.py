@@ -16,7 +16,7 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
@@ -25,6 +25,8 @@ from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
 from instant_ic.console.protocol import FrameKind, ProtocolError, number, parse_text, whole
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
+
+from ..ranges import Positive, PositiveInt, Range, check_ranges
 
 STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096
@@ -62,19 +64,14 @@ class ServerConfig:
     """Where the page is served, and to whom."""
 
     host: str = "127.0.0.1"
-    port: int = 8080  # 0 = any free port
+    port: Annotated[int, Range(0, 65535)] = 8080  # 0 = any free port
     allowed_hosts: tuple[str, ...] = ()  # names by which browsers may reach the page besides localhost
-    max_clients: int = 16
-    background_picture_hz: float = 2.0  # pictures that are not shown (camera in the v-space)
+    max_clients: PositiveInt = 16
+    background_picture_hz: Positive = 2.0  # pictures that are not shown (camera in the v-space)
     drive: DriveConfig = field(default_factory=DriveConfig)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.port <= 65535:
-            raise ValueError(f"port must be in [0, 65535] (got {self.port})")
-        if self.max_clients < 1:
-            raise ValueError(f"max_clients must be >= 1 (got {self.max_clients})")
-        if not self.background_picture_hz > 0:
-            raise ValueError(f"background_picture_hz must be > 0 (got {self.background_picture_hz})")
+        check_ranges(self)
 
 
 class ConsoleServer:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import pose_matrix
+
+from ..ranges import NotNegative, Positive, Range, check_ranges
 
 MAX_FOV_RAD = math.radians(150)
 
@@ -17,25 +20,15 @@ MAX_FOV_RAD = math.radians(150)
 class ViewConfig:
     """Rendered views that the console asks for."""
 
-    width: int = 320  # with height: the number of pixels; the shape follows the operator's window
-    height: int = 180
-    fov_margin: float = 1.15  # asked field of view over the shown one, so that it can be re-aimed
-    virtual_rate_hz: float = 10.0  # while the virtual space is shown
-    real_rate_hz: float = 1.0  # while the camera is shown, to keep the renderer warm; 0 = none
-    response_timeout_s: float = 0.5  # a request without an answer counts as lost after this
+    width: Annotated[int, Range(16, 4096)] = 320  # with height: number of pixels; the shape is the window's
+    height: Annotated[int, Range(16, 4096)] = 180
+    fov_margin: Annotated[float, Range(1, 2)] = 1.15  # asked field of view over the shown one, to be re-aimed
+    virtual_rate_hz: Positive = 10.0  # while the virtual space is shown
+    real_rate_hz: NotNegative = 1.0  # while the camera is shown, to keep the renderer warm; 0 = none
+    response_timeout_s: Positive = 0.5  # a request without an answer counts as lost after this
 
     def __post_init__(self) -> None:
-        for key in ("width", "height"):
-            if not 16 <= getattr(self, key) <= 4096:
-                raise ValueError(f"{key} must be in [16, 4096] (got {getattr(self, key)})")
-        if not 1.0 <= self.fov_margin <= 2.0:
-            raise ValueError(f"fov_margin must be in [1, 2] (got {self.fov_margin})")
-        if not self.virtual_rate_hz > 0:
-            raise ValueError(f"virtual_rate_hz must be > 0 (got {self.virtual_rate_hz})")
-        if not self.real_rate_hz >= 0:
-            raise ValueError(f"real_rate_hz must be >= 0 (got {self.real_rate_hz})")
-        if not self.response_timeout_s > 0:
-            raise ValueError(f"response_timeout_s must be > 0 (got {self.response_timeout_s})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..ranges import NotNegative, Positive, check_ranges
+
 
 @dataclass(frozen=True)
 class KeyframeConfig:
@@ -20,16 +22,12 @@ class KeyframeConfig:
             a better one; then it goes out marked as not fit. A fit one replaces it as soon as there is one.
     """
 
-    distance_m: float = 0.6
-    angle_deg: float = 45.0
-    unfit_after_s: float = 5.0
+    distance_m: Positive = 0.6
+    angle_deg: Positive = 45.0
+    unfit_after_s: NotNegative = 5.0
 
     def __post_init__(self) -> None:
-        for key in ("distance_m", "angle_deg"):
-            if getattr(self, key) <= 0:
-                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
-        if self.unfit_after_s < 0:
-            raise ValueError(f"unfit_after_s must be 0 or more (got {self.unfit_after_s})")
+        check_ranges(self)
 
 
 class KeyframeSelector:

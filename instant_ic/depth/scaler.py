@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import equirect_pixels
+
+from ..ranges import NotNegative, Positive, Range, Share, check_ranges
 
 Floats = NDArray[np.floating]
 MIN_VALUES = 20
@@ -45,36 +48,27 @@ class ScalerConfig:
 
     method: str = "median_ratio"
     maxima: str = "lidar"
-    confidence: float = 0.995
+    confidence: Annotated[float, Range(0.5, 1)] = 0.995
     output_kind: str = "metric"
-    min_range_m: float = 0.4
-    max_range_m: float = 16.0
-    min_points: int = 300
-    min_azimuth_deg: float = 90.0
-    agreement: float = 0.15
-    min_quality: float = 0.25
-    min_scale: float = 0.05
-    max_scale: float = 20.0
-    assumed_sigma: float = 0.2
+    min_range_m: NotNegative = 0.4
+    max_range_m: Positive = 16.0
+    min_points: Annotated[int, Range(MIN_VALUES)] = 300
+    min_azimuth_deg: Annotated[float, Range(0, 360)] = 90.0
+    agreement: Annotated[float, Range(above=0, below=1)] = 0.15
+    min_quality: Share = 0.25
+    min_scale: Positive = 0.05
+    max_scale: Positive = 20.0
+    assumed_sigma: Annotated[float, Range(above=0, high=1)] = 0.2
 
     def __post_init__(self) -> None:
         for key, allowed in (("method", METHODS), ("maxima", MAXIMA), ("output_kind", OUTPUT_KINDS)):
             if getattr(self, key) not in allowed:
                 raise ValueError(f"{key} must be one of {', '.join(allowed)} (got {getattr(self, key)!r})")
-        if not 0.5 <= self.confidence <= 1.0:
-            raise ValueError(f"confidence must be 0.5 to 1 (got {self.confidence})")
-        if not 0 <= self.min_range_m < self.max_range_m:
+        check_ranges(self)
+        if not self.min_range_m < self.max_range_m:
             raise ValueError(f"min_range_m must be under max_range_m (got {self.min_range_m}, {self.max_range_m})")
-        if self.min_points < MIN_VALUES:
-            raise ValueError(f"min_points must be {MIN_VALUES} or more (got {self.min_points})")
-        if not 0 <= self.min_azimuth_deg <= 360:
-            raise ValueError(f"min_azimuth_deg must be 0 to 360 (got {self.min_azimuth_deg})")
-        if not 0 < self.agreement < 1 or not 0 <= self.min_quality <= 1:
-            raise ValueError(f"agreement and min_quality must lie in 0..1 (got {self.agreement}, {self.min_quality})")
-        if not 0 < self.min_scale < self.max_scale:
-            raise ValueError(f"min_scale must be under max_scale, above 0 (got {self.min_scale}, {self.max_scale})")
-        if not 0 < self.assumed_sigma <= 1:
-            raise ValueError(f"assumed_sigma must lie in 0..1 (got {self.assumed_sigma})")
+        if not self.min_scale < self.max_scale:
+            raise ValueError(f"min_scale must be under max_scale (got {self.min_scale}, {self.max_scale})")
         if self.method == "as_estimated" and self.output_kind != "metric":
             raise ValueError(f"method as_estimated needs output_kind metric (got {self.output_kind!r})")
 

@@ -2,6 +2,9 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
+
+from ..ranges import NotNegative, Positive, Range, Share, check_ranges
 
 
 @dataclass(frozen=True)
@@ -14,19 +17,15 @@ class DecoderConfig:
         max_range: farther returns are left out, metres.
     """
 
-    cut_angle_deg: float = 180.0
-    min_range: float = 0.4
-    max_range: float = 130.0
+    cut_angle_deg: Annotated[float, Range(0, below=360)] = 180.0
+    min_range: NotNegative = 0.4
+    max_range: Annotated[float, Range(above=0, high=131.07)] = 130.0
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if not 0.0 <= self.cut_angle_deg < 360.0:
-            raise ValueError(f"cut_angle_deg must be in 0..360 (got {self.cut_angle_deg})")
-        if not 0.0 <= self.min_range < self.max_range <= 131.07:
-            raise ValueError(
-                f"min_range must be >= 0 and below max_range, which is at most 131.07 m "
-                f"(got {self.min_range}, {self.max_range})"
-            )
+        check_ranges(self)
+        if not self.min_range < self.max_range:
+            raise ValueError(f"min_range must be below max_range (got {self.min_range}, {self.max_range})")
 
 
 @dataclass(frozen=True)
@@ -44,18 +43,15 @@ class FlatScanConfig:
 
     min_height: float = 0.10
     max_height: float = 1.30
-    beams: int = 720
-    range_min: float = 0.4
-    range_max: float = 100.0
-    min_coverage: float = 0.5
+    beams: Annotated[int, Range(4, 7200)] = 720
+    range_min: NotNegative = 0.4
+    range_max: Positive = 100.0
+    min_coverage: Share = 0.5
 
     def __post_init__(self) -> None:
         """Check the values."""
+        check_ranges(self)
         if not (math.isfinite(self.min_height) and self.min_height < self.max_height):
             raise ValueError(f"min_height must be below max_height (got {self.min_height}, {self.max_height})")
-        if not 4 <= self.beams <= 7200:
-            raise ValueError(f"beams must be in 4..7200 (got {self.beams})")
-        if not 0.0 <= self.range_min < self.range_max:
+        if not self.range_min < self.range_max:
             raise ValueError(f"range_min must be below range_max (got {self.range_min}, {self.range_max})")
-        if not 0.0 <= self.min_coverage <= 1.0:
-            raise ValueError(f"min_coverage must be in 0..1 (got {self.min_coverage})")

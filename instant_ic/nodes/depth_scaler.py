@@ -71,8 +71,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.last_ns: int | None = None
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
-        if self.config.scaler.method == "as_estimated":
-            self.log.warning("depth is taken as estimated, the LiDAR is not asked: for recordings, not for driving")
+        self.warn_of_method()
         self.transforms = self.tf  # subscribes now: the past must be known when the first depth comes
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_picture, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.clouds.append, qos=SENSOR)
@@ -81,6 +80,11 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     def reconfigure(self, config: DepthScalerConfig) -> None:
         super().reconfigure(config)
         self.scaler.config, self.selector.config = config.scaler, config.keyframes
+        self.warn_of_method()
+
+    def warn_of_method(self) -> None:
+        if self.config.scaler.method == "as_estimated":
+            self.log.warning("depth is taken as estimated, the LiDAR is not asked: for recordings, not for driving")
 
     def on_picture(self, message: Any) -> None:
         self.pictures[stamp_ns(message)] = message
