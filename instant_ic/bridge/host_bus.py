@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,10 +29,13 @@ class ExportedTopics:
         node: the bridge's node.
         rules: topics to give, by name without namespace.
         link: where they go.
+        on_trouble: called with topic and words when a topic cannot go.
     """
 
-    def __init__(self, node: Node[Any], rules: dict[str, TopicRule], link: HostLink) -> None:
-        self._node, self._rules, self._link = node, rules, link
+    def __init__(
+        self, node: Node[Any], rules: dict[str, TopicRule], link: HostLink, on_trouble: Callable[[str, str], None]
+    ) -> None:
+        self._node, self._rules, self._link, self._on_trouble = node, rules, link, on_trouble
         self._bridges: set[str] = {node.node_name}
         self._offered: dict[tuple[str, str], QoS] = {}
         for name in rules:
@@ -50,7 +54,8 @@ class ExportedTopics:
                 qos = PRESETS.get(publisher.qos, SENSOR)
                 self._offered[name, publisher.node] = qos
                 if publisher.node not in self._bridges and (name, publisher.node) not in before:
-                    self._link.open(name, publisher.node, publisher.type_name, (qos.name, qos.latched, qos.reliable))
+                    with self._told(name):
+                        self._link.open(name, publisher.node, publisher.type_name, _fields(qos))
         for name, origin in before.keys() - self._offered.keys():
             self._link.forget(name, origin)
 
@@ -62,15 +67,23 @@ class ExportedTopics:
         if origin in self._bridges:
             return
         qos = self._offered[name, origin]
-        self._link.offer(
-            name,
-            origin,
-            received.type_name,
-            (qos.name, qos.latched, qos.reliable),
-            bytes(received.payload),
-            received.publish_ns,
-            wall_time=not self._node.use_sim_time,
-        )
+        wall_time = not self._node.use_sim_time
+        with self._told(name):
+            self._link.offer(
+                name, origin, received.type_name, _fields(qos), received.payload, received.publish_ns, wall_time
+            )
+
+    @contextmanager
+    def _told(self, name: str) -> Iterator[None]:
+        """A type that this host does not know is told once, not with a trace for each message."""
+        try:
+            yield
+        except ValueError as error:
+            self._on_trouble(name, str(error))
+
+
+def _fields(qos: QoS) -> tuple[str, bool, bool]:
+    return qos.name, qos.latched, qos.reliable
 
 
 @dataclass

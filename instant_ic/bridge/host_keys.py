@@ -177,15 +177,19 @@ class KeyStore:
         """The allowed hosts; none when the file is not there.
 
         Raises:
-            KeyFileError: the file cannot be read, or a line of it is wrong.
+            KeyFileError: the file cannot be read, others can write it, or a line of it is wrong.
         """
         path = self.allowed_path
         try:
-            lines = path.read_text().splitlines()
+            with path.open() as file:
+                mode = os.fstat(file.fileno()).st_mode
+                lines = file.read().splitlines()
         except FileNotFoundError:
             return []
         except (OSError, UnicodeDecodeError) as error:
             raise KeyFileError(f"{path} cannot be read: {error}") from error
+        if mode & 0o022:
+            raise KeyFileError(f"{path} can be written by others (mode {mode & 0o777:04o}): chmod 600 {path}")
         peers: list[Peer] = []
         for number, line in enumerate(lines, 1):
             words = line.partition("#")[0].split()

@@ -178,7 +178,7 @@ class HostLink(ABC):
         origin: str,
         type_name: str,
         qos: tuple[str, bool, bool],
-        payload: bytes,
+        payload: bytes | memoryview,
         publish_ns: int,
         wall_time: bool = True,
     ) -> None:
@@ -189,17 +189,23 @@ class HostLink(ABC):
             origin: node that published it.
             type_name: its type.
             qos: preset's name, whether latched, whether reliable.
-            payload: CDR bytes.
+            payload: CDR bytes; copied where anybody takes them.
             publish_ns: when it was published.
             wall_time: whether that is the machine's time, not a simulated one.
+
+        Raises:
+            ValueError: the type is not known here.
         """
         with self._lock:
             channel = self._channel(topic, origin, type_name, qos)
             channel.sequence += 1
-            item = Item(payload, publish_ns, time.monotonic_ns(), channel.sequence, wall_time)
+            connections = self._connections()
+            if not connections and not channel.latched:
+                return
+            item = Item(bytes(payload), publish_ns, time.monotonic_ns(), channel.sequence, wall_time)
             if channel.latched:
                 channel.last = item
-            for connection in self._connections():
+            for connection in connections:
                 connection.session.offer(channel, item)
             self._wake()
 

@@ -191,7 +191,7 @@ class Session:
         memory: what is known of the other host from earlier links.
         clocks: the machine's, or simulated ones.
         times: pings and timeouts.
-        may_send: whether the other's topics are taken at all (a viewer's are not); its topics are refused otherwise.
+        may_send: whether the other's topics are taken at all; a viewer's are not.
     """
 
     def __init__(
@@ -231,6 +231,8 @@ class Session:
             self._replies.append(Hello(VERSION, side.name, side.instance, self._wants()))
 
     def _wants(self) -> dict[str, Any]:
+        if not self.may_send:
+            return {}
         return {topic: rule.rate_hz for topic, rule in self.side.imports.items()}
 
     # -- out --------------------------------------------------------------------------------------
@@ -397,6 +399,8 @@ class Session:
         self.peer_name, self.peer_instance = message.name[:64], message.instance[:64]
         self.outbox.wants = {topic: float(rate) for topic, rate in wants.items()}
         self.up, self.up_ns = True, self.clocks.mono_ns()
+        if not self.may_send:
+            self.notify("role", f"this host may only watch {self.side.name} (role viewer)")
         self._next_ping_ns = self.up_ns
         # Starts of the other that are over: their numbers say nothing any more.
         received = self.memory.received

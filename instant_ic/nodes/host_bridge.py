@@ -30,7 +30,8 @@ from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main
 from instant_ic.msg import type_hash
 from instant_ic.ranges import Positive, check_ranges
 
-LOOK_S = 0.25
+LOOK_S = 0.5
+LATE_READERS_S = 0.1
 RECENT_S = 10.0
 
 
@@ -95,17 +96,18 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.log.info("connects to %s at %s as %s", robot.name, config.connect, identity.name)
         except (KeyFileError, LinkError) as error:
             raise NodeError(str(error)) from None
-        self.outgoing = ExportedTopics(self, exports, self.link)
+        self.outgoing = ExportedTopics(self, exports, self.link, self.trouble)
         self.problem = ""
         self.lost_link = ""
         self.strangers = RecentCount(RECENT_S)
         self.misses = RecentCount(RECENT_S)
         self.missed = 0
         self.clock_told: set[str] = set()
+        self.troubled: set[str] = set()
         self.outgoing.look()
         self.link.start()
         self.timer(LOOK_S, self.outgoing.look)
-        self.timer(LOOK_S, self.incoming.serve_late_readers)
+        self.timer(LATE_READERS_S, self.incoming.serve_late_readers)
         self.timer(1.0, self.tell)
 
     def teardown(self) -> None:
@@ -134,6 +136,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         match event:
             case Up():
                 self.log.info("linked with %s", peer)
+                for topic in self.troubled:
+                    self.diagnose(f"topic {topic}", OK, "no trouble since the newest link was made")
+                self.troubled.clear()
                 self.tell()
             case Ended():
                 self.lost_link = f"the link with {peer} ended: {event.reason}"
@@ -161,6 +166,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
 
     def trouble(self, topic: str, text: str) -> None:
         """A topic that does not go over the link."""
+        self.troubled.add(topic)
         self.diagnose(f"topic {topic}", ERROR, text)
 
     # -- what it tells -----------------------------------------------------------------------------

@@ -80,6 +80,13 @@ def test_key_that_others_can_read_is_refused(store):
         store.identity()
 
 
+def test_list_that_others_can_write_is_refused(store):
+    store.allow(Peer("station", "driver", KEY))
+    store.allowed_path.chmod(0o620)
+    with pytest.raises(KeyFileError, match=r"written by others .*chmod 600"):
+        store.peers()
+
+
 def test_missing_and_damaged_identity(store):
     with pytest.raises(KeyFileError, match="ic keys new"):
         store.identity()

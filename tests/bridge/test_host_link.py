@@ -242,7 +242,8 @@ def test_robot_that_starts_anew_is_met_again_within_two_seconds(ends, keys):
     b = station(ends, keys, port)
     linked(a, b)
     a.link.stop()
-    wait_for(lambda: any(e.code == "closing" for e in b.of(Ended)), "goodbye")
+    wait_for(lambda: b.of(Ended), "goodbye")
+    assert b.of(Ended)[0].code in ("closing", "gone")  # on a busy machine the connection may be faster than the word
     again = robot(ends, keys, port)
     begun = time.monotonic()
     linked(again, b)

@@ -335,14 +335,19 @@ def test_other_fields_of_a_type_are_refused_and_told_on_both_sides():
 
 def test_viewer_may_send_nothing():
     world = World([STATE], [COMMAND])
-    world.sessions["robot"].may_send = False
+    robot = world.sessions["robot"]
+    robot.may_send = False
     world.run(0.1)
     world.publish("station", COMMAND.topic, b"go")
     world.publish("robot", STATE.topic, b"x")
     world.run(0.1)
     assert world.arrived("robot") == [] and len(world.arrived("station")) == 1
-    (refused,) = [e for _, e in world.events["station"] if isinstance(e, Refused)]
+    assert sum(world.sessions["station"].outbox.sent) == 0
+    assert "may only watch robot (role viewer)" in world.sessions["station"].notices["role"]
+    # Nor if it tries all the same.
+    (refused,) = robot.receive(Announce(1, COMMAND.topic, "n", "std_msgs/msg/String", DIGEST, "sensor").encode())
     assert "viewer" in refused.reason
+    assert robot.receive(Data(1, 1, 0, 0, 0, 2, 0, b"go").encode()) == []
 
 
 def test_topic_that_is_not_on_the_list_is_refused_even_from_a_driver():
