@@ -45,6 +45,8 @@ SPARE_M = 0.05
 """A goal is reachable when the footprint with this much to spare on every side gets there."""
 TURNING_RAD_S = 0.1
 """Slower than this the robot does not count as turning when changes of direction are counted."""
+LET_GO_M = 0.1
+"""A contact with a person is over when they are this far apart again."""
 OPERATOR_M_S = 0.4
 
 
@@ -147,7 +149,7 @@ class _Drive:
 
     def run(self) -> Episode:
         episode = self.episode
-        limit_s = 60.0 + (3.0 * episode.optimum_m / OPERATOR_M_S if episode.reachable else 0.0)
+        limit_s = 60.0 + 3.0 * episode.optimum_m / OPERATOR_M_S if episode.reachable else 40.0
         tracks: dict[str, list[FloatArray]] = {"robot": [], "vbot": []}
         turning, before = 0.0, self.robot.pose.copy()
         for k in range(round(limit_s / DT_S)):
@@ -264,9 +266,9 @@ class _Drive:
             self.robot.step(steering.motors_from_tracks(steering.tracks_from_twist(*self.velocity)), DT_S / 3)
         for i, person in enumerate(self.people):
             gap, _ = worlds.gap_to_robot(person.place, self.robot.pose)
-            if gap > 0.0:
+            if gap > LET_GO_M:
                 self.touching.discard(i)
-            elif i not in self.touching:
+            elif gap <= 0.0 and i not in self.touching:
                 self.touching.add(i)
                 # Whose doing it is: had the robot stood still, would they be as near?
                 closer = worlds.gap_to_robot(person.place, before)[0] - gap

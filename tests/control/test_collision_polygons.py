@@ -1,0 +1,135 @@
+"""Collision monitor: each action of a polygon by hand, the most restrictive wins, old points stop."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.control.arbiter import Arbiter, ArbiterInputs, Mode
+from instant_ic.control.costmap import CostmapConfig, RollingCostmap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.heights import sort_points
+from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig, parse_polygon
+
+OFF = PolygonConfig(enabled=False)
+AHEAD = "[[1.0, 0.4], [1.0, -0.4], [0.0, -0.4], [0.0, 0.4]]"
+
+
+def monitor(**polygons: PolygonConfig) -> CollisionMonitor:
+    config = {"stop": OFF, "slowdown": OFF, "limit": OFF, "approach": OFF} | polygons
+    return CollisionMonitor(CollisionMonitorConfig(**config), Footprint())
+
+
+def post(x: float, y: float = 0.0, points: int = 3) -> np.ndarray:
+    return np.array([[x, y + 0.001 * k] for k in range(points)])
+
+
+def test_slowdown_takes_its_share_while_something_is_inside() -> None:
+    slow = monitor(slowdown=PolygonConfig(action_type="slowdown", points=AHEAD, slowdown_ratio=0.4))
+    found = slow.limit((0.5, 0.2), post(0.9))
+    assert found.command == pytest.approx((0.2, 0.08))
+    assert (found.action, found.polygon) == ("slowdown", "slowdown")
+    assert slow.limit((0.5, 0.2), post(1.1)).action == "free"
+    assert slow.limit((0.5, 0.2), post(0.9, 0.5)).action == "free"
+
+
+def test_limit_caps_both_speeds_by_one_factor() -> None:
+    capped = monitor(limit=PolygonConfig(action_type="limit", points=AHEAD, linear_limit=0.25, angular_limit=0.5))
+    assert capped.limit((0.5, 0.2), post(0.9)).command == pytest.approx((0.25, 0.1))
+    assert capped.limit((0.5, 2.0), post(0.9)).command == pytest.approx((0.125, 0.5))
+    assert capped.limit((0.2, 0.3), post(0.9)).action == "free"  # slow enough already
+    assert capped.limit((-0.5, 0.0), post(0.9)).command == pytest.approx((-0.25, 0.0))
+
+
+def test_stop_holds_what_leads_deeper_and_lets_out_what_leads_away() -> None:
+    stop = monitor(stop=PolygonConfig(action_type="stop", points=AHEAD))
+    assert stop.limit((0.3, 0.0), post(0.9)).command == (0.0, 0.0)
+    assert stop.limit((0.3, 0.0), post(0.9)).polygon == "stop"
+    assert stop.limit((-0.3, 0.0), post(0.9)).action == "free"
+    assert stop.limit((0.3, 0.0), post(1.1)).action == "free"  # it looks at what is inside, not ahead
+
+
+def test_approach_slows_in_proportion_to_the_time_to_contact() -> None:
+    # Padded nose at 0.34 m, wall at 0.64 m: 0.30 m at 0.5 m/s is 0.6 s of 1.2 s.
+    wall = np.column_stack([np.full(81, 0.641), np.linspace(-0.5, 0.5, 81)])
+    found = monitor(approach=PolygonConfig()).limit((0.5, 0.0), wall)
+    assert found.action == "approach"
+    assert found.command[0] == pytest.approx(0.25, abs=0.025)
+    assert found.time_to_collision_s == pytest.approx(0.6, abs=0.051)
+
+
+def test_the_most_restrictive_wins() -> None:
+    both = monitor(
+        slowdown=PolygonConfig(action_type="slowdown", points=AHEAD, slowdown_ratio=0.8),
+        limit=PolygonConfig(action_type="limit", points=AHEAD, linear_limit=0.1),
+    )
+    assert both.limit((0.5, 0.0), post(0.9)).polygon == "limit"  # 0.1 against 0.4
+    assert both.limit((0.11, 0.0), post(0.9)).polygon == "slowdown"  # 0.088 against 0.1
+    everything = CollisionMonitor(CollisionMonitorConfig(), Footprint())
+    assert everything.limit((0.5, 0.0), post(0.345)).command == (0.0, 0.0)
+
+
+def test_few_points_are_noise() -> None:
+    slow = monitor(slowdown=PolygonConfig(action_type="slowdown", points=AHEAD, min_points=3))
+    assert slow.limit((0.5, 0.0), post(0.9, points=2)).action == "free"
+    assert slow.limit((0.5, 0.0), post(0.9, points=3)).action == "slowdown"
+
+
+@pytest.mark.parametrize("age", [0.51, math.inf, math.nan])
+def test_points_that_are_too_old_stop_the_robot(age: float) -> None:
+    watched = CollisionMonitor(CollisionMonitorConfig(), Footprint())
+    assert watched.limit((0.5, 0.0), post(5.0), 0.49).action == "free"
+    found = watched.limit((0.5, 0.0), post(5.0), age)
+    assert (found.command, found.polygon) == ((0.0, 0.0), "source_timeout")
+
+
+def test_polygons_are_read_as_nav2_writes_them() -> None:
+    corners = parse_polygon("[[0.5, 0.3], [0.5, -0.3], [-0.5, 0.0]]")
+    area = 0.5 * sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True))
+    assert area == pytest.approx(0.3)  # counter-clockwise now
+    np.testing.assert_allclose(PolygonConfig(padding_m=0.1).corners(Footprint())[0], [0.40, 0.35])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("0.5, 0.3", "a list like"),
+        ("[[0.5, 0.3], [0.5]]", "a list like"),
+        ("[[0.5, 0.3], [0.5, -0.3]]", "three corners"),
+        ("[[1, 0], [0, 1], [0.1, 0.1], [0, -1]]", "convex"),
+        ("[[0, 0], [1, 0], [2, 0]]", "convex"),
+        ('[[0, 0], [1, 0], ["a", 1]]', "a list like"),
+        ("[[0, 1], [0.6, -0.8], [-0.95, 0.3], [0.95, 0.3], [-0.6, -0.8]]", "convex"),  # a star
+    ],
+)
+def test_what_is_no_polygon_is_told(text: str, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        PolygonConfig(points=text)
+
+
+def test_the_arbiter_holds_before_a_low_thing_that_only_its_memory_knows() -> None:
+    """A kerb 0.10 m high, 0.5 m ahead: the LiDAR does not see it from here, and the operator drives on."""
+    rolling = RollingCostmap(CostmapConfig(width=6.0), Footprint())
+    kerb = np.array([[0.62 + 0.01 * i, y, 0.1] for i in range(5) for y in np.arange(-0.4, 0.4, 0.01)], np.float32)
+    pose = np.eye(4)
+    pose[0, 3], pose[2, 3] = -2.0, 0.6  # seen from 2 m farther back
+    points = (kerb - pose[:3, 3]).astype(np.float32)
+    sweep = sort_points(points, np.zeros(len(points), np.float32), pose[None], 0.0, CostmapConfig().points)
+    costmap = rolling.update(np.zeros(3), None, None, sweep)
+    arbiter = Arbiter()
+    arbiter.mode = Mode.REAL
+    inputs = ArbiterInputs(
+        robot_pose=np.zeros(3),
+        operator_command=(0.4, 0.0),
+        costmap=costmap,
+        ages=dict.fromkeys(["scan", "odometry", "pose", "camera", "command"], 0.0),
+    )
+    sent = arbiter._monitored((0.4, 0.0), arbiter._assess(inputs, 0))
+    # Padded nose at 0.34 m, kerb from 0.625 m: 0.285 m at 0.4 m/s is 0.71 s of 1.2 s.
+    assert sent.action == "approach"
+    assert sent.command[0] == pytest.approx(0.4 * 0.71 / 1.2, abs=0.03)
+    assert arbiter._monitored((-0.4, 0.0), arbiter._assess(inputs, 0)).action == "free"
+    old = ArbiterInputs(**{**vars(inputs), "ages": {**inputs.ages, "points": 0.6}})
+    assert arbiter._monitored((-0.4, 0.0), arbiter._assess(old, 0)).polygon == "source_timeout"

@@ -1,0 +1,215 @@
+"""``ic evaluate follow``: its own world by hand (LiDAR, people, shortest way), and one drive from end to end."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from instant_ic.cli.main import main
+from instant_ic.evaluation import follow
+from instant_ic.evaluation import follow_worlds as worlds
+from instant_ic.evaluation.follow_worlds import Person, Room
+
+
+def room(*shapes: tuple[float, ...]) -> Room:
+    size = np.array([10.0, 8.0])
+    kinds = np.ones(len(shapes), int)
+    start = np.array([2.0, 4.0, 0.0])
+    return Room(size, np.array(shapes, float).reshape(-1, 7), kinds, start, np.array([8.0, 4.0]), np.zeros((2, 2)))
+
+
+class Quiet:
+    """A source of noise that makes none."""
+
+    @staticmethod
+    def normal(mean: float, sigma: float, shape: tuple[int, ...]) -> np.ndarray:
+        return np.zeros(shape)
+
+
+def ahead(points: np.ndarray) -> np.ndarray:
+    """Points within 1° of straight ahead, by height."""
+    near = points[np.abs(np.arctan2(points[:, 1], points[:, 0])) < math.radians(0.15)]
+    return near[np.argsort(near[:, 2])]
+
+
+class TestLidar:
+    def test_each_ring_meets_what_is_at_its_height(self) -> None:
+        # A box 0.5 m high whose front is 3 m ahead; a wall behind it at 6 m, 2.5 m high.
+        seen = ahead(
+            worlds.look(
+                room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.5), (8.05, 4.0, 0.05, 3.0, 0.0, 0.0, 2.5)),
+                [],
+                np.array([2.0, 4.0, 0.0]),
+                Quiet(),
+            )
+        )  # type: ignore[arg-type]
+        rings = np.degrees(np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1])))
+        reach = dict(zip(np.round(rings[::2]).astype(int), np.hypot(seen[::2, 0], seen[::2, 1]), strict=True))
+        assert reach[-15] == pytest.approx(0.6 / math.tan(math.radians(15)), abs=1e-3)  # the ground
+        assert reach[-11] == pytest.approx(3.0, abs=1e-3)  # 0.6 - 3 tan 11° = 0.017: just its foot
+        assert reach[-3] == pytest.approx(3.0, abs=1e-3)  # 0.44 m high
+        assert reach[-1] == pytest.approx(6.0, abs=1e-3)  # over it
+        assert reach[15] == pytest.approx(6.0, abs=1e-3)  # 2.2 m: the wall still
+        top = ahead(worlds.look(room((5.5, 4.0, 0.5, 1.0, 0.0, 0.0, 0.4)), [], np.array([2.0, 4.0, 0.0]), Quiet()))  # type: ignore[arg-type]
+        assert np.isclose(top[:, 0], 0.2 / math.tan(math.radians(3)), atol=1e-3).any()  # its top, 3.8 m off
+
+    def test_hanging_things_and_people(self) -> None:
+        person = Person(np.array([4.0, 4.0]), np.zeros(2), 0.0, True)
+        seen = ahead(
+            worlds.look(room((4.0, 6.0, 0.2, 0.2, 0.0, 0.9, 2.0)), [person], np.array([2.0, 4.0, 0.0]), Quiet())
+        )  # type: ignore[arg-type]
+        level = seen[np.argmin(np.abs(seen[:, 2]))]
+        assert level[0] == pytest.approx(2.0 - worlds.PERSON_M, abs=1e-3)
+        side = worlds.look(room((2.0, 6.5, 0.2, 0.2, 0.0, 0.9, 2.0)), [], np.array([2.0, 4.0, 0.0]), Quiet())  # type: ignore[arg-type]
+        left = side[np.abs(np.arctan2(side[:, 1], side[:, 0]) - math.pi / 2) < 0.01]
+        above = left[left[:, 2] > 0]
+        assert (above[:, 2] + 0.6).min() >= 0.9 - 1e-6  # rings under it pass through
+        assert above[:, 1].min() == pytest.approx(2.3, abs=1e-3)
+
+    def test_the_flat_scan_takes_the_nearest_of_its_band(self) -> None:
+        low, post = [1.0, 0.001, 0.05 - 0.6], [2.0, 0.001, 0.5 - 0.6]
+        ranges = worlds.flat_ranges(np.array([low, post]))
+        assert ranges[360] == pytest.approx(2.0, abs=1e-3)
+        assert np.isinf(np.delete(ranges, 360)).all()
+
+
+class TestPeople:
+    robot = np.array([2.0, 4.0, 0.0])
+
+    def test_gap_to_the_footprint(self) -> None:
+        gap, towards = worlds.gap_to_robot(np.array([3.0, 4.1]), self.robot)  # 0.7 m from the nose
+        assert gap == pytest.approx(0.7 - worlds.PERSON_M)
+        np.testing.assert_allclose(towards, [-1.0, 0.0], atol=1e-9)
+        turned, _ = worlds.gap_to_robot(np.array([3.0, 4.0]), np.array([2.0, 4.0, math.pi / 2]))
+        assert turned == pytest.approx(0.75 - worlds.PERSON_M)
+        assert worlds.gap_to_robot(np.array([2.1, 4.0]), self.robot)[0] < 0
+
+    @pytest.mark.parametrize(("looks", "nearest"), [(True, 0.5), (False, 0.0)])
+    def test_who_looks_stops_before_the_robot_who_does_not_walks_into_it(self, looks: bool, nearest: float) -> None:
+        person, rng = Person(np.array([6.0, 4.0]), np.array([0.6, 4.0]), 1.0, looks), np.random.default_rng(0)
+        gaps = []
+        for _ in range(100):
+            worlds.walk(room((9.9, 4.0, 0.05, 4.0, 0.0, 0.0, 2.5)), person, self.robot, 0.05, rng)
+            gaps.append(worlds.gap_to_robot(person.place, self.robot)[0])
+            if person.waited_s > 0:
+                break
+        assert gaps[-1] == pytest.approx(nearest, abs=0.051)
+
+    def test_a_contact_is_of_who_made_it(self) -> None:
+        drive = follow._Drive(0, 0)
+        drive.late.clear()
+        drive.late.append((0.0, 0.0))
+        x, y, yaw = drive.robot.pose
+        inside = np.array([x + 0.45 * math.cos(yaw), y + 0.45 * math.sin(yaw)])  # 0.15 m before the nose
+        drive.people = [Person(inside, inside, 0.0, True)]
+        drive._move((0.0, 0.0))
+        drive._move((0.0, 0.0))
+        assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 0)
+        drive.touching.clear()
+        drive.velocity, drive.robot.tracks[:] = (0.4, 0.0), 0.4
+        drive.late[0] = (0.4, 0.0)
+        drive._move((0.4, 0.0))
+        assert (drive.episode.people_into_robot, drive.episode.people_contacts) == (1, 1)
+
+
+class TestShortestWay:
+    @staticmethod
+    def way(*shapes: tuple[float, ...], margin: float = 0.0) -> np.ndarray | None:
+        mask = worlds.filled(room(*shapes).shapes, np.array([10.0, 8.0]), 0.025, worlds.IN_THE_WAY_M)
+        return worlds.shortest_way(mask, np.array([2.0, 4.0, 0.0]), np.array([8.0, 4.0, 0.0]), 0.05, margin)
+
+    def test_straight_where_nothing_is_and_over_and_under_what_is_not_in_the_way(self) -> None:
+        flat, high = (5.0, 4.0, 0.3, 3.0, 0.0, 0.0, 0.04), (6.0, 4.0, 0.3, 3.0, 0.0, 1.4, 2.0)
+        way = self.way(flat, high)
+        assert way is not None
+        assert np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum() == pytest.approx(6.0, abs=0.1)
+
+    def test_through_a_door_that_the_body_fits_and_no_other(self) -> None:
+        def wall(door: float) -> list[tuple[float, ...]]:
+            reach = (4.0 - door / 2) / 2
+            return [(5.0, reach, 0.05, reach, 0.0, 0.0, 2.5), (5.0, 8 - reach, 0.05, reach, 0.0, 0.0, 2.5)]
+
+        outer = [(5.0, -0.2, 6.0, 0.2, 0.0, 0.0, 2.5), (5.0, 8.2, 6.0, 0.2, 0.0, 0.0, 2.5)]
+        assert self.way(*wall(0.60), *outer) is not None
+        assert self.way(*wall(0.60), *outer, margin=0.08) is None
+        assert self.way(*wall(0.44), *outer) is None
+
+    def test_round_a_box_by_as_much_as_the_body_needs(self) -> None:
+        way = self.way((5.0, 4.0, 0.5, 1.0, 0.0, 0.0, 1.0))
+        assert way is not None
+        # To (4.5 - 0.25, 5.25), past it, and back: 2·hypot(2.25, 1.25) + 1.5 = 6.65; steps of 22.5° add 2 % at most.
+        length = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum())
+        assert 6.45 < length < 1.04 * 6.65
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[dict, Path]]:
+    out = tmp_path_factory.mktemp("r")
+    words = [
+        "--episodes",
+        "1",
+        "--seed",
+        "3",
+        "--jobs",
+        "1",
+        "--json",
+        str(out / "f.json"),
+        "--plot",
+        str(out / "f.png"),
+    ]
+    assert main(["evaluate", "follow", *words]) == 0
+    yield json.loads((out / "f.json").read_text()), out
+
+
+def test_a_drive_reaches_its_goal_without_contact_and_is_told_in_full(drive: tuple[dict, Path]) -> None:
+    figures, out = drive
+    assert figures["reached"] == figures["reachable"] == 1
+    assert figures["contacts"] == 0
+    assert figures["path_ratio_mean"] < 1.3
+    assert figures["yaw_rate_changes_per_m"] < 4
+    (each,) = figures["each"]
+    assert each["reached"] and each["people"] > 0
+    assert each["driven_m"] > 0.9 * each["optimum_m"] > 4.0
+    for name in ("planner", "controller", "costmap"):
+        assert 0 < figures[f"{name}_ms_p50"] <= figures[f"{name}_ms_p99"]
+    assert set(figures["targets"]) >= {"contacts == 0", "reached_share >= 0.95", "path_ratio_mean <= 1.2"}
+    assert (out / "f.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_same_seed_gives_the_same_drive(drive: tuple[dict, Path]) -> None:
+    again = follow.run_episode(3, 0)
+    (each,) = drive[0]["each"]
+    assert again.driven_m == pytest.approx(each["driven_m"], abs=1e-9)
+    assert (again.seconds, again.yaw_rate_changes) == (each["seconds"], each["yaw_rate_changes"])
+
+
+def test_what_cannot_be_done_is_told(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["evaluate", "follow", "--episodes", "0"]) == 1
+    assert "at least 1" in capsys.readouterr().err
+    assert main(["evaluate", "follow", "--json", str(tmp_path / "none" / "f.json")]) == 1
+    assert "no folder" in capsys.readouterr().err
+
+
+def test_figures_of_episodes_by_hand() -> None:
+    good = follow.Episode(0, 0, True, True, 20.0, 8.0, 8.8, yaw_rate_changes=4, clearance_m=0.2, planner_ms=[2.0, 4.0])
+    long = follow.Episode(1, 2, True, True, 30.0, 5.0, 6.0, people_into_robot=1, yaw_rate_changes=2, clearance_m=0.1)
+    lost = follow.Episode(2, 0, True, False, 60.0, 5.0, 3.2, contacts=1, clearance_m=0.0, reason="no way")
+    none = follow.Episode(3, 0, False, False, 40.0, math.inf, 2.0, clearance_m=0.3)
+    figures = follow.summary([good, long, lost, none])
+    assert (figures["reachable"], figures["reached"], figures["contacts"]) == (3, 2, 1)
+    assert figures["people_walked_into_robot"] == 1
+    assert figures["path_ratio_mean"] == pytest.approx((1.1 + 1.2) / 2)
+    assert figures["path_ratio_mean_without_people"] == pytest.approx(1.1)
+    assert figures["yaw_rate_changes_per_m"] == pytest.approx(6 / 20.0)
+    assert figures["planner_ms_p50"] == 3.0
+    assert not figures["targets"]["contacts == 0"]
+    assert not figures["targets"]["reached_share >= 0.95"]
+    assert figures["targets"]["path_ratio_mean <= 1.2"]
+    rows = follow.report([good, long, lost, none], 0)["each"]
+    assert rows[3]["optimum_m"] is None and rows[2]["path_ratio"] is None  # JSON knows no infinity
+    json.dumps(rows, allow_nan=False)
