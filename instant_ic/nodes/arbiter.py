@@ -151,7 +151,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.tick()  # not at the next timer: now
 
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
-        self.camera_ns = self.clock.now_ns()
+        self.camera_ns = self.clock.steady_ns()
 
     def age(self, latest: Latest) -> float:
         """Seconds since the newest message came, or since it was measured where that is longer."""
@@ -161,7 +161,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return max(latest.age_s, (self.clock.now_ns() - stamp_ns(message)) / 1e9)
 
     def ages(self) -> dict[str, float]:
-        camera = math.inf if self.camera_ns is None else (self.clock.now_ns() - self.camera_ns) / 1e9
+        camera = math.inf if self.camera_ns is None else (self.clock.steady_ns() - self.camera_ns) / 1e9
         ages = {
             "scan": self.age(self.scan),
             "odometry": self.age(self.odometry),
@@ -280,7 +280,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.publish_costmap(stamp_ns(scan))
 
     def publish_costmap(self, scan_ns: int) -> None:
-        now_ns, costmap = self.clock.now_ns(), self.costmap
+        now_ns, costmap = self.clock.steady_ns(), self.costmap
         # A little early counts: updates come at the scan's rate, not at this one.
         due_ns = 0.9e9 / self.config.costmap.publish_frequency
         if costmap is None or (self.costmap_sent_ns is not None and now_ns - self.costmap_sent_ns < due_ns):
@@ -319,7 +319,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             nav_command=_twist(self.nav),
             ages=ages,
         )
-        decision = self.arbiter.step(inputs, now_ns)
+        # Steady time: a clock that is set back must not make what has fallen silent look fresh.
+        decision = self.arbiter.step(inputs, self.clock.steady_ns())
         self.cmd_vel.publish(twist_stamped(*decision.command, now_ns))
         self.tell(decision, inputs, now_ns)
 

@@ -140,7 +140,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_panorama(self, message: CompressedImage) -> None:
         """Passes a panorama on as it came, with the camera's pose when it was taken."""
-        self._picture_ns = self.clock.now_ns()
+        self._picture_ns = self.clock.steady_ns()
         stamp = stamp_ns(message)
         map_from_camera = self.lookup("map", "camera", stamp)
         self.server.send_frame(
@@ -176,9 +176,9 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def request_view(self) -> None:
         """Asks the virtual space for the picture where the operator looks, if one is due."""
-        now = self.clock.now_ns()
+        now, steady_s = self.clock.now_ns(), self.clock.steady_ns() / 1e9
         virtual = self.mode == "virtual"
-        if not self.views.due(now / 1e9, virtual=virtual) or not (virtual or self.vspace_alive()):
+        if not self.views.due(steady_s, virtual=virtual) or not (virtual or self.vspace_alive()):
             return
         map_from_base = self.vbot_pose() if virtual else self.robot_pose()
         if map_from_base is None:
@@ -190,7 +190,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.request_out.publish(
             ViewRequest(
                 header=header("map", now),
-                id=self.views.asked(now / 1e9),
+                id=self.views.asked(steady_s),
                 pose=pose_message(map_from_camera),
                 fov_rad=shape.fov_rad,
                 width=shape.width,
@@ -246,7 +246,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def send_health(self) -> None:
         """Tells the page what is wrong, in the words of whoever found it."""
-        age_s = math.inf if self._picture_ns is None else (self.clock.now_ns() - self._picture_ns) / 1e9
+        age_s = math.inf if self._picture_ns is None else (self.clock.steady_ns() - self._picture_ns) / 1e9
         self.check("camera", age_s <= PICTURE_TIMEOUT_S, "no picture from the camera", age_s=age_s)
         self.check("controller", self.control.message is not None, "no state from the arbiter")
         self.check("pose", self.robot_pose() is not None, "the robot's pose is unknown")
@@ -266,7 +266,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def faults(self) -> list[dict[str, str]]:
         """Present faults, the worst of each node, the worst first: ``level`` (warn, error), ``name``, ``text``."""
-        now = self.clock.now_ns() / 1e9
+        now = self.clock.steady_ns() / 1e9
         found = [
             (level, name.partition(":")[0], text)
             for name, (level, text, seen) in self._diagnoses_seen.items()
@@ -287,13 +287,13 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
         """Keeps the newest diagnosis of each name."""
-        now = self.clock.now_ns() / 1e9
+        now = self.clock.steady_ns() / 1e9
         for status in message.status:
             self._diagnoses_seen[status.name] = (int(status.level), status.message, now)
 
     def on_heartbeat(self, message: NodeStatus) -> None:
         """Notes that a node lives; one that says it stops is not missed."""
-        self._heartbeats[message.node] = (self.clock.now_ns() / 1e9, int(message.state) == NodeStatus.STOPPING)
+        self._heartbeats[message.node] = (self.clock.steady_ns() / 1e9, int(message.state) == NodeStatus.STOPPING)
 
     # ---- map ------------------------------------------------------------------------------------
 

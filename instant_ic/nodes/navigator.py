@@ -107,7 +107,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         occupancy, resolution, origin = grid_array(grid)
         costmap = Costmap.from_occupancy(occupancy, resolution, np.array(origin))
         subgoal, velocity = self.moving(pose2_from_matrix(pose_matrix(goal)))
-        step = self.navigator.step(pose, self.speed, subgoal, costmap, self.clock.now_ns(), velocity)
+        step = self.navigator.step(pose, self.speed, subgoal, costmap, self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
             self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
         self.diagnose("follow", OK if step.plan.reached else WARN, step.plan.reason or step.state, state=step.state)

@@ -77,7 +77,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.loop: CameraLoop | None = None
         self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
         self.tell_mount()
-        self.last_ns = self.started_ns = self.clock.now_ns()
+        self.last_ns = self.started_ns = self.clock.steady_ns()
         self.published = self.published_told = 0
         self.camera = self.make_camera()
         self.diagnose("camera", WARN, f"connecting to {config.url}")
@@ -130,7 +130,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
     def publish(self, frame: Frame) -> None:
         """Send a picture as it is; runs on the camera's thread."""
         self.out.publish(compressed_image_message(frame.jpeg, self.config.frame_id, frame.stamp_ns))
-        self.last_ns = self.clock.now_ns()
+        self.last_ns = self.clock.steady_ns()
         self.published += 1
 
     def on_event(self, connected: bool, text: str) -> None:
@@ -139,7 +139,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
 
     def check(self) -> None:
         """Tell of silence, and of the rate; each second."""
-        silent_s = (self.clock.now_ns() - self.last_ns) * 1e-9
+        silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
         values = {
             "pictures": self.published,
             "rate_hz": self.published - self.published_told,

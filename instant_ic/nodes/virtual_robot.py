@@ -58,7 +58,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.map: StaticMap | None = None
         self.map_is_new = False
         self.transitions: int | None = None
-        self.stepped_ns = self.clock.now_ns()
+        self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
         self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
@@ -91,10 +91,10 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.walls = walls
 
     def tick(self) -> None:
-        now_ns = self.clock.now_ns()
+        now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
         # A late timer must not become a leap of the picture.
-        dt_s = min((now_ns - self.stepped_ns) / 1e9, 0.2)
-        self.stepped_ns = now_ns
+        dt_s = min((steady_ns - self.stepped_ns) / 1e9, 0.2)
+        self.stepped_ns = steady_ns
         state = self.state.message
         if state is None:
             self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")

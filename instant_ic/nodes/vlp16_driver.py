@@ -105,7 +105,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.partial = 0
         self.partial_told = 0
         self.told = (0, 0, 0)
-        self.last_ns = self.clock.now_ns()
+        self.last_ns = self.clock.steady_ns()
         self.base_from_lidar = pose_matrix(*config.mount_xyz, *np.radians(config.mount_rpy_deg))
         self.tf_broadcast_static("base_link", config.frame_id, self.base_from_lidar)
         self.tf.frames()  # odometry is listened to from now on
@@ -191,7 +191,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
 
     def take(self, payload: bytes, stamp: int) -> None:
         """Take one data packet; on whichever thread packets come."""
-        self.last_ns = self.clock.now_ns()
+        self.last_ns = self.clock.steady_ns()
         revolution = self.stream.feed(payload, stamp)
         if len(payload) == DATA_PACKET_BYTES:
             self.raw.append((payload, stamp))
@@ -284,7 +284,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     def check(self) -> None:
         """Tell of silence and losses; each second."""
         counters = self.stream.counters
-        silent_s = (self.clock.now_ns() - self.last_ns) * 1e-9
+        silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
         losses = (counters.missing, counters.bad, self.skipped)
         new = [now - before for now, before in zip(losses, self.told, strict=True)]
         self.told = losses
