@@ -15,7 +15,9 @@ from instant_ic.slam.config import (
     LoopConfig,
     MapConfig,
     MatchConfig,
+    MotionConfig,
     OdometryNoise,
+    ParticleConfig,
     SlamConfig,
 )
 from instant_ic.slam.grid_slam import GridSlam, SlamResult, SlamStatus
@@ -29,9 +31,11 @@ __all__ = [
     "LoopConfig",
     "MapConfig",
     "MatchConfig",
+    "MotionConfig",
     "OccupancyGrid",
     "OccupancyMap",
     "OdometryNoise",
+    "ParticleConfig",
     "Scan",
     "SlamConfig",
     "SlamResult",

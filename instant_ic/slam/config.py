@@ -169,6 +169,64 @@ class LoopConfig:
 
 
 @dataclass(frozen=True)
+class MotionConfig:
+    """When the wheels and the scans contradict each other."""
+
+    window_s: float = 2.0
+    still_m: float = 0.02
+    still_rad: float = 0.03
+    moved_m: float = 0.1
+    moved_rad: float = 0.15
+    carried_jump_m: float = 0.4
+    slip_share: float = 0.4
+    stuck_share: float = 0.85
+    turn_memory: float = 0.95
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "window_s", "still_m", "still_rad", "carried_jump_m")
+        _require(self, "moved_m", self.moved_m > self.still_m, "> still_m")
+        _require(self, "moved_rad", self.moved_rad > self.still_rad, "> still_rad")
+        _require(self, "slip_share", 0 < self.slip_share < 1, "between 0 and 1")
+        _require(self, "stuck_share", self.slip_share < self.stuck_share < 1, "between slip_share and 1")
+        _require(self, "turn_memory", 0 < self.turn_memory < 1, "between 0 and 1")
+
+
+@dataclass(frozen=True)
+class ParticleConfig:
+    """The particle filter (``backend: rbpf``); names and defaults are GMapping's, for who knows these."""
+
+    particles: int = 30
+    linearUpdate: float = 1.0
+    angularUpdate: float = 0.5
+    resampleThreshold: float = 0.5
+    maxUrange: float = 20.0
+    sigma: float = 0.05
+    kernelSize: int = 1
+    lstep: float = 0.05
+    astep: float = 0.05
+    iterations: int = 5
+    lsigma: float = 0.075
+    ogain: float = 3.0
+    lskip: int = 0
+    minimumScore: float = 0.0
+    srr: float = 0.1
+    srt: float = 0.2
+    str: float = 0.1
+    stt: float = 0.2
+    delta: float = 0.05
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _require_positive(
+            self, "linearUpdate", "angularUpdate", "maxUrange", "sigma", "lstep", "astep", "lsigma", "ogain", "delta"
+        )
+        _require_not_negative(self, "minimumScore", "srr", "srt", "str", "stt", "lskip", "kernelSize", "seed")
+        _require(self, "particles", self.particles >= 1, ">= 1")
+        _require(self, "iterations", self.iterations >= 0, ">= 0")
+        _require(self, "resampleThreshold", 0 <= self.resampleThreshold <= 1, "between 0 and 1")
+
+
+@dataclass(frozen=True)
 class MapConfig:
     """Occupancy grid drawn by ray casting from the keyframes."""
 
@@ -202,6 +260,8 @@ class SlamConfig:
     keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
+    motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
+    rbpf: ParticleConfig = dataclasses.field(default_factory=ParticleConfig)
 
     def __post_init__(self) -> None:
         _require(self, "backend", self.backend in BACKENDS, f"one of {', '.join(BACKENDS)}")

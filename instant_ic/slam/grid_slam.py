@@ -20,6 +20,7 @@ from instant_ic.slam.keyframes import Keyframe, grown_drift
 from instant_ic.slam.localization import Localizer
 from instant_ic.slam.loop_search import Found
 from instant_ic.slam.map_files import save_graph, save_grid
+from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray, Scan, scan_points
@@ -112,6 +113,7 @@ class GridSlam:
 
     Attributes:
         localized: whether the place in the saved map is known; True without one.
+        motion: compares wheels and scans.
     """
 
     def __init__(
@@ -129,6 +131,7 @@ class GridSlam:
         self.front_end = FrontEnd(self.config)
         self.back_end = BackEnd(self.config)
         self.map = OccupancyMap(self.config.map)
+        self.motion = MotionMonitor(self.config.motion)
         self._handed_over = 0
         self._busy = False
         self.map_from_base: FloatArray = np.zeros(3)
@@ -184,6 +187,18 @@ class GridSlam:
         if self._known is not None and (self._graph is None or not self.localized):
             return self._known
         return self.map.grid()
+
+    @property
+    def map_version(self) -> int:
+        """Grows when `grid` changes; 0 before there is one."""
+        if self._known is not None and (self._graph is None or not self.localized):
+            return 1
+        return self.map.version
+
+    @property
+    def map_clipped(self) -> int:
+        """Points outside ``map.max_size_m``."""
+        return self.map.clipped
 
     def save(self, stem: Path) -> list[Path]:
         """Write the map as ``stem.yaml``, ``stem.pgm`` and ``stem.graph.npz``; returns the files.
@@ -358,6 +373,9 @@ class GridSlam:
         step = relative2(self.map_from_base, track.pose)
         if self._stamp_ns is not None:
             self._step, self._step_s = step, (stamp_ns - self._stamp_ns) * 1e-9
+            if odometry is not None and self._odometry_stamp_ns == self._stamp_ns:
+                matched = track.status in (TrackStatus.TRACKED, TrackStatus.RECOVERED)
+                self.motion.update(relative2(self._odometry_pose, odometry), step, self._step_s, matched)
             if track.status not in (TrackStatus.TRACKED, TrackStatus.RECOVERED):
                 # A robot that cannot see must not run on in the estimate for ever.
                 self._step = 0.5 * self._step

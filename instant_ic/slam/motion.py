@@ -1,0 +1,126 @@
+"""What the wheels say against what the scans say: slip, a robot stuck, pushed or carried, and how it really turns."""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections import deque
+from dataclasses import dataclass
+
+from instant_ic.slam.config import MotionConfig
+from instant_ic.slam.scan import FloatArray
+
+
+class MotionState(enum.StrEnum):
+    """How the robot moves."""
+
+    NORMAL = "normal"
+    SLIPPING = "slipping"
+    """The tracks turn clearly farther than the robot moves."""
+    STUCK = "stuck"
+    """The tracks turn, the robot stands."""
+    PUSHED = "pushed"
+    """The robot moves, the tracks stand."""
+    CARRIED = "carried"
+    """The tracks stand, and the scan shows another place, or none that is known."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    seconds: float
+    wheels_m: float
+    wheels_rad: float
+    seen_m: float
+    seen_rad: float
+    seen: bool
+
+
+class MotionMonitor:
+    """Compares odometry steps with matched ones over the last ``window_s``.
+
+    Attributes:
+        state: see `MotionState`.
+        slip: share of the tracks' way that was lost over the window, 0..1; negative where the robot went farther.
+        turn_factor: encoder yaw over true yaw, from all turns so far, newer ones count more. The effective track width
+            that makes the encoders right is the one in use times this factor.
+        turn_factor_sigma: one standard deviation of it; inf before the first turn.
+    """
+
+    def __init__(self, config: MotionConfig) -> None:
+        self.config = config
+        self.state = MotionState.NORMAL
+        self.slip = 0.0
+        self.turn_factor = 1.0
+        self.turn_factor_sigma = math.inf
+        self._steps: deque[_Step] = deque()
+        self._span_s = 0.0
+        # Sums of the regression of encoder yaw on matched yaw, in blocks of half a radian or so.
+        self._block_wheels = self._block_seen = 0.0
+        self._block_turned = 0.0
+        self._squares = self._products = self._errors = self._weight = 0.0
+
+    def update(self, wheels: FloatArray, seen: FloatArray, elapsed_s: float, matched: bool) -> MotionState:
+        """Take in a step.
+
+        Args:
+            wheels: odometry's (3,), in the base's frame.
+            seen: the matched one (3,).
+            elapsed_s: its time.
+            matched: whether the scan was placed at all.
+        """
+        wheels_m = math.copysign(math.hypot(wheels[0], wheels[1]), wheels[0])
+        seen_m = math.copysign(math.hypot(seen[0], seen[1]), seen[0])
+        self._steps.append(_Step(elapsed_s, wheels_m, float(wheels[2]), seen_m, float(seen[2]), matched))
+        self._span_s += elapsed_s
+        while len(self._steps) > 1 and self._span_s - self._steps[0].seconds >= self.config.window_s:
+            self._span_s -= self._steps.popleft().seconds
+        if matched:
+            self._learn_turn(float(wheels[2]), float(seen[2]))
+        self.state = self._judge()
+        return self.state
+
+    def _judge(self) -> MotionState:
+        config, steps = self.config, self._steps
+        wheels_way = sum(abs(s.wheels_m) for s in steps)
+        wheels_turn = sum(abs(s.wheels_rad) for s in steps)
+        seen = [s for s in steps if s.seen]
+        seen_way = abs(sum(s.seen_m for s in seen))
+        seen_turn = abs(sum(s.seen_rad for s in seen))
+        stands = wheels_way < config.still_m and wheels_turn < config.still_rad
+        if stands:
+            self.slip = 0.0
+            if len(seen) < 0.5 * len(steps):
+                return MotionState.CARRIED
+            jump = max((abs(s.seen_m) for s in seen), default=0.0)
+            if jump > config.carried_jump_m:
+                return MotionState.CARRIED
+            return (
+                MotionState.PUSHED if seen_way > config.moved_m or seen_turn > config.moved_rad else MotionState.NORMAL
+            )
+        net = abs(sum(s.wheels_m for s in seen))
+        self.slip = 1.0 - seen_way / net if net > config.moved_m else 0.0
+        turned = abs(sum(s.wheels_rad for s in seen))
+        lost_turn = 1.0 - seen_turn * self.turn_factor / turned if turned > config.moved_rad else 0.0
+        if max(self.slip, lost_turn) > config.stuck_share and max(seen_way, 0.3 * seen_turn) < config.still_m * 2:
+            return MotionState.STUCK
+        return MotionState.SLIPPING if max(self.slip, lost_turn) > config.slip_share else MotionState.NORMAL
+
+    def _learn_turn(self, wheels_rad: float, seen_rad: float) -> None:
+        self._block_wheels += wheels_rad
+        self._block_seen += seen_rad
+        self._block_turned += abs(seen_rad)
+        if self._block_turned < 0.5:
+            return
+        wheels, seen = self._block_wheels, self._block_seen
+        self._block_wheels = self._block_seen = self._block_turned = 0.0
+        if abs(seen) < 0.3 or abs(wheels) > 3 * abs(seen):
+            return  # to and fro, or a robot that was stuck: says nothing about the width
+        keep = self.config.turn_memory
+        error = wheels - self.turn_factor * seen
+        self._squares = keep * self._squares + seen * seen
+        self._products = keep * self._products + seen * wheels
+        self._errors = keep * self._errors + error * error
+        self._weight = keep * self._weight + 1.0
+        self.turn_factor = self._products / self._squares
+        if self._weight > 1.5:
+            self.turn_factor_sigma = math.sqrt(self._errors / (self._weight - 1.0) / self._squares)
