@@ -485,7 +485,7 @@ class Recorder:
 
     def _stop(self, state: str, words: str) -> None:
         self._state, self.error, self.failed = state, words, True
-        log.error("%s", words)
+        log.debug("%s", words)  # told by the node's diagnosis, and by close()
 
     def _save(self, snapshot: Snapshot, content: list[Entry]) -> None:
         """Writes a snapshot; what goes wrong concerns this one, the next may succeed."""
