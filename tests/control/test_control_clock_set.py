@@ -1,0 +1,53 @@
+"""The machine's clock is set back while the arbiter runs: what falls silent then is still seen to be silent."""
+
+import pytest
+
+from instant_ic.bus.clock import ManualClock
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.msg import ControlState, compressed_image_message
+from instant_ic.nodes.arbiter import ArbiterNode
+from instant_ic.nodes.virtual_robot import VirtualRobotNode
+
+S = 1_000_000_000
+
+
+class SetClock(ManualClock):
+    """A machine's clock that was set by ``set_by`` nanoseconds."""
+
+    set_by = 0
+
+    def now_ns(self) -> int:
+        return self._now_ns + self.set_by
+
+    def steady_ns(self) -> int:
+        return self._now_ns
+
+
+@pytest.mark.parametrize("jump_s", [-3600, 3600], ids=["back", "forward"])
+def test_silent_sources_stop_the_robot_after_the_clock_was_set(jump_s: int) -> None:
+    bus = LockstepBus(1_700_000_000 * S)
+    clock = bus.clock = SetClock(1_700_000_000 * S)
+    arbiter = bus.add(ArbiterNode)
+    bus.publish("/camera/image/compressed", compressed_image_message(b"jpeg", "camera", clock.now_ns()))
+    assert arbiter.ages()["camera"] == 0.0
+    clock.set_by = jump_s * S
+    for _ in range(300):  # 3 s without any message
+        clock.set(clock.steady_ns() + S // 100)
+        arbiter.spin_once()
+    assert arbiter.ages()["camera"] == pytest.approx(3.0)
+    state = bus.last("/ic/state")
+    assert state.mode == ControlState.STOPPED and "no camera picture for 3.0 s" in state.reason
+    assert state.header.stamp.sec == clock.now_ns() // S  # stamps are those of the clock as it is now
+    assert len(bus.messages("/cmd_vel")) >= 50  # 20 a second, none left out and none made up for
+    assert all(message.twist.linear.x == 0.0 for message in bus.messages("/cmd_vel"))
+
+
+def test_v_bot_makes_no_leap_when_the_clock_is_set() -> None:
+    bus = LockstepBus(1_700_000_000 * S)
+    clock = bus.clock = SetClock(1_700_000_000 * S)
+    node = bus.add(VirtualRobotNode)
+    before_ns = node.stepped_ns
+    clock.set_by = -3600 * S
+    clock.set(clock.steady_ns() + S // 20)
+    node.spin_once()
+    assert node.stepped_ns - before_ns == S // 20
