@@ -5,6 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Annotated, TypeAlias
+
+from ..ranges import Positive, PositiveInt, Range, Share, check_ranges
+
+_UpToOne: TypeAlias = Annotated[float, Range(above=0, high=1)]
 
 
 def _require(condition: bool, key: str, value: object, rule: str) -> None:
@@ -16,22 +21,19 @@ def _require(condition: bool, key: str, value: object, rule: str) -> None:
 class FieldConfig:
     """Multi-resolution hash grid and the small network behind it."""
 
-    levels: int = 8
+    levels: Annotated[int, Range(1, 16)] = 8
     features: int = 4
     """Features of a table entry; the CPU kernels know 2 and 4."""
-    log2_table: int = 17
-    base_resolution: int = 16
+    log2_table: Annotated[int, Range(10, 22)] = 17
+    base_resolution: Annotated[int, Range(2, 256)] = 16
     """Cells of the coarsest level across the scene."""
-    hidden: int = 32
+    hidden: Annotated[int, Range(4, 64)] = 32
     """Width of the hidden layer; a multiple of 4."""
 
     def __post_init__(self) -> None:
-        _require(1 <= self.levels <= 16, "levels", self.levels, "1 to 16")
+        check_ranges(self)
         _require(self.features in (2, 4), "features", self.features, "2 or 4")
-        _require(10 <= self.log2_table <= 22, "log2_table", self.log2_table, "10 to 22")
-        _require(2 <= self.base_resolution <= 256, "base_resolution", self.base_resolution, "2 to 256")
-        hidden_ok = 4 <= self.hidden <= 64 and self.hidden % 4 == 0
-        _require(hidden_ok, "hidden", self.hidden, "a multiple of 4 from 4 to 64")
+        _require(self.hidden % 4 == 0, "hidden", self.hidden, "a multiple of 4")
         inputs = self.levels * self.features
         _require(inputs % 4 == 0 and inputs <= 64, "levels * features", inputs, "a multiple of 4 up to 64")
 
@@ -40,82 +42,71 @@ class FieldConfig:
 class TrainConfig:
     """One training run over a keyframe."""
 
-    ray_columns: int = 128
+    ray_columns: Annotated[int, Range(8, 1024)] = 128
     """Strata in azimuth; a batch has ``ray_columns * ray_rows`` rays, one jittered in each."""
-    ray_rows: int = 64
-    iterations: int = 600
+    ray_rows: Annotated[int, Range(8, 1024)] = 64
+    iterations: PositiveInt = 600
     """Length of the learning-rate schedule; training idles after it."""
-    table_lr: float = 0.04
-    network_lr: float = 0.01
-    final_lr_share: float = 0.03
-    fine_lr_share: float = 0.1
+    table_lr: _UpToOne = 0.04
+    network_lr: _UpToOne = 0.01
+    final_lr_share: _UpToOne = 0.03
+    fine_lr_share: _UpToOne = 0.1
     """Learning rate of the finest level against the coarsest's, between them by equal ratios: it keeps grain down."""
-    refresh_lr_share: float = 0.5
+    refresh_lr_share: _UpToOne = 0.5
     """Share of the learning rates when a keyframe refreshes a trained field."""
-    distance_weight: float = 0.1
+    distance_weight: Positive = 0.1
     """Weight of the signed-distance error against the colour error."""
-    band_colour_weight: float = 0.3
+    band_colour_weight: Share = 0.3
     """Weight of the colour error of samples beside the surface against those on it."""
     seed: int = 1
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         for key in ("ray_columns", "ray_rows"):
-            value = getattr(self, key)
-            _require(8 <= value <= 1024 and value % 8 == 0, key, value, "a multiple of 8 from 8 to 1024")
-        _require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
-        for key in ("table_lr", "network_lr", "final_lr_share", "fine_lr_share", "refresh_lr_share"):
-            _require(0 < getattr(self, key) <= 1, key, getattr(self, key), "in (0, 1]")
-        _require(0 <= self.band_colour_weight <= 1, "band_colour_weight", self.band_colour_weight, "in 0..1")
-        _require(self.distance_weight > 0, "distance_weight", self.distance_weight, "above 0")
+            _require(getattr(self, key) % 8 == 0, key, getattr(self, key), "a multiple of 8")
 
 
 @dataclass(frozen=True)
 class GeometryConfig:
     """How the keyframe's depth shapes the field and the occupancy grid."""
 
-    band_min: float = 0.05
+    band_min: Annotated[float, Range(above=0, high=0.5)] = 0.05
     """Half width of the band round the depth in which the signed distance is learnt, share of the depth."""
-    band_max: float = 0.06
-    band_sigmas: float = 2.0
+    band_max: Annotated[float, Range(above=0, high=0.5)] = 0.06
+    band_sigmas: Positive = 2.0
     """Half width of the band in standard deviations of the depth, between the two limits."""
-    torn_ratio: float = 0.10
+    torn_ratio: Annotated[float, Range(above=0, below=1)] = 0.10
     """Neighbouring depths that differ by more than this share are an edge, unless they lie on one plane."""
-    min_depth_m: float = 0.2
-    max_depth_m: float = 30.0
+    min_depth_m: Positive = 0.2
+    max_depth_m: Positive = 30.0
     """Depths beyond are set to it."""
-    min_known_share: float = 0.5
+    min_known_share: _UpToOne = 0.5
     """A keyframe whose depth is known in less of the picture is refused."""
-    cell_m: float = 0.04
+    cell_m: _UpToOne = 0.04
     """Smallest cell of the occupancy grid, metres; larger where max_cells would be passed."""
-    max_cells: int = 6_000_000
+    max_cells: Annotated[int, Range(10_000, 2**27)] = 6_000_000
 
     def __post_init__(self) -> None:
-        _require(0 < self.band_min <= 0.5, "band_min", self.band_min, "in (0, 0.5]")
-        _require(self.band_min <= self.band_max <= 0.5, "band_max", self.band_max, "between band_min and 0.5")
-        _require(self.band_sigmas > 0, "band_sigmas", self.band_sigmas, "above 0")
-        _require(0 < self.torn_ratio < 1, "torn_ratio", self.torn_ratio, "in (0, 1)")
-        _require(0 < self.min_depth_m < self.max_depth_m, "min_depth_m", self.min_depth_m, "in (0, max_depth_m)")
-        _require(0 < self.min_known_share <= 1, "min_known_share", self.min_known_share, "in (0, 1]")
-        _require(0 < self.cell_m <= 1, "cell_m", self.cell_m, "in (0, 1]")
-        _require(10_000 <= self.max_cells <= 2**27, "max_cells", self.max_cells, "from 1e4 to 2**27")
+        check_ranges(self)
+        _require(self.band_min <= self.band_max, "band_max", self.band_max, "at least band_min")
+        _require(self.min_depth_m < self.max_depth_m, "min_depth_m", self.min_depth_m, "below max_depth_m")
 
 
 @dataclass(frozen=True)
 class ReadinessConfig:
     """When the space is fit to show, and how far from the keyframe."""
 
-    psnr_db: float = 24.0
+    psnr_db: Positive = 24.0
     """PSNR of the training rays that is good enough, also to take over from the keyframe before."""
-    plateau_iterations: int = 100
-    plateau_db: float = 0.3
+    plateau_iterations: PositiveInt = 100
+    plateau_db: Positive = 0.3
     """Less gain than this over ``plateau_iterations`` also counts as ready."""
-    max_radius_m: float = 3.0
-    parallax_rad: float = 0.035
+    max_radius_m: Positive = 3.0
+    parallax_rad: Positive = 0.035
     """Shift of a surface in the picture, from the depth's error, that is still fit to show."""
 
     def __post_init__(self) -> None:
-        for key in ("psnr_db", "plateau_iterations", "plateau_db", "max_radius_m", "parallax_rad"):
-            _require(getattr(self, key) > 0, key, getattr(self, key), "above 0")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
