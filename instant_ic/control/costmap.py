@@ -229,6 +229,10 @@ class RollingCostmap:
         self._body = footprint.points(0.5 * config.resolution)
         # What 3D points marked may never be seen again from near: a pose that is a cell off must not wipe it out.
         self._under = footprint.points(0.5 * config.resolution, -config.resolution)
+        # Distances between cells are roots of whole numbers: the cost of each, up to the inflation radius.
+        reach = (max(config.inflation_radius, footprint.inscribed_radius_m) + SLACK_M) / config.resolution
+        metres = np.sqrt(np.arange(math.floor(reach**2) + 1)) * config.resolution
+        self._cost_of_square = np.array([inflated_cost(d, config, footprint) for d in metres], dtype=np.uint8)
 
     def reset(self) -> None:
         """Forgets what was seen, as after a jump of the map."""
@@ -311,15 +315,7 @@ class RollingCostmap:
         free = (master != LETHAL).astype(np.uint8)
         if free.all():
             return master
-        distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        _inflate(
-            master,
-            distance,
-            self.config.resolution,
-            self.footprint.inscribed_radius_m,
-            self.config.inflation_radius,
-            self.config.cost_scaling_factor,
-        )
+        _inflate(master, cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), self._cost_of_square)
         return master
 
 
@@ -368,23 +364,16 @@ def _join(
 
 
 @njit(cache=True)
-def _inflate(
-    master: NDArray[np.uint8],
-    distance: NDArray[np.float32],
-    resolution: float,
-    inscribed_m: float,
-    inflation_m: float,
-    scaling: float,
-) -> None:
+def _inflate(master: NDArray[np.uint8], distance: NDArray[np.float32], cost_of_square: NDArray[np.uint8]) -> None:
+    """Writes the cost of each cell's distance (cells) to the nearest lethal one; unknown cells only if inscribed."""
+    most = math.sqrt(len(cost_of_square) - 0.5)
     for r in range(master.shape[0]):
         for c in range(master.shape[1]):
-            away = distance[r, c] * resolution
-            if master[r, c] == 254 or away > max(inflation_m, inscribed_m) + SLACK_M:
+            if distance[r, c] > most or master[r, c] == 254:
                 continue
-            if away <= inscribed_m + SLACK_M:
-                master[r, c] = 253
-            elif master[r, c] != 255:
-                master[r, c] = np.uint8(252.0 * math.exp(-scaling * (away - inscribed_m)))
+            cost = cost_of_square[int(distance[r, c] * distance[r, c] + 0.5)]
+            if cost >= 253 or master[r, c] != 255:
+                master[r, c] = cost
 
 
 @njit(cache=True)

@@ -23,6 +23,8 @@ GROUND, OBSTACLE, OVERHEAD, NEAR = 0, 1, 2, 3
 """Kinds of points: driven over, stands in the way, passed under, on the robot's own body."""
 AZIMUTHS = 720
 """Directions in which beams are told apart."""
+FAST = {"contract", "arcp", "afn"}
+"""Faster arithmetic that still knows nan and inf."""
 INSTANTS = 65
 """Poses of the sensor over a sweep: at 1 rad/s, within 1 mrad of where it was."""
 
@@ -164,7 +166,7 @@ def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArr
     return moved
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _angle(y: float, x: float) -> float:
     """atan2 to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
     ax, ay = abs(x), abs(y)
@@ -180,7 +182,7 @@ def _angle(y: float, x: float) -> float:
     return -angle if y < 0.0 else angle
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _sort(
     points: NDArray[np.float32],
     time_s: NDArray[np.float32],
@@ -205,6 +207,7 @@ def _sort(
     near_m = np.full(AZIMUTHS, np.inf)
     near_at = np.full(AZIMUTHS, -1, dtype=np.int64)
     counts = np.zeros(4, dtype=np.int64)
+    per_radian, rows_per_radian = AZIMUTHS / (2.0 * math.pi), 1.0 / per_row
     kept = 0
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
@@ -224,8 +227,8 @@ def _sort(
         # Seen from where the sensor is at the end.
         dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
         distance = math.sqrt(dx * dx + dy * dy)
-        column = int((_angle(dy, dx) + math.pi) * AZIMUTHS / (2.0 * math.pi)) % AZIMUTHS
-        row = min(int((_angle(dz, distance) + 0.5 * math.pi) / per_row), rows - 1)
+        column = min(int((_angle(dy, dx) + math.pi) * per_radian), AZIMUTHS - 1)
+        row = min(int((_angle(dz, distance) + 0.5 * math.pi) * rows_per_radian), rows - 1)
         if distance < ends[row, column]:
             ends[row, column] = distance
         # The robot pitches a little: far off, a given tilt lifts the ground by its share of the distance.
@@ -280,7 +283,7 @@ def _clear_and_mark(
             if distance < resolution:
                 continue
             azimuth = _angle(cos * dy - sin * dx, cos * dx + sin * dy)
-            column = int((azimuth + math.pi) * azimuths / (2.0 * math.pi)) % azimuths
+            column = min(int((azimuth + math.pi) * azimuths / (2.0 * math.pi)), azimuths - 1)
             # Half a cell more each way: the points of a surface scatter by that much.
             first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
             last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row

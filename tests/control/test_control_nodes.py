@@ -14,6 +14,7 @@ from instant_ic.bus import OK, WARN, params
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
+    POINT_DTYPE,
     Bool,
     CompressedImage,
     ControlState,
@@ -21,7 +22,9 @@ from instant_ic.msg import (
     PoseWithCovarianceStamped,
     TFMessage,
     VspaceStatus,
+    cloud_message,
     compressed_image_message,
+    grid_array,
     grid_message,
     header,
     odometry_message,
@@ -70,9 +73,13 @@ class Stack:
         for node in (VirtualRobotNode, NavigatorNode, ArbiterNode):
             self.bus.add(node)
         self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
-        mount = transform_message(np.eye(4), "base_link", "velodyne", self.now)
+        lidar = np.eye(4)
+        lidar[2, 3] = 0.6
+        mount = transform_message(lidar, "base_link", "velodyne", self.now)
         self.bus.publish("/tf_static", TFMessage([mount]), latched=True)
         self.silent: set[str] = set()
+        self.cloud: np.ndarray | None = None
+        """(N, 3) places over ground and height in the world, seen wherever the robot is; None: no 3D points."""
         self.k = 0
         self.contact = False
 
@@ -104,6 +111,11 @@ class Stack:
             covariance = PoseWithCovariance(pose=pose_message(map_from_base), covariance=np.zeros(36))
             self.send("/pose", PoseWithCovarianceStamped(header=header("map", now), pose=covariance))
             self.send("/camera/image/compressed", compressed_image_message(b"not a JPEG", "camera", now))
+        if self.k % 2 == 0 and self.cloud is not None:
+            points = np.zeros(len(self.cloud), POINT_DTYPE)
+            seen = (self.cloud - [*self.base.pose[:2], 0.6]) @ map_from_base[:3, :3]
+            points["x"], points["y"], points["z"] = seen.T
+            self.send("/lidar/points", cloud_message(points, "velodyne", now))
         if self.k % 10 == 0:
             self.send("/vspace/status", self.status(now))
         if command is not None:
@@ -300,3 +312,56 @@ def test_the_arbiter_leaves_a_zero_behind() -> None:
     assert twist_values(stack.bus.last("/cmd_vel"))[0] > 0
     stack.bus.close()
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+
+
+def kerb(x: float) -> np.ndarray:
+    """Points (N, 3) of a kerb 0.09 m high across the corridor, under the flat scan's band."""
+    ys = np.arange(-1.0, 1.0, 0.02)
+    return np.array([[x + 0.02 * i, y, 0.09] for i in range(6) for y in ys])
+
+
+def test_a_kerb_that_the_flat_scan_does_not_see_stops_the_robot() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.cloud = kerb(2.5)
+    states = stack.drive(1.5, None) + stack.drive(12.0, (0.4, 0.0))
+    assert stack.base.pose[0] + 0.30 < 2.5
+    assert stack.base.pose[0] > 1.5
+    assert states[-1].blocked
+    grid, resolution, origin = grid_array(stack.bus.last("/costmap"))
+    column, row = (math.floor((v - o) / resolution) for v, o in zip((2.53, 0.1), origin, strict=True))
+    assert grid[row, column] == 100
+    arbiter = next(node for node in stack.bus.nodes if isinstance(node, ArbiterNode))
+    assert arbiter.diagnoses()["points"][2]["obstacle"] == len(stack.cloud)
+
+
+def test_3d_points_are_needed_once_they_have_come() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    assert stack.drive(1.5, None)[-1].mode == ControlState.REAL  # a robot without them drives by its scan
+    stack.cloud = kerb(8.0)
+    stack.drive(0.5, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/cmd_vel"))[0] == pytest.approx(0.4)
+    stack.silent.add("/lidar/points")
+    states = stack.drive(0.7, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+    assert "no 3D points for" in states[-1].reason
+    assert stack.drive(1.5, (0.4, 0.0))[-1].mode == ControlState.STOPPED
+    assert stack.drive(12.0, (0.0, 0.0))[-1].mode == ControlState.STOPPED  # however long they are gone
+    stack.silent.clear()
+    assert stack.drive(1.0, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+def test_points_without_coordinates_hold_the_robot_and_are_told() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    arbiter = next(node for node in stack.bus.nodes if isinstance(node, ArbiterNode))
+    bare = cloud_message(np.zeros(4, np.dtype([("x", "<f4"), ("intensity", "<f4")])), "velodyne", stack.now)
+    stack.send("/lidar/points", bare)
+    states = stack.drive(0.3, (0.4, 0.0))
+    level, words, _ = arbiter.diagnoses()["points"]
+    assert level == WARN
+    assert "x, intensity; x, y and z are needed" in words
+    assert twist_values(states[-1].applied_command) == (0.0, 0.0)
+    stack.cloud = kerb(8.0)
+    stack.drive(2.5, (0.0, 0.0))
+    assert arbiter.diagnoses()["points"][0] == OK
+    assert twist_values(stack.drive(0.5, (0.4, 0.0))[-1].applied_command)[0] > 0.3
