@@ -1,0 +1,74 @@
+"""``ic evaluate slam-sim``: SLAM on the simulated crawler; see `instant_ic.cli.commands.evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+
+
+def add_kind(kinds: Any) -> None:
+    """Adds ``slam-sim`` to ``ic evaluate``."""
+    parser = kinds.add_parser(
+        "slam-sim",
+        help="a round trip of the simulated crawler on slipping tracks",
+        description=(
+            "Drives the simulated crawler up a corridor and back on tracks that lose a random share of their way, runs "
+            "SLAM on its scans and encoders, and compares with the true poses. Prints the figures of each seed as JSON."
+        ),
+        epilog="example: ic evaluate slam-sim --slip 0.2 --seeds 5",
+    )
+    parser.add_argument("--world", default="corridor", help="of the simulator (default: %(default)s)")
+    parser.add_argument("--slip", type=float, default=0.2, help="share of the way, one σ (default: %(default)g)")
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="drives (default: %(default)d)")
+    parser.add_argument("--rounds", type=int, default=2, help="of about 39 m each (default: %(default)d)")
+    parser.add_argument("--backend", choices=("graph", "rbpf"), default="graph", help="SLAM method")
+    parser.add_argument("--no-odometry", action="store_true", help="leave the encoders out")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="picture of the last drive's map and paths")
+    parser.set_defaults(func=evaluate_slam_sim)
+
+
+def evaluate_slam_sim(args: argparse.Namespace) -> int:
+    """Runs ``ic evaluate slam-sim``; returns the exit status."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from ...evaluation.pictures import save_map
+    from ...evaluation.slam_sim import evaluate_round_trip, round_trip
+    from ...sim.worlds import make_world
+    from ...slam import SlamConfig
+
+    if args.seeds < 1 or args.rounds < 1:
+        raise UserError("--seeds and --rounds must be at least 1", 2)
+    console = Console(stderr=True)
+    reports: list[dict[str, object]] = []
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("round trips", total=args.seeds)
+        try:
+            world = make_world(args.world)
+            for seed in range(args.seeds):
+                trip = round_trip(world, args.slip, seed, args.rounds)
+                config = SlamConfig(backend=args.backend)
+                report, run = evaluate_round_trip(trip, config, use_wheel_odom=not args.no_odometry)
+                reports.append({"seed": seed, **report})
+                progress.advance(task)
+        except ValueError as error:
+            raise UserError(f"evaluate slam-sim: {error}") from None
+    worst = {key: max(float(report[key]) for report in reports) for key in _WORST}  # type: ignore[arg-type]
+    text = json.dumps({"world": args.world, "slip": args.slip, "worst": worst, "drives": reports}, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+    if args.plot:
+        grid = run.slam.grid()
+        paths = {"estimate": run.trajectory[:, 1:], "truth": trip.truth}
+        save_map(args.plot, grid.values, grid.resolution, (float(grid.origin[0]), float(grid.origin[1])), paths=paths)
+    return 0
+
+
+_WORST = ("end_error_m", "end_error_deg", "max_error_m", "max_error_deg", "cpu_ms_per_scan_mean", "cpu_ms_per_scan_p99")
