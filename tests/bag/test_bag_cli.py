@@ -1,0 +1,154 @@
+"""``ic bag`` and ``ic replay`` on files: what is printed, and what mistakes are told."""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from instant_ic.bag import BagReader, BagWriter
+from instant_ic.bus import LATCHED, SENSOR
+from instant_ic.cli.commands.bag import size
+from instant_ic.cli.main import main
+from instant_ic.msg import Bool, scan_message, serialize
+
+SCAN, BOOL = "sensor_msgs/msg/LaserScan", "std_msgs/msg/Bool"
+S = 1_000_000_000
+CORRIDOR = Path(__file__).resolve().parents[1] / "data" / "corridor_drive"
+
+
+def make(path: Path, gain: float = 1.0, **how: float) -> Path:
+    with BagWriter(path, **how) as writer:  # type: ignore[arg-type]
+        writer.set_custom("instant_ic.lost", json.dumps({"/scan": 3}))
+        writer.set_custom("instant_ic.lost_by", json.dumps({"/scan": {"front": 3}}))
+        writer.set_custom("instant_ic.overflow", json.dumps({"/scan": 7}))
+        writer.write("/operator/estop", BOOL, bytes(serialize(Bool(data=False))), 1 * S, LATCHED)
+        for index in range(10):
+            message = scan_message(np.full(4, gain * index, np.float32), 0, 0.1, 0.1, 30, "velodyne", index * S)
+            writer.write("/scan", SCAN, bytes(serialize(message)), (1 + index) * S, SENSOR)
+    return path
+
+
+def ic(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, str, str]:
+    status = main([str(word) for word in words])
+    out, error = capsys.readouterr()
+    return status, out, error
+
+
+def test_info(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    bag = make(tmp_path / "bag", max_duration_s=5.0)
+    status, out, _ = ic(capsys, "bag", "info", bag)
+    assert status == 0 and "bag_0.mcap" in out and "bag_1.mcap" in out
+    assert "1.00 Hz  sensor  3 lost (3 from front)" in out
+    assert "left out because the disk was too slow: /scan 7" in out
+    status, out, _ = ic(capsys, "bag", "info", bag, "--json")
+    told = json.loads(out)
+    assert (told["messages"], told["duration_s"], len(told["files"])) == (11, 9.0, 2)
+    assert {t["topic"]: (t["messages"], t["lost_by"]) for t in told["topics"]} == {
+        "/operator/estop": (1, {}),
+        "/scan": (10, {"front": 3}),
+    }
+
+
+def test_info_names_a_file_that_is_not_in_the_bag(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    bag = make(tmp_path / "bag")
+    (bag / "bag_1.mcap").write_bytes((bag / "bag.mcap").read_bytes()[:-50])
+    status, out, _ = ic(capsys, "bag", "info", bag)
+    assert (
+        status == 0
+        and f"bag_1.mcap is in the folder but not in the bag: its recording was cut short: ic bag recover {bag}" in out
+    )
+
+
+def test_diff_prints_what_differs(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    a, b = make(tmp_path / "a"), make(tmp_path / "b", gain=1.5)
+    status, out, _ = ic(capsys, "bag", "diff", a, b)
+    assert status == 1 and "message 2: ranges[0] is 1.0 and 1.5 (4 of 4 entries differ)" in out
+    assert "ranges: largest difference 4.5, in 9 messages, first in message 2" in out
+    assert "1 of 2 topics are the same" in out
+    status, out, _ = ic(capsys, "bag", "diff", a, b, "--tolerance", "/scan:ranges=4.5")
+    assert status == 0 and "2 of 2 topics are the same" in out
+    assert ic(capsys, "bag", "diff", a, b, "--rtol", "0.5")[0] == 0
+    assert ic(capsys, "bag", "diff", a, b, "--ignore-field", "ranges")[0] == 0
+    assert ic(capsys, "bag", "diff", a, b, "--ignore", "/scan")[0] == 0
+    status, out, _ = ic(capsys, "bag", "diff", a, b, "--json")
+    (estop, scan) = json.loads(out)
+    assert status == 1 and estop["same"] and scan["fields"]["ranges"]["largest"] == 4.5 and scan["differing"] == 9
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--tolerance", "ranges"), "--tolerance ranges: expected FROM=TO"),
+        (("--tolerance", "ranges=much"), "--tolerance ranges=much: much is no number"),
+        (("--tolerance", "ranges=-1"), "tolerance of ranges must be >= 0"),
+    ],
+)
+def test_wrong_tolerances_are_told(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    bag = make(tmp_path / "bag")
+    status, _, error = ic(capsys, "bag", "diff", bag, bag, *words)
+    assert status == 2 and message in error
+
+
+def test_convert_recover_reindex(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    bag = make(tmp_path / "bag")
+    words = ("-t", "scan", "--start", "2", "--end", "7", "--remap", "/scan:=/front", "-d", "2", "--compression")
+    status, out, _ = ic(capsys, "bag", "convert", bag, "-o", tmp_path / "new", *words)
+    assert status == 0 and "5 messages in 3 files" in out and "/front: 5" in out
+    (tmp_path / "new" / "metadata.yaml").unlink()
+    status, _, error = ic(capsys, "bag", "info", tmp_path / "new")
+    assert status == 1 and "ic bag reindex" in error
+    status, out, _ = ic(capsys, "bag", "reindex", tmp_path / "new")
+    assert status == 0 and "5 messages in 3 files" in out
+    file = tmp_path / "new" / "new_2.mcap"
+    file.write_bytes(file.read_bytes()[:-100])
+    status, _, error = ic(capsys, "bag", "reindex", tmp_path / "new")
+    assert status == 1 and "new_2.mcap is not whole" in error
+    status, out, _ = ic(capsys, "bag", "recover", tmp_path / "new", "-o", tmp_path / "saved")
+    assert status == 0 and "5 messages" in out and "new_2.mcap" in out
+    with BagReader(tmp_path / "saved") as reader:
+        assert [m.stamp_ns // S for m in reader.messages()] == [3, 4, 5, 6, 7]
+
+
+def test_control_without_a_node(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path / "run"))
+    for words, status, message in (
+        (("snapshot",), 1, "no bag_recorder runs in"),
+        (("control", "pause"), 1, "no bag_recorder or bag_player runs in"),
+        (("control", "rate"), 2, "ic bag control rate needs a value"),
+        (("control", "pause", "3"), 2, "ic bag control pause takes no value"),
+        (("control", "pause", "--node", "x"), 1, "named x runs in"),
+    ):
+        got, _, error = ic(capsys, "bag", *words)
+        assert got == status and message in error, words
+
+
+@pytest.mark.parametrize(
+    ("text", "bytes_"), [("1000000", 10**6), ("500MB", 5 * 10**8), ("1.5GiB", 3 * 2**29), ("2 gb", 2 * 10**9)]
+)
+def test_sizes(text: str, bytes_: int) -> None:
+    assert size(text) == bytes_
+
+
+@pytest.mark.parametrize("text", ["", "MB", "5XB", "-5MB", "1e9"])
+def test_what_is_no_size(text: str) -> None:
+    with pytest.raises(argparse.ArgumentTypeError, match="is no size"):
+        size(text)
+
+
+def test_replay_compares_with_a_reference(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    words = ("replay", CORRIDOR, "--nodes", "vlp16_driver", "-p", "vlp16_driver.source:=topic")
+    status, out, _ = ic(capsys, *words, "-o", tmp_path / "one")
+    assert status == 0 and "x real time" in out and "/scan: 48" in out
+    status, out, _ = ic(capsys, *words, "-o", tmp_path / "two", "--compare", tmp_path / "one")
+    assert status == 0 and "3 of 3 topics are the same" in out, out
+    moved = (*words, "-p", "vlp16_driver.mount_xyz:=[0.0, 0.0, 0.7]", "-o", tmp_path / "three")
+    status, out, _ = ic(capsys, *moved, "--compare", tmp_path / "one", "--ignore", "/lidar/points", "--ignore", "/scan")
+    assert status == 1 and "transforms[].transform.translation.z: largest difference 0.1" in out
+    status, _, error = ic(capsys, *words, "-o", tmp_path / "four", "--compare", tmp_path / "nowhere")
+    assert status == 1 and "nowhere does not exist" in error
