@@ -4,8 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag import BagError, BagReader, BagWriter, Schema
 from instant_ic.bag.compare import compare, digest
+from instant_ic.bag.convert import ConvertOptions, convert
+from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.replay import ReplayError, ReplayNode, make_node, replay
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node
 from instant_ic.geometry.transforms import TransformError
@@ -189,3 +191,21 @@ def test_parameters_of_a_replayed_node(tmp_path: Path) -> None:
     file.write_text("bag_player:\n  ros__parameters:\n    bag: here\n    rate: 2.0\n")
     node = make_node("bag_player", [file], ["bag_player.rate:=3.0", "grid_slam.rate:=4.0"])
     assert (node.config.bag, node.config.rate) == ("here", 3.0)
+
+
+def test_type_of_another_definition_is_refused(tmp_path: Path) -> None:
+    theirs = with_hash(Schema("sensor_msgs/msg/LaserScan", "ros2msg", "uint8 number\n", ""))
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/scan", theirs.name, b"\x00\x01\x00\x00\x2a", START_NS, SENSOR, theirs)
+    with pytest.raises(ReplayError, match="/scan is of a sensor_msgs/msg/LaserScan with another definition than ours"):
+        replay(tmp_path / "bag", [mean_node()], tmp_path / "out")
+
+
+def test_bare_file_split_bag_and_compressed_bag_replay_alike(bag: Path, tmp_path: Path) -> None:
+    convert([bag], tmp_path / "split", ConvertOptions(max_duration_s=0.3, compressed=True))
+    digests = set()
+    for number, source in enumerate((bag, bag / "bag.mcap", tmp_path / "split")):
+        result = replay(source, [mean_node()], tmp_path / f"{number}" / "out", compressed=number == 2)
+        digests.add(digest(tmp_path / f"{number}" / "out"))
+        assert result.bag_s == pytest.approx(0.9) and result.wall_s > 0
+    assert len(digests) == 1
