@@ -93,7 +93,7 @@ class _Reader:
         self._flying: dict[int, SharedBuffer] = {}
         self._known: set[int] = set()
         self._queue: deque[_Outgoing] = deque()
-        self._queue_bytes = 0
+        self._queue_bytes = self._queued_buffers = 0
         self._part: memoryview | None = None  # what is left of a frame that went out in part
         self._skipped = 0
         self._incoming = b""
@@ -139,15 +139,15 @@ class _Reader:
             self._start(message)
         else:
             self._enqueue(message)
+            if self._part is None:  # buffers may have come back since, and nobody else would notice
+                self.flush()
 
     def flush(self) -> None:
         """Sends what waits, as far as the socket and the reader's buffers allow."""
         if self._part is not None:
             self._send_part()
         while self._part is None and self._queue and self._may_fly(self._queue[0]) and not (self.deaf or self.gone):
-            message = self._queue.popleft()
-            self._queue_bytes -= message.size
-            self._start(message)
+            self._start(self._pop())
         self.prompt = not (self._part is not None or self._queue or self._skipped or self.deaf or self.gone)
 
     def release(self) -> None:
@@ -201,6 +201,7 @@ class _Reader:
             if message.buffer is not None:
                 message.buffer.holders.discard(self)
         self._queue.clear()
+        self._queue_bytes = self._queued_buffers = 0
         self._part = None
 
     def _may_fly(self, message: _Outgoing) -> bool:
@@ -212,19 +213,25 @@ class _Reader:
     def _enqueue(self, message: _Outgoing) -> None:
         self.prompt = False
         message = message.kept()
-        if self.depth > 1 and len(self._flying) >= BUFFERS_A_READER:
+        if self.depth > 1 and len(self._flying) + self._queued_buffers >= BUFFERS_A_READER:
             message = message.inline()
         if message.buffer is not None:
             message.buffer.holders.add(self)
+            self._queued_buffers += 1
         while self._queue and (len(self._queue) >= self.depth or self._queue_bytes + message.size > _QUEUE_BYTES):
-            old = self._queue.popleft()
-            self._queue_bytes -= old.size
+            old = self._pop()
             if old.buffer is not None:
                 old.buffer.holders.discard(self)
             if self.depth == 1:  # it asked for the newest only: what it does not see is not lost
                 self._skipped += 1
         self._queue.append(message)
         self._queue_bytes += message.size
+
+    def _pop(self) -> _Outgoing:
+        message = self._queue.popleft()
+        self._queue_bytes -= message.size
+        self._queued_buffers -= message.buffer is not None
+        return message
 
     def _start(self, message: _Outgoing) -> None:
         skipped, self._skipped = self._skipped, 0
@@ -477,6 +484,9 @@ class LocalPublisher:
             return None
         for reader in readers:
             reader.release()
+            if reader.waiting:
+                reader.flush()
+                self._rewatch(reader)
         if time.monotonic() < self._memory_retry_s:
             self.stats.not_shared += 1
             return None

@@ -1,0 +1,475 @@
+"""What users of other middlewares complain about, each complaint with its test: we do not have it."""
+
+import errno
+import gc
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pytest
+from local_bus import BYTES, LARGE, Bus, number, numbered, wait_for, whole
+
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, QoS, RegistryError, registry
+from instant_ic.bus.clock import SystemClock
+from instant_ic.bus.node import Node
+from instant_ic.msg import Image, deserialize, image_array, image_message
+
+HERE = Path(__file__).parent
+PICTURE = (1080, 1700, 3)  # 5.5 MB
+
+
+def test_rclpy_763_slow_images_in_python(bus: Bus) -> None:
+    """A picture is copied once: into the memory that its readers look at."""
+    node = Node[None](None, bus.node("sender"), SystemClock(), "sender")
+    out = node.publisher("/picture", Image, SENSOR)
+    reader = bus.reader("/picture", SENSOR, type_name="sensor_msgs/msg/Image")
+    wait_for(lambda: out.subscriber_count == 1)
+    picture = np.random.default_rng(0).integers(0, 256, PICTURE, dtype=np.uint8)
+    message = image_message(picture, "rgb8", "camera", 5)
+    out.publish(message)  # the first one makes the buffer
+    wait_for(reader.poll)
+    reader.received.clear()
+    tracemalloc.start()
+    out.publish(message)
+    received = wait_for(reader.poll)[0]
+    got = image_array(deserialize(received.payload, received.type_name))
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < picture.nbytes // 10  # no second copy on either side
+    assert np.array_equal(got, picture)
+    assert not got.flags.writeable
+    assert out.raw.stats.not_shared == 0
+
+
+def test_received_arrays_are_read_only_whatever_the_way(bus: Bus) -> None:
+    out, reader = bus.publisher(), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    for size in (100, LARGE):
+        out.send(bytearray(numbered(1, size)))
+        message = wait_for(reader.poll).pop()
+        assert not np.frombuffer(message.payload, np.uint8).flags.writeable
+        assert len(message.payload) == size
+
+
+@pytest.mark.parametrize("size", [100, LARGE], ids=["small", "shared"])
+def test_ros_comm_536_buff_size_lag_a_slow_node_works_on_the_newest(bus: Bus, size: int) -> None:
+    """While a callback lasts, fifty frames are sent; the next callback gets the fiftieth and no other."""
+    out = bus.publisher(qos=SENSOR)
+    node = Node[None](None, bus.node("slow"), SystemClock(), "slow")
+    worked_on: list[int] = []
+
+    def slow(received) -> None:
+        worked_on.append(number(received))
+        if len(worked_on) == 1:
+            for i in range(2, 51):
+                out.send(numbered(i, size))
+            wait_for(lambda: number(subscription.raw._queue[-1]) == 50 if subscription.raw._queue else False)
+        else:
+            node.stop()
+
+    subscription = node.subscribe_received("/x", slow, SENSOR)
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1, size))
+    node.start()
+    node.spin()
+    assert worked_on == [1, 50]
+    assert subscription.raw.stats.lost == 0
+
+
+def test_dora_515_and_3428_silent_input_loss(bus: Bus) -> None:
+    """What does not fit a reader's queue is counted, with the name of the node that sent it."""
+    out = bus.publisher()
+    reader = bus.reader(qos=QoS("short", depth=5, reliable=True))
+    wait_for(lambda: out.subscriber_count == 1)
+    for i in range(1, 21):
+        out.send(numbered(i))
+    wait_for(lambda: reader.stats.count == 20)
+    assert reader.numbers() == [16, 17, 18, 19, 20]
+    assert reader.stats.lost_by == {"sender": 15}
+
+
+def test_dora_3518_loss_of_a_reader_that_stands_still_is_counted(bus: Bus) -> None:
+    """Sockets and queues full, as of a recorder on a stalled disk: received and lost together are what was sent."""
+    out, reader = bus.publisher(), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    with reader.transport._read_lock:  # its process stands still
+        for i in range(1, 3001):
+            out.send(numbered(i, 2000))
+    out.send(numbered(3001))
+    wait_for(lambda: reader.poll() and number(reader.received[-1]) == 3001)
+    assert reader.stats.lost > 0
+    assert len(reader.received) + reader.stats.lost == 3001
+    assert reader.numbers() == sorted(set(reader.numbers()))
+
+
+def test_losses_stand_in_heartbeat_and_diagnostics_by_publisher(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = bus.publisher()
+    node = Node[None](None, bus.node("reader"), SystemClock(), "reader")
+    subscription = node.subscribe_raw("/x", lambda *_: None)
+    node.start()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1))
+    out._sequence += 3  # three messages that never reached the wire
+    out.send(numbered(5))
+    wait_for(lambda: subscription.raw.stats.count == 2)
+    told: list = []
+    for publisher in (node._heartbeat, node._diagnostics):
+        monkeypatch.setattr(publisher, "publish", told.append)
+    node._beat()
+    node._publish_diagnostics()
+    beat, diagnostics = told
+    assert (beat.lost_topics, beat.lost_publishers, list(beat.lost_counts)) == (["/x"], ["sender"], [3])
+    (entry,) = [status for status in diagnostics.status if status.name == "reader: input /x"]
+    assert entry.message == "3 messages lost, 0 refused"
+    assert {value.key: value.value for value in entry.values}["lost from sender"] == "3"
+
+
+def test_dora_2152_a_node_exits_though_its_reader_stands_still(bus: Bus) -> None:
+    reader = bus.reader("/chatter", type_name="std_msgs/msg/String")
+    process = subprocess.Popen(
+        [sys.executable, str(HERE / "talker_node.py"), "-p", "period_s:=0.001", "--run-dir", str(bus.run_dir)]
+    )
+    try:
+        wait_for(lambda: len(reader.poll()) > 10)
+        with reader.transport._read_lock:
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+    finally:
+        process.kill()
+        process.wait(10)
+
+
+def test_foxglove_bridge_329_stale_flood_after_a_stall(bus: Bus) -> None:
+    """After a stall the newest message is there, once; those that nobody wanted any more are not called lost."""
+    out, reader = bus.publisher(qos=SENSOR), bus.reader(qos=SENSOR)
+    wait_for(lambda: out.subscriber_count == 1)
+    with reader.transport._read_lock:
+        for i in range(1, 201):
+            out.send(numbered(i, 20_000))  # 4 MB: more than its socket holds
+    wait_for(lambda: reader.raw._queue and number(reader.raw._queue[-1]) == 200)
+    assert reader.numbers() == [200]
+    assert reader.stats.lost == 0
+
+
+def test_zeromq_second_bind_steals_the_path(bus: Bus) -> None:
+    """A second stack in one run directory is refused in words; the first goes on."""
+    out, reader = bus.publisher(), bus.reader()
+    other = Bus(bus.run_dir)
+    try:
+        with pytest.raises(RegistryError, match="publisher of /x by node sender is already there"):
+            other.publisher()
+    finally:
+        other.close()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(7))
+    wait_for(lambda: reader.numbers() == [7])
+
+
+def test_zeromq_slow_joiner(bus: Bus) -> None:
+    """From the moment a reader is counted, it gets every message."""
+    reader, out = bus.reader(), bus.publisher()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1))
+    wait_for(lambda: reader.numbers() == [1])
+
+
+def test_late_joiner_misses_what_was_before_and_that_is_no_loss(bus: Bus) -> None:
+    out = bus.publisher()
+    for i in range(1, 6):
+        out.send(numbered(i))
+    reader = bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(6))
+    wait_for(lambda: reader.numbers() == [6])
+    assert reader.stats.lost == 0
+
+
+@pytest.mark.parametrize("size", [100, LARGE], ids=["small", "shared"])
+def test_ros_comm_706_latched_value_for_a_late_joiner_and_no_duplicate_for_others(bus: Bus, size: int) -> None:
+    out = bus.publisher(qos=LATCHED)
+    early = bus.reader(qos=LATCHED, node="early")
+    wait_for(lambda: out.subscriber_count == 1)
+    for i in range(1, 4):
+        out.send(numbered(i, size))
+    late = bus.reader(qos=LATCHED, node="late")
+    wait_for(late.poll)
+    out.send(numbered(4, size))
+    wait_for(lambda: late.numbers() == [3, 4])
+    wait_for(lambda: early.numbers() == [1, 2, 3, 4])
+    assert all(whole(message) for message in late.received + early.received)
+
+
+def holder(bus: Bus, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, str(HERE / "holding_reader.py"), str(bus.run_dir), *arguments],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def test_reader_killed_gives_its_buffers_back_and_is_back_when_restarted(bus: Bus) -> None:
+    out = bus.publisher()
+    for _ in range(2):
+        process = holder(bus)
+        try:
+            wait_for(lambda: out.subscriber_count == 1)
+            for i in range(1, 5):
+                out.send(numbered(i, LARGE))
+            assert process.stdout.readline() == "holding 4\n"
+            assert sum(bool(buffer.holders) for buffer in out._pool.buffers) == 4
+        finally:
+            process.kill()
+            process.wait(10)
+            process.stdout.close()
+        wait_for(lambda: out.subscriber_count == 0)
+        assert not any(buffer.holders for buffer in out._pool.buffers)
+
+
+def test_what_a_reader_holds_outlives_its_publisher(bus: Bus) -> None:
+    process = subprocess.Popen([sys.executable, str(HERE / "large_talker.py"), str(bus.run_dir)])
+    try:
+        reader = bus.reader()
+        wait_for(lambda: len(reader.poll()) >= 3)
+    finally:
+        process.kill()
+        process.wait(10)
+    assert all(whole(message) for message in reader.received)
+
+
+def test_killed_publisher_leaves_no_memory_behind_and_its_place_is_swept(bus: Bus) -> None:
+    process = subprocess.Popen([sys.executable, str(HERE / "large_talker.py"), str(bus.run_dir)])
+    try:
+        reader = bus.reader()
+        wait_for(lambda: len(reader.poll()) >= 3)
+        assert isinstance(reader.received[0].payload, memoryview)  # it did come through shared memory
+    finally:
+        process.kill()
+        process.wait(10)
+    assert "memfd:instant_ic" in Path("/proc/self/maps").read_text()
+    reader.received.clear()
+    wait_for(lambda: gc.collect() >= 0 and "memfd:instant_ic" not in Path("/proc/self/maps").read_text())
+    assert registry.sweep(bus.run_dir) == 1
+    assert list(bus.run_dir.glob("topics/*/*.sock")) == []
+
+
+def test_message_of_another_type_is_refused_counted_and_named(bus: Bus, caplog: pytest.LogCaptureFixture) -> None:
+    out = bus.publisher(type_name="std_msgs/msg/Bool")
+    reader = bus.reader(type_name="std_msgs/msg/String")
+    wait_for(lambda: out.subscriber_count == 1)
+    for size in (100, LARGE):
+        out.send(numbered(1, size))
+    wait_for(lambda: reader.stats.rejected == 2)
+    assert reader.poll() == []
+    assert "/x: node sender sends std_msgs/msg/Bool, std_msgs/msg/String expected" in caplog.text
+    assert caplog.text.count("refused and counted") == 1  # told once, not with every message
+
+
+def test_no_memory_for_a_buffer_sends_through_the_socket_and_tells(bus: Bus, caplog: pytest.LogCaptureFixture) -> None:
+    """The kernel refuses (here by a limit on file sizes); a SIGBUS in the midst of a copy would be the easy way."""
+    out, reader = bus.publisher(), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, hard))
+    try:
+        out.send(numbered(1, 5_500_000))
+        out.send(numbered(2, 5_500_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    wait_for(lambda: reader.numbers() == [1, 2])
+    assert all(whole(message) for message in reader.received)
+    assert out.stats.not_shared == 2
+    assert caplog.text.count("no shared memory for 5500000 bytes: File too large") == 1
+
+
+def test_full_memory_is_told_in_diagnostics(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("instant_ic.bus.shm.os.posix_fallocate", full)
+    node = Node[None](None, bus.node("sender"), SystemClock(), "sender")
+    out = node.publisher_raw("/x", BYTES, RELIABLE)
+    node.start()
+    reader = bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.publish_bytes(numbered(1, LARGE))
+    wait_for(lambda: reader.numbers() == [1])
+    told: list = []
+    monkeypatch.setattr(node._diagnostics, "publish", told.append)
+    node._publish_diagnostics()
+    (entry,) = [status for status in told[0].status if status.name == "sender: output /x"]
+    assert entry.message == (
+        f"1 large messages without shared memory: no shared memory for {LARGE} bytes: No space left on device"
+    )
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("unshare"), reason="mounting a small /dev/shm needs root")
+def test_full_dev_shm_does_not_matter(bus: Bus) -> None:
+    """/dev/shm of 64 kB, as in a container: large messages still go through shared memory."""
+    script = (
+        f"mount -t tmpfs -o size=64k none /dev/shm && exec {sys.executable} {HERE / 'large_talker.py'} {bus.run_dir}"
+    )
+    process = subprocess.Popen(["unshare", "-m", "sh", "-c", script], stderr=subprocess.PIPE, text=True)
+    try:
+        reader = bus.reader()
+        wait_for(lambda: len(reader.poll()) >= 3 or process.poll() is not None)
+        if process.poll() is not None:
+            pytest.skip(f"no mount namespace here: {process.stderr.read().strip()}")
+    finally:
+        process.kill()
+        process.wait(10)
+        process.stderr.close()
+    assert all(isinstance(message.payload, memoryview) and whole(message) for message in reader.received[:3])
+
+
+def test_reader_that_cannot_map_memory_asks_for_bytes(
+    bus: Bus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+    monkeypatch.setattr("instant_ic.bus.local_subscription.SharedMapping", refuse)
+    out, reader = bus.publisher(qos=LATCHED), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1, LARGE))
+    message = wait_for(reader.poll)[0]
+    assert number(message) == 1 and whole(message)
+    assert "shared memory cannot be used (Cannot allocate memory); connecting again without it" in caplog.text
+
+
+def test_torn_frames_fast_writer_slow_readers(bus: Bus) -> None:
+    """Readers keep views for a while, let them go in any order, and look at every byte before and after."""
+    out = bus.publisher(qos=SENSOR)
+    readers = [bus.reader(qos=qos, node=f"reader{i}") for i, qos in enumerate((SENSOR, RELIABLE, SENSOR))]
+    wait_for(lambda: out.subscriber_count == 3)
+    stop = threading.Event()
+    sent = 0
+
+    def write() -> None:
+        nonlocal sent
+        while not stop.is_set():
+            sent += 1
+            out.send(numbered(sent, LARGE + sent % 7 * 50_000))
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    random = np.random.default_rng(1)
+    try:
+        held: list = []
+        looked_at = 0
+        while looked_at < 600:
+            for reader in readers:
+                held += reader.raw.take()
+            random.shuffle(held)
+            while len(held) > 9:
+                message = held.pop()
+                assert whole(message), f"message {number(message)} was written over"
+                looked_at += 1
+    finally:
+        stop.set()
+        writer.join()
+    assert all(whole(message) for message in held)
+    assert all(reader.stats.torn == 0 and reader.raw.stats.rejected == 0 for reader in readers)
+    held.clear()
+
+
+def test_writing_over_a_lent_buffer_is_seen_and_told(bus: Bus, caplog: pytest.LogCaptureFixture) -> None:
+    """A publisher that breaks the rule: its readers notice after use, and before it."""
+    out, reader = bus.publisher(), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1, LARGE))
+    wait_for(reader.poll)
+    out._pool.buffers[0].finish(99)
+    reader.received.clear()
+    gc.collect()
+    wait_for(lambda: reader.stats.torn == 1)
+    with reader.transport._read_lock:
+        out.send(numbered(2, LARGE))
+        next(buffer for buffer in out._pool.buffers if buffer.holders).finish(98)
+    wait_for(lambda: reader.stats.torn == 2)
+    assert reader.poll() == []
+    assert reader.stats.lost_by == {"sender": 1}
+    assert "sender wrote over a message that was still being read" in caplog.text
+
+
+def test_a_recorder_that_collects_does_not_starve_the_publisher(bus: Bus) -> None:
+    """A queue of a hundred large messages holds four buffers; the rest are copies, and nothing is lost."""
+    out, collector, other = bus.publisher(), bus.reader(node="collector"), bus.reader(node="other", qos=SENSOR)
+    wait_for(lambda: out.subscriber_count == 2)
+    for i in range(1, 101):
+        out.send(numbered(i, LARGE))
+        wait_for(lambda i=i: collector.stats.count == i)
+    assert collector.numbers() == list(range(1, 101))
+    assert all(whole(message) for message in collector.received)
+    assert collector.stats.lost == 0
+    assert out.stats.not_shared == 0
+    assert len(out._pool.buffers) <= 8
+    wait_for(lambda: other.raw._queue and number(other.raw._queue[-1]) == 100)
+
+
+@pytest.mark.parametrize("qos", [SENSOR, RELIABLE], ids=["sensor", "reliable"])
+def test_reader_goes_on_after_it_held_all_it_may_hold(bus: Bus, qos: QoS) -> None:
+    """Found by the soak: a queue that waited for a buffer was never sent when the next message brought it back."""
+    out, reader, other = bus.publisher(qos=qos), bus.reader(qos=qos), bus.reader(qos=qos, node="other")
+    wait_for(lambda: out.subscriber_count == 2)
+    last = 0
+    for _ in range(5):
+        with reader.transport._read_lock:  # its process stands still, and then both go on together
+            for _ in range(30):
+                out.send(numbered(last := last + 1, LARGE))
+        out.send(numbered(last := last + 1, LARGE))
+    for each in (reader, other):
+        wait_for(lambda each=each: each.poll() and number(each.received[-1]) == last)
+        assert each.stats.lost == 0
+        assert all(whole(message) for message in each.received)
+    if qos is RELIABLE:
+        assert reader.numbers() == list(range(1, last + 1))
+
+
+def test_view_outlives_its_subscription(bus: Bus) -> None:
+    out, reader = bus.publisher(), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1, LARGE))
+    message = wait_for(reader.poll)[0]
+    reader.raw.close()
+    for i in range(2, 30):
+        out.send(numbered(i, LARGE))
+    assert number(message) == 1 and whole(message)
+    wait_for(lambda: out.subscriber_count == 0)
+
+
+def test_full_disk_under_the_run_directory_is_told(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(RegistryError, match=r"publisher of /x by node sender: .*No space left on device"):
+        bus.publisher()
+    monkeypatch.undo()
+    out, reader = bus.publisher(), bus.reader()  # the name is free again
+    wait_for(lambda: out.subscriber_count == 1)
+    out.send(numbered(1))
+    wait_for(lambda: reader.numbers() == [1])
+
+
+def test_message_that_does_not_fit_its_type_leaves_the_topic_usable(bus: Bus) -> None:
+    from instant_ic.msg import MessageError
+
+    node = Node[None](None, bus.node("sender"), SystemClock(), "sender")
+    out = node.publisher("/picture", Image, SENSOR)
+    reader = bus.reader("/picture", SENSOR, type_name="sensor_msgs/msg/Image")
+    wait_for(lambda: out.subscriber_count == 1)
+    message = image_message(np.zeros(PICTURE, np.uint8), "rgb8", "camera", 5)
+    wrong = image_message(np.zeros(PICTURE, np.uint8), "rgb8", "camera", 5)
+    wrong.step = "no number"
+    for _ in range(12):
+        with pytest.raises(MessageError, match="sensor_msgs/msg/Image"):
+            out.publish(wrong)
+    out.publish(message)
+    wait_for(reader.poll)
+    assert reader.stats.lost == 0 and len(out.raw._pool.buffers) == 1
