@@ -1,6 +1,7 @@
 """Two machines: latency of commands, age of pictures and state over the bridge and without it, CPU; as JSON.
 
 python benchmarks/bridge.py [SECONDS]     # a scenario, default 20
+python benchmarks/bridge.py --cut         # as root: real stacks in two network namespaces, the cable pulled
 
 Commands go 20 times a second from the station to the robot; pictures (200 kB, 10 a second) and states (20 a second) the
 other way. Two bridges with CURVE and the shipped lists, in processes of their own; the network is
@@ -10,6 +11,7 @@ other way. Two bridges with CURVE and the shipped lists, in processes of their o
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import platform
 import subprocess
@@ -29,6 +31,7 @@ from instant_ic.bus import SENSOR, Node
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.zmq_transport import ZmqTransport
 from instant_ic.evaluation.stack import Observer, _NoParameters, free_port
+from instant_ic.evaluation.two_machines import TwoMachines, drive_and_cut, missing
 from instant_ic.msg import (
     CompressedImage,
     Odometry,
@@ -167,8 +170,20 @@ def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
         return report
 
 
+def cut() -> dict[str, Any]:
+    """Robot and station in two network namespaces; the cable is pulled while the robot drives."""
+    if why := missing():
+        raise SystemExit(why)
+    with tempfile.TemporaryDirectory(prefix="ic2") as name, TwoMachines(Path(name), 20, 5) as machines:
+        with machines.robot() as robot, machines.station(depth=False, vspace=False) as station:
+            return {"network": machines.made_by, **dataclasses.asdict(drive_and_cut(machines, robot, station))}
+
+
 def main() -> None:
     """Prints one JSON object."""
+    if sys.argv[1:] == ["--cut"]:
+        print(json.dumps(cut(), indent=2))
+        return
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     scenarios = {name: run(network, seconds) for name, network in SCENARIOS.items()}
     print(json.dumps({"python": platform.python_version(), "seconds": seconds, "scenarios": scenarios}, indent=2))

@@ -31,6 +31,7 @@ _ALLOW_LIST_S = 0.25
 _STRANGER_S = 60.0
 _RETRY_S = 0.2
 _REFUSED_RETRY_S = 2.0
+_UNPROVED_RETRY_S = 0.7
 _GREETING_S = 2.0
 _IDLE_S = 0.1
 _RECEIVE_MOST = 200
@@ -683,10 +684,11 @@ class ConnectingLink(HostLink):
                     self._hang_up(_RETRY_S)
                     return
                 self._say(
-                    f"{self.endpoint} does not prove the key of {self.peer.name} ({self.peer.fingerprint}): another "
-                    f"machine, or a new key; `ic keys list` there, `ic keys allow {self.peer.name} KEY` here"
+                    f"{self.endpoint} hangs up before it has proved the key of {self.peer.name} "
+                    f"({self.peer.fingerprint}): another machine, a new key (`ic keys list` there, "
+                    f"`ic keys allow {self.peer.name} KEY` here), or a network that breaks off"
                 )
-                self._hang_up(_REFUSED_RETRY_S)
+                self._hang_up(_UNPROVED_RETRY_S)
             elif kind == zmq.EVENT_CONNECT_RETRIED and not up:
                 self._say(f"{self.endpoint} cannot be reached: is the robot's bridge running, is the address right?")
 

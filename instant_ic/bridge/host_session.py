@@ -6,8 +6,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
+from ..ranges import Range, check_ranges
 from .host_clock import ClockFilter
 from .host_flow import Channel, Item, Outbox, Window
 from .host_protocol import (
@@ -68,18 +69,15 @@ class LinkTimes:
         queue_s: time that a picture may wait in the link's queues.
     """
 
-    ping_s: float = 0.25
-    timeout_s: float = 1.0
-    queue_s: float = 0.05
+    ping_s: Annotated[float, Range(0.02, 5)] = 0.25
+    timeout_s: Annotated[float, Range(0.1, 60)] = 1.0
+    queue_s: Annotated[float, Range(0.005, 1)] = 0.05
 
     def __post_init__(self) -> None:
         """Checks the values."""
-        if not 0.02 <= self.ping_s <= 5:
-            raise ValueError(f"ping_s must be in 0.02..5 (got {self.ping_s})")
-        if not 2 * self.ping_s <= self.timeout_s <= 60:
-            raise ValueError(f"timeout_s must be at least two ping_s, and 60 at most (got {self.timeout_s})")
-        if not 0.005 <= self.queue_s <= 1:
-            raise ValueError(f"queue_s must be in 0.005..1 (got {self.queue_s})")
+        check_ranges(self)
+        if self.timeout_s < 2 * self.ping_s:
+            raise ValueError(f"timeout_s must be at least two ping_s (got {self.timeout_s} and {self.ping_s})")
 
 
 @dataclass(frozen=True)

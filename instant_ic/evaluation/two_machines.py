@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bridge.host_keys import KeyStore, Peer
+from ..bus import LATCHED, RELIABLE
+from ..msg import message_type, stamp_ns, twist_stamped
 from .stack import Stack, StackError
 
 ROBOT_ADDRESS, STATION_ADDRESS = "10.231.75.1", "10.231.75.2"
@@ -136,8 +146,6 @@ class TwoMachines:
         self.station_target = ("127.0.0.1", PORT)
 
     def _make_keys(self) -> None:
-        from ..bridge.host_keys import KeyStore, Peer
-
         stores = {host: KeyStore(self.keys(host)) for host in ("robot", "station")}
         made = {host: store.create(host) for host, store in stores.items()}
         stores["robot"].allow(Peer("station", "driver", made["station"].public_key))
@@ -152,29 +160,152 @@ class TwoMachines:
 
 
 class Hand:
-    """An operator's hand: commands on ``/operator/cmd_vel`` of a stack, 20 a second, from a thread of its own.
+    """An operator's hand: commands on ``/operator/cmd_vel`` of a stack, 20 a second; a context manager.
 
     Args:
         stack: where; its observer publishes.
     """
 
     def __init__(self, stack: Stack) -> None:
-        import threading
-
-        from ..msg import message_type, twist_stamped
-
         self.command = (0.0, 0.0)
-        self._message = twist_stamped
         self._out = stack.observer.publisher("/operator/cmd_vel", message_type("TwistStamped"))
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hand", daemon=True)
-        self._thread.start()
 
     def _run(self) -> None:
         while not self._stop.wait(0.05):
-            self._out.publish(self._message(*self.command, time.time_ns()))
+            self._out.publish(twist_stamped(*self.command, time.time_ns()))
 
-    def let_go(self) -> None:
+    def __enter__(self) -> Self:
+        """Begins to send."""
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         """Sends nothing any more."""
         self._stop.set()
         self._thread.join(5)
+
+
+@dataclass
+class CutDrive:
+    """What came of :func:`drive_and_cut`; seconds and metres.
+
+    Attributes:
+        picture_age_s: from the exposure of the newest picture at the station until then.
+        driven_m: by the operator's command, before the cut.
+        stop_s: from the cut to the last motion of the wheels.
+        drift_m: of the robot that stands, until the cable is back and the station linked.
+        relink_s: from the cable's return to the link.
+        driven_again_m: after it.
+        offset_ms, rtt_ms, jitter_ms: of the robot's clock as the station sees it.
+        console: what the station's page missed; empty words where nothing.
+        words: what both bridges said while the cable was out.
+    """
+
+    picture_age_s: float = math.nan
+    driven_m: float = 0.0
+    stop_s: float = math.nan
+    drift_m: float = math.nan
+    relink_s: float = math.nan
+    driven_again_m: float = 0.0
+    offset_ms: float = math.nan
+    rtt_ms: float = math.nan
+    jitter_ms: float = math.nan
+    console: dict[str, str] = field(default_factory=dict)
+    words: dict[str, str] = field(default_factory=dict)
+
+
+class _Diagnoses:
+    """The newest diagnoses on a stack's bus by name: words and values."""
+
+    def __init__(self, stack: Stack) -> None:
+        self.words: dict[str, str] = {}
+        self.values: dict[str, dict[str, str]] = {}
+        stack.observer.subscribe("/diagnostics", message_type("DiagnosticArray"), self._take, RELIABLE)
+
+    def _take(self, message: Any) -> None:
+        for status in message.status:
+            self.words[status.name] = status.message
+            self.values[status.name] = {pair.key: pair.value for pair in status.values}
+
+
+def drive_and_cut(machines: TwoMachines, robot: Stack, station: Stack) -> CutDrive:
+    """The station drives the robot, the cable is pulled while it moves, and put back; then it drives on.
+
+    Raises:
+        StackError: something did not happen in time.
+    """
+    result = CutDrive()
+    real = message_type("ControlState").REAL
+    odometry, state_type = message_type("Odometry"), message_type("ControlState")
+    speeds, states = robot.collect("/wheel/odom", odometry), robot.collect("/ic/state", state_type, LATCHED)
+    truth = robot.collect("/ground_truth/odom", odometry)
+    pictures = station.collect("/camera/image/compressed", message_type("CompressedImage"))
+    maps = station.collect("/map", message_type("OccupancyGrid"), LATCHED)
+    seen, told = _Diagnoses(station), _Diagnoses(robot)
+
+    def wait(condition: Callable[[], Any], timeout_s: float, what: str) -> None:
+        def look() -> Any:
+            robot.observer.spin_once()
+            return condition()
+
+        station.wait_for(look, timeout_s, what)
+
+    def place() -> NDArray[np.float64]:
+        point = truth[-1].pose.pose.position
+        return np.array([point.x, point.y])
+
+    def driven_from(start: NDArray[np.float64]) -> float:
+        return float(np.linalg.norm(place() - start))
+
+    def speed() -> float:
+        return abs(speeds[-1].twist.twist.linear.x) if speeds else 0.0
+
+    # What the operator needs comes over: picture, state, pose, map, in the console's own judgement.
+    wait(lambda: pictures and maps, 180, "picture and map at the station")
+    names = [f"console: {name}" for name in ("camera", "controller", "pose")]
+    wait(lambda: all(seen.words.get(name) == "" for name in names), 120, "console that misses nothing")
+    result.console = {name: seen.words[name] for name in names}
+    result.picture_age_s = (time.time_ns() - stamp_ns(pictures[-1])) / 1e9
+    wait(lambda: states and states[-1].mode == real, 120, "robot that may drive")
+    with Hand(station) as hand:
+        start = place()
+        hand.command = (0.25, 0.0)
+        wait(lambda: driven_from(start) > 0.3 and speed() > 0.15, 60, "motion")
+        result.driven_m = driven_from(start)
+        machines.cut()
+        moved_s = cut_s = time.monotonic()
+
+        def stands() -> bool:
+            nonlocal moved_s
+            if any(abs(message.twist.twist.linear.x) > 0.01 for message in speeds):
+                moved_s = time.monotonic()
+            speeds.clear()
+            return time.monotonic() - moved_s > 1.5
+
+        wait(stands, 30, "robot that stands")
+        result.stop_s = moved_s - cut_s
+        standing = place()
+        link = "host_bridge: link"
+        wait(lambda: "nothing heard" in told.words.get(link, ""), 30, "words of the robot's bridge")
+        wait(lambda: seen.words.get(link, "").startswith(("robot:", "tcp:")), 30, "words of the station's bridge")
+        result.words = {"robot": told.words[link], "station": seen.words[link]}
+        hand.command = (0.0, 0.0)
+        machines.mend()
+        mended_s = time.monotonic()
+        wait(lambda: seen.words.get(link, "").startswith("linked with robot"), 60, "link")
+        result.relink_s = time.monotonic() - mended_s
+        result.drift_m = driven_from(standing)
+        count = len(pictures)
+        wait(lambda: len(pictures) > count + 3, 60, "pictures after the cut")
+        wait(lambda: states[-1].mode == real, 120, "robot that may drive again")
+        start = place()
+        hand.command = (-0.25, 0.0)
+        wait(lambda: driven_from(start) > 0.2, 60, "motion after the cut")
+        result.driven_again_m = driven_from(start)
+    clock = seen.values["host_bridge: clock of robot"]
+    result.offset_ms, result.rtt_ms, result.jitter_ms = (float(clock[k]) for k in ("offset_ms", "rtt_ms", "jitter_ms"))
+    return result

@@ -283,7 +283,8 @@ def test_driver_is_handed_over_by_a_live_parameter(hosts):
         ({"connect": "tcp://robot"}, "connect: .* must look like tcp://192.168.1.20:7450"),
         ({"listen": "tcp://0.0.0.0:1"}, "to_station and to_robot are empty"),
         ({"listen": "tcp://0.0.0.0:1", "to_robot": ["/scan rat=3"]}, "to_robot: /scan: 'rat=3' is not one of"),
-        ({"listen": "tcp://0.0.0.0:1", "link.ping_s": 9.0}, "ping_s must be in 0.02..5"),
+        ({"listen": "tcp://0.0.0.0:1", "link.ping_s": 9.0}, "ping_s must lie in 0.02..5"),
+        ({"listen": "tcp://0.0.0.0:1", "link.ping_s": 0.8}, "timeout_s must be at least two ping_s"),
         ({"listen": "tcp://0.0.0.0:1", "max_offset_ms": -1.0}, "max_offset_ms must be > 0"),
     ],
 )
