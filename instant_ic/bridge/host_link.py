@@ -29,6 +29,7 @@ _ZAP = "inproc://zeromq.zap.01"
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+(%\w+)?\]|[A-Za-z0-9_.*-]+):(\d{1,5})\Z")
 _ALLOW_LIST_S = 0.25
 _STRANGER_S = 60.0
+_STRANGERS_A_MINUTE = 10
 _RETRY_S = 0.2
 _REFUSED_RETRY_S = 2.0
 _UNPROVED_RETRY_S = 0.7
@@ -447,16 +448,17 @@ class ListeningLink(HostLink):
             self._zap.send_multipart([back, empty, version, request, code, text, user, b""])
 
     def _turn_away(self, address: str, key: bytes) -> None:
-        """Logged once a minute for each address and key, with the number of tries in between."""
+        """Told once a minute for each address and key, and ten times a minute in all, with the tries in between."""
         self.strangers += 1
         who = (address, fingerprint(key) if key else "without a key")
         told_s, times = self._told.get(who, (-_STRANGER_S, 0))
         now = time.monotonic()
-        if now - told_s < _STRANGER_S:
-            self._told[who] = (told_s, times + 1)
-            return
         if len(self._told) >= 1000:
             self._told.clear()
+        lately = sum(now - other_s < _STRANGER_S for other_s, _ in self._told.values())
+        if now - told_s < _STRANGER_S or lately >= _STRANGERS_A_MINUTE:
+            self._told[who] = (told_s, times + 1)
+            return
         self._told[who] = (now, 0)
         self._emit("", Stranger(*who, times + 1))
 

@@ -168,6 +168,15 @@ def test_a_stranger_gets_nothing_and_is_told_once(ends, keys):
     wait_for(lambda: c.payloads("/ic/state") == [b"secret"], "state")
 
 
+def test_stranger_with_ever_new_keys_does_not_flood_the_log(ends, keys):
+    a = robot(ends, keys)
+    with a.link._lock:
+        for index in range(3000):
+            a.link._turn_away("10.0.0.9", index.to_bytes(32, "little"))
+    assert a.link.strangers == 3000 and 10 <= len(a.of(Stranger)) <= 40
+    assert len(a.link._told) <= 1000
+
+
 def test_viewer_sees_and_sends_nothing(ends, keys):
     allow(keys, "tablet", "viewer")
     a = robot(ends, keys)
