@@ -57,6 +57,7 @@ def test_which_nodes_run() -> None:
     assert set(nodes("sim")) == ROBOT | STATION | {"simulator"}
     without = {"console", "nerf"}
     assert set(nodes("sim", headless="true", vspace="false")) == (ROBOT | STATION | {"simulator"}) - without
+    assert set(nodes("sim", snapshots="snaps")) == ROBOT | STATION | {"simulator", "snapshot_recorder"}
     assert set(nodes("sim", record="drive")) == ROBOT | STATION | {"simulator", "bag_recorder"}
     assert set(nodes("replay")) == PERCEPTION | {"bag_player"}
     assert set(nodes("replay", nerf="true", record="again")) == PERCEPTION | {"bag_player", "bag_recorder", "nerf"}
