@@ -50,6 +50,7 @@ _SOCKET_BYTES = 1 << 20
 _QUEUE_BYTES = 128 << 20
 _LINGER_S = 0.2  # a last zero command still goes out when a node ends
 _MEMORY_RETRY_S = 5.0
+_DOOR_S = 0.05
 _READ_ONLY = select.EPOLLIN | select.EPOLLRDHUP
 
 log = logging.getLogger(__name__)
@@ -329,6 +330,7 @@ class LocalPublisher:
         self._memory_retry_s = 0.0
         self._last: _Outgoing | None = None
         self._closed = False
+        self._told_full = False
         digest = type_digest(type_name)
         self._claim, self._path = registry.claim_socket(transport.run_dir, topic, transport.node)
         identity = os.urandom(8).hex()
@@ -349,11 +351,18 @@ class LocalPublisher:
                     "started_ns": time.time_ns(),
                 }
             )
+        except registry.RegistryError:
+            self._give_up()
+            raise
         except OSError as error:
-            self._listener.close()
-            self._claim.release()
+            self._give_up()
             raise registry.RegistryError(f"publisher of {topic} by node {transport.node}: {error}") from error
         transport.watch(self._listener.fileno(), select.EPOLLIN, self._on_listener)
+
+    def _give_up(self) -> None:
+        self._listener.close()
+        self._path.unlink(missing_ok=True)
+        self._claim.release()
 
     @property
     def subscriber_count(self) -> int:
@@ -531,10 +540,13 @@ class LocalPublisher:
                     connection, _address = self._listener.accept()
                 except BlockingIOError:
                     return
-                except OSError as error:  # too many open files: told, and tried again with the next reader
-                    log.error("%s: a reader cannot be let in: %s", self.topic, error)
-                    time.sleep(0.05)
+                except OSError as error:  # too many open files: it waits at the door until there are fewer
+                    if not self._told_full:
+                        log.error("%s: a reader cannot be let in: %s", self.topic, error)
+                    self._told_full = True
+                    time.sleep(_DOOR_S)
                     return
+                self._told_full = False
                 connection.setblocking(False)
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
                 reader = _Reader(connection, self._rewatch)

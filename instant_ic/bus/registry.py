@@ -129,6 +129,7 @@ class Claim:
 
     def __init__(self, stem: Path, what: str, timeout_s: float = 2.0) -> None:
         self.stem = stem
+        self._what = what
         self.json_path = stem.with_name(stem.name + ".json")
         lock_path = stem.with_name(stem.name + ".lock")
         try:
@@ -148,10 +149,18 @@ class Claim:
                 time.sleep(0.02)
 
     def write(self, content: dict[str, Any]) -> None:
-        """Replaces the JSON in one step, so that a reader never sees half of it."""
+        """Replaces the JSON in one step, so that a reader never sees half of it.
+
+        Raises:
+            RegistryError: the disk is full, or the run directory is gone.
+        """
         scratch = self.json_path.with_suffix(".tmp")
-        scratch.write_text(json.dumps(content, default=str))
-        scratch.replace(self.json_path)
+        try:
+            scratch.write_text(json.dumps(content, default=str))
+            scratch.replace(self.json_path)
+        except OSError as error:
+            scratch.unlink(missing_ok=True)
+            raise RegistryError(f"{self._what} cannot be told to others: {error}") from error
 
     def release(self) -> None:
         """Takes the JSON away and gives the lock back; twice does no harm."""
