@@ -448,7 +448,7 @@ def test_full_disk_under_the_run_directory_is_told(bus: Bus, monkeypatch: pytest
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(RegistryError, match=r"publisher of /x by node sender: .*No space left on device"):
+    with pytest.raises(RegistryError, match=r"publisher of /x by node sender cannot be told to others: .*No space left on device"):
         bus.publisher()
     monkeypatch.undo()
     out, reader = bus.publisher(), bus.reader()  # the name is free again
