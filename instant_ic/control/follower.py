@@ -42,7 +42,7 @@ class FollowerConfig:
     approach_decel_m_s2: Positive = 0.4
     use_collision_detection: bool = True
     max_allowed_time_to_collision_up_to_carrot: Positive = 1.0
-    collision_padding_m: Positive = 0.02
+    collision_padding_m: Positive = 0.01
     xy_goal_tolerance: Positive = 0.05
     yaw_goal_tolerance: Positive = 0.05
     track_distance_m: Positive = 0.6

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import Positive, check_ranges
+from ..ranges import NotNegative, Positive, check_ranges
 from .costmap import Costmap
 from .follower import FollowerCommand, PathFollower
 from .planner import HybridPlanner, Plan, no_plan
@@ -23,6 +23,7 @@ class RecoveryConfig:
     speed_m_s: Positive = 0.15
     moved_m: Positive = 0.03
     turned_rad: Positive = 0.05
+    keep_plan_s: NotNegative = 3.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -46,6 +47,9 @@ class Navigator:
 
     A robot that is told to move and does not (a corner would touch when it turns, say) backs off a little, the next
     time forwards, and plans again. The collision monitor stands behind that as behind everything.
+
+    In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. A path to the
+    goal that is still free is therefore kept for ``recovery.keep_plan_s`` when no new one is found.
     """
 
     def __init__(
@@ -59,6 +63,7 @@ class Navigator:
         self.follower = follower
         self.replan_period_s = replan_period_s
         self.recovery = recovery or RecoveryConfig()
+        self._body = planner.footprint.points(0.045)
         self.reset()
 
     def reset(self) -> None:
@@ -66,6 +71,7 @@ class Navigator:
         self.follower.reset()
         self._plan = _NO_PLAN
         self._planned_ns: int | None = None
+        self._found_ns: int | None = None  # when a path all the way was planned last
         self._moved_ns: int | None = None  # when the robot last moved, or was not told to
         self._moved_pose: NDArray[np.float64] = np.zeros(3)
         self._recovering_ns: int | None = None
@@ -83,7 +89,7 @@ class Navigator:
         """Twist towards ``subgoal`` (x, y, yaw) from ``pose``, both in the costmap's frame."""
         due = self._planned_ns is None or now_ns - self._planned_ns >= self.replan_period_s * 1e9
         if due:
-            self._plan = self.planner.plan(costmap, pose, subgoal, self._plan)
+            self._plan = self._planned(costmap, pose, subgoal, now_ns)
             self._planned_ns = now_ns
         plan = _with_end(self._plan, subgoal)
         if self._recovering(pose, now_ns):
@@ -92,6 +98,23 @@ class Navigator:
         if step.command == (0.0, 0.0) and step.state != "blocked":
             self._moved_ns = now_ns
         return NavigatorStep(step.command, step.state, plan, due)
+
+    def _planned(self, costmap: Costmap, pose: NDArray[np.float64], subgoal: NDArray[np.float64], now_ns: int) -> Plan:
+        before = self._plan
+        plan = self.planner.plan(costmap, pose, subgoal, before)
+        if plan.reached:
+            self._found_ns = now_ns
+            return plan
+        young = self._found_ns is not None and now_ns - self._found_ns <= self.recovery.keep_plan_s * 1e9
+        if not before.reached or not young:
+            return plan
+        if float(np.linalg.norm(before.poses[-1, :2] - subgoal[:2])) > self.planner.config.tolerance:
+            return plan
+        rest = int(np.argmin(np.linalg.norm(before.poses[:, :2] - pose[:2], axis=1)))
+        overlap = costmap.lethal_overlap(np.concatenate([pose[None], before.poses[rest:]]), self._body)
+        if (overlap > overlap[0]).any():
+            return plan
+        return replace(before, poses=before.poses[rest:], reverse=before.reverse[rest:])
 
     def _recovering(self, pose: NDArray[np.float64], now_ns: int) -> bool:
         recovery = self.recovery

@@ -50,7 +50,7 @@ class PlannerConfig:
     non_straight_penalty: Annotated[float, Range(low=1)] = 1.05
     rotation_penalty: NotNegative = 0.3
     retrospective_gain: Annotated[float, Range(0, 0.2)] = 0.15
-    footprint_padding: NotNegative = 0.03
+    footprint_padding: NotNegative = 0.02
     escape_radius_m: NotNegative = 0.6
     tolerance: NotNegative = 0.5
     max_iterations: PositiveInt = 8000
