@@ -54,7 +54,9 @@ class Player(Node[PlayerConfig]):
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Listener, Player]]:
     run_dir: Path = tmp_path_factory.mktemp("r")
     clock, system = ManualClock(), SystemClock()
-    listener = Listener(ListenerConfig(), LocalTransport(run_dir, "listener", clock.now_ns), clock, use_sim_time=True)
+    listener = Listener(
+        ListenerConfig(), LocalTransport(run_dir, "listener", clock.now_ns, clock.steady_ns), clock, use_sim_time=True
+    )
     player = Player(PlayerConfig(), LocalTransport(run_dir, "player", system.now_ns), system)
     listener.start()
     player.start()
