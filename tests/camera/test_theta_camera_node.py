@@ -15,7 +15,7 @@ from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.params import build, load_file
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.camera.config import FilesConfig, ThetaConfig
 from instant_ic.camera.loop import ReconnectConfig
 from instant_ic.msg import CompressedImage, stamp_ns, transform_matrix
@@ -88,7 +88,7 @@ def test_theta_over_real_sockets(run_dir: Path, monkeypatch: pytest.MonkeyPatch)
         )
         nodes: list[Node[Any]] = []
         for kind in (Probe, ThetaCameraNode):
-            nodes.append(kind(config, ZmqTransport(run_dir, kind.name, clock.now_ns), clock))
+            nodes.append(kind(config, LocalTransport(run_dir, kind.name, clock.now_ns), clock))
             nodes[-1].start()
         probe, camera = nodes
         assert isinstance(probe, Probe) and isinstance(camera, ThetaCameraNode)

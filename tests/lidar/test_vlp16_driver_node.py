@@ -18,7 +18,7 @@ from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.params import build, load_file
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.packets import PACKET_PERIOD_US, encode_position_packet
@@ -179,7 +179,7 @@ def test_udp_over_real_sockets(run_dir: Path) -> None:
     config = Vlp16DriverConfig(host="127.0.0.1", port=0, position_port=0, silence_s=0.05)
     nodes: list[Node[Any]] = []
     for kind in (Vlp16DriverNode, Probe):
-        transport = ZmqTransport(run_dir, kind.name, clock.now_ns)
+        transport = LocalTransport(run_dir, kind.name, clock.now_ns)
         nodes.append(kind(config, transport, clock))
         nodes[-1].start()
     driver, probe = nodes
