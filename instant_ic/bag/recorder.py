@@ -216,6 +216,7 @@ class Recorder:
                 path, self.options.compressed, self.options.max_bytes, self.options.max_duration_s, _LEVEL
             )
         self._queue = _Queue(self.options.queue_bytes)
+        self._counting = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
         self._thread.start()
@@ -320,11 +321,12 @@ class Recorder:
 
     def lost(self) -> dict[str, int]:
         """Messages lost on the way, by topic, where there are any."""
-        return {topic: counter.lost for topic, counter in self._losses.items() if counter.lost}
+        # A copy: the writing thread asks while this one may find topics.
+        return {topic: counter.lost for topic, counter in list(self._losses.items()) if counter.lost}
 
     def lost_by(self) -> dict[str, dict[str, int]]:
         """The same, topic → publisher → messages."""
-        return {topic: dict(counter.lost_by) for topic, counter in self._losses.items() if counter.lost_by}
+        return {topic: dict(counter.lost_by) for topic, counter in list(self._losses.items()) if counter.lost_by}
 
     def unknown_types(self) -> dict[str, str]:
         """Types recorded without their definition, with one of their topics."""
@@ -371,6 +373,10 @@ class Recorder:
         if self._state == FAILED:
             raise BagError(self.error)
 
+    def _count(self, counter: Counter[str], topic: str) -> None:
+        with self._counting:  # two threads leave out messages
+            counter[topic] += 1
+
     def _begin(self, stamp_ns: int) -> None:
         self._begun_ns = stamp_ns
         held, self._held = self._held, []
@@ -385,7 +391,7 @@ class Recorder:
         if self._paused or self._state in (DISK_FULL, FAILED):
             if qos.latched:
                 self._not_written.append(entry)
-            (self.told.paused if self._paused else self.told.disk_full)[topic] += 1
+            self._count(self.told.paused if self._paused else self.told.disk_full, topic)
             return
         if self._cache is not None:
             self._cache.add(entry, time.monotonic())
@@ -450,7 +456,7 @@ class Recorder:
     def _write(self, entry: Entry) -> None:
         try:
             if self._writer is None or self._state != RECORDING:
-                self.told.disk_full[entry.topic] += 1
+                self._count(self.told.disk_full, entry.topic)
                 if entry.qos.latched:
                     self._not_written.append(entry)
                 return
@@ -461,7 +467,7 @@ class Recorder:
             self._queue.done(entry)
 
     def _end_part(self) -> None:
-        if self._writer is not None and self._state == RECORDING:
+        if self._writer is not None and self._state == RECORDING and not self._writer.part_is_empty:
             self._tell(self._writer)
             self._writer.end_part()
 
@@ -477,7 +483,8 @@ class Recorder:
         if self._state == RECORDING and free < reserve:
             words = f"only {free / 1e6:.0f} MB are free where {self.path} is, {reserve / 1e6:.0f} MB are the reserve"
             if self._writer is not None:
-                self._end_part()
+                self._tell(self._writer)
+                self._writer.end_part()
             self._stop(DISK_FULL, f"{words}: not recording; the bag is complete up to here")
         elif self._state == DISK_FULL and free >= reserve + _ROOM_AGAIN:
             log.warning("%s: there is room again, recording goes on in a new file", self.path)

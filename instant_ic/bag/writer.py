@@ -105,9 +105,9 @@ class BagWriter:
         return len(self._done) + (self._part is not None)
 
     @property
-    def folder_bytes(self) -> int:
-        """What has come onto the disk."""
-        return sum(file.stat().st_size for file in self.path.glob("*.mcap"))
+    def part_is_empty(self) -> bool:
+        """Whether the present file has no message yet."""
+        return self._part is None or self._part.given == 0
 
     def write(
         self,
