@@ -588,7 +588,14 @@ class Node(Generic[ConfigT]):
         for subscription in self._inputs():
             pending += [(received.order, subscription, received) for received in subscription.raw.take()]
         pending.sort(key=lambda entry: entry[0])
-        for _, subscription, received in pending:
+        for index, (_, subscription, received) in enumerate(pending):
+            if index and subscription.raw.qos.depth == 1 and not self.lockstep:
+                # The callbacks before may have lasted: of a topic whose newest counts, take what came meanwhile.
+                for newer in subscription.raw.take():
+                    if newer.publisher == received.publisher:
+                        received = newer
+                    else:
+                        pending.append((newer.order, subscription, newer))
             self._guard(f"callback of {received.topic}", subscription.callback, received)
             ran = True
         return self._fire_timers() or ran

@@ -83,6 +83,37 @@ def test_ros_comm_536_buff_size_lag_a_slow_node_works_on_the_newest(bus: Bus, si
     assert subscription.raw.stats.lost == 0
 
 
+def test_a_slow_callback_does_not_age_what_waits_behind_it(bus: Bus) -> None:
+    """Two topics came together; while the first one's callback lasts, the second one's newest is replaced."""
+    slow, quick = bus.publisher("/slow", SENSOR), bus.publisher("/quick", SENSOR)
+    node = Node[None](None, bus.node("busy"), SystemClock(), "busy")
+    worked_on: list[int] = []
+
+    def last() -> int:
+        queue = quick_in.raw._queue
+        return number(queue[-1]) if queue else 0
+
+    def work(_) -> None:
+        for i in range(2, 10):
+            quick.send(numbered(i))
+        wait_for(lambda: last() == 9)
+
+    def note(received) -> None:
+        worked_on.append(number(received))
+        node.stop()
+
+    slow_in = node.subscribe_received("/slow", work, SENSOR)
+    quick_in = node.subscribe_received("/quick", note, SENSOR)
+    wait_for(lambda: slow.subscriber_count == 1 and quick.subscriber_count == 1)
+    slow.send(numbered(1))
+    wait_for(lambda: slow_in.raw.stats.count == 1)
+    quick.send(numbered(1))
+    wait_for(lambda: quick_in.raw.stats.count == 1)
+    node.start()
+    node.spin()
+    assert worked_on == [9]
+
+
 def test_dora_515_and_3428_silent_input_loss(bus: Bus) -> None:
     """What does not fit a reader's queue is counted, with the name of the node that sent it."""
     out = bus.publisher()
@@ -448,7 +479,9 @@ def test_full_disk_under_the_run_directory_is_told(bus: Bus, monkeypatch: pytest
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(RegistryError, match=r"publisher of /x by node sender cannot be told to others: .*No space left on device"):
+    with pytest.raises(
+        RegistryError, match=r"publisher of /x by node sender cannot be told to others: .*No space left on device"
+    ):
         bus.publisher()
     monkeypatch.undo()
     out, reader = bus.publisher(), bus.reader()  # the name is free again
