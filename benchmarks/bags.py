@@ -117,9 +117,9 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, {root!r})
 from instant_ic.bus.qos import SENSOR
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.local_transport import LocalTransport
 from benchmarks.bags import picture
-transport = ZmqTransport(Path({run!r}), "camera", time.time_ns)
+transport = LocalTransport(Path({run!r}), "camera", time.time_ns)
 out = transport.advertise("/image", "sensor_msgs/msg/Image", SENSOR)
 payload = picture({size})
 while out.subscriber_count == 0:

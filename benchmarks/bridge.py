@@ -29,7 +29,7 @@ import psutil
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bus import SENSOR, Node
 from instant_ic.bus.clock import SystemClock
-from instant_ic.bus.zmq_transport import ZmqTransport
+from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.evaluation.stack import Observer, _NoParameters, free_port
 from instant_ic.evaluation.two_machines import TwoMachines, drive_and_cut, missing
 from instant_ic.msg import (
@@ -58,7 +58,9 @@ class Host:
     """A node that sends and listens, spinning on a thread of its own."""
 
     def __init__(self, run_dir: Path, name: str) -> None:
-        self.node: Node[Any] = Observer(_NoParameters(), ZmqTransport(run_dir, name, time.time_ns), SystemClock(), name)
+        self.node: Node[Any] = Observer(
+            _NoParameters(), LocalTransport(run_dir, name, time.time_ns), SystemClock(), name
+        )
         self.ages_ms: dict[str, list[float]] = {}
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.stop = threading.Event()
