@@ -145,7 +145,7 @@ class _Drive:
         inside = [(c > 0) & (c < s) for c, s in zip(centres, self.room.size, strict=True)]
         occupancy[np.ix_(inside[1], inside[0])] = 0
         occupancy[walls.cells] = 100
-        return StaticMap(occupancy, 0.05, walls.origin)
+        return StaticMap(occupancy, 0.05, np.asarray(walls.origin, dtype=np.float64))
 
     def run(self) -> Episode:
         episode = self.episode
