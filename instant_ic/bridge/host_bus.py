@@ -12,7 +12,7 @@ from typing import Any
 
 from ..bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
 from ..bus.qos import PRESETS
-from ..bus.transport import Received
+from ..bus.transport import Received, TransportError
 from .host_link import HostLink
 from .host_protocol import Announce
 from .host_session import Arrived
@@ -135,7 +135,7 @@ class ImportedTopics:
             if topic.publisher is None:
                 topic.waiting.append(arrived)
             else:
-                topic.publisher.publish_bytes(arrived.payload, arrived.publish_ns)
+                self._publish(topic.publisher, arrived)
 
     def _advertise(self, name: str, topic: _Imported) -> None:
         try:
@@ -145,7 +145,7 @@ class ImportedTopics:
             return
         with topic.lock:
             for arrived in topic.waiting if topic.qos.depth > 1 else list(topic.waiting)[-1:]:
-                publisher.publish_bytes(arrived.payload, arrived.publish_ns)
+                self._publish(publisher, arrived)
             topic.waiting.clear()
             topic.publisher = publisher
 
@@ -162,4 +162,10 @@ class ImportedTopics:
             if came:
                 with topic.lock:
                     for arrived in topic.last.values():
-                        topic.publisher.publish_bytes(arrived.payload, arrived.publish_ns)
+                        self._publish(topic.publisher, arrived)
+
+    def _publish(self, publisher: Publisher, arrived: Arrived) -> None:
+        try:
+            publisher.publish_bytes(arrived.payload, arrived.publish_ns)
+        except (TransportError, OSError) as error:  # one message that this bus cannot carry must not end the link
+            self._on_trouble(arrived.announce.topic, str(error))

@@ -489,6 +489,8 @@ class Session:
         publish_ns = data.publish_ns
         if data.wall_time and (offset := self.wall_offset_ns) is not None:
             publish_ns -= offset
+        if not 0 <= publish_ns < 1 << 63:
+            raise ProtocolError(f"{announce.topic}: published at {publish_ns} ns cannot be")
         arrived = Arrived(announce, payload, publish_ns, age_ns or 0)
         if not (self.drives or rule.shared):
             counts.not_driving += 1

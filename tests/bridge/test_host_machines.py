@@ -43,5 +43,5 @@ def test_the_operator_drives_a_robot_on_another_machine_and_a_cut_cable_stops_it
     assert result.stop_s < 5.0  # 0.3 s and 0.5 s of braking on a free machine
     assert result.drift_m < 0.05  # and no command from before the cut moved it when the cable was back
     assert result.driven_again_m > 0.2
-    # One machine has one clock; 2 x (20 ± 5) ms and what a busy machine adds.
-    assert abs(result.offset_ms) < 15 and 25 < result.rtt_ms < 500, result
+    # One machine has one clock: what is measured is the error, which half of the round trip bounds.
+    assert abs(result.offset_ms) <= result.rtt_ms / 2 + 1 and result.rtt_ms > 25, result

@@ -6,6 +6,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from simulated_link import DIGEST, World
 
 from instant_ic.bridge import host_protocol as protocol
 from instant_ic.bridge.host_clock import ClockFilter
@@ -190,3 +191,19 @@ def test_window_of_a_sender_that_does_not_fill_it_stays():
     for index in range(100):
         window.acked(1000, 1_000_000, 1000, index * 1_000_000)
     assert window.size == 65536
+
+
+@given(st.lists(st.one_of(MESSAGES.map(lambda message: message.encode()), st.binary(max_size=60)), max_size=8))
+def test_no_message_of_a_linked_host_breaks_the_session(frames):
+    """It is taken, refused, or ends the link; never an exception, which would end the links of all hosts."""
+    world = World([TopicRule("/ic/state")], [TopicRule("/operator/cmd_vel", lane="command", max_age_s=0.25)])
+    world.run(0.02)
+    session = world.sessions["robot"]
+    announce = Announce(1, "/operator/cmd_vel", "n", "std_msgs/msg/String", DIGEST, "sensor")
+    for frame in (announce.encode(), *frames):
+        session.receive(frame)
+        for data in session.outgoing():
+            decode(data)
+        session.check()
+        session.next_due_ns()
+        assert session.ended is None or not session.up
