@@ -43,7 +43,7 @@ class NodeRow:
     Attributes:
         node: its name.
         pid: of its process.
-        state: as in its heartbeat, or ``silent``.
+        state: as in its heartbeat; ``silent`` or ``busy`` where there is none.
         message: its worst diagnosis, or what is wrong with its rates.
         cpu_percent: of one core, over the time since the last look.
         rss_mb: resident memory.

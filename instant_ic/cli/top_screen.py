@@ -61,7 +61,8 @@ def _flows(rows: Sequence[TopicRow]) -> Text:
     text = Text()
     for row in rows:
         if row.rate_hz > 0 or row.fault:
-            text.append(f"{row.topic} ", style="dim").append(f"{rate_words(row)}  ", style="red" if row.fault else "")
+            rate = f"\u00a0{rate_words(row)}"  # a space that does not part the rate from its topic
+            text.append(row.topic, style="dim").append(rate, style="red" if row.fault else "").append("  ")
     return text
 
 

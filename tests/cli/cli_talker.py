@@ -36,6 +36,7 @@ class TalkerConfig:
         label: a word.
         late_s: how old the stamps are.
         drives: whether it commands the robot.
+        sleep_s: how long its callback of /sleep takes.
         inner: group.
     """
 
@@ -43,6 +44,7 @@ class TalkerConfig:
     label: str = "hello"
     late_s: float = 0.25
     drives: bool = False
+    sleep_s: float = 3.0
     inner: Inner = field(default_factory=Inner)
 
     def __post_init__(self) -> None:
@@ -64,7 +66,7 @@ class Talker(Node[TalkerConfig]):
             self.drive = self.publisher("/cmd_vel", TwistStamped, qos=SENSOR)
             self.timer(0.1, lambda: self.drive.publish(twist_stamped(0.0, 0.0, self.clock.now_ns())))
         self.subscribe("/order", TwistStamped, self.on_order, qos=RELIABLE)
-        self.subscribe("/sleep", Bool, lambda _: time.sleep(3.0), qos=RELIABLE)
+        self.subscribe("/sleep", Bool, lambda _: time.sleep(self.config.sleep_s), qos=RELIABLE)
         self.timer(1 / self.config.rate_hz, self.tick)
 
     def on_order(self, message: TwistStamped) -> None:

@@ -21,7 +21,7 @@ def in_run_dir(talker, monkeypatch):
 
 
 def test_list_and_get(ic):
-    keys = ["drives", "inner.depth", "inner.share", "label", "late_s", "nice", "rate_hz", "use_sim_time"]
+    keys = ["drives", "inner.depth", "inner.share", "label", "late_s", "nice", "rate_hz", "sleep_s", "use_sim_time"]
     assert ic("param", "list", "talker")[:2] == (0, "talker:\n" + "".join(f"  {key}\n" for key in keys))
     assert "  inner.depth: 7\n" in ic("param", "list", "-v")[1]
     assert ic("param", "get", "talker", "inner.depth")[:2] == (0, "7\n")
@@ -41,7 +41,7 @@ def test_describe(ic):
         "  Description: scans a second.\n"
     )
     assert "Value: 7 (default 3)" in ic("param", "describe", "talker", "inner")[1]
-    assert ic("param", "describe", "talker")[1].count("Parameter name: ") == 8
+    assert ic("param", "describe", "talker")[1].count("Parameter name: ") == 9
 
 
 def test_set_is_seen_in_what_the_node_does_and_tells(ic):

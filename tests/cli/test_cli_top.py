@@ -13,9 +13,10 @@ import sys
 import time
 
 import pytest
-from cli_helpers import talking
+from cli_helpers import talking, wait_until
 from rich.console import Console
 
+from instant_ic.bus.control import NodeControl
 from instant_ic.bus.registry import NodeInfo
 from instant_ic.cli.heartbeats import Flow, Heartbeat
 from instant_ic.cli.top import SORT_KEYS, Processes, as_json, expected_rate, make_rows, plain_table
@@ -65,7 +66,7 @@ def test_texts():
     console = Console(file=io.StringIO(), width=140)
     console.print(table(rows(), "cpu", inputs=True))
     text = console.file.getvalue()
-    assert "3 nodes, 116 %" in text and "sorted by cpu" in text and "/scan 10.0/10" in text
+    assert "3 nodes, 116 %" in text and "sorted by cpu" in text and "/scan\u00a010.0/10" in text
 
 
 def test_nominal_rate_of_a_namespace():
@@ -98,6 +99,23 @@ def test_once_and_json(ic, run_dir, monkeypatch):
     assert re.search(r"→ /scan [\d.]+/10 Hz", out)
     row = json.loads(ic("top", "--json")[1])[0]
     assert row["node"] == "talker" and row["rss_mb"] > 10 and row["threads"] > 2 and row["cpu_percent"] is not None
+
+
+def test_node_in_a_long_callback_and_one_that_hangs(ic, tmp_path_factory, monkeypatch):
+    """A node that sends no heartbeat is shown with what it is doing; a stopped process as silent."""
+    run_dir = tmp_path_factory.mktemp("r")
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    with talking(run_dir, "-p", "sleep_s:=8.0") as process:
+        assert ic("topic", "pub", "--once", "/sleep", "Bool", "{data: true}")[0] == 0
+        wait_until(lambda: NodeControl(run_dir, "talker").status()["busy_s"] > 0.5, "the long callback")
+        row = json.loads(ic("top", "--json")[1])[0]
+        assert row["state"] == "busy" and re.match(r"in callback of /sleep for \d s", row["message"])
+        process.send_signal(signal.SIGSTOP)
+        try:
+            row = json.loads(ic("top", "--json")[1])[0]
+        finally:
+            process.send_signal(signal.SIGCONT)
+        assert row["state"] == "silent" and row["rss_mb"] > 10
 
 
 def test_nobody_runs(ic, tmp_path, monkeypatch):

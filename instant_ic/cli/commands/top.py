@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from instant_ic.cli.arguments import positive
+
+if TYPE_CHECKING:
+    from instant_ic.cli.top import NodeRow
 
 _SORT = ("cpu", "memory", "name", "lost")
 
@@ -27,6 +31,19 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(func=show)
 
 
+def _ask(row: NodeRow, run_dir: Path) -> None:
+    """What a node without a heartbeat is doing, by its control channel."""
+    from instant_ic.bus.control import ControlError, NodeControl
+
+    try:
+        status = NodeControl(run_dir, row.node, 0.3).status()
+    except ControlError:
+        return
+    if status["busy"]:
+        row.state = "starting" if status["busy"] == "setup" else "busy"
+        row.message = f"in {status['busy']} for {status['busy_s']:.0f} s"
+
+
 def show(args: argparse.Namespace) -> int:
     """Prints the table, or shows it until it is left."""
     import json
@@ -37,7 +54,7 @@ def show(args: argparse.Namespace) -> int:
     from instant_ic.bus import registry
     from instant_ic.cli.errors import UserError
     from instant_ic.cli.heartbeats import Heartbeats
-    from instant_ic.cli.top import SORT_KEYS, NodeRow, Processes, as_json, expected_rate, make_rows, plain_table
+    from instant_ic.cli.top import SORT_KEYS, Processes, as_json, expected_rate, make_rows, plain_table
 
     run_dir = paths.run_dir()
     processes = Processes()
@@ -50,7 +67,11 @@ def show(args: argparse.Namespace) -> int:
             for info in infos:
                 processes.begin(info.pid)
             beats = heartbeats.listen(seconds, [info.name for info in infos] if until_all else ())
-            return make_rows(infos, beats, processes.look, expected_rate, time.time_ns())
+            made = make_rows(infos, beats, processes.look, expected_rate, time.time_ns())
+            for row in made:
+                if row.state == "silent":
+                    _ask(row, run_dir)
+            return made
 
         live = sys.stdin.isatty() and sys.stdout.isatty() and not (args.once or args.json)
         if live:
