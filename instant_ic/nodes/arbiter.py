@@ -283,7 +283,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         now_ns, costmap = self.clock.steady_ns(), self.costmap
         # A little early counts: updates come at the scan's rate, not at this one.
         due_ns = 0.9e9 / self.config.costmap.publish_frequency
-        if costmap is None or (self.costmap_sent_ns is not None and now_ns - self.costmap_sent_ns < due_ns):
+        sent_ns = self.costmap_sent_ns  # later than now where the clock went back: a player began again
+        if costmap is None or (sent_ns is not None and 0 <= now_ns - sent_ns < due_ns):
             return
         self.costmap_sent_ns = now_ns
         origin = (float(costmap.origin[0]), float(costmap.origin[1]))
