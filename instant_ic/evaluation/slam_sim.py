@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from instant_ic.base.kinematics import SkidSteer
 from instant_ic.evaluation.slam import LogResult, run_log
@@ -63,7 +64,7 @@ def round_trip(
     robot = TrackedRobot(config, world.occupied(config.contact_low, config.contact_high), start, seed)
     kinematics = SkidSteer(config.steering)
     rng = np.random.default_rng([37, seed])
-    angles = -math.pi + 2 * math.pi / BEAMS * np.arange(BEAMS)
+    angles = np.asarray(-math.pi + 2 * math.pi / BEAMS * np.arange(BEAMS), dtype=np.float64)
     entries: list[LogEntry] = []
     truth: list[FloatArray] = []
     odometry = np.zeros(3)
@@ -78,8 +79,8 @@ def round_trip(
             pulses = now
             forward, _, turn = kinematics.twist_from_tracks(np.array([left, right]))
             odometry = compose2(odometry, [forward * math.cos(turn / 2), forward * math.sin(turn / 2), turn])
-            entries.append(_entry(world, robot.pose, angles, odometry, len(entries), rng))
-            truth.append(robot.pose.copy())
+            entries.append(_entry(world, np.asarray(robot.pose, dtype=np.float64), angles, odometry, len(entries), rng))
+            truth.append(np.asarray(robot.pose, dtype=np.float64).copy())
         robot.step(kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w)), STEP_S)
         if robot.contact:
             raise ValueError(f"the simulated robot ran into something at {robot.pose[:2].round(2)}")
@@ -89,7 +90,7 @@ def round_trip(
     return RoundTrip(entries, np.array([relative2(origin, pose) for pose in truth]), driven)
 
 
-def _towards(pose: FloatArray, targets: list[tuple[float, float]]) -> tuple[float, float]:
+def _towards(pose: NDArray[np.floating], targets: list[tuple[float, float]]) -> tuple[float, float]:
     """Speed and yaw rate to the first of ``targets``; reached ones are taken out."""
     while targets and math.hypot(targets[0][0] - pose[0], targets[0][1] - pose[1]) < 0.15:
         targets.pop(0)
@@ -104,8 +105,8 @@ def _entry(
 ) -> LogEntry:
     directions = np.column_stack([np.cos(angles + pose[2]), np.sin(angles + pose[2]), np.zeros(BEAMS)])
     origin = np.array([pose[0], pose[1], LIDAR_HEIGHT_M], dtype=np.float32)
-    ranges, _ = world.caster.cast(origin, directions.astype(np.float32))
-    ranges = ranges + RANGE_NOISE_M * rng.standard_normal(BEAMS)
+    hits, _ = world.caster.cast(origin, directions.astype(np.float32))
+    ranges = hits.astype(np.float64) + RANGE_NOISE_M * rng.standard_normal(BEAMS)
     ranges[ranges > RANGE_MAX_M] = np.inf
     scan = Scan(ranges, float(angles[0]), 2 * math.pi / BEAMS, 0.3, RANGE_MAX_M, (index + 1) * 100_000_000)
     return LogEntry(scan, odometry, np.zeros(3))

@@ -27,6 +27,8 @@ SETTLED_M, SETTLED_RAD = 0.02, 0.004
 """Loops that the graph fits this well already need no optimisation of their own."""
 SETTLED_EDGES = 20
 """... until there are so many of them."""
+MAX_LOOPS_OF_ONE = 4
+"""A keyframe that inherits loops keeps no more than so many."""
 PENDING_KEYFRAMES = 40
 """A closed loop that is not confirmed within so many keyframes is forgotten."""
 
@@ -40,12 +42,16 @@ class Outcome:
         poses: of these (count, 3); None: not changed.
         drift: covariance of the last one in the map (3, 3).
         map: drawn anew from all of them; None: not.
+        merged: keyframes taken out, each with the one that stands for it and its pose there (3,).
+        edges: of the graph now.
     """
 
     count: int
     poses: FloatArray | None
     drift: FloatArray
     map: OccupancyMap | None
+    merged: list[tuple[int, int, FloatArray]]
+    edges: list[Edge]
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,8 @@ class BackEnd:
         self._unsettled = 0
         self._searched_at_m = 0.0
         self._drawn: FloatArray = np.zeros((0, 3))
+        self._alive = np.zeros(256, dtype=np.bool_)
+        self._merged: list[tuple[int, int, FloatArray]] = []
         field = replace(config.field, max_range_m=loop.max_range_m)
         self._field = LikelihoodField(FieldConfig(**vars(field)), loop.max_reach_m + OVERLAP_M)
         self._search = LoopSearch(config.match.residual_sigma)
@@ -105,11 +113,13 @@ class BackEnd:
             if self.config.loop.enabled and self._travelled[here] - self._searched_at_m >= self.config.loop.spacing_m:
                 self._searched_at_m = self._travelled[here]
                 changed |= self._close(here)
+            self._thin_out(here - self.config.field.keyframes - 2 * self.config.loop.query_keyframes)
         if last and self._unsettled:
             changed |= self._optimise(self.edges[len(self.edges) :])
         drift = self._drifts[-1] if self._drifts else np.zeros((3, 3))
         redrawn = self._redraw(last) if changed or last else None
-        return Outcome(len(self), self.poses.copy() if changed else None, drift, redrawn)
+        merged, self._merged = self._merged, []
+        return Outcome(len(self), self.poses.copy() if changed else None, drift, redrawn, merged, list(self.edges))
 
     def load(self, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
         """Begin with a saved graph; its first keyframe stays where it is."""
@@ -136,6 +146,8 @@ class BackEnd:
         here = len(self._keyframes)
         if here == len(self._poses):
             self._poses = np.concatenate([self._poses, np.zeros_like(self._poses)])
+            self._alive = np.concatenate([self._alive, np.zeros_like(self._alive)])
+        self._alive[here] = True
         if here == 0:
             self._poses[0] = keyframe.map_from_base
             self._drifts.append(keyframe.drift)
@@ -205,10 +217,10 @@ class BackEnd:
     def _chains(self, pose: FloatArray, old: int, radius_m: float) -> list[list[int]]:
         """Runs of keyframes before ``old`` within ``radius_m`` of a pose, those that the map knows best first."""
         way = self._poses[:old, :2] - pose[:2]
-        near = np.flatnonzero((way**2).sum(axis=1) <= radius_m**2)
+        near = np.flatnonzero(((way**2).sum(axis=1) <= radius_m**2) & self._alive[:old])
         if len(near) == 0:
             return []
-        runs = np.split(near, np.flatnonzero(np.diff(near) > 3) + 1)
+        runs = np.split(near, np.flatnonzero(np.diff(near) > 6) + 1)
         chains = [[int(k) for k in run] for run in runs if len(run) >= self.config.loop.min_chain_keyframes]
         return sorted(chains, key=lambda chain: float(np.trace(self._drifts[chain[0]][:2, :2])))
 
@@ -266,6 +278,41 @@ class BackEnd:
                 step = self._poses[k + 1, :2] - self._poses[k, :2]
                 drift = grown_drift(drift, step, float(self._poses[k, 2]), self._keyframes[k + 1].step_covariance)
 
+    # -- keeping it small -------------------------------------------------------------------------
+
+    def _thin_out(self, k: int) -> None:
+        """Take keyframe ``k`` out when enough older ones stand at its place: a known area costs no more and more."""
+        loop = self.config.loop
+        if loop.same_place == 0 or k < 1 or not self._alive[k]:
+            return
+        apart = self._poses[:k] - self._poses[k]
+        near = np.hypot(apart[:, 0], apart[:, 1]) <= loop.same_place_m
+        near &= np.abs(np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))) <= loop.same_place_rad
+        near &= self._alive[:k]
+        near[max(0, k - 2 * self.config.field.keyframes) :] = False  # one's own track is no return to a known place
+        if int(near.sum()) < loop.same_place:
+            return
+        own = [edge for edge in self.edges if k in (edge.a, edge.b)]
+        step = next((edge for edge in own if edge.b == k and not edge.robust), None)
+        if step is None:
+            return
+        heir = step.a
+        loops = sum(edge.robust and heir in (edge.a, edge.b) for edge in self.edges)
+        kept = [edge for edge in self.edges if k not in (edge.a, edge.b)]
+        for edge in own:
+            if edge is step:
+                continue
+            if edge.robust:
+                loops += 1
+                if loops > MAX_LOOPS_OF_ONE:
+                    continue
+            outward = edge if edge.a == k else _reversed(edge)
+            if outward.b != heir:
+                kept.append(_chained(step, outward))
+        self.edges = kept
+        self._alive[k] = False
+        self._merged.append((k, heir, relative2(self._poses[heir], self._poses[k])))
+
     # -- graph ------------------------------------------------------------------------------------
 
     def _fits(self, edge: Edge, within_m: float, within_rad: float) -> bool:
@@ -275,15 +322,16 @@ class BackEnd:
     def _optimise(self, accepted: Sequence[Edge]) -> bool:
         """Bring the poses in accord with all edges; loops that the rest contradicts are taken back."""
         self._unsettled = 0
-        index = {k: k for k in range(len(self))}
-        solution = optimise(self.poses, self.edges, index)
+        alive = np.flatnonzero(self._alive[: len(self)])
+        index = {int(k): row for row, k in enumerate(alive)}
+        solution = optimise(self._poses[alive], self.edges, index)
         wrong = {id(edge) for edge, weight in zip(self.edges, solution.weights, strict=True) if weight < 0.5}
         if wrong:
             self.refused += len(wrong)
             self.edges = [edge for edge in self.edges if id(edge) not in wrong]
-            solution = optimise(self.poses, self.edges, index)
+            solution = optimise(self._poses[alive], self.edges, index)
         self.closed += sum(id(edge) not in wrong for edge in accepted)
-        self._poses[: len(self)] = solution.poses
+        self._poses[alive] = solution.poses
         return True
 
     def _redraw(self, last: bool) -> OccupancyMap | None:
@@ -300,10 +348,35 @@ class BackEnd:
         if not last and far < 0.2 and turned < 0.05 and count - drawn < max(20, count // 10):
             return None
         drawing = OccupancyMap(self.config.map)
-        for keyframe, pose in zip(self._keyframes, self.poses, strict=True):
-            drawing.insert(pose, keyframe.scan)
+        for k in np.flatnonzero(self._alive[:count]):
+            drawing.insert(self._poses[k], self._keyframes[k].scan)
         self._drawn = self.poses.copy()
         return drawing
+
+
+def _turned(covariance: FloatArray, yaw: float) -> FloatArray:
+    """A covariance (3, 3) of a frame, in one that is turned by ``-yaw`` against it."""
+    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
+    turned: FloatArray = turn @ covariance @ turn.T
+    return turned
+
+
+def _reversed(edge: Edge) -> Edge:
+    """The same edge seen from its other end."""
+    b_from_a = inverse2(edge.a_from_b)
+    carry = np.eye(3)
+    carry[0, 2], carry[1, 2] = edge.a_from_b[1], -edge.a_from_b[0]
+    covariance = _turned(carry @ edge.covariance @ carry.T, -float(edge.a_from_b[2]))
+    return Edge(edge.b, edge.a, b_from_a, covariance, edge.robust)
+
+
+def _chained(first: Edge, second: Edge) -> Edge:
+    """From the start of one edge over its end, where the second begins, to the second's end."""
+    a_from_c = compose2(first.a_from_b, second.a_from_b)
+    way = a_from_c[:2] - first.a_from_b[:2]
+    covariance = grown_drift(first.covariance, way, float(first.a_from_b[2]), second.covariance)
+    return Edge(first.a, second.b, a_from_c, covariance, first.robust or second.robust)
 
 
 def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints], loop: LoopConfig) -> FloatArray:

@@ -152,17 +152,21 @@ class LoopConfig:
     sure_rad: float = 0.06
     step_sigma_m: float = 0.005
     step_sigma_rad: float = 0.0015
+    same_place: int = 3
+    same_place_m: float = 0.35
+    same_place_rad: float = 0.35
     loop_sigma_m: float = 0.03
     loop_sigma_rad: float = 0.01
 
     def __post_init__(self) -> None:
         _require_positive(
             self, "spacing_m", "max_range_m", "sigmas", "max_reach_m", "max_reach_rad", "sure_m", "sure_rad",
-            "step_sigma_m", "step_sigma_rad", "loop_sigma_m", "loop_sigma_rad",
+            "step_sigma_m", "step_sigma_rad", "same_place_m", "same_place_rad", "loop_sigma_m", "loop_sigma_rad",
         )  # fmt: skip
         for key in ("query_keyframes", "chain_keyframes", "min_chain_keyframes", "chains", "confirmations"):
             _require(self, key, getattr(self, key) >= 1, ">= 1")
         _require(self, "max_points", self.max_points >= 20, ">= 20")
+        _require(self, "same_place", self.same_place >= 0, ">= 0")
         for key in ("min_score", "min_gain"):
             _require(self, key, 0 < getattr(self, key) < 1, "between 0 and 1")
         _require(self, "min_shape", 0 <= self.min_shape < 1, "between 0 and 1")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,7 +16,7 @@ from instant_ic.geometry.poses import compose2, inverse2, relative2
 from instant_ic.slam.back_end import BackEnd, correction, gather
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, Track, TrackStatus, constant_velocity
-from instant_ic.slam.keyframes import Keyframe, grown_drift
+from instant_ic.slam.keyframes import NO_SCAN, Keyframe, grown_drift
 from instant_ic.slam.localization import Localizer
 from instant_ic.slam.loop_search import Found
 from instant_ic.slam.map_files import save_graph, save_grid
@@ -134,6 +134,8 @@ class GridSlam:
         self.motion = MotionMonitor(self.config.motion)
         self._handed_over = 0
         self._busy = False
+        self._merged = 0
+        self._edges: list[Edge] = []
         self.map_from_base: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
         self.map_from_odom: FloatArray = np.zeros(3)
@@ -210,10 +212,14 @@ class GridSlam:
         if self._known is not None and not (self._graph is not None and self.localized):
             return files  # driven in, not made here: its graph, if any, is where it came from
         keyframes = self.front_end.trajectory.keyframes
-        edges = [edge for edge in self.back_end.edges if max(edge.a, edge.b) < len(keyframes)]
-        for k in range(len(self.back_end), len(keyframes)):  # those that the back end has not taken in yet
+        known = max((edge.b for edge in self._edges), default=0) + 1
+        edges = list(self._edges)
+        for k in range(known, len(keyframes)):  # those that the back end has not answered for yet
             edges.append(Edge(k - 1, k, keyframes[k].step, keyframes[k].step_covariance))
-        return [*files, save_graph(stem, keyframes, edges)]
+        kept = [k for k, keyframe in enumerate(keyframes) if keyframe.merged_into is None]
+        row = {k: index for index, k in enumerate(kept)}
+        edges = [replace(edge, a=row[edge.a], b=row[edge.b]) for edge in edges]
+        return [*files, save_graph(stem, [keyframes[k] for k in kept], edges)]
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
         """Say where in the saved map the robot is (3,): within 1 m and 60° suffices, scans do the rest.
@@ -272,6 +278,11 @@ class GridSlam:
             self.map = outcome.map
             for keyframe in keyframes[outcome.count :]:
                 self.map.insert(keyframe.map_from_base, keyframe.scan)
+        self._edges = outcome.edges
+        for gone, heir, heir_from_gone in outcome.merged:
+            keyframes[gone].merged_into = (keyframes[heir], heir_from_gone)
+            keyframes[gone].scan = NO_SCAN
+            self._merged += 1
         drift = outcome.drift
         for before, keyframe in zip(keyframes[outcome.count - 1 :], keyframes[outcome.count :], strict=False):
             way = keyframe.map_from_base[:2] - before.map_from_base[:2]
@@ -325,6 +336,7 @@ class GridSlam:
         self.front_end.trajectory.keyframes = [*saved, *own]
         self.back_end = BackEnd(self.config)
         self.back_end.load(saved, edges)
+        self._edges = list(edges)
         self.back_end.tie(len(saved), first.map_from_base, covariance)
         self._handed_over = len(saved)
         if drawn is None:
@@ -350,7 +362,7 @@ class GridSlam:
     def figures(self) -> dict[str, object]:
         """Keyframes, loops closed, loops taken back."""
         return {
-            "keyframes": len(self.front_end.trajectory),
+            "keyframes": len(self.front_end.trajectory) - self._merged,
             "loops": self.back_end.closed,
             "loops_refused": self.back_end.refused,
         }

@@ -10,6 +10,9 @@ import numpy as np
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
+NO_SCAN = ScanPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.bool_), np.zeros(2), np.zeros((0, 2)))
+"""Of a keyframe that was taken out."""
+
 
 @dataclass
 class Keyframe:
