@@ -45,7 +45,10 @@ NAMES = {
     "rospy": "rospy",
     "zmq_tcp": "ZeroMQ tcp (raw)",
     "zmq_curve": "ZeroMQ tcp with CURVE",
+    "inline": "Instant IC, sockets only",
+    "shared": "Instant IC, shared memory only",
 }
+LATENCY_ONLY = ("zmq_tcp", "zmq_curve", "inline", "shared")
 
 
 class Peer:
@@ -149,6 +152,8 @@ def addresses(transports: list[str], folder: Path) -> Iterator[dict[str, str]]:
     found = {
         "ours": str(folder / "ours"),
         "image": str(folder / "image"),
+        "inline": str(folder / "inline"),
+        "shared": str(folder / "shared"),
         "zmq": f"ipc://{folder}/zmq",
         "zmq_tcp": f"tcp://127.0.0.1:{free_port()}",
         "zmq_curve": f"tcp://127.0.0.1:{free_port()}",
@@ -237,11 +242,11 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
                 pair.close()
         for transport in pairs:
             result["latency"][transport] = {t: summary(latency[transport][t], sent[transport][t]) for t in topics}
-        for transport in [t for t in pairs if t not in ("zmq_tcp", "zmq_curve")]:
+        for transport in [t for t in pairs if t not in LATENCY_ONLY]:
             with contextlib.suppress(RuntimeError):
                 result["throughput"][transport] = flood(transport, address[transport], flood_s)
                 note(f"throughput, {transport}")
-        fan = [t for t in pairs if t not in ("zmq_tcp", "zmq_curve")]
+        fan = [t for t in pairs if t not in LATENCY_ONLY]
         gathered: dict[str, list[float]] = defaultdict(list)
         fan_sent: dict[str, int] = defaultdict(int)
         for _ in range(max(1, rounds // 2)):
@@ -330,7 +335,7 @@ def plot(result: dict[str, Any], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(7.5, 4.5), layout="constrained")
     sizes = list(SIZES.values())
     for transport, cells in result["latency"].items():
-        if transport in ("zmq_tcp", "zmq_curve"):
+        if transport in LATENCY_ONLY:
             continue
         own = transport in ("ours", "image")
         median = [cells[t]["p50_us"] or float("nan") for t in SIZES]
@@ -352,7 +357,14 @@ def main() -> int:
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="draw latency over size")
     parser.add_argument("--quick", action="store_true", help="fewer messages")
-    parser.add_argument("--only", nargs="+", choices=list(NAMES), default=list(NAMES), metavar="TRANSPORT")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=list(NAMES),
+        default=[t for t in NAMES if t not in ("inline", "shared")],
+        metavar="TRANSPORT",
+        help=", ".join(NAMES),
+    )
     args = parser.parse_args()
     started = time.monotonic()
 

@@ -39,8 +39,9 @@ from .transport import Payload, PublisherStats, TransportError
 if TYPE_CHECKING:
     from .local_transport import LocalTransport
 
-SHARED_FROM_BYTES = 1 << 16
-"""Messages of this size and more go through shared memory (measured: benchmarks/bus.py threshold)."""
+SHARED_FROM_BYTES = 96 << 10
+"""Messages of this size and more go through shared memory: below, the copies through a socket cost less than the
+bookkeeping (``benchmarks/bus.py --only inline shared``)."""
 
 BUFFERS_A_READER = 8
 """How many buffers one reader can hold; see also :data:`~.local_subscription.VIEWS_HELD`."""
@@ -473,7 +474,8 @@ class LocalPublisher:
         for reader in self._readers.values():
             if reader.depth:
                 reader.offer(message)
-                self._rewatch(reader)
+                if not reader.prompt:
+                    self._rewatch(reader)
         if self.qos.latched:
             self._keep(message)
         self.stats.add(self._transport.steady_ns(), size)
@@ -488,15 +490,15 @@ class LocalPublisher:
 
     def _buffer(self, size: int) -> SharedBuffer | None:
         """A free buffer, or None when this message must go through the sockets."""
-        readers = list(self._readers.values())
+        readers = self._readers.values()
         if not readers and not self.qos.latched:
             return None
         for reader in readers:
             reader.release()
-            if reader.waiting:
+            if not reader.prompt and reader.waiting:
                 reader.flush()
                 self._rewatch(reader)
-        if time.monotonic() < self._memory_retry_s:
+        if self._memory_retry_s and time.monotonic() < self._memory_retry_s:
             self.stats.not_shared += 1
             return None
         try:

@@ -124,8 +124,11 @@ class Inlet:
             end = start + count
             if end >= HEADER.size:
                 kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(self._scratch)
-                if kind == DATA and size + HEADER.size == end:  # one whole message: the usual case
-                    self._deliver(self, sequence, skipped, publish_ns, bytes(self._scratch[HEADER.size : end]))
+                if size + HEADER.size == end and (kind == DATA or (kind == SHARED and not ancillary)):
+                    # One whole message: the usual case.
+                    whole = bytes(self._scratch[HEADER.size : end])
+                    payload = whole if kind == DATA else self._shared(whole, sequence)
+                    self._deliver(self, sequence, skipped, publish_ns, payload)
                     return True
             self._parse(end)
             if end < SCRATCH_BYTES and self._body is None and not ancillary:
@@ -185,7 +188,7 @@ class Inlet:
             raise FrameError(f"a message of {size} bytes in buffer {number}, which is not known or smaller")
         if mapping.sequence != sequence:
             self._give_back(number)
-            return None
+            return None  # somebody writes over what was lent
         if len(self._views) >= VIEWS_HELD or self.refused:
             copy = memoryview(b"" if self.refused else bytes(mapping.view(size)))
             torn = mapping.sequence != sequence

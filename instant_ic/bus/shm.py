@@ -99,12 +99,12 @@ class BufferPool:
         Raises:
             OSError: the machine has no memory for one more.
         """
-        free = [buffer for buffer in self.buffers if not buffer.holders]
-        for buffer in free:
-            if buffer.capacity >= size:
-                self.buffers.remove(buffer)
-                self.buffers.insert(0, buffer)
+        for index, buffer in enumerate(self.buffers):
+            if not buffer.holders and buffer.capacity >= size:
+                if index:
+                    self.buffers.insert(0, self.buffers.pop(index))
                 return buffer, []
+        free = [buffer for buffer in self.buffers if not buffer.holders]
         for buffer in free:  # too small for what is sent now
             self.buffers.remove(buffer)
             buffer.close()
