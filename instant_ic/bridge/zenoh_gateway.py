@@ -106,6 +106,21 @@ def known_hash(type_name: str) -> str | None:
         return None
 
 
+def parse_subscribe(entries: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """Patterns, and types of those topics that have one, of lines like ``/scan`` and ``/x std_msgs/msg/String``.
+
+    Raises:
+        RegistryError, MessageError: a topic's name is not legal, or a type is not known.
+    """
+    patterns, types = [], {}
+    for entry in entries:
+        topic, _, name = entry.partition(" ")
+        if name:
+            types[check_topic(topic)] = message_type(name.strip()).__msgtype__
+        patterns.append(topic)
+    return patterns, types
+
+
 @dataclass
 class _Out:
     """A topic that goes out: one subscription here, a publisher there for each of its publishers."""
@@ -296,15 +311,9 @@ class Incoming:
         self._gate = gate
         self._gate_lock = threading.Lock()  # each subscription calls on its own thread
         self._topics: dict[str, _In] = {}
-        self._types: dict[str, str] = {}
-        self._patterns: list[str] = []
         self._refusing: set[str] = set()
         self.count = 0
-        for entry in subscribe:
-            topic, _, name = entry.partition(" ")
-            if name:
-                self._types[check_topic(topic)] = name.strip()
-            self._patterns.append(topic)
+        self._patterns, self._types = parse_subscribe(subscribe)
         self._types.update({topic: COMMANDS[topic] for topic in commands})
         self._commands = set(commands)
         self._own = own
@@ -338,9 +347,7 @@ class Incoming:
         entry = self._topics.get(topic)
         if not alive:
             if entry is not None and source in entry.sources:
-                entry.sources.remove(source)
-                if not entry.sources:
-                    self._silenced(topic, entry)
+                self._left(topic, entry, source)
             return
         if not self._same_type(topic, token, entry):
             return
@@ -412,20 +419,20 @@ class Incoming:
         def command(payload: bytes, attachment: Attachment) -> None:
             with self._gate_lock:
                 try:
-                    self._check(topic, payload, attachment)
+                    self._check(topic, entry, payload, attachment)
                 except CommandRefused as error:
                     self._refusing.add(topic)
                     self._tell(topic, ERROR, f"command refused: {error}")
                     return
-            if topic in self._refusing:
-                self._refusing.discard(topic)
-                self._tell(topic, OK, "commands come in")
-            self.count += 1
-            publish(payload, attachment.source_ns)
+                if topic in self._refusing:
+                    self._refusing.discard(topic)
+                    self._tell(topic, OK, "commands come in")
+                self.count += 1
+                publish(payload, attachment.source_ns)
 
         return command if topic in self._commands else plain
 
-    def _check(self, topic: str, payload: bytes, attachment: Attachment) -> None:
+    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> None:
         now_ns = time.time_ns()
         try:
             message = deserialize(payload, COMMANDS[topic])
@@ -436,18 +443,24 @@ class Incoming:
             if not message.data:
                 self._gate.check_age(attachment.source_ns, now_ns)
             return
+        if not entry.sources:
+            raise self._gate.refuse("no sender", "nobody in the ROS graph sends this topic, or not any more")
         self._gate.check_age(attachment.source_ns, now_ns)
         self._gate.check_drive(attachment.gid.hex()[:8], *twist_values(message), now_ns)
 
     def _tell(self, topic: str, level: int, words: str) -> None:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)
 
-    def _silenced(self, topic: str, entry: _In) -> None:
-        """The last publisher there has left."""
-        entry.gone_s = time.monotonic()
-        if topic == "/operator/cmd_vel" and topic in self._commands:
-            # Not after the arbiter's time-out: at once.
-            entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns()))
+    def _left(self, topic: str, entry: _In, source: tuple[str, int]) -> None:
+        """A publisher there has left; with the last driver the robot stops."""
+        with self._gate_lock:  # a command of its that is still on its way must not come after the zero
+            entry.sources.remove(source)
+            if entry.sources:
+                return
+            entry.gone_s = time.monotonic()
+            if topic == "/operator/cmd_vel" and topic in self._commands:
+                # Not after the arbiter's time-out: at once.
+                entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns()))
 
     def reconcile(self) -> None:
         """Lets go of topics whose publishers have left for a while."""

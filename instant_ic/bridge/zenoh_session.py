@@ -9,8 +9,9 @@ import itertools
 import json
 import logging
 import os
+import queue
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -19,6 +20,7 @@ from ..paths import shipped_file
 from .zenoh_format import ADMIN_SPACE, GID_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
+_OPEN_S = 10.0
 _HEARTBEAT_S = 0.5  # by which a late or unlucky reader of a latched topic finds what it missed, as in rmw_zenoh
 
 SESSION_DEFAULTS = {
@@ -30,7 +32,10 @@ SESSION_DEFAULTS = {
     # The cache of a latched topic orders by time.
     "timestamping/enabled": "{router: true, peer: true, client: true}",
 }
-"""What rmw_zenoh's sessions have: peers of one router, which tells them of each other; no multicast."""
+"""What rmw_zenoh's sessions have: peers of the router on their host, which tells them of each other; no multicast."""
+
+CLIENT_DEFAULTS = {**SESSION_DEFAULTS, "mode": '"client"', "listen/endpoints": "[]"}
+"""For a router on another host: Zenoh's routers do not carry messages between peers that have no link of their own."""
 
 ROUTER_DEFAULTS = {
     **SESSION_DEFAULTS,
@@ -73,15 +78,18 @@ def config_path(name: str) -> Path | None:
 
 
 def load_config(
-    path: Path | None, connect: Sequence[str] = (), listen: Sequence[str] = (), defaults: dict[str, str] | None = None
+    path: Path | None,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    defaults: Mapping[str, str] = SESSION_DEFAULTS,
 ) -> Any:
     """A Zenoh configuration.
 
     Args:
-        path: a Zenoh JSON5 file, taken as it is; None takes ``defaults``.
+        path: a Zenoh JSON5 file, taken as it is; None takes ``defaults``: keys of Zenoh's and JSON5 values.
         connect: endpoints (``tcp/10.0.0.1:7447``) instead of the file's.
         listen: the same for listening.
-        defaults: :data:`SESSION_DEFAULTS` if not given.
+        defaults: see ``path``.
 
     Raises:
         ZenohError: the file cannot be read, is no Zenoh configuration, or an endpoint is none.
@@ -92,7 +100,7 @@ def load_config(
             config = package.Config.from_json5(path.read_text())
         else:
             config = package.Config()
-            for key, value in (SESSION_DEFAULTS if defaults is None else defaults).items():
+            for key, value in defaults.items():
                 config.insert_json5(key, value)
     except OSError as error:
         raise ZenohError(f"{path}: cannot be read: {error.strerror}") from None
@@ -107,18 +115,44 @@ def load_config(
     return config
 
 
+def is_client(config: Any) -> bool:
+    """Whether a configuration is that of a client, which cannot be opened before its router is there."""
+    return bool(json.loads(config.get_json("mode")) == "client")
+
+
 def open_zenoh(config: Any) -> Any:
-    """A Zenoh session; where the router is not there yet it is looked for in the background.
+    """A Zenoh session; in peer mode one whose router is not there yet looks for it in the background.
 
     Raises:
-        ZenohError: an endpoint cannot be listened on, certificates cannot be read, and the like.
+        ZenohError: an endpoint cannot be listened on, certificates cannot be read, a client finds no router.
     """
     package = zenoh()
     package.init_log_from_env_or("error")
+    opened: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    given_up = threading.Event()
+
+    def work() -> None:
+        try:
+            session = package.open(config)
+        except package.ZError as error:
+            opened.put(error)
+            return
+        opened.put(session)
+        if given_up.is_set():
+            session.close()
+
+    # By its own configuration Zenoh may wait for ever.
+    threading.Thread(target=work, name="zenoh open", daemon=True).start()
     try:
-        return package.open(config)
-    except package.ZError as error:
-        raise ZenohError(f"Zenoh session: {error}") from None
+        session = opened.get(timeout=_OPEN_S)
+    except queue.Empty:
+        given_up.set()
+        raise ZenohError(
+            f"Zenoh session: not open after {_OPEN_S:g} s; as a client it waits for its router: is it running?"
+        ) from None
+    if isinstance(session, package.ZError):
+        raise ZenohError(f"Zenoh session: {session}")
+    return session
 
 
 class RosSession:

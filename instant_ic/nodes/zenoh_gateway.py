@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
 from instant_ic.bridge.commands import CommandGate, CommandLimits
-from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing, parse_publish
-from instant_ic.bridge.zenoh_session import RosNode, RosSession, ZenohError, config_path, load_config
+from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing, parse_publish, parse_subscribe
+from instant_ic.bridge.zenoh_session import (
+    CLIENT_DEFAULTS,
+    SESSION_DEFAULTS,
+    RosNode,
+    RosSession,
+    ZenohError,
+    config_path,
+    is_client,
+    load_config,
+)
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.msg import MessageError
 from instant_ic.ranges import Range, check_ranges
+
+_AGAIN_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -20,8 +31,9 @@ class ZenohGatewayConfig:
     Attributes:
         namespace: the robot's name in the fleet; ``/scan`` here is ``/robot1/scan`` there. Empty: names stay.
         domain: ROS domain (``ROS_DOMAIN_ID``).
-        connect: routers to connect to; empty: those of the session file.
-        session_file: Zenoh configuration (JSON5), path or file of config/; empty: as rmw_zenoh, router on localhost.
+        mode: peer: of a router on this host, as rmw_zenoh; client: of a router elsewhere.
+        connect: routers to connect to; empty: tcp/localhost:7447, or those of the session file.
+        session_file: Zenoh configuration (JSON5), path or file of config/, instead of mode; empty: none.
         publish: topics that go out: NAME or PATTERN, with rate_hz=N behind it for at most N messages a second.
         subscribe: topics that come in: NAME, PATTERN, or "NAME TYPE" to have it before anybody publishes it.
         commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop.
@@ -31,6 +43,7 @@ class ZenohGatewayConfig:
 
     namespace: str = ""
     domain: Annotated[int, Range(0, 232)] = 0
+    mode: Literal["peer", "client"] = "peer"
     connect: tuple[str, ...] = ()
     session_file: str = ""
     publish: tuple[str, ...] = ()
@@ -56,6 +69,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
 
     name = "zenoh_gateway"
     session: RosSession | None = None
+    _zenoh: Any
 
     def setup(self) -> None:
         """Opens the session."""
@@ -65,31 +79,63 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             raise NodeError(f"--namespace {self.namespace}: for the names there set the parameter namespace instead")
         config = self.config
         self.gate = CommandGate(config.limits)
-        namespace = Namespace(config.namespace)
-        try:
-            zenoh_config = load_config(config_path(config.session_file), config.connect)
-            self.session = RosSession(zenoh_config, config.domain)
-            own = RosNode(self.session, namespace.ros, self.node_name)
-            self.outgoing = Outgoing(self, self.session, namespace, own, config.publish)
-            self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate)
-        except (ZenohError, MessageError, ValueError, FileNotFoundError, registry.RegistryError) as error:
-            raise NodeError(str(error)) from None
-        self.outgoing.brought_in = self.incoming.wants
-        self.session.watch(self.incoming.on_token)
         self._lost = 0
-        self.look()
+        try:
+            parse_subscribe(config.subscribe)
+            defaults = CLIENT_DEFAULTS if config.mode == "client" else SESSION_DEFAULTS
+            self._zenoh = load_config(config_path(config.session_file), config.connect, defaults=defaults)
+            client = is_client(self._zenoh)
+            if not client:
+                self.opened(RosSession(self._zenoh, config.domain))
+        except (ZenohError, MessageError, FileNotFoundError, registry.RegistryError) as error:
+            raise NodeError(str(error)) from None
+        if client:  # its router may come later
+            self._opener = self.background(self.open, self.opened)
+            self._opener.submit(None)
+            self.timer(_AGAIN_S, self.try_again)
         self.timer(config.discovery_period_s, self.look)
         self.timer(1.0, self.tell)
 
+    def open(self, _: None) -> RosSession | ZenohError:
+        """Tries to reach the router (background thread)."""
+        try:
+            return RosSession(self._zenoh, self.config.domain)
+        except ZenohError as error:
+            return error
+
+    def opened(self, session: RosSession | ZenohError) -> None:
+        """Enters the ROS graph."""
+        if isinstance(session, ZenohError):
+            self.diagnose("link", WARN, f"{session}; trying again (is the router running? ic run zenoh_router)")
+            return
+        if self.stopping:
+            session.close()
+            return
+        config, namespace = self.config, Namespace(self.config.namespace)
+        self.session = session
+        own = RosNode(session, namespace.ros, self.node_name)
+        self.outgoing = Outgoing(self, session, namespace, own, config.publish)
+        self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate)
+        self.outgoing.brought_in = self.incoming.wants
+        session.watch(self.incoming.on_token)
+        self.look()
+
+    def try_again(self) -> None:
+        """Tries the router again."""
+        if self.session is None and not self._opener.busy:
+            self._opener.submit(None)
+
     def look(self) -> None:
         """Follows what comes and goes."""
-        assert self.run_dir is not None
+        if self.session is None or self.run_dir is None:
+            return
         self.outgoing.reconcile(registry.list_topics(self.run_dir))
         self.incoming.reconcile()
 
     def tell(self) -> None:
         """Tells links, counts and losses."""
-        assert self.session is not None
+        if self.session is None:
+            return
         routers, peers = self.session.routers(), self.session.peers()
         if routers or peers:
             self.diagnose("link", OK, f"{len(routers)} routers, {len(peers)} peers")

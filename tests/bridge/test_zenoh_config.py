@@ -1,0 +1,195 @@
+"""The shipped Zenoh files: as they stand, and with their TLS and access-control parts over real links."""
+
+import re
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+from live_nodes import LiveNode, Neighbour, wait_for
+
+from instant_ic import paths
+from instant_ic.bridge.zenoh_format import TopicQoS
+from instant_ic.bridge.zenoh_session import RosNode, RosPublisher, RosSession, ZenohError, load_config, open_zenoh
+from instant_ic.bus import LATCHED
+from instant_ic.bus.registry import list_topics
+from instant_ic.evaluation.stack import free_port
+from instant_ic.msg import String, deserialize, serialize, type_hash
+from instant_ic.nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
+from instant_ic.nodes.zenoh_router import ZenohRouterConfig, ZenohRouterNode
+
+zenoh = pytest.importorskip("zenoh")
+pytestmark = pytest.mark.xdist_group("zenoh")
+STRING = "std_msgs/msg/String"
+FILES = ("zenoh_router.json5", "zenoh_robot.json5", "zenoh_station.json5")
+
+
+def with_tls(name: str) -> str:
+    """A shipped file as its first lines say: without the lines that end in "// open", and without the marks."""
+    lines = paths.shipped_file("config", name).read_text().splitlines()
+    kept = [line for line in lines if not line.rstrip().endswith("// open")]
+    return "\n".join(re.sub(r"^//:", "", line) for line in kept)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_shipped_files_are_zenoh_configurations_with_and_without_tls(name):
+    plain = load_config(paths.shipped_file("config", name))
+    secure = zenoh.Config.from_json5(with_tls(name))
+    for config in (plain, secure):
+        assert config.get_json("scouting/multicast/enabled") == "false"
+        assert config.get_json("timestamping/enabled").count("true") == 3
+    assert "tls/" in secure.get_json("listen/endpoints") + secure.get_json("connect/endpoints")
+
+
+def test_gateways_meet_at_a_router_node_by_the_shipped_files(tmp_path_factory):
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    things = []
+
+    def start(node_class, config, name, run_dir):
+        things.append(LiveNode(run_dir, node_class, config, name))
+        return things[-1]
+
+    robot, station = tmp_path_factory.mktemp("r"), tmp_path_factory.mktemp("r")
+    try:
+        router = start(ZenohRouterNode, ZenohRouterConfig((endpoint,), "zenoh_router.json5"), "zenoh_router", station)
+        for where, name, lists in [
+            (robot, "robot", {"publish": ("/x",)}),
+            (station, "station", {"subscribe": ("/x",)}),
+        ]:
+            config = ZenohGatewayConfig("robot1", connect=(endpoint,), session_file=f"zenoh_{name}.json5", **lists)
+            start(ZenohGatewayNode, config, "zenoh_gateway", where)
+        talker = Neighbour(robot, "talker")
+        things.append(talker)
+        talker.publisher("/x", String, LATCHED).publish(String("hello"))
+        listener = Neighbour(station, "listener")
+        things.append(listener)
+        heard = listener.listen("/x", LATCHED)
+        listener.wait(lambda: heard, "the message")
+        assert deserialize(heard[0].payload, STRING).data == "hello"
+        wait_for(lambda: "2 peers" in router.told("link"), "both at the router")
+    finally:
+        for thing in reversed(things):
+            thing.close()
+
+
+# -- TLS and access control ----------------------------------------------------------------------------
+
+
+def openssl(folder: Path, *words: str) -> None:
+    subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True, timeout=60)
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    """An authority, and certificates by it of a router, two robots and a station, as docs/fleet.md makes them."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed, and the certificates are made with it")
+    folder = tmp_path_factory.mktemp("tls")
+    curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes")
+    openssl(
+        folder, "req", "-x509", *curve, "-days", "2", "-subj", "/CN=fleet", "-keyout", "ca.key", "-out", "ca.pem",
+        "-addext", "keyUsage=critical,keyCertSign",
+    )  # fmt: skip
+    (folder / "names.txt").write_text("subjectAltName=DNS:localhost,IP:127.0.0.1\n")
+    for name in ("router", "robot1", "robot2", "station"):
+        openssl(folder, "req", *curve, "-subj", f"/CN={name}", "-keyout", f"{name}.key", "-out", f"{name}.csr")
+        openssl(
+            folder, "x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial",
+            "-days", "2", "-extfile", "names.txt", "-out", f"{name}.pem",
+        )  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def secure(certificates):
+    """Makes sessions by the shipped files with TLS; the router runs."""
+    port = free_port()
+    opened = []
+
+    def config(name: str, who: str):
+        text = with_tls(name).replace("/etc/zenoh", str(certificates)).replace("robot1.pem", f"{who}.pem")
+        text = text.replace("robot1.key", f"{who}.key").replace("router.example:7447", f"127.0.0.1:{port}")
+        return zenoh.Config.from_json5(text.replace("tls/[::]:7447", f"tls/127.0.0.1:{port}"))
+
+    class Secure:
+        endpoint = f"127.0.0.1:{port}"
+
+        def session(self, name, who):
+            opened.append(RosSession(config(f"zenoh_{name}.json5", who)))
+            return opened[-1]
+
+        def keep(self, thing):
+            opened.append(thing)
+            return thing
+
+    opened.append(open_zenoh(config("zenoh_router.json5", "robot1")))
+    yield Secure()
+    for thing in reversed(opened):
+        thing.close()
+
+
+def put_until(publisher, condition, what, timeout_s=30.0):
+    def once():
+        publisher.put(bytes(serialize(String("x"))), time.time_ns())
+        time.sleep(0.02)
+        return condition()
+
+    return wait_for(once, what, timeout_s)
+
+
+def test_access_control_lets_a_robot_into_its_own_namespace_and_a_station_everywhere(secure):
+    robot, other, station = (secure.session(*who) for who in (
+        ("robot", "robot1"), ("robot", "robot2"), ("station", "station"),
+    ))  # fmt: skip
+    graph = {}
+    station.watch(lambda token, alive: graph.update({token: alive}))
+    heard = []
+    hash_ = type_hash(STRING)
+    for topic in ("robot1/x", "robot2/x"):
+        station.zenoh.declare_subscriber(f"0/{topic}/**", lambda s: heard.append(str(s.key_expr)))
+    own = RosPublisher(RosNode(robot, "/robot1", "node"), "/robot1/x", STRING, hash_, TopicQoS())
+    foreign = RosPublisher(RosNode(robot, "/robot2", "spoof"), "/robot2/x", STRING, hash_, TopicQoS())
+    stranger = RosPublisher(RosNode(other, "/robot2", "node"), "/robot2/x", STRING, hash_, TopicQoS())
+    put_until(own, lambda: heard, "robot1's message at the station")
+    for _ in range(20):
+        foreign.put(b"x", 1)
+        stranger.put(b"x", 1)  # a certificate of the fleet, but no rule
+    put_until(own, lambda: len(heard) > 5, "more of robot1's messages")
+    assert {key.split("/")[1] for key in heard} == {"robot1"}
+    wait_for(lambda: any(t.topic == "/robot1/x" for t in graph), "robot1's topic in the graph")
+    assert {t.namespace for t in graph} == {"/robot1"}
+    # Commands: the station reaches the robot.
+    back = []
+    robot.zenoh.declare_subscriber("0/robot1/operator/**", back.append)
+    command = RosPublisher(RosNode(station, "/robot1", "console"), "/robot1/operator/x", STRING, hash_, TopicQoS())
+    put_until(command, lambda: back, "the station's command at the robot")
+
+
+def test_latched_values_reach_late_stations_through_access_control(secure, certificates, tmp_path_factory):
+    robot = secure.session("robot", "robot1")
+    latched = TopicQoS(latched=True, depth=1)
+    publisher = RosPublisher(RosNode(robot, "/robot1", "slam"), "/robot1/map", STRING, type_hash(STRING), latched)
+    publisher.put(bytes(serialize(String("the map"))), time.time_ns())
+    wait_for(robot.routers, "the router")
+    text = with_tls("zenoh_station.json5").replace("/etc/zenoh", str(certificates))
+    file = tmp_path_factory.mktemp("c") / "station.json5"
+    file.write_text(text.replace("router.example:7447", secure.endpoint))
+    run_dir = tmp_path_factory.mktemp("r")
+    config = ZenohGatewayConfig("robot1", session_file=str(file), subscribe=("/map",))
+    secure.keep(LiveNode(run_dir, ZenohGatewayNode, config, "zenoh_gateway"))
+    listener = secure.keep(Neighbour(run_dir, "listener"))
+    heard = listener.listen("/map", LATCHED)
+    listener.wait(lambda: heard, "the latched value")
+    assert deserialize(heard[0].payload, STRING).data == "the map"
+    assert "/map" in {info.topic for info in list_topics(run_dir)}
+
+
+def test_without_a_certificate_nobody_gets_in(secure, certificates, tmp_path):
+    text = with_tls("zenoh_robot.json5").replace("router.example:7447", secure.endpoint)
+    text = text.replace("/etc/zenoh/ca.pem", str(certificates / "ca.pem"))
+    text = "\n".join(line for line in text.splitlines() if "connect_" not in line and "enable_mtls" not in line)
+    inside = secure.session("robot", "robot1")
+    wait_for(inside.routers, "the router, for the robot with a certificate")
+    with pytest.raises(ZenohError, match="Unable to connect"):
+        RosSession(zenoh.Config.from_json5(text))
