@@ -791,17 +791,20 @@ class _RosoutHandler(logging.Handler):
         self._log_type = message_type("Log")
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.node._rosout.publish(
-            self._log_type(
-                stamp=to_time(int(record.created * 1e9)),
-                level=self._LEVELS.get(record.levelno, 50),
-                name=self.node.node_name,
-                msg=record.getMessage(),
-                file=record.pathname,
-                function=record.funcName or "",
-                line=record.lineno,
+        try:
+            self.node._rosout.publish(
+                self._log_type(
+                    stamp=to_time(int(record.created * 1e9)),
+                    level=self._LEVELS.get(record.levelno, 50),
+                    name=self.node.node_name,
+                    msg=record.getMessage().encode(errors="replace").decode(),
+                    file=record.pathname,
+                    function=record.funcName or "",
+                    line=record.lineno,
+                )
             )
-        )
+        except Exception:  # noqa: BLE001 - a bad log line must not end the callback that wrote it
+            self.handleError(record)
 
 
 def _process() -> Any:

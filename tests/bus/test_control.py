@@ -204,6 +204,30 @@ def test_log_level(tuned):
         node.set_log_level("notset")
 
 
+def test_bad_log_line_ends_no_callback(tuned, capsys):
+    """A format that does not fit is told on the error output, as logging does; odd characters are replaced."""
+    node, _ = tuned
+    heard = []
+    node.subscribe_raw("/rosout", lambda *message: heard.append(deserialize(message[2], message[1]).msg))
+    deadline = time.monotonic() + 20
+    while not node._rosout.subscriber_count and time.monotonic() < deadline:
+        time.sleep(0.01)
+    (handler,) = [h for h in node.log.handlers if type(h).__name__ == "_RosoutHandler"]  # pytest's own would raise
+    for text, arguments in (("%d", ("x",)), ("file \udc80", ())):
+        record = {
+            "levelno": logging.WARNING,
+            "levelname": "WARNING",
+            "msg": text,
+            "args": arguments,
+            "pathname": __file__,
+        }
+        handler.handle(logging.makeLogRecord(record))
+    while not heard and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert heard == ["file ?"]
+    assert "%d format: a real number is required, not str" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("line", "words"),
     [

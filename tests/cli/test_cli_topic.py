@@ -2,12 +2,15 @@
 
 import json
 import re
+import signal
+import subprocess
+import sys
 import threading
 import time
 
 import numpy as np
 import pytest
-from cli_helpers import talking
+from cli_helpers import talking, wait_until
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -264,3 +267,45 @@ def test_json_and_csv_of_a_message():
     assert json.loads(json_line(path))["poses"][0]["pose"]["orientation"] == {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
     assert csv_line(path) == '0,0,"a,""b",0,0,,0,0,0,0,0,0,1'
     assert describe(build("String", {"data": "x" * 30}, 0), Style(length=2)) == f"data: {'x' * 20!r}... 30 characters"
+
+
+def test_losses_are_told_by_publisher(ic, tmp_path_factory, monkeypatch):
+    """dora 515, 3428: what a reader that stands still loses is counted, and says whose it was."""
+    run_dir = tmp_path_factory.mktemp("r")
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
+    flood = LocalTransport(run_dir, "flood", time.time_ns)
+    with talking(run_dir) as node:
+        publisher = flood.advertise("/order", "geometry_msgs/msg/TwistStamped", RELIABLE)
+        payload = serialize(build("TwistStamped", {}, 0))
+        command = [sys.executable, "-u", "-m", "instant_ic.cli.main", "topic", "hz", "/order"]
+        watcher = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        heard: list[str] = []
+        threading.Thread(target=lambda: heard.extend(iter(watcher.stdout.readline, "")), daemon=True).start()
+        try:
+            wait_until(lambda: publisher.subscriber_count == 2, "both readers")
+            for process in (node, watcher):
+                process.send_signal(signal.SIGSTOP)
+            for _ in range(30_000):
+                publisher.send(payload)
+            for process in (node, watcher):
+                process.send_signal(signal.SIGCONT)
+
+            def told() -> bool:
+                publisher.send(payload)
+                return any(re.search(r"lost: (\d+) \(flood \1\)", line) for line in heard)
+
+            wait_until(told, "the losses in ic topic hz")
+
+            def info() -> bool:
+                publisher.send(payload)
+                return bool(
+                    re.search(r"  Lost: (\d+)\n    flood → talker: \1\n", ic("topic", "info", "-v", "/order")[1])
+                )
+
+            wait_until(info, "the losses in ic topic info")
+            assert re.search(r"/order: .* Hz, lost \d+ of flood\n", ic("node", "info", "talker")[1])
+        finally:
+            watcher.kill()
+            watcher.wait()
+            watcher.stdout.close()
+            flood.close()
