@@ -46,7 +46,8 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
         output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
         status = 1
         try:
-            output.event(f"{len(description.nodes)} nodes of {description.file}, run directory {run_dir}")
+            count = f"{len(description.nodes)} node{'' if len(description.nodes) == 1 else 's'}"
+            output.event(f"{count} of {description.file}, run directory {run_dir}")
             status = Supervisor(
                 description.nodes,
                 run_dir,
@@ -126,6 +127,8 @@ class _Output:
             # Its thread holds standard output, and the interpreter would wait for it for ever. The nodes have ended,
             # the logs are written.
             os._exit(status)
+        if self._outlet.broken is not None:  # ic launch ... | head: what is still in the buffer can go nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequence[TopicFault]) -> Row:
@@ -137,7 +140,7 @@ def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequenc
     if not process.spec.heartbeat:
         return Row(label, "running", starts=starts)
     health = monitor.nodes.get(label) if monitor is not None else None
-    if health is None or health.pid != process.pid:
+    if health is None or health.seen_s < process.started_s:
         return Row(label, "starting", starts=starts)
     own = {fault.topic: fault for fault in faults if fault.label == label}
     state = "silent" if health.silent else health.state

@@ -140,7 +140,9 @@ class Screen:
     def _tell_progress(self, view: View, now: float) -> None:
         if not view.missing and not self._told_nodes:
             self._told_nodes = True
-            self.event(f"all {len(self._colours)} nodes are up after {now - self._started_s:.1f} s")
+            count = len(self._colours)
+            up = "the node is up" if count == 1 else f"all {count} nodes are up"
+            self.event(f"{up} after {now - self._started_s:.1f} s")
         if self._address is None and view.address:
             self._address = view.address
             self.event(f"console: {view.address}")

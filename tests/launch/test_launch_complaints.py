@@ -344,6 +344,29 @@ def test_a_stack_whose_terminal_takes_nothing_runs_on_and_ends_when_it_is_asked_
         launched.stdout.close()
 
 
+def test_a_stack_goes_on_and_ends_well_when_the_reader_of_its_output_has_gone(tmp_path: Path) -> None:
+    """As in ``ic launch ... | head -1``."""
+    talk = "while :; do echo tick; sleep 0.02; done"
+    file = launch_file(tmp_path, f"launch:\n- executable: {{cmd: '{talk}', shell: true, name: talker}}\n")
+    log = tmp_path / "r" / "log" / "talker.log"
+    command = [sys.executable, "-m", "instant_ic.cli.main", "launch", file, "--run-dir", str(tmp_path / "r"), "--plain"]
+    launched = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        assert launched.stdout is not None
+        assert b"1 node of" in launched.stdout.readline()
+        launched.stdout.close()
+        limit_s = time.monotonic() + 60
+        while not log.exists() or log.stat().st_size < 500:
+            assert time.monotonic() < limit_s and launched.poll() is None
+            time.sleep(0.05)
+        launched.send_signal(signal.SIGINT)
+        _, errors = launched.communicate(timeout=30)
+        assert launched.returncode == 0 and errors == b""
+    finally:
+        launched.kill()
+        launched.wait()
+
+
 def test_output_whose_reader_has_gone_is_given_up_and_the_stack_goes_on() -> None:
     def broken() -> None:
         raise BrokenPipeError(32, "Broken pipe")

@@ -1,6 +1,7 @@
 import io
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ from instant_ic.bus import RELIABLE
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.registry import NodeInfo, prepare
 from instant_ic.launch import NodeSpec
-from instant_ic.launch.health import HealthMonitor, find_console
+from instant_ic.launch.app import _row
+from instant_ic.launch.health import HealthMonitor, NodeHealth, TopicFault, find_console
+from instant_ic.launch.process import State
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.msg import NodeStatus, header, serialize
 
@@ -185,3 +188,29 @@ def test_console_address(server: dict[str, object], address: str | None) -> None
     info = NodeInfo("page", "m", 1, 0, {"server": server})
     assert find_console([info], ["page"]) == address
     assert find_console([info], ["another"]) is None
+
+
+def test_row_of_a_node_from_its_process_its_heartbeat_and_its_topics() -> None:
+    process: Any = SimpleNamespace(
+        spec=NodeSpec("lidar", "vlp16_driver", ()),
+        state=State.RUNNING,
+        limit=SimpleNamespace(retries=1),
+        reason="",
+        ending=False,
+        started_s=50.0,
+    )
+    now_s = time.monotonic()
+    rates = {"/heartbeat": 2.0, "/unknown": 3.0, "/lidar/points": 10.0, "/scan": 5.0, "/lidar/packets": 0.0}
+    health = NodeHealth("running", "", 7.0, 180.0, rates, now_s)
+    monitor: Any = SimpleNamespace(nodes={"lidar": health})
+    slow = TopicFault("lidar", "/scan", "5.0 of 10 Hz", stopped=False)
+    row = _row(process, monitor, [slow, TopicFault("other", "/pose", "stopped 3.0 s ago", stopped=True)])
+    assert (row.state, row.starts, row.text) == ("slow", 1, "")
+    # Wrong ones first, then those whose rate is known.
+    assert row.sends == (("/scan", 5.0, False), ("/lidar/points", 10.0, True), ("/unknown", 3.0, True))
+    stopped = _row(process, monitor, [TopicFault("lidar", "/scan", "stopped 3.0 s ago", stopped=True)])
+    assert (stopped.state, stopped.text) == ("slow", "scan stopped 3.0 s ago")
+    process.started_s = now_s + 1.0  # started again: what its predecessor said counts no more
+    assert _row(process, monitor, []).state == "starting"
+    process.ending, process.reason = True, "hangs: no heartbeat for 10 s"
+    assert (_row(process, monitor, []).state, _row(process, monitor, []).text) == ("stopping", process.reason)
