@@ -10,7 +10,8 @@ from pathlib import Path
 
 from instant_ic.bag.choice import EVERYTHING, TopicChoice
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.files import BagMessage, BagReader
+from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
+from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 
 NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics", "/parameter_events")
@@ -66,13 +67,19 @@ class BagPlayer:
     def __init__(self, path: Path, options: PlayOptions) -> None:
         self.options = options
         self._reader = BagReader(path)
-        played = {t.topic for t in self._reader.topics if options.choice.takes(t.topic)} - set(NEVER_PLAYED)
+        self.left_out: dict[str, str] = {}
+        """Topics, and types, that are not sent, with the reason."""
+        chosen: dict[str, TopicSummary] = {}
         # Of a topic with several types the one with most messages: a publisher has one type.
-        chosen = {t.topic: t for t in sorted(self._reader.topics, key=lambda t: t.count) if t.topic in played}
+        for topic in sorted(self._reader.topics, key=lambda topic: -topic.count):
+            if topic.topic in NEVER_PLAYED or not options.choice.takes(topic.topic):
+                continue
+            if why := self._why_not(topic) or ("it has another type too" if topic.topic in chosen else ""):
+                self.left_out[f"{topic.topic} ({topic.type_name}, {topic.count} messages)"] = why
+            else:
+                chosen[topic.topic] = topic
         self.topics = [chosen[topic] for topic in sorted(chosen)]
         """What will be sent."""
-        self.left_out = [t for t in self._reader.topics if t.topic in chosen and t != chosen[t.topic]]
-        """Topics with another type than the one that is sent."""
         self._types = {t.topic: t.type_name for t in self.topics}
         self.start_ns = self._reader.start_ns + int(options.start_offset_s * 1e9)
         self.end_ns = self._reader.end_ns
@@ -80,7 +87,8 @@ class BagPlayer:
             self.end_ns = min(self.end_ns, self.start_ns + int(options.duration_s * 1e9))
         if not self.topics:
             self._reader.close()
-            raise BagError(f"bag {path} has none of the topics that were asked for")
+            why = "".join(f"; {topic}: {words}" for topic, words in self.left_out.items())
+            raise BagError(f"bag {path} has none of the topics that were asked for{why}")
         if self.start_ns > self.end_ns:
             self._reader.close()
             raise BagError(f"bag {path} ends before start_offset_s = {options.start_offset_s}")
@@ -105,9 +113,14 @@ class BagPlayer:
         """Closes the bag."""
         self._reader.close()
 
-    def differing_types(self) -> list[str]:
-        """Types of what is played whose definition in the bag is another than ours."""
-        return [name for name in self._reader.differing_types() if name in {t.type_name for t in self.topics}]
+    def _why_not(self, topic: TopicSummary) -> str:
+        """Why a topic cannot be sent; empty where it can."""
+        own = schema_or_unknown(topic.type_name)
+        if not own.encoding and topic.schema.encoding != "ros2msg":
+            return "its type is not known, and the bag holds no definition of it"
+        if own.encoding and topic.schema.type_hash not in ("", own.type_hash):
+            return "its type has another definition in the bag than here"
+        return ""
 
     # -- controls ----------------------------------------------------------------------------------
 

@@ -127,6 +127,7 @@ def play(args: argparse.Namespace) -> int:
         topics=topic_names(args.topics),
         exclude=topic_names(args.exclude),
         publish_clock=not args.no_clock,
+        delay_s=args.delay,
         wait_for=args.wait_for,
     )
     for remap in args.remap:

@@ -36,7 +36,17 @@ from .convert import (
     twist_stamped,
     twist_values,
 )
-from .types import MessageError, deserialize, message_type, serialize, serializer, type_hash, type_name, typestore
+from .types import (
+    MessageError,
+    deserialize,
+    message_type,
+    register_type,
+    serialize,
+    serializer,
+    type_hash,
+    type_name,
+    typestore,
+)
 
 __all__ = [
     "POINT_DTYPE",
@@ -58,6 +68,7 @@ __all__ = [
     "pose_matrix",
     "pose_message",
     "pose_stamped",
+    "register_type",
     "scan_message",
     "serialize",
     "serializer",

@@ -41,6 +41,30 @@ def typestore() -> Typestore:
     return store
 
 
+def register_type(name: str, definition: str) -> None:
+    """Makes another project's type known to this process, from a definition as bags carry it.
+
+    Types that are known already, also inside of it, stay as they are.
+
+    Args:
+        name: full name, for example ``rover_msgs/msg/Cells``.
+        definition: text in the ``ros2msg`` form, with those of the types inside.
+
+    Raises:
+        MessageError: the text is no definition.
+    """
+    if name in typestore().fielddefs:
+        return
+    from rosbags.typesys import TypesysError, get_types_from_msg
+
+    try:
+        found = get_types_from_msg(definition, name)
+        known = typestore().fielddefs
+        typestore().register({inner: fields for inner, fields in found.items() if inner not in known})
+    except TypesysError as error:
+        raise MessageError(f"the definition of {name} cannot be read: {error}") from None
+
+
 @functools.cache
 def message_type(name: str) -> Any:
     """Class of a type by full name (``sensor_msgs/msg/Image``, ``sensor_msgs/Image``) or short name (``Image``).

@@ -14,7 +14,7 @@ from instant_ic.bag.player import RATES, BagPlayer, PlayOptions
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
-from instant_ic.msg import message_type, to_time
+from instant_ic.msg import message_type, register_type, to_time
 from instant_ic.ranges import NotNegative, Positive, Range, check_ranges
 
 
@@ -34,6 +34,7 @@ class BagPlayerConfig:
         drop_transforms: transforms with these child frames are left out of ``/tf``: somebody broadcasts them anew.
         publish_clock: whether to send ``/clock``.
         clock_hz: how often at least, also in a pause and where the bag has gaps.
+        delay_s: how long the time stands at the beginning, so that readers find the topics, s.
         wait_for: nodes that must run, and be connected to what they read, before it begins.
         wait_timeout_s: how long to wait for them before it gives up, s.
         linger_s: how long it stays after the last message, so that the others finish their work, s.
@@ -50,6 +51,7 @@ class BagPlayerConfig:
     drop_transforms: tuple[str, ...] = ()
     publish_clock: bool = True
     clock_hz: Annotated[float, Range(1, 1000)] = 40.0
+    delay_s: NotNegative = 0.5
     wait_for: tuple[str, ...] = ()
     wait_timeout_s: Positive = 60.0
     linger_s: NotNegative = 1.0
@@ -79,6 +81,8 @@ class BagPlayerNode(Node[BagPlayerConfig]):
     name = "bag_player"
     live_parameters = ("rate", "linger_s")
     player: BagPlayer | None = None
+    _thread: threading.Thread | None = None
+    _failed = ""
 
     def setup(self) -> None:
         """Opens the bag, makes its topics, starts the thread."""
@@ -89,13 +93,11 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self._clock_out: Publisher | None = None
         if self.config.publish_clock:
             self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
+        for topic in self.player.topics:  # another project's types come with the bag
+            register_type(topic.type_name, topic.schema.text)
         self._out = {t.topic: self.publisher_raw(t.topic, t.type_name, t.qos) for t in self.player.topics}
-        for topic in self.player.left_out:
-            self.log.warning(
-                "%s also carries %s: its %d messages are not played", topic.topic, topic.type_name, topic.count
-            )
-        for type_name in self.player.differing_types():
-            self.log.warning("the bag's %s is another than ours: our nodes may refuse it", type_name)
+        for name, why in self.player.left_out.items():
+            self.log.warning("%s is not played: %s", name, why)
         self.commands = {
             "pause": self.player.pause,
             "resume": self.player.resume,
@@ -105,7 +107,6 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             "seek": self.player.seek,
             "status": self.status,
         }
-        self._failed = ""
         self._thread = threading.Thread(target=self._run, name="player", daemon=True)
         self._thread.start()
 
@@ -165,7 +166,12 @@ class BagPlayerNode(Node[BagPlayerConfig]):
 
     def _wait_for_readers(self) -> None:
         """Until each node of ``wait_for`` runs, reads something of the bag, and is connected to all that it reads."""
-        if not self.config.wait_for or self.run_dir is None or self.player is None:
+        if self.run_dir is None or self.player is None:
+            return
+        begin_s = time.monotonic() + self.config.delay_s
+        while time.monotonic() < begin_s and not self._stop.wait(1.0 / self.config.clock_hz):
+            self._tell_time(self.player.start_ns)
+        if not self.config.wait_for:
             return
         deadline_s = time.monotonic() + self.config.wait_timeout_s
         missing = ""
@@ -197,7 +203,8 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         """Ends the thread, closes the bag."""
         if self.player is None:
             return
-        self._thread.join(timeout=3.0)
+        if self._thread is not None:
+            self._thread.join(timeout=3.0)
         self.player.close()
         if self._failed:
             self.log.error("%s", self._failed)

@@ -5,8 +5,9 @@ from typing import Any
 
 import pytest
 
-from instant_ic.bag import BagError, BagMessage, BagWriter
+from instant_ic.bag import BagError, BagMessage, BagWriter, Schema
 from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 
@@ -221,7 +222,7 @@ def test_of_a_topic_with_two_types_one_is_played(tmp_path: Path) -> None:
             writer.write("/a", BOOL, b"b", stamp_ns, SENSOR)
     player = BagPlayer(tmp_path / "bag", PlayOptions())
     assert [(t.topic, t.type_name) for t in player.topics] == [("/a", BOOL)]
-    assert [(t.topic, t.type_name, t.count) for t in player.left_out] == [("/a", TF, 1)]
+    assert player.left_out == {f"/a ({TF}, 1 messages)": "it has another type too"}
     sent: list[bytes] = []
     player.play(lambda message: sent.append(message.payload), threading.Event())
     player.close()
@@ -243,3 +244,20 @@ def test_damage_found_while_playing_is_told(tmp_path: Path) -> None:
         player.play(lambda message: sent.append(message.payload[0]), threading.Event())
     player.close()
     assert sent == [0, 1, 2, 3]
+
+
+def test_types_that_cannot_be_sent_are_named(tmp_path: Path) -> None:
+    theirs = with_hash(Schema(BOOL, "ros2msg", "uint8 number\n", ""))
+    new = with_hash(Schema("rover_msgs/msg/Cells", "ros2msg", "uint8 number\n", ""))
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.write("/unknown", "their_msgs/msg/Odd", b"u", 1, SENSOR)
+        writer.write("/other", BOOL, b"o", 1, SENSOR, theirs)
+    with pytest.raises(BagError, match=r"/unknown \(their_msgs/msg/Odd, 1 messages\): its type is not known"):
+        BagPlayer(tmp_path / "bag", PlayOptions())
+    with BagWriter(tmp_path / "more") as writer:
+        writer.write("/cells", new.name, b"c", 1, SENSOR, new)
+        writer.write("/other", BOOL, b"o", 1, SENSOR, theirs)
+    player = BagPlayer(tmp_path / "more", PlayOptions())
+    assert [t.topic for t in player.topics] == ["/cells"]  # its definition is in the bag
+    assert player.left_out == {f"/other ({BOOL}, 1 messages)": "its type has another definition in the bag than here"}
+    player.close()

@@ -98,6 +98,9 @@ def add_parser(subparsers: Any) -> None:
     playing.add_argument("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
     playing.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="other name; repeatable")
     playing.add_argument("--no-clock", action="store_true", help="send no /clock")
+    playing.add_argument(
+        "--delay", type=_seconds, default=0.5, metavar="S", help="for readers to connect (default: 0.5)"
+    )
     playing.add_argument("--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads")
 
     looking = verb("info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive")
