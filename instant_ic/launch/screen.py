@@ -162,11 +162,10 @@ class Screen:
         """A topic is told when it becomes wrong and when it is right again; the numbers in between change nothing."""
         before = {fault.partition(":")[0] for fault in self._told_faults}
         now = {fault.partition(":")[0] for fault in faults}
-        for fault in faults:
-            if fault.partition(":")[0] not in before:
-                self.event(fault, bad=True)
-        for topic in sorted(before - now):
-            self.event(f"{topic} flows as it should again")
+        if new := [fault for fault in faults if fault.partition(":")[0] not in before]:
+            self.event(f"too slow: {', '.join(new)}", bad=True)
+        if over := sorted(before - now):
+            self.event(f"at the right rate again: {', '.join(over)}")
         self._told_faults = faults
 
     def table(self, view: View) -> RenderableType:

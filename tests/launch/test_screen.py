@@ -51,12 +51,14 @@ def test_plain_lines_tell_what_is_waited_for(out: io.StringIO) -> None:
 def test_plain_lines_tell_a_degraded_topic_once_and_its_recovery(out: io.StringIO) -> None:
     with screen_on(out, live=False) as screen:
         screen.refresh(View())
-        screen.refresh(View(faults=("/pose of slam: 7.2 of 10 Hz",)))
+        screen.refresh(View(faults=("/pose of slam: 7.2 of 10 Hz", "/scan of lidar: stopped 3.0 s ago")))
+        screen.refresh(View(faults=("/pose of slam: 7.9 of 10 Hz", "/scan of lidar: stopped 4.0 s ago")))
         screen.refresh(View(faults=("/pose of slam: 7.9 of 10 Hz",)))
         screen.refresh(View())
     assert out.getvalue().splitlines()[2:] == [
-        "launch │ /pose of slam: 7.2 of 10 Hz",
-        "launch │ /pose of slam flows as it should again",
+        "launch │ too slow: /pose of slam: 7.2 of 10 Hz, /scan of lidar: stopped 3.0 s ago",
+        "launch │ at the right rate again: /scan of lidar",
+        "launch │ at the right rate again: /pose of slam",
     ]
 
 
