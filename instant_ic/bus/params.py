@@ -72,12 +72,16 @@ def load_file(path: Path, node: str) -> Values:
         raise ParameterError(f"{path}: cannot be read: {error.strerror}") from error
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
+        return {} if root is None else _sections(root, path, node)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise ParameterError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
-    if root is None:
-        return {}
+    except RecursionError:
+        raise ParameterError(f"{path}: nested without end: an anchor inside itself?") from None
+
+
+def _sections(root: yaml.Node, path: Path, node: str) -> Values:
     sections: dict[str, Values] = {}
     for name, section in _items(root, path):
         values: Values = {}
@@ -111,15 +115,43 @@ def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values) -> None:
         if isinstance(value, yaml.MappingNode) and value.value:
             _flatten(value, f"{prefix}{key}.", path, out)
         else:
-            out[prefix + key] = Value(_construct(value), _where(path, value))
+            out[prefix + key] = Value(_construct(value, f"{_where(path, value)}: {prefix}{key}"), _where(path, value))
 
 
-def _construct(node: yaml.Node) -> Any:
+_YAML_FAULTS = (yaml.YAMLError, ValueError, AttributeError)
+"""What PyYAML raises for a value that is none: 2001-13-45 is a ValueError, ``!!timestamp x`` an AttributeError."""
+
+
+def _construct(node: yaml.Node, what: str) -> Any:
     loader = yaml.SafeLoader("")
     try:
         return loader.construct_object(node, deep=True)
+    except _YAML_FAULTS as error:
+        raise ParameterError(f"{what}: the value is not YAML: {_one_line(error)}") from error
     finally:
         loader.dispose()
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
+def yaml_value(text: str, what: str) -> Any:
+    """A value as the user types it.
+
+    Args:
+        text: YAML.
+        what: stands in front of the error.
+
+    Raises:
+        ParameterError: it is no YAML.
+    """
+    try:
+        return yaml.safe_load(text)
+    except _YAML_FAULTS as error:
+        raise ParameterError(f"{what}: the value is not YAML: {_one_line(error)}") from error
+    except RecursionError:
+        raise ParameterError(f"{what}: the value is nested too deep") from None
 
 
 def parse_override(word: str) -> tuple[str, Value]:
@@ -131,10 +163,7 @@ def parse_override(word: str) -> tuple[str, Value]:
     key, separator, text = word.partition(":=")
     if not separator or not key:
         raise ParameterError(f"-p {word}: expected key:=value")
-    try:
-        return key, Value(yaml.safe_load(text), f"-p {word}")
-    except yaml.YAMLError as error:
-        raise ParameterError(f"-p {word}: the value is not YAML: {error}") from error
+    return key, Value(yaml_value(text, f"-p {word}"), f"-p {word}")
 
 
 def build(config_class: type[ConfigT], values: Mapping[str, Value], base: ConfigT | None = None) -> ConfigT:

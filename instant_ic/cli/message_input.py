@@ -6,8 +6,8 @@ import difflib
 from typing import Any
 
 import numpy as np
-import yaml
 
+from instant_ic.bus.params import ParameterError, yaml_value
 from instant_ic.cli.errors import UserError
 from instant_ic.msg import MessageError, message_type, to_time, type_name, typestore
 
@@ -33,9 +33,9 @@ def parse(text: str, name: str) -> Any:
         UserError: it is not YAML, or not a mapping.
     """
     try:
-        values = yaml.safe_load(text) if text.strip() else {}
-    except yaml.YAMLError as error:
-        raise UserError(f"the values are not YAML: {' '.join(str(error).split())}", 2) from None
+        values = yaml_value(text, name) if text.strip() else {}
+    except ParameterError as error:
+        raise UserError(str(error), 2) from None
     if not isinstance(values, dict):
         example = next(iter(fields(name)), ("field", None))[0]
         raise UserError(f"the values of a {name} must be a mapping such as '{{{example}: ...}}' (got {text!r})", 2)

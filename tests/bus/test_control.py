@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Annotated
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from instant_ic.bus import Node, ParameterError, control
 from instant_ic.bus.clock import SystemClock
@@ -85,6 +87,7 @@ def tuned(tmp_path_factory):
     node = Tuned(TunedConfig(), LocalTransport(run_dir, "tuned", clock.now_ns), clock)
     server = ControlServer(node, run_dir / "nodes" / "tuned.sock")
     node.start()
+    node.server = server
     node.thread = threading.Thread(target=node.spin)
     node.thread.start()
     yield node, NodeControl(run_dir, "tuned")
@@ -251,6 +254,29 @@ def test_malformed_requests_are_refused(tuned, line, words):
         answer = json.loads(raw.makefile().readline())
     assert not answer["ok"] and words in answer["error"]
     assert client.get()["rate_hz"] == 10.0
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+keys = (
+    st.sampled_from(["rate_hz", "label", "places", "port", "inner", "inner.gain", "inner.gain.x", "nice", ""])
+    | st.text()
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=150, deadline=None)
+@given(st.binary(max_size=40), st.dictionaries(keys, json_values, max_size=3))
+def test_whatever_is_asked_is_answered(tuned, line, values):
+    """Bytes of any kind, and values of any kind: an answer, and a configuration that its own checks accept."""
+    node, _ = tuned
+    assert isinstance(node.server.answer(line)["ok"], bool)
+    answer = node.server.answer(json.dumps({"op": "set", "values": values}).encode())
+    assert answer["ok"] or (answer["kind"] in ("parameter", "request") and answer["error"])
+    node.config.__post_init__()
+    node.config.inner.__post_init__()
 
 
 def test_too_long_a_request_and_too_many_connections(tuned):

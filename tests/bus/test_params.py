@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from instant_ic.bus import params
 
@@ -91,3 +93,41 @@ def test_other_mistakes(tmp_path):
         load(tmp_path, "", "rate:=x")
     with pytest.raises(params.ParameterError, match="cannot be read"):
         params.load_file(tmp_path / "none.yaml", "driver")
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("    rate: 2001-13-45", r"p\.yaml:3: rate: the value is not YAML: month must be in 1\.\.12"),
+        ("    rate: !!timestamp x", r"p\.yaml:3: rate: the value is not YAML"),
+        ("    rate: " + "[" * 3000 + "]" * 3000, r"p\.yaml: nested without end"),
+        ("    matcher: &a {window_m: *a}", r"p\.yaml(:3)?: "),
+        ("    ? [1]\n    : 2", r"unknown parameter"),
+    ],
+)
+def test_values_that_break_yaml_readers_are_told(tmp_path, body, message):
+    with pytest.raises(params.ParameterError, match=message):
+        load(tmp_path, f"driver:\n  ros__parameters:\n{body}\n")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=200)
+@given(st.text(alphabet=st.sampled_from("ab:- []{}!&*'\"\n#,?|>%@0123.e~"), max_size=60), st.text(max_size=30))
+def test_any_file_and_any_word_give_values_or_words(tmp_path, body, word):
+    """What comes out is a configuration or an error with words, whatever the file holds."""
+    try:
+        load(tmp_path, f"driver:\n  ros__parameters:\n    {body}\n")
+    except params.ParameterError as error:
+        assert str(error)
+    try:
+        params.build(Config, dict([params.parse_override(word)]))
+    except params.ParameterError as error:
+        assert str(error)
+
+
+def test_change_keeps_the_rest():
+    config = Config(rate=5.0, matcher=Matcher(0.7))
+    changed, different = params.change(config, {"matcher": {"window_m": 0.4}, "beams": 720}, lambda key: True, "set")
+    assert changed == Config(rate=5.0, matcher=Matcher(0.4)) and different == {"matcher.window_m": 0.4}
+    with pytest.raises(params.ParameterError, match="set: beams, rate takes effect at start"):
+        params.change(config, {"rate": 6.0, "beams": 3}, lambda key: key == "frame", "set")
+    assert params.change(config, {"rate": 5.0}, lambda key: False, "set") == (config, {})

@@ -165,7 +165,7 @@ def test_pub_reaches_the_node(ic, talker):
     [
         (("/order", "TwistStamped", "{twist: {liner: {x: 1}}}"), "no field 'twist.liner' (did you mean 'linear'?)"),
         (("/order", "TwistStamped", "{twist: {linear: {x: fast}}}"), "twist.linear.x must be float64 (got 'fast')"),
-        (("/order", "TwistStamped", "{twist: [1"), "the values are not YAML"),
+        (("/order", "TwistStamped", "{twist: [1"), "the value is not YAML"),
         (("/order", "Twits", "{}"), "did you mean 'Twist'?"),
         (("/order", "Bool", "{data: true}"), "/order is a geometry_msgs/msg/TwistStamped for talker"),
         (("/flag", "Bool", "true"), "must be a mapping such as '{data: ...}' (got 'true')"),

@@ -107,18 +107,13 @@ def _no_parameter(node: str, key: str, known: Any) -> UserError:
 
 def set_parameters(args: argparse.Namespace) -> int:
     """Changes parameters together."""
-    import yaml
+    from instant_ic.bus import params
 
     words = args.pairs
     if len(words) % 2:
         raise UserError(f"{words[-1]}: a value is missing (ic param set {args.node} KEY VALUE ...)", 2)
-    values = {}
-    for key, text in zip(words[::2], words[1::2], strict=True):
-        try:
-            values[key] = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise UserError(f"{key}: {text!r} is not YAML: {' '.join(str(error).split())}", 2) from None
-    return _change(args.node, values)
+    pairs = zip(words[::2], words[1::2], strict=True)
+    return _change(args.node, {key: params.yaml_value(text, f"{key} {text}") for key, text in pairs})
 
 
 def _change(node: str, values: dict[str, Any]) -> int:
