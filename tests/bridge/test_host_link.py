@@ -245,6 +245,15 @@ def test_nobody_at_the_address_is_told_and_waited_for(ends, keys):
     assert b.of(Problem)[-1].text == ""
 
 
+def test_name_that_nobody_knows_is_told(ends, keys):
+    end = End(
+        ConnectingLink, "tcp://no-such-robot.invalid:7450", keys["station"].peer("robot"), name="station",
+        store=keys["station"], exports=[COMMAND], imports=[STATE],
+    )  # fmt: skip
+    ends.append(end)
+    wait_for(lambda: end.said("cannot be reached"), "words")
+
+
 def test_robot_that_starts_anew_is_met_again_within_two_seconds(ends, keys):
     a = robot(ends, keys)
     port = a.link.port
