@@ -1,0 +1,97 @@
+"""The shipped Foxglove layout: whole, and only of topics and fields that this stack has."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from instant_ic import paths
+from instant_ic.msg import message_type, typestore
+
+ROOT = Path(__file__).resolve().parents[2]
+# Foxglove's panel types that the layout may use (docs.foxglove.dev, panels).
+PANELS = {
+    *("3D", "Image", "Plot", "StateTransitions", "DiagnosticSummary", "RosOut", "RawMessages", "Parameters", "Tab"),
+}
+
+
+@pytest.fixture(scope="module")
+def layout():
+    return json.loads(paths.shipped_file("config", "foxglove_layout.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def types():
+    """Topic → type of docs/architecture.md, which the system test holds to what runs."""
+    found = {}
+    for names, kinds in re.findall(
+        r"^\| ((?:`/[\w/]+`(?:, )?)+) \| ([^|]+) \|", (ROOT / "docs/architecture.md").read_text(), re.M
+    ):
+        topics, words = re.findall(r"`(/[\w/]+)`", names), re.findall(r"\w+/\w+", kinds)
+        found.update(zip(topics, words if len(words) == len(topics) else words * len(topics), strict=True))
+    return found
+
+
+def panels_of(tree):
+    """Ids of the panels in a split, as Foxglove nests them."""
+    if isinstance(tree, str):
+        return [tree]
+    assert set(tree) <= {"first", "second", "direction", "splitPercentage"}
+    assert tree["direction"] in ("row", "column") and 0 < tree["splitPercentage"] < 100
+    return panels_of(tree["first"]) + panels_of(tree["second"])
+
+
+def test_every_panel_stands_somewhere_once_and_is_configured(layout):
+    placed = panels_of(layout["layout"])
+    for config in layout["configById"].values():
+        for tab in config.get("tabs", []):
+            placed += panels_of(tab["layout"])
+    assert sorted(placed) == sorted(layout["configById"])
+    assert {name.split("!")[0] for name in placed} == PANELS
+    assert {"globalVariables", "userNodes", "playbackConfig"} <= set(layout)
+
+
+def topics_in(value):
+    """Every topic, or path into its messages, that a configuration names."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            if key == "topics":
+                yield from inner
+            elif key in ("imageTopic", "topicToRender", "topicPath", "value") and isinstance(inner, str):
+                yield inner
+            elif key != "publish":
+                yield from topics_in(inner)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from topics_in(inner)
+
+
+def field_type(type_name, path):
+    """Follows ``.twist.linear.x`` and ``[0]`` through a message's definition; KeyError where there is no such field."""
+    kind = type_name
+    for name in re.findall(r"\.(\w+)", re.sub(r"\[\d*:?\d*\]", "", path)):
+        definition = dict(typestore().get_msgdef(message_type(kind).__msgtype__).fields)
+        if name not in definition:
+            raise KeyError(f"{kind} has no field {name}")
+        node = definition[name]
+        while not isinstance(node[1], str):  # an array: its element
+            node = node[1][0]
+        kind = node[1]
+    return kind
+
+
+def test_it_shows_only_topics_and_fields_that_there_are(layout, types):
+    named = set(topics_in(layout["configById"]))
+    assert len(named) > 20
+    for text in named:
+        topic, condition, path = re.fullmatch(r"(/[\w/]+)(?:\{(\w+)==.*?\})?((?:\.\w+|\[\d+\])*)", text).groups()
+        assert topic in types, f"{text}: nobody publishes {topic}"
+        field_type(types[topic], path)
+        if condition:
+            field_type(types[topic], f".{condition}")
+
+
+def test_the_checks_themselves_find_a_wrong_field():
+    with pytest.raises(KeyError, match="has no field speed"):
+        field_type("geometry_msgs/TwistStamped", ".twist.linear.speed")
