@@ -245,6 +245,23 @@ def test_nobody_at_the_address_is_told_and_waited_for(ends, keys):
     assert b.of(Problem)[-1].text == ""
 
 
+def test_link_over_ipv6(ends, keys):
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    a = End(
+        ListeningLink, "tcp://[::1]:0", name="robot", store=keys["robot"], exports=[STATE], imports=[COMMAND]
+    )  # fmt: skip
+    b = End(
+        ConnectingLink, f"tcp://[::1]:{a.link.port}", keys["station"].peer(), name="station", store=keys["station"],
+        exports=[COMMAND], imports=[STATE],
+    )  # fmt: skip
+    ends += [a, b]
+    linked(a, b)
+    assert a.link.peers()[0].address == "::1"
+
+
 def test_name_that_nobody_knows_is_told(ends, keys):
     end = End(
         ConnectingLink, "tcp://no-such-robot.invalid:7450", keys["station"].peer("robot"), name="station",

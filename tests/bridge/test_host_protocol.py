@@ -10,7 +10,7 @@ from simulated_link import DIGEST, World
 
 from instant_ic.bridge import host_protocol as protocol
 from instant_ic.bridge.host_clock import ClockFilter
-from instant_ic.bridge.host_flow import Window
+from instant_ic.bridge.host_flow import Channel, Item, Outbox, Window
 from instant_ic.bridge.host_protocol import (
     Ack,
     Announce,
@@ -140,6 +140,36 @@ def test_wrong_lines_say_what_is_wrong(line, words):
 def test_topic_twice_is_an_error():
     with pytest.raises(ValueError, match="/scan stands twice"):
         parse_rules(("/scan", "/scan rate_hz=2"))
+
+
+@given(st.text(max_size=80) | st.from_regex(r"/[a-z]{1,5}( [a-z_]{1,9}=[a-z0-9.]{0,5}){0,3}", fullmatch=True))
+def test_any_line_is_a_rule_or_an_error(line):
+    try:
+        rule = TopicRule.parse(line)
+    except ValueError as error:
+        assert str(error)
+        return
+    assert rule.topic == line.split()[0]
+
+
+@pytest.mark.parametrize(
+    ("own_hz", "wanted_hz", "expected"), [(5, 2, 20), (2, 5, 20), (0, 4, 40), (4, 0, 40), (0, 0, 100)]
+)
+@pytest.mark.parametrize("queued", [False, True])
+def test_the_lower_of_both_rates_holds_and_thinning_is_no_loss(own_hz, wanted_hz, expected, queued):
+    outbox = Outbox({"/tf": float(wanted_hz)})
+    channel = Channel(1, TopicRule("/tf", rate_hz=own_hz), "n", "t", "d", "q", False, queued and not own_hz)
+    sent = []
+    for index in range(100):  # ten seconds of 10 Hz
+        now = index * 100_000_000
+        outbox.offer(channel, Item(b"x", now, now, index + 1), now)
+        while (message := outbox.next(now)) is not None:
+            if isinstance(message, Data):
+                sent.append(message.sequence)
+            outbox.acked(tuple(outbox.sent), 1_000_000, now)
+    assert len(sent) == pytest.approx(expected, abs=1)
+    assert sent == list(range(1, len(sent) + 1))
+    assert outbox.counts["/tf"].thinned == 100 - len(sent)
 
 
 def test_clock_exchange_by_hand():
