@@ -23,6 +23,7 @@ import pytest
 from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Publisher, registry
+from instant_ic.bus.control import NodeControl
 from instant_ic.cli.main import main
 from instant_ic.evaluation.stack import Observer, observer
 from instant_ic.msg import Bool, Clock, Float32, NodeStatus, deserialize, serialize
@@ -207,7 +208,11 @@ def test_player_is_steered_from_another_terminal(talker: Talker, tmp_path: Path)
         bad = talker.ic("bag", "control", "rate", "0")
         assert bad.returncode == 1 and "rate must lie in" in bad.stderr
         assert talker.ic("bag", "control", "seek", "9.75").returncode == 0
-        assert talker.ic("bag", "control", "rate", "0.5").returncode == 0
+        assert talker.ic("bag", "control", "rate", "3").returncode == 0
+        assert status(talker)["rate"] == 3.0
+        name = f"bag_player_{process.pid}"  # and as any other parameter
+        assert NodeControl(talker.run_dir, name).set({"rate": 0.5}) == {"rate": 0.5}
+        assert status(talker)["rate"] == 0.5
         assert talker.ic("bag", "control", "resume").returncode == 0
         wait_for(lambda: 99.0 in seen(), "the last message")
         assert process.wait(40) == 0
