@@ -33,7 +33,7 @@ _STRANGERS_A_MINUTE = 10
 _RETRY_S = 0.2
 _REFUSED_RETRY_S = 2.0
 _UNPROVED_RETRY_S = 0.7
-_GREETING_S = 2.0
+_GREETING_S = 4.0  # CURVE and the greeting take four round trips
 _IDLE_S = 0.1
 _RECEIVE_MOST = 200
 
@@ -514,8 +514,10 @@ class ListeningLink(HostLink):
                 self._handle(old, old.session.end("replaced", "this key has made a newer link", tell=True))
                 self._send(old_route, old)
         connection = _Connection(peer, self._new_session(peer, connecting=False, may_send=peer.role == "driver"))
-        connection.file, connection.address = int(frame.get(zmq.SRCFD)), str(frame.get("Peer-Address"))
-        connection.remote = _remote_of(connection.file)
+        connection.address = str(frame.get("Peer-Address"))
+        with contextlib.suppress(zmq.ZMQError):  # libzmq may be built without it: then its own heartbeats end the rest
+            connection.file = int(frame.get(zmq.SRCFD))
+            connection.remote = _remote_of(connection.file)
         self._by_route[route] = connection
         return connection
 
@@ -613,7 +615,7 @@ class ConnectingLink(HostLink):
         dealer = self._socket(zmq.DEALER)
         dealer.setsockopt(zmq.CURVE_SERVERKEY, z85.encode(self.peer.public_key))
         dealer.setsockopt(zmq.RECONNECT_IVL, int(_RETRY_S * 1000))
-        dealer.setsockopt(zmq.CONNECT_TIMEOUT, 800)  # a try that fell into a hole of the link is not waited for
+        dealer.setsockopt(zmq.CONNECT_TIMEOUT, 1000)  # a try that fell into a hole of the link is not waited for
         dealer.setsockopt(zmq.IPV6, int("[" in self.endpoint))
         self._monitor = dealer.get_monitor_socket()
         dealer.connect(self.endpoint)
