@@ -10,12 +10,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.poses import wrap_angle
-from ..ranges import NotNegative, Positive, check_ranges
+from ..ranges import NotNegative, Positive, Range, check_ranges
 from .costmap import Costmap
 from .footprint import Footprint
 from .kinematics import MotionLimits, clip_twist
@@ -110,21 +111,25 @@ SOURCES: tuple[Source, ...] = (
 )
 
 
+_Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
+"""Longer than this is no time-out: a robot must not drive on what it saw or was told so long ago."""
+
+
 @dataclass(frozen=True)
 class TimeoutConfig:
     """Age in seconds beyond which a source is stale and the command is zero."""
 
-    scan: Positive = 0.3
-    points: Positive = 0.5
-    odometry: Positive = 0.3
-    pose: Positive = 1.0
-    camera: Positive = 1.0
-    vbot: Positive = 0.3
-    nav: Positive = 0.3
-    command: Positive = 0.3
-    vspace: Positive = 2.0
-    stop_after_s: Positive = 1.5
-    recover_s: Positive = 0.5
+    scan: _Timeout = 0.3
+    points: _Timeout = 0.5
+    odometry: _Timeout = 0.3
+    pose: _Timeout = 1.0
+    camera: _Timeout = 1.0
+    vbot: _Timeout = 0.3
+    nav: _Timeout = 0.3
+    command: _Timeout = 0.3
+    vspace: _Timeout = 2.0
+    stop_after_s: _Timeout = 1.5
+    recover_s: _Timeout = 0.5
 
     def __post_init__(self) -> None:
         check_ranges(self)
