@@ -1,7 +1,8 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+import yaml
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from instant_ic.bus.params import parse_override
@@ -513,3 +514,59 @@ def test_share_folder_holds_launch_and_config(context: Context) -> None:
 def test_anonymous_names_differ(context: Context) -> None:
     names = {substitute("$(anon view)", context) for _ in range(3)}
     assert len(names) == 3 and all(name.startswith("view_") for name in names)
+
+
+# -- whatever stands in a file -------------------------------------------------------------------
+
+_ACTIONS = (
+    *("arg", "let", "node", "executable", "include", "group", "set_env", "unset_env", "append_env", "set_remap"),
+    *(
+        "push_ros_namespace",
+        "set_parameter",
+        "set_parameters_from_file",
+        "set_use_sim_time",
+        "log",
+        "timer",
+        "shutdown",
+    ),
+    *("node_container", "nothing"),
+)
+_KEYS = (
+    *("name", "default", "type", "choices", "choice", "value", "exec", "cmd", "param", "from", "to", "remap", "env"),
+    *("args", "ros_args", "if", "unless", "file", "arg", "launch", "children", "run_dir", "namespace", "scoped"),
+    *("respawn", "respawn_delay", "respawn_max_retries", "hang_timeout", "output", "cwd", "launch-prefix", "period"),
+    *("message", "reason", "pkg", "shell", "allow_substs", "filename", "separator", "prepend"),
+)
+_SCALARS = st.one_of(
+    st.sampled_from(["true", "1", "-3", "1.5", "a", "talker.py", "grid_slam", "echo", "", "int", "params.yaml", "~"]),
+    st.sampled_from(["$(var a)", "$(eval a == 1)", "$(env HOME)", "$(if true x)", "$(", "'", "$(run-dir)", "\\$(x"]),
+    st.none(),
+    st.text(max_size=8),
+    st.integers(),
+    st.booleans(),
+)
+_BODIES = st.recursive(
+    _SCALARS,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.dictionaries(st.sampled_from(_KEYS), inner, max_size=6),
+        st.lists(st.dictionaries(st.sampled_from(_ACTIONS), inner, min_size=1, max_size=1), max_size=3),
+    ),
+    max_leaves=20,
+)
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(st.dictionaries(st.sampled_from(_ACTIONS), _BODIES, min_size=1, max_size=2), max_size=6))
+def test_any_file_is_read_or_refused_with_lines(tmp_path: Path, program: Path, actions: list[object]) -> None:
+    write(tmp_path, "a:\n  ros__parameters: {b: 1}\n", "params.yaml")
+    file = write(tmp_path, yaml.safe_dump({"launch": actions}, allow_unicode=True))
+    lines = file.read_text().count("\n") + 1
+    read_arguments(file)
+    try:
+        description = read_launch_file(file, {"a": "1"}, tmp_path / "r")
+    except LaunchFileError as error:
+        assert error.problems and all(problem.text for problem in error.problems)
+        assert all(1 <= problem.line <= lines for problem in error.problems if problem.file == file)
+    else:
+        assert all(node.command for node in description.nodes)
