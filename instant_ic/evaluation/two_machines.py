@@ -34,10 +34,18 @@ def missing() -> str:
     if shutil.which("ip") is None:
         return "there is no ip command (Debian package iproute2)"
     name = f"ict{os.getpid()}"
-    made = subprocess.run(["ip", "netns", "add", name], capture_output=True, text=True)
-    if made.returncode:
-        return f"network namespaces cannot be made: {made.stderr.strip()}"
-    subprocess.run(["ip", "netns", "del", name], check=True)
+    tries = (
+        f"ip netns add {name}",
+        f"ip link add ict0 netns {name} type veth peer name ict1 netns {name}",
+        f"ip netns exec {name} true",
+    )
+    try:
+        for words in tries:
+            made = subprocess.run(words.split(), capture_output=True, text=True)
+            if made.returncode:
+                return f"network namespaces cannot be made: {words}: {made.stderr.strip()}"
+    finally:
+        subprocess.run(["ip", "netns", "del", name], capture_output=True)
     return ""
 
 
