@@ -6,73 +6,64 @@ import argparse
 import json
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from instant_ic.bag.replay import find_node_class
+from instant_ic.bus import Node
 from instant_ic.bus.control import ControlError, NodeBusyError, NodeControl
 from instant_ic.bus.process import run as run_node
 from instant_ic.bus.registry import NodeInfo, list_nodes
 from instant_ic.cli.commands.bag import argument_of, topic_names
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.terminal import Terminal
-from instant_ic.nodes.bag_player import BagPlayerNode
-from instant_ic.nodes.bag_recorder import BagRecorderNode
 from instant_ic.paths import run_dir
 
 _STARTING_S = 10.0  # a node that is just starting gets so much time
 _STEERED = ("bag_recorder", "bag_player")
 
 
-class _Recorder(BagRecorderNode):
-    """With keys and a status line."""
+def _attended(name: str, attend: Callable[[Node[Any]], Terminal]) -> type[Node[Any]]:
+    """A node's class with keys and a status line."""
+    base = find_node_class(name)
 
-    def setup(self) -> None:
-        super().setup()
-        keys = {" ": lambda: self.call_soon(self._toggle), "s": lambda: self.call_soon(self._on_key)}
-        self.terminal = Terminal(keys, self._line)
+    def setup(self: Any) -> None:
+        base.setup(self)
+        self.terminal = attend(self)
         self.terminal.start()
 
-    def _on_key(self) -> None:
-        if self.config.snapshot:
-            self._snapshot("key")
+    def teardown(self: Any) -> None:
+        if hasattr(self, "terminal"):
+            self.terminal.close()
+        base.teardown(self)
 
-    def _line(self) -> str:
-        assert self.recorder is not None
-        told = self.recorder.status()
+    return type(base.__name__, (base,), {"setup": setup, "teardown": teardown, "__module__": base.__module__})
+
+
+def _recorder_terminal(node: Node[Any]) -> Terminal:
+    def line() -> str:
+        told = node.commands["status"]()
         words = f"{told['state']}  {told['messages']} messages  {told['topics']} topics"
         if "bytes" in told:
             words += f"  {told['bytes'] / 1e6:.1f} MB  {told['files']} files   [space] pause"
         else:
             words += f"  last {told['cached_s']:g} s at hand   [s] snapshot [space] pause"
-        lost = sum(self.recorder.lost().values()) + sum(told["overflow"].values())
-        return words + (f"   LOST {lost}" if lost else "")
+        left_out = sum(told["overflow"].values())
+        return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if told["lost"] else "")
 
-    def teardown(self) -> None:
-        if hasattr(self, "terminal"):
-            self.terminal.close()
-        super().teardown()
+    # On the node's thread, which the recorder is used from.
+    keys = {" ": lambda: node.call_soon(node.commands["toggle"])}
+    if getattr(node.config, "snapshot", False):
+        keys["s"] = lambda: node.call_soon(node.commands["snapshot"], "key")
+    return Terminal(keys, line)
 
 
-class _Player(BagPlayerNode):
-    """With keys and a status line."""
+def _player_terminal(node: Node[Any]) -> Terminal:
+    do = node.commands
 
-    def setup(self) -> None:
-        super().setup()
-        assert self.player is not None
-        player = self.player
-        keys = {
-            " ": player.toggle,
-            "right": player.step,
-            "up": lambda: player.set_rate(player.rate * 1.1),
-            "down": lambda: player.set_rate(player.rate / 1.1),
-            "left": lambda: player.seek(max(0.0, (player.position_ns - player.start_ns) / 1e9 - 5.0)),
-            "q": self.stop,
-        }
-        self.terminal = Terminal(keys, self._line)
-        self.terminal.start()
-
-    def _line(self) -> str:
-        told = self.status()
+    def line() -> str:
+        told = do["status"]()
         done = told["position_s"] / max(told["length_s"], 1e-9)
         bar = "█" * round(20 * done) + "·" * (20 - round(20 * done))
         return (
@@ -80,10 +71,15 @@ class _Player(BagPlayerNode):
             "   [space] pause [→] step [↑↓] rate [←] back 5 s [q] end"
         )
 
-    def teardown(self) -> None:
-        if hasattr(self, "terminal"):
-            self.terminal.close()
-        super().teardown()
+    keys = {
+        " ": do["toggle"],
+        "right": do["step"],
+        "up": lambda: do["rate"](do["status"]()["rate"] * 1.1),
+        "down": lambda: do["rate"](do["status"]()["rate"] / 1.1),
+        "left": lambda: do["seek"](max(0.0, do["status"]()["position_s"] - 5.0)),
+        "q": node.stop,
+    }
+    return Terminal(keys, line)
 
 
 def record(args: argparse.Namespace) -> int:
@@ -108,7 +104,7 @@ def record(args: argparse.Namespace) -> int:
     if args.snapshot:
         words += _parameters(snapshot_seconds=args.snapshot_seconds, snapshot_after_s=args.snapshot_after)
     words += _parameters(use_sim_time=True) if args.use_sim_time else []
-    return run_node(_Recorder, words)
+    return run_node(_attended("bag_recorder", _recorder_terminal), words)
 
 
 def play(args: argparse.Namespace) -> int:
@@ -132,7 +128,7 @@ def play(args: argparse.Namespace) -> int:
     )
     for remap in args.remap:
         words += ["-r", remap]
-    return run_node(_Player, words)
+    return run_node(_attended("bag_player", _player_terminal), words)
 
 
 def snapshot(args: argparse.Namespace) -> int:
