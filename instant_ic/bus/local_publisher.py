@@ -52,6 +52,7 @@ _QUEUE_BYTES = 128 << 20
 _LINGER_S = 0.2  # a last zero command still goes out when a node ends
 _MEMORY_RETRY_S = 5.0
 _DOOR_S = 0.05
+_SCATTER_FROM_BYTES = 8192
 _READ_ONLY = select.EPOLLIN | select.EPOLLRDHUP
 
 log = logging.getLogger(__name__)
@@ -171,7 +172,7 @@ class _Reader:
             if self._part is not None:
                 self._part = memoryview(bytes(self._part) + frame)
             else:
-                self._write(frame)
+                self.write(frame)
 
     def wanted_events(self) -> int:
         """What epoll should wait for."""
@@ -240,10 +241,10 @@ class _Reader:
         buffer = message.buffer
         if buffer is None:
             head = HEADER.pack(DATA, skipped, message.size, message.sequence, message.publish_ns)
-            if message.size < 16384:  # one copy is cheaper than a scattered write
-                self._write(head + message.body)
+            if message.size < _SCATTER_FROM_BYTES:
+                self.write(head + message.body)
             else:
-                self._write(head, message.body)
+                self.write(head, message.body)
             return
         new = buffer.number not in self._known
         frame = HEADER.pack(SHARED, skipped, SHARED_BODY.size, message.sequence, message.publish_ns) + SHARED_BODY.pack(
@@ -252,9 +253,9 @@ class _Reader:
         buffer.holders.add(self)
         self._flying[buffer.number] = buffer
         self._known.add(buffer.number)
-        self._write(frame, fd=buffer.fd if new else None)
+        self.write(frame, fd=buffer.fd if new else None)
 
-    def _write(self, head: bytes, body: bytes | memoryview | None = None, fd: int | None = None) -> None:
+    def write(self, head: bytes, body: bytes | memoryview | None = None, fd: int | None = None) -> None:
         """Sends a frame; what the socket does not take is kept for :meth:`flush`."""
         try:
             if fd is not None:
@@ -378,12 +379,12 @@ class LocalPublisher:
         """
         if not isinstance(payload, (bytes, bytearray, memoryview)):
             payload = payload[0] if len(payload) == 1 else b"".join(payload)
-        size = len(payload) if isinstance(payload, bytes) else memoryview(payload).nbytes
+        body = payload if isinstance(payload, bytes) else memoryview(payload).cast("B")
+        size = len(body)
         if size >= SHARED_FROM_BYTES:
-            source = memoryview(payload).cast("B")
 
             def copy(target: memoryview) -> None:
-                target[:] = source
+                target[:] = body
 
             self.send_filled(size, copy, publish_ns)
             return
@@ -393,19 +394,25 @@ class LocalPublisher:
             self._sequence = sequence = self._sequence + 1
             stamp = self._transport.now_ns() if publish_ns is None else publish_ns
             # Every microsecond between here and the readers is latency; what is not needed for it comes after.
-            frame = HEADER.pack(DATA, 0, size, sequence, stamp) + payload
+            head = HEADER.pack(DATA, 0, size, sequence, stamp)
+            frame = head + body if size < _SCATTER_FROM_BYTES else None  # one copy costs less than a scattered write
             late = None
             for reader in self._readers.values():
                 if reader.prompt:
+                    if frame is None:
+                        reader.write(head, body)
+                        if not reader.prompt:
+                            self._rewatch(reader)
+                        continue
                     if reader.send_now(frame):
                         continue
                 elif not reader.depth or reader.deaf:
                     continue
-                late = late or _Outgoing(sequence, stamp, size, frame[HEADER.size :])
+                late = late or _Outgoing(sequence, stamp, size, bytes(body))
                 reader.offer(late)
                 self._rewatch(reader)
             if self.qos.latched:
-                self._keep(_Outgoing(sequence, stamp, size, frame[HEADER.size :]))
+                self._keep(_Outgoing(sequence, stamp, size, bytes(body)))
         self.stats.add(self._transport.steady_ns(), size)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
@@ -571,7 +578,7 @@ class LocalPublisher:
                     log.error("%s: refused %s", self.topic, error)
                     self._drop(reader)
                     return
-                reader._write(self._hello)
+                reader.write(self._hello)
                 if self._last is not None:
                     reader.offer(self._last)
             else:

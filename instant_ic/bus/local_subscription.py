@@ -44,7 +44,8 @@ VIEWS_HELD = 4
 """Views into shared memory that one reader keeps; what comes beyond them is copied, so that a queue or a node that
 collects messages cannot take the publisher's buffers away."""
 
-SCRATCH_BYTES = 1 << 19
+RECEIVE_BYTES = 100_000  # a whole message that does not go through shared memory
+_VIEW_FROM_BYTES = 16_384
 _FDS_SPACE = socket.CMSG_SPACE(4 * 8)
 _FULL_LOOK_S = 1.0
 
@@ -54,14 +55,12 @@ log = logging.getLogger(__name__)
 class Inlet:
     """The connection to one publisher; reads frames, maps its buffers, gives them back."""
 
-    def __init__(self, subscription: LocalSubscription, path: str, scratch: memoryview) -> None:
+    def __init__(self, subscription: LocalSubscription, path: str) -> None:
         self.subscription = subscription
         self.hello: Hello | None = None
         self.refused = False
         self.node = self.type_name = ""
         self.expected = 0  # sequence of the next message; 0 before the first
-        self._scratch = scratch
-        self._whole_scratch = [scratch]
         self._deliver = subscription.deliver
         self._rest = b""  # the start of a frame whose end has not come yet
         self._header = (0, 0, 0, 0, 0)
@@ -72,6 +71,7 @@ class Inlet:
         self._views: dict[int, weakref.ref[Any]] = {}
         self._closing = False
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC)
+        self._receive = self.socket.recvmsg
         try:
             self.socket.connect(path)
             self.socket.send(GREETING.pack(MAGIC, VERSION, subscription.shared, subscription.qos.depth))
@@ -100,64 +100,51 @@ class Inlet:
                 elif not count:
                     return False
                 continue
-            start = len(self._rest)
-            if start:
-                self._scratch[:start] = self._rest
-                self._rest = b""
-                buffers = [self._scratch[start:]]
-            else:
-                buffers = self._whole_scratch
             try:
-                count, ancillary, flags, _ = self.socket.recvmsg_into(buffers, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
+                data, ancillary, flags, _ = self._receive(RECEIVE_BYTES, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
             except BlockingIOError:
-                self._rest = bytes(self._scratch[:start])
                 return True
             except OSError:  # ECONNRESET: it died with data of ours unread
                 return False
             if ancillary:
-                for _level, _kind, data in ancillary:
-                    self._fds.extend(fd for (fd,) in struct.iter_unpack("@i", data[: len(data) // 4 * 4]))
+                for _level, _kind, fds in ancillary:
+                    self._fds.extend(fd for (fd,) in struct.iter_unpack("@i", fds[: len(fds) // 4 * 4]))
                 if flags & socket.MSG_CTRUNC:
                     self._without_shared_memory("too many open files")
+            count = len(data)
             if not count:
                 return False
-            end = start + count
-            if end >= HEADER.size:
-                kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(self._scratch)
-                if size + HEADER.size == end and (kind == DATA or (kind == SHARED and not ancillary)):
-                    # One whole message: the usual case.
-                    whole = bytes(self._scratch[HEADER.size : end])
-                    payload = whole if kind == DATA else self._shared(whole, sequence)
-                    self._deliver(self, sequence, skipped, publish_ns, payload)
-                    return True
-            self._parse(end)
-            if end < SCRATCH_BYTES and self._body is None and not ancillary:
+            if self._rest:
+                data, self._rest = self._rest + data, b""
+            self._parse(data)
+            if count < RECEIVE_BYTES and self._body is None and not ancillary:
                 return True  # it was all there was
 
-    def _parse(self, end: int) -> None:
-        at = 0
-        scratch = self._scratch
+    def _parse(self, data: bytes) -> None:
+        at, end = 0, len(data)
         while end - at >= HEADER.size:
-            kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(scratch, at)
+            kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(data, at)
             body_at = at + HEADER.size
             at = body_at + size
-            if at <= end:
-                body = bytes(scratch[body_at:at])
-                if kind == DATA:
-                    self._deliver(self, sequence, skipped, publish_ns, body)
-                else:
-                    self._frame(kind, skipped, size, sequence, publish_ns, body)
-                continue
-            check_kind(kind)
-            at = body_at - HEADER.size
-            if size > SCRATCH_BYTES // 2:  # comes in pieces, straight to where it stays
-                self._header = (kind, skipped, size, sequence, publish_ns)
-                self._body, self._got = memoryview(np.empty(size, np.uint8).data), end - body_at
-                self._body[: self._got] = scratch[body_at:end]
-                return
-            break
+            if at > end:
+                check_kind(kind)
+                at = body_at - HEADER.size
+                if size > RECEIVE_BYTES:  # comes in pieces, straight to where it stays
+                    self._header = (kind, skipped, size, sequence, publish_ns)
+                    self._body, self._got = memoryview(np.empty(size, np.uint8).data), end - body_at
+                    self._body[: self._got] = memoryview(data)[body_at:]
+                    return
+                break
+            # A view keeps all that came with it: worth it where the copy would cost more.
+            body = data[body_at:at] if size < _VIEW_FROM_BYTES else memoryview(data)[body_at:at]
+            if kind == DATA:
+                self._deliver(self, sequence, skipped, publish_ns, body)
+            elif kind == SHARED:
+                self._deliver(self, sequence, skipped, publish_ns, self._shared(bytes(body), sequence))
+            else:
+                self._frame(kind, skipped, size, sequence, publish_ns, body)
         if at < end:
-            self._rest = bytes(scratch[at:end])
+            self._rest = data[at:]
 
     def _frame(self, kind: int, skipped: int, _: int, sequence: int, publish_ns: int, body: bytes | memoryview) -> None:
         check_kind(kind)
@@ -288,7 +275,7 @@ class LocalSubscription:
         for identity, path in wanted.items():
             if identity not in self._inlets:
                 try:
-                    inlet = Inlet(self, path, self._transport.scratch)
+                    inlet = Inlet(self, path)
                 except OSError:  # it is just starting or just ending: the next look decides
                     self._next_full_look = now
                     continue

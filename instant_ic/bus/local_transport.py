@@ -20,7 +20,7 @@ from pathlib import Path
 from . import registry
 from .frame import FrameError
 from .local_publisher import LocalPublisher
-from .local_subscription import SCRATCH_BYTES, Inlet, LocalSubscription
+from .local_subscription import Inlet, LocalSubscription
 from .qos import QoS
 
 _DISCOVERY_S = 0.1
@@ -94,7 +94,6 @@ class LocalTransport:
         self.now_ns = now_ns
         self.steady_ns = steady_ns
         self.driver: int | None = None
-        self.scratch = memoryview(bytearray(SCRATCH_BYTES))
         self._orders = itertools.count()
         self._lock = threading.Lock()
         self._read_lock = threading.RLock()

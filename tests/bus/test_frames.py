@@ -14,7 +14,7 @@ from local_bus import BYTES, LARGE, Bus, numbered, wait_for, whole
 
 from instant_ic.bus import RELIABLE, SENSOR
 from instant_ic.bus.frame import DATA, GREETING, HEADER, HELLO, MAGIC, VERSION, FrameError, Hello, type_digest
-from instant_ic.bus.local_subscription import SCRATCH_BYTES, Inlet
+from instant_ic.bus.local_subscription import RECEIVE_BYTES, Inlet
 from instant_ic.bus.shm import BufferPool, SharedBuffer, SharedMapping
 
 HELLO_FRAME = Hello("sender", "/x", BYTES, type_digest(BYTES), "00" * 8).pack()
@@ -34,7 +34,7 @@ class Listener:
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         server.bind(str(path))
         server.listen()
-        self.inlet = Inlet(self, str(path), memoryview(bytearray(SCRATCH_BYTES)))
+        self.inlet = Inlet(self, str(path))
         self.socket, _ = server.accept()
         server.close()
         assert self.socket.recv(GREETING.size) == GREETING.pack(MAGIC, VERSION, True, RELIABLE.depth)
@@ -60,9 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 messages = st.lists(
-    st.tuples(
-        st.integers(0, 2**31), st.integers(-(2**62), 2**62), st.integers(0, 3000) | st.integers(200_000, 600_000)
-    ),
+    st.tuples(st.integers(0, 2**31), st.integers(-(2**62), 2**62), st.integers(0, 3000) | st.integers(60_000, 400_000)),
     max_size=6,
 )
 
@@ -101,7 +99,7 @@ def test_foreign_bytes_are_refused_in_words_or_wait_for_more(folder: Path, data:
     try:
         listener.socket.sendall(data)
         try:
-            while listener.inlet.read() and len(data) > SCRATCH_BYTES:
+            while listener.inlet.read() and len(data) > RECEIVE_BYTES:
                 pass
         except FrameError as error:
             assert str(error)
