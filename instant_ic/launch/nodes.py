@@ -138,6 +138,9 @@ def _process(fields: Mapping[str, Value], scope: Scope, body: Value) -> dict[str
         fields["cwd"].problem(f"folder {cwd} does not exist")
     env: dict[str, str | None] = dict(scope.env)
     env.update(pairs_of(fields.get("env"), "name", "value", context))
+    for variable in env:
+        if "=" in variable:
+            body.problem(f"environment variable {variable!r}: a name has no =")
     delay_s = seconds_of(fields.get("respawn_delay"), context)
     return {
         "prefix": prefix,

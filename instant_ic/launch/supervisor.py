@@ -306,7 +306,7 @@ class Supervisor:
         self._silences[process] = _Silence()
         try:
             process.start()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a zero byte in a word
             process.state, process.exit_status = State.FAILED, 127
             self._output.event(f"{process.spec.label} cannot be started: {error}", bad=True)
             self._after_end(process)

@@ -463,6 +463,7 @@ launch:
         ("node: {exec: talker.py, param: [{from: s.yaml, allow_substs: true}]}", "substitutions inside a parameter"),
         ("executable: {cmd: no_such_program -v}", "program 'no_such_program' does not exist"),
         ("executable: {cmd: ''}", "cmd is empty"),
+        ("executable: {cmd: echo, env: [{name: A=B, value: c}]}", "environment variable 'A=B': a name has no ="),
         ('executable: {cmd: "echo \'open"}', "No closing quotation"),
         ("node_container: {pkg: a}", "'node_container' is ROS 2's, but not here: every node is a process"),
         ("lifecycle_node: {pkg: a}", "'lifecycle_node' is ROS 2's, but not here"),

@@ -229,3 +229,9 @@ def test_previous_log_is_kept(run_dir: Path) -> None:
         supervise(run_dir, [program("talker", f"print({word!r})")], Lines())
     assert (run_dir / "log" / "talker.log").read_text() == "second\n"
     assert (run_dir / "log" / "talker.log.1").read_text() == "first\n"
+
+
+def test_command_that_the_kernel_cannot_be_given(run_dir: Path) -> None:
+    output = Lines()
+    assert supervise(run_dir, [NodeSpec("odd", "odd", (sys.executable, "-c", "pass\0"))], output) == 1
+    assert "odd cannot be started: embedded null byte" in output.events[0]
