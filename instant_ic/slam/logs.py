@@ -167,9 +167,10 @@ def _pile(readings: FloatArray) -> float:
     if len(readings) == 0:
         return _SICK_RANGE_MAX_M
     top = float(readings.max())
-    at_top = int((readings >= top - 0.02).sum())
-    below = int(((readings < top - 0.02) & (readings >= 0.9 * top)).sum())
-    return top - 0.02 if at_top >= max(50, 0.002 * len(readings)) and at_top > below else _SICK_RANGE_MAX_M
+    at_top = readings >= top - 5e-4  # the very same value; a wall's readings are scattered
+    below = int((~at_top & (readings >= 0.9 * top)).sum())
+    piled = int(at_top.sum())
+    return top - 5e-4 if piled >= max(50, 0.002 * len(readings)) and piled > below else _SICK_RANGE_MAX_M
 
 
 def _numbers(fields: list[str], what: str, count: int) -> FloatArray:

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import gzip
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from slam_planar_world import box_room
 
 from instant_ic.evaluation.slam import (
     Relations,
     evaluate_log,
     interpolate_trajectory,
+    perturb_odometry,
     read_relations,
     read_stamps,
     relation_error,
     run_log,
 )
-from instant_ic.slam.logs import LogError, read_carmen, read_log, read_mines
+from instant_ic.slam.logs import LogEntry, LogError, read_carmen, read_log, read_mines
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "slam2d"
 real_data = [
@@ -102,6 +105,83 @@ def test_no_line_raises_anything_but_a_log_error(tmp_path_factory: pytest.TempPa
         assert "fuzz.log:1:" in str(error)
     else:
         assert len(entries) == 1
+
+
+def flaser(ranges: list[float], laser: list[float], robot: list[float], stamp: float) -> str:
+    numbers = [*ranges, *laser, *robot]
+    return f"FLASER {len(ranges)} {' '.join(map(str, numbers))} {stamp} host {stamp - 100}\n"
+
+
+def test_readings_that_pile_up_at_the_top_mean_nothing_was_met(tmp_path: Path) -> None:
+    # A laser in millimetre mode: 8.183 m where nothing is, in one beam of four.
+    rng = np.random.default_rng(0)
+    lines = []
+    for k in range(20):
+        ranges = rng.uniform(0.5, 8.0, 180).round(2)
+        ranges[::4] = 8.183
+        lines.append(flaser(list(ranges), [k, 0, 0], [k, 0, 0], float(k + 200)))
+    entries = list(read_carmen(write(tmp_path / "a.log", "".join(lines))))
+    for entry in entries:
+        assert np.isinf(entry.scan.ranges[::4]).all()
+        assert np.isfinite(entry.scan.ranges).sum() == 135
+    assert entries[3].scan.stamp_ns == 203_000_000_000 and entries[3].logger_s == 103.0
+    # The same readings with a maximum that the log itself gives, and one that the caller gives.
+    named = write(tmp_path / "b.log", "PARAM robot_front_laser_max 5.0 n 0 h 0\n" + "".join(lines))
+    assert max(r for e in read_carmen(named) for r in e.scan.ranges if np.isfinite(r)) < 5.0
+    assert np.isfinite(next(iter(read_carmen(named, 20.0))).scan.ranges).all()
+    # A wall at the far end of a room is no pile.
+    wall = [6.0 + round(0.01 * (k % 3), 2) for k in range(20)]
+    far = [flaser([3.0] * 160 + wall, [k, 0, 0], [k, 0, 0], float(k)) for k in range(200, 210)]
+    assert np.isfinite(next(iter(read_carmen(write(tmp_path / "c.log", "".join(far))))).scan.ranges).all()
+
+
+def test_a_corrected_pose_in_the_log_is_no_mount(tmp_path: Path) -> None:
+    lines = [flaser([1.0] * 180, [k, 0.1 * k, 0.02 * k], [k, 0, 0], float(k)) for k in range(9)]
+    entries = list(read_carmen(write(tmp_path / "a.log", "".join(lines))))
+    assert [e.odom_pose.tolist() for e in entries[:2]] == [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    assert all(e.base_from_laser.tolist() == [0.0, 0.0, 0.0] for e in entries)
+
+
+def test_odometry_in_the_first_pose_or_nowhere(tmp_path: Path) -> None:
+    first = [flaser([1.0] * 180, [k, 0, 0], [0, 0, 0], float(k)) for k in range(3)]
+    assert [e.odom_pose[0] for e in read_carmen(write(tmp_path / "a.log", "".join(first)))] == [0.0, 1.0, 2.0]
+    none = [flaser([1.0] * 180, [0, 0, 0], [0, 0, 0], float(k)) for k in range(3)]
+    assert [e.odom_pose for e in read_carmen(write(tmp_path / "b.log", "".join(none)))] == [None] * 3
+
+
+@pytest.mark.parametrize(("count", "first", "step"), [(180, -90, 1), (181, -90, 1), (361, -90, 0.5), (401, -50, 0.25)])
+def test_angles_follow_from_the_number_of_beams(tmp_path: Path, count: int, first: float, step: float) -> None:
+    (entry,) = read_carmen(write(tmp_path / "a.log", flaser([1.0] * count, [0, 0, 0], [0, 0, 0], 1.0)))
+    assert math.degrees(entry.scan.angle_min) == pytest.approx(first)
+    assert math.degrees(entry.scan.angle_increment) == pytest.approx(step)
+
+
+def test_relations_may_be_in_the_loggers_clock() -> None:
+    scan = box_room().scan(np.zeros(3), 10**12)
+    entries = [
+        LogEntry(replace(scan, stamp_ns=10**12 + k * 10**8), np.zeros(3), np.zeros(3), 5.0 + 0.1 * k) for k in range(4)
+    ]
+    relations = Relations(np.array([[5.0, 5.2]]), np.zeros((1, 3)))
+    report, _ = evaluate_log(entries, relations)
+    assert report["relations"] == 1 and report["translation_mean_m"] < 0.01
+    # A clock that stands still, or steps back, loses no scan: one line of the trajectory for each.
+    again, run = evaluate_log([entries[0], entries[0], entries[2], entries[1]])
+    assert again["scans"] == 4 and again["statuses"] == {"first": 1, "tracked": 3}
+    assert run.trajectory[:, 0] == pytest.approx([1000.0, 1000.0, 1000.2, 1000.1])
+    with pytest.raises(LogError, match="no scan"):
+        evaluate_log([])
+
+
+def test_perturbed_odometry_is_as_bad_as_said() -> None:
+    scan = box_room().scan(np.zeros(3), 1)
+    entries = [LogEntry(scan, np.array([0.1 * k, 0.0, 0.0]), np.zeros(3)) for k in range(1001)]
+    ends = np.array([list(perturb_odometry(entries, seed))[-1].odom_pose for seed in range(30)])
+    # 100 m straight ahead: ±2 m of scale; 5 % of each step, independently, is 0.16 m at the end.
+    assert np.abs(np.abs(ends[:, 0] - 100.0) - 2.0).max() < 0.7
+    assert 0.05 < ends[:, 1].std() < 0.4
+    assert [e.odom_pose.tolist() for e in perturb_odometry(entries, 3)] == [
+        e.odom_pose.tolist() for e in perturb_odometry(entries, 3)
+    ]
 
 
 def mines_line(time_us: int, left: int, right: int, ranges: list[int]) -> str:

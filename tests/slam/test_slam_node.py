@@ -16,9 +16,14 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose2_from_matrix, pose_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.msg import (
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    String,
     TFMessage,
     grid_array,
+    header,
     odometry_message,
+    pose_message,
     scan_message,
     stamp_ns,
     transform_matrix,
@@ -26,6 +31,7 @@ from instant_ic.msg import (
 )
 from instant_ic.msg import pose_matrix as message_pose
 from instant_ic.nodes.grid_slam import GridSlamConfig, GridSlamNode
+from instant_ic.slam import ParticleConfig
 
 START_NS = 1_700_000_000_000_000_000
 MOUNT = np.array([0.1, 0.0, 0.0])
@@ -234,3 +240,127 @@ def test_the_shipped_parameters_are_the_defaults() -> None:
 def test_a_bad_parameter_is_named() -> None:
     with pytest.raises(ValueError, match="map_period_s must be > 0"):
         GridSlamConfig(map_period_s=0.0)
+
+
+def save_box_map(folder: Path) -> Path:
+    """The box room's map, saved through the node's topic; its origin is the start of the rig."""
+    rig = Rig()
+    rig.wheel()
+    rig.scan()
+    rig.drive(0.4, 0.4, 60)
+    stem = folder / "maps" / "box"
+    rig.bus.publish("/slam/save", String(data=str(stem)), stamp_ns=rig.now_ns)
+    answer = rig.bus.last("/slam/saved").data
+    assert answer.startswith("saved: ") and str(stem) in answer
+    return stem
+
+
+def test_the_map_is_saved_on_request_and_a_fault_is_told(tmp_path: Path) -> None:
+    stem = save_box_map(tmp_path)
+    assert sorted(file.name for file in stem.parent.iterdir()) == ["box.graph.npz", "box.pgm", "box.yaml"]
+    rig = Rig()
+    rig.bus.publish("/slam/save", String(data=str(tmp_path / "none")), stamp_ns=rig.now_ns)
+    assert rig.bus.last("/slam/saved").data == "error: the map is empty: nothing to save"
+
+
+@pytest.mark.parametrize("mode", ["localization", "mapping"])
+def test_no_pose_is_told_before_the_place_in_a_saved_map_is_known(tmp_path: Path, mode: str) -> None:
+    stem = save_box_map(tmp_path)
+    rig = Rig(GridSlamConfig(mode=mode, map_file=str(stem)))
+    rig.world = PlanarWorld([(-90.0, -1.0, 90.0, -1.0), (-90.0, 1.0, 90.0, 1.0)])  # looks like nothing on the map
+    rig.wheel()
+    rig.scan()
+    rig.drive(0.4, 0.0, 12)
+    assert rig.bus.messages("/pose") == [] and rig.transforms("odom") == []
+    level, text, _ = rig.node.diagnoses()["place"]
+    assert level == WARN and "not known yet" in text
+
+
+def test_the_place_in_a_saved_map_is_found(tmp_path: Path) -> None:
+    stem = save_box_map(tmp_path)
+    rig = Rig(GridSlamConfig(mode="localization", map_file=f"{stem}.yaml"))
+    rig.true = np.array([1.0, -0.6, 2.0])  # not where the map began, and the odometry knows nothing of it
+    rig.wheel()
+    rig.scan()
+    rig.drive(0.2, 0.1, 30)
+    errors = rig.pose_errors()
+    assert len(errors) > 20 and max(errors) < 0.06
+    assert rig.node.diagnoses()["place"][:2] == (OK, "found in the saved map")
+    grid, _, _ = grid_array(rig.bus.last("/map"))
+    assert (grid == 100).sum() > 100
+    # Somebody says that it is elsewhere, a little wrong: the scans decide.
+    pose = PoseWithCovarianceStamped(
+        header=header("map", rig.now_ns),
+        pose=PoseWithCovariance(
+            pose=pose_message(matrix_from_pose2(compose2(rig.true, [0.2, 0.1, 0.2]))), covariance=np.zeros(36)
+        ),
+    )
+    rig.bus.publish("/initialpose", pose, stamp_ns=rig.now_ns)
+    rig.drive(0.2, 0.1, 5)
+    assert max(rig.pose_errors()[-4:]) < 0.06
+
+
+def test_a_map_that_is_not_there_ends_the_node(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="cannot be read"):
+        Rig(GridSlamConfig(map_file=str(tmp_path / "none")))
+    with pytest.raises(ValueError, match="needs map_file"):
+        GridSlamConfig(mode="localization")
+    with pytest.raises(ValueError, match="mode must be one of"):
+        GridSlamConfig(mode="both")
+
+
+def test_map_updates_bring_the_old_map_to_the_new_one() -> None:
+    rig = Rig(GridSlamConfig(map_full_period_s=1000.0))
+    rig.wheel()
+    rig.scan()
+    rig.drive(0.4, 0.4, 60)
+    whole, updates = rig.bus.messages("/map"), rig.bus.messages("/map_updates")
+    assert updates
+    last_whole = stamp_ns(whole[-1])
+    grid = grid_array(whole[-1])[0].copy()
+    for update in updates:
+        assert update.width * update.height == len(update.data) > 0
+        if stamp_ns(update) > last_whole:
+            part = np.asarray(update.data, dtype=np.int8).reshape(update.height, update.width)
+            grid[update.y : update.y + update.height, update.x : update.x + update.width] = part
+    assert np.array_equal(grid, rig.node.published.values)
+
+
+def test_a_stuck_robot_is_told() -> None:
+    rig = Rig()
+    rig.wheel()
+    rig.scan()
+    rig.drive(0.4, 0.0, 10)
+    assert rig.node.diagnoses()["motion"][0] == OK
+    for _ in range(30):  # the tracks turn, the robot stands
+        rig.now_ns += 100_000_000
+        rig.odometry = compose2(rig.odometry, [0.04, 0.0, 0.0])
+        rig.scan()
+        rig.wheel()
+    level, text, values = rig.node.diagnoses()["motion"]
+    assert level == ERROR and "stuck" in text
+    assert values["slip"] > 0.85
+
+
+def test_a_fault_of_the_worker_is_told_and_the_scans_go_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig()
+    rig.wheel()
+    rig.scan()
+
+    def broken(*args: object) -> None:
+        raise RuntimeError("no more")
+
+    monkeypatch.setattr(rig.node.slam.back_end, "update", broken)
+    rig.drive(0.4, 0.3, 20)
+    assert len(rig.bus.messages("/pose")) == 21 and max(rig.pose_errors()) < 0.03
+
+
+def test_the_particle_filter_runs_in_the_same_node() -> None:
+    rig = Rig(GridSlamConfig(backend="rbpf", rbpf=ParticleConfig(particles=5, linearUpdate=0.2, angularUpdate=0.2)))
+    rig.wheel()
+    rig.scan()
+    rig.drive(0.4, 0.2, 30)
+    assert len(rig.bus.messages("/pose")) == 31
+    assert max(rig.pose_errors()) < 0.1
+    grid, _, _ = grid_array(rig.bus.last("/map"))
+    assert (grid == 100).sum() > 100
