@@ -1,0 +1,192 @@
+"""`ic evaluate slam` and `slam-sim`: what a user types, what comes out, what goes wrong."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from slam_planar_world import rectangle
+
+from instant_ic.bag.files import BagWriter
+from instant_ic.cli.main import main
+from instant_ic.evaluation.slam_bag import read_bag
+from instant_ic.evaluation.slam_sim import evaluate_round_trip, round_trip
+from instant_ic.evaluation.slam_worlds import Drive, Laser, drive
+from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose_matrix, relative2
+from instant_ic.msg import TFMessage, odometry_message, scan_message, serialize, transform_message, type_name
+from instant_ic.slam.logs import LogError
+
+LASER = Laser(180, 179.0, 80.0, 0.01, (0.1, 0.0, 0.0))
+NAMES = {
+    "translation_mean_m", "translation_std_m", "translation_median_m", "translation_max_m", "rotation_mean_deg",
+    "rotation_std_deg", "relations", "scans", "cpu_ms_per_scan_mean", "cpu_ms_per_scan_p99", "peak_rss_mb",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def journey() -> Drive:
+    walls = [*rectangle(-2.0, -1.5, 6.0, 2.5), *rectangle(1.5, 1.0, 2.0, 1.4), *rectangle(4.0, -1.0, 4.4, -0.4)]
+    return drive(walls, [(0.0, 0.0), (4.5, 0.5), (1.0, 0.3)], LASER, 0)
+
+
+def stamp(entry: object) -> str:
+    return f"{entry.scan.stamp_ns * 1e-9 + 1000:.6f}"  # type: ignore[attr-defined]
+
+
+@pytest.fixture(scope="module")
+def log(journey: Drive, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The drive as a CARMEN log."""
+    lines = ["# made up\n"]
+    for entry in journey.entries:
+        ranges = np.where(np.isinf(entry.scan.ranges), 81.91, entry.scan.ranges)
+        poses = [*compose2(entry.odom_pose, entry.base_from_laser), *entry.odom_pose]
+        numbers = " ".join(f"{value:.4f}" for value in [*ranges, *poses])
+        lines.append(f"FLASER {len(ranges)} {numbers} {stamp(entry)} nohost {stamp(entry)}\n")
+    path = tmp_path_factory.mktemp("log") / "made.log.gz"
+    path.write_bytes(gzip.compress("".join(lines).encode()))
+    return path
+
+
+@pytest.fixture(scope="module")
+def relations(journey: Drive, log: Path) -> Path:
+    """True relations, 20 scans apart."""
+    lines = []
+    for k in range(0, len(journey.entries) - 20, 10):
+        x, y, yaw = relative2(journey.truth[k], journey.truth[k + 20])
+        lines.append(f"{stamp(journey.entries[k])} {stamp(journey.entries[k + 20])} {x} {y} 0 0 0 {yaw}\n")
+    path = log.with_name("made.relations")
+    path.write_text("".join(lines))
+    return path
+
+
+def test_figures_trajectory_and_plot(
+    log: Path, relations: Path, journey: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    stamps = tmp_path / "stamps"
+    stamps.write_text("\n".join(stamp(e) for e in journey.entries[: len(journey.entries) // 2]) + "\n")
+    words = ["evaluate", "slam", str(log), "--relations", str(relations), "--stamps", str(stamps)]
+    assert main([*words, "--json", "out.json", "--plot", "map.png"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report == json.loads((tmp_path / "out.json").read_text())
+    assert set(report) >= NAMES
+    assert report["scans"] == len(journey.entries)
+    assert 0 < report["relations"] < sum(1 for _ in relations.open())
+    assert report["translation_mean_m"] < 0.03 and report["rotation_mean_deg"] < 0.5
+    assert report["translation_median_m"] <= report["translation_max_m"]
+    assert 0 < report["cpu_ms_per_scan_mean"] < report["cpu_ms_per_scan_p99"] * 10 and report["peak_rss_mb"] > 50
+    rows = np.loadtxt(tmp_path / "made.trajectory.txt")
+    assert rows.shape == (len(journey.entries), 4)
+    assert [f"{t:.6f}" for t in rows[:, 0]] == [stamp(e) for e in journey.entries]
+    rest = relative2(relative2(journey.truth[0], journey.truth[-1]), relative2(rows[0, 1:], rows[-1, 1:]))
+    assert math.hypot(rest[0], rest[1]) < 0.05
+    assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_particle_filter_by_name(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["evaluate", "slam", str(log), "--backend", "rbpf", "--trajectory", str(tmp_path / "t"), "-p"]
+    assert main([*words, "rbpf.particles:=5"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["backend"] == "rbpf" and report["updates"] > 3
+    assert len(np.loadtxt(tmp_path / "t")) == report["scans"]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (
+            "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 h 1\nFLASER 3 1.0 2.0\n",
+            "bad.log:2: FLASER: 3 readings announced, 2 there",
+        ),
+        ("hello\n", "bad.log: no FLASER or ROBOTLASER1 line"),
+    ],
+)
+def test_a_bad_log_is_told_by_its_line(
+    tmp_path: Path, text: str, what: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.log").write_text(text)
+    assert main(["evaluate", "slam", "bad.log"]) == 1
+    assert what in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["bad.log"]
+
+
+def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "slam", str(tmp_path / "none.log")]) == 1
+    assert "none.log" in capsys.readouterr().err
+    assert main(["evaluate", "slam", str(log), "--stamps", "x"]) == 2
+    assert "--relations" in capsys.readouterr().err
+    assert main(["evaluate", "slam", str(log), "--plot", str(tmp_path / "no" / "x.png")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+    (tmp_path / "r").write_text("5 6 0 0 0 0 0 0\n")
+    assert (
+        main(["evaluate", "slam", str(log), "--relations", str(tmp_path / "r"), "--trajectory", str(tmp_path / "t")])
+        == 1
+    )
+    assert "within the trajectory's time" in capsys.readouterr().err
+    (tmp_path / "b").mkdir()
+    assert main(["evaluate", "slam", str(tmp_path / "b")]) == 1
+    assert "metadata.yaml" in capsys.readouterr().err
+
+
+def write_bag(path: Path, journey: Drive, scan_topics: tuple[str, ...] = ("/scan",)) -> Path:
+    with BagWriter(path) as bag:
+        mount = transform_message(pose_matrix(x=0.1, z=0.6), "base_link", "laser", 0)
+
+        def put(topic: str, message: object, stamp_ns: int) -> None:
+            bag.write(topic, type_name(message), bytes(serialize(message)), stamp_ns)
+
+        put("/tf_static", TFMessage([mount]), 1)
+        for entry in journey.entries:
+            scan, now = entry.scan, entry.scan.stamp_ns
+            pose = matrix_from_pose2(entry.odom_pose)
+            put("/wheel/odom", odometry_message(pose, 0.0, 0.0, "odom", "base_link", now), now)
+            for topic in scan_topics:
+                message = scan_message(
+                    scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max, "laser", now
+                )  # fmt: skip
+                put(topic, message, now)
+    return path
+
+
+def test_a_bag_is_a_log_too(journey: Drive, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_bag(tmp_path / "bag", journey)
+    entries = list(read_bag(bag))
+    assert len(entries) == len(journey.entries)
+    assert entries[7].odom_pose == pytest.approx(journey.entries[7].odom_pose)
+    assert entries[7].base_from_laser == pytest.approx([0.1, 0.0, 0.0])
+    assert np.array_equal(np.isinf(entries[7].scan.ranges), np.isinf(journey.entries[7].scan.ranges))
+    assert main(["evaluate", "slam", str(bag), "--trajectory", str(tmp_path / "t")]) == 0
+    assert json.loads(capsys.readouterr().out)["statuses"]["tracked"] == len(entries) - 1
+
+
+def test_bags_that_do_not_suit_are_told(journey: Drive, tmp_path: Path) -> None:
+    few = Drive(journey.entries[:3], journey.truth[:3])
+    with pytest.raises(LogError, match="no topic of type LaserScan"):
+        list(read_bag(write_bag(tmp_path / "none", few, ())))
+    two = write_bag(tmp_path / "two", few, ("/a", "/b"))
+    with pytest.raises(LogError, match=r"several LaserScan topics \(/a, /b\)"):
+        list(read_bag(two))
+    assert len(list(read_bag(two, "/b"))) == 3
+    with pytest.raises(LogError, match="no LaserScan topic /c"):
+        list(read_bag(two, "/c"))
+    with pytest.raises(LogError, match="does not exist"):
+        list(read_bag(tmp_path / "gone"))
+
+
+def test_the_simulated_crawler_on_slipping_tracks() -> None:
+    from instant_ic.sim.worlds import corridor_world
+
+    world = corridor_world(0, light_cell_m=0.5)
+    trip = round_trip(world, 0.2, 1, rounds=1, route=((0.0, 0.0), (3.0, 0.7), (6.0, 0.5), (0.0, 0.0)))
+    assert trip.driven_m > 11.0 and len(trip.entries) == len(trip.truth) > 200
+    report, _ = evaluate_round_trip(trip)
+    assert report["wheels_end_error_deg"] > 5.0  # what there was to correct
+    assert report["end_error_m"] < 0.05 and report["end_error_deg"] < 1.0
+    with pytest.raises(ValueError, match="ran into something"):
+        round_trip(world, 0.0, 0, 1, route=((0.0, 0.0), (8.0, 0.0)))  # through the obstacle

@@ -1,0 +1,260 @@
+"""Maps on disk, and finding one's place in them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from slam_planar_world import rectangle
+
+from instant_ic.evaluation.slam_worlds import Drive, Laser, drive
+from instant_ic.geometry.poses import compose2, relative2
+from instant_ic.slam import GridSlam, OccupancyGrid, SlamConfig, SlamResult, SlamStatus
+from instant_ic.slam.backend import make_slam
+from instant_ic.slam.localization import score_places
+from instant_ic.slam.map_files import (
+    MapError,
+    graph_file,
+    load_graph,
+    load_grid,
+    occupied_points,
+    save_graph,
+    save_grid,
+)
+
+LASER = Laser(240, 360.0, 12.0, 0.01)
+# Two rooms and a door; nothing in it looks like anything else.
+WALLS = [
+    *rectangle(-3.0, -2.0, 9.0, 3.0), (3.0, -2.0, 3.0, 0.0), (3.0, 1.2, 3.0, 3.0), *rectangle(-2.0, 1.5, -1.0, 2.2),
+    *rectangle(6.0, -1.5, 6.7, -1.0), (9.0, 1.0, 8.0, 3.0),
+]  # fmt: skip
+START = np.array([0.0, 0.5, 0.0])
+
+
+def feed(slam: GridSlam, journey: Drive) -> list[SlamResult]:
+    results = []
+    for entry in journey.entries:
+        results.append(slam.process(entry.scan, entry.odom_pose, entry.base_from_laser))
+        job = slam.background_job()
+        if job is not None:
+            slam.take_over(job())
+    return results
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GridSlam]:
+    """A map of the two rooms, its origin at START, and its files."""
+    slam = GridSlam()
+    feed(slam, drive(WALLS, [(0.0, 0.5), (5.0, 0.5), (7.0, 1.0), (0.0, 0.5)], LASER, 0, step_m=0.15))
+    slam.finish()
+    stem = tmp_path_factory.mktemp("m") / "deep" / "rooms"
+    assert [file.name for file in slam.save(stem)] == ["rooms.yaml", "rooms.pgm", "rooms.graph.npz"]
+    return stem, slam
+
+
+def test_the_files_by_hand(tmp_path: Path) -> None:
+    values = np.array([[-1, 0, 25], [26, 64, 65], [100, 50, -1]], dtype=np.int8)
+    save_grid(tmp_path / "m", OccupancyGrid(values, 0.05, np.array([-1.5, 2.0])))
+    picture = (tmp_path / "m.pgm").read_bytes()
+    # The top row of the picture is the last row of the map: 100 → 0, 50 → 205, unknown → 205.
+    assert picture == b"P5\n3 3\n255\n" + bytes([0, 205, 205, 205, 205, 0, 205, 254, 254])
+    text = (tmp_path / "m.yaml").read_text()
+    assert "image: m.pgm\n" in text and "origin: [-1.5, 2, 0]\n" in text and "resolution: 0.05\n" in text
+    again = load_grid(tmp_path / "m.yaml")
+    assert again.values.tolist() == [[-1, 0, 0], [-1, -1, 100], [100, -1, -1]]
+    assert again.resolution == 0.05 and again.origin.tolist() == [-1.5, 2.0]
+    # Centre of the cell in row 1, column 2; and of the one in row 2, column 0.
+    assert occupied_points(again) == pytest.approx(np.array([[-1.375, 2.075], [-1.475, 2.125]]))
+
+
+def write_map(folder: Path, pixels: bytes, text: str) -> Path:
+    (folder / "p.pgm").write_bytes(b"P5\n%d 1\n255\n" % len(pixels) + pixels)
+    path = folder / "p.yaml"
+    path.write_text(f"image: p.pgm\nresolution: 0.1\norigin: [0, 0, 0]\n{text}")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        # Shares occupied of 0, 50, 100, 205, 254: 1.0, 0.80, 0.61, 0.196, 0.004.
+        ("mode: trinary\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n", [100, 100, -1, -1, 0]),
+        ("negate: 1\noccupied_thresh: 0.65\nfree_thresh: 0.25\n", [0, 0, -1, 100, 100]),
+        # Between the thresholds 0.3 and 0.9: 99 · (share − 0.3) / 0.6.
+        ("mode: scale\noccupied_thresh: 0.9\nfree_thresh: 0.3\n", [100, 83, 51, -1, 0]),
+        ("mode: raw\n", [0, 50, 100, -1, -1]),
+    ],
+)
+def test_modes_of_map_server(tmp_path: Path, text: str, expected: list[int]) -> None:
+    grid = load_grid(write_map(tmp_path, bytes([0, 50, 100, 205, 254]), text))
+    assert grid.values.tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("- 1\n", "keys image"),
+        ("image: p.pgm\nresolution: 0\norigin: [0, 0, 0]\n", "resolution must be > 0"),
+        ("image: p.pgm\nresolution: x\norigin: [0, 0, 0]\n", "resolution must be a number"),
+        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0.5]\n", "turned map"),
+        ("image: p.pgm\nresolution: .1\norigin: here\n", "origin must be"),
+        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nmode: best\n", "mode must be"),
+        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nfree_thresh: 0.9\n", "free_thresh < occupied_thresh"),
+        ("image: none.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "does not exist"),
+        ("image: bad.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "no picture"),
+        ("a: [\n", "cannot be read"),
+    ],
+)
+def test_a_bad_map_is_told(tmp_path: Path, text: str, what: str) -> None:
+    (tmp_path / "p.pgm").write_bytes(b"P5\n1 1\n255\n\x00")
+    (tmp_path / "bad.pgm").write_bytes(b"not a picture")
+    (tmp_path / "p.yaml").write_text(text)
+    with pytest.raises(MapError, match=what):
+        load_grid(tmp_path / "p")
+
+
+@settings(max_examples=60)
+@given(st.text(max_size=80))
+def test_no_text_raises_anything_but_a_map_error(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.getbasetemp() / "fuzz.yaml"
+    path.write_text(text)
+    with pytest.raises(MapError):
+        load_grid(path)
+
+
+def test_faults_of_saving_and_loading(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="empty"):
+        GridSlam().save(tmp_path / "m")
+    with pytest.raises(MapError, match="no pose graph"):
+        load_graph(tmp_path / "m")
+    graph_file(tmp_path / "m").write_bytes(b"zip?")
+    with pytest.raises(MapError, match="damaged"):
+        load_graph(tmp_path / "m")
+    save_graph(tmp_path / "e", [], [])
+    with pytest.raises(MapError, match="no keyframe"):
+        load_graph(tmp_path / "e")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MapError, match="cannot be written"):
+        save_grid(tmp_path / "file" / "m", OccupancyGrid(np.zeros((1, 1), np.int8), 0.1, np.zeros(2)))
+    with pytest.raises(ValueError, match="needs a saved map"):
+        make_slam(localize=True)
+    with pytest.raises(ValueError, match="rbpf cannot"):
+        make_slam(SlamConfig(backend="rbpf"), tmp_path / "m")
+
+
+def test_the_graph_comes_back_as_it_was(made: tuple[Path, GridSlam]) -> None:
+    stem, slam = made
+    keyframes, edges = load_graph(stem)
+    kept = [k for k in slam.front_end.trajectory.keyframes if k.merged_into is None]
+    assert len(keyframes) == len(kept) > 20
+    for one, two in zip(keyframes, kept, strict=True):
+        assert one.stamp_ns == two.stamp_ns
+        assert np.array_equal(one.map_from_base, two.map_from_base)
+        assert np.allclose(one.scan.points, two.scan.points, atol=1e-6)
+        assert np.array_equal(one.scan.joined, two.scan.joined)
+    assert len(edges) == len(slam.back_end.edges) >= len(keyframes) - 1
+    assert np.array_equal(edges[3].covariance, slam.back_end.edges[3].covariance)
+
+
+def elsewhere(seed: int = 5) -> tuple[Drive, list[np.ndarray]]:
+    """A drive in the second room, with the true poses in the saved map's frame."""
+    way = [(7.0, 2.0), (5.0, 1.0), (4.0, 0.5), (0.0, 0.5)]
+    journey = drive(WALLS, way, LASER, seed, step_m=0.15)
+    first = np.array([7.0, 2.0, math.atan2(-1.0, -2.0)])
+    return journey, [compose2(relative2(START, first), pose) for pose in journey.truth]
+
+
+@pytest.mark.parametrize("localize", [True, False])
+def test_the_place_is_found_without_a_hint(made: tuple[Path, GridSlam], localize: bool) -> None:
+    stem, maker = made
+    journey, truth = elsewhere()
+    slam = make_slam(SlamConfig(), stem.with_suffix(".yaml"), localize)
+    assert isinstance(slam, GridSlam)
+    results = feed(slam, journey)
+    found = [k for k, result in enumerate(results) if result.localized]
+    assert found and found[0] < 12 and found == list(range(found[0], len(results)))
+    errors = [relative2(truth[k], results[k].map_from_base) for k in found]
+    assert max(math.hypot(e[0], e[1]) for e in errors) < 0.06
+    assert max(abs(e[2]) for e in errors) < math.radians(1.0)
+    # Odometry is untouched, all of it is in map→odom.
+    assert np.array_equal(slam.odom_from_base, journey.entries[-1].odom_pose)
+    assert compose2(slam.map_from_odom, slam.odom_from_base) == pytest.approx(slam.map_from_base)
+    if localize:
+        assert np.array_equal(slam.grid().values, load_grid(stem).values)
+        assert len(slam.front_end.trajectory) < 12
+    else:
+        slam.finish()
+        before = len(load_graph(stem)[0])
+        more = stem.with_name("more")
+        slam.save(more)
+        keyframes, _ = load_graph(more)
+        assert len(keyframes) > before
+        # What was there stays where it was.
+        assert keyframes[5].map_from_base == pytest.approx(
+            maker.front_end.trajectory.keyframes[5].map_from_base, abs=0.03
+        )
+
+
+def test_a_robot_carried_off_is_found_again(made: tuple[Path, GridSlam]) -> None:
+    stem, _ = made
+    journey, _ = elsewhere()
+    slam = make_slam(SlamConfig(), stem, True)
+    feed(slam, journey)
+    assert slam.localized
+    # Lifted, and set down in the other room: odometry says nothing of it.
+    other = drive(WALLS, [(-2.0, -1.0), (1.5, -1.0), (1.5, 2.0)], LASER, 6, step_m=0.15)
+    held = slam.odom_from_base
+    last_ns = journey.entries[-1].scan.stamp_ns
+    from dataclasses import replace
+
+    moved = [
+        replace(e, scan=replace(e.scan, stamp_ns=e.scan.stamp_ns + last_ns), odom_pose=compose2(held, e.odom_pose))
+        for e in other.entries
+    ]
+    results = feed(slam, Drive(moved, other.truth))
+    statuses = [r.status for r in results]
+    assert SlamStatus.LOST in statuses
+    assert not all(r.localized for r in results) and results[-1].localized
+    truth = compose2(relative2(START, np.array([-2.0, -1.0, 0.0])), other.truth[-1])
+    error = relative2(truth, results[-1].map_from_base)
+    assert math.hypot(error[0], error[1]) < 0.06
+
+
+def test_a_symmetric_map_gives_no_answer_until_told(tmp_path: Path) -> None:
+    walls = rectangle(-2.0, -2.0, 2.0, 2.0)
+    maker = GridSlam()
+    feed(maker, drive(walls, [(-0.5, 0.0), (0.5, 0.0)], LASER, 0))
+    maker.save(tmp_path / "square")
+    slam = make_slam(SlamConfig(), tmp_path / "square", True)
+    with pytest.raises(ValueError, match="no scan"):
+        slam.set_pose([0.0, 0.0, 0.0])
+    results = feed(slam, drive(walls, [(0.0, -0.5), (0.0, 0.9)], LASER, 1))
+    assert not any(result.localized for result in results)  # four headings fit equally well
+    # The drive began in map coordinates (0.5, −0.5), looking along +y, and went 1.4 m: told within 0.3 m and 15°.
+    slam.set_pose([0.7, 0.7, math.pi / 2 + 0.25])
+    last = drive(walls, [(0.0, -0.5), (0.0, 0.9)], LASER, 1).entries[-1]
+    from dataclasses import replace
+
+    scan = replace(last.scan, stamp_ns=last.scan.stamp_ns + 10**8)
+    result = slam.process(scan, last.odom_pose)
+    assert result.localized
+    assert result.map_from_base == pytest.approx([0.5, 0.9, math.pi / 2], abs=0.05)
+    with pytest.raises(ValueError, match="not finite"):
+        slam.set_pose([math.nan, 0.0, 0.0])
+    with pytest.raises(ValueError, match="no saved map"):
+        maker.set_pose([0.0, 0.0, 0.0])
+
+
+def test_scoring_of_places_by_hand() -> None:
+    field = np.zeros((10, 10), dtype=np.float32)
+    field[5, 7] = 1.0
+    points = np.array([[2.0, 0.0], [0.0, 5.0]])
+    places = np.array([[5.0, 5.0], [1.0, 1.0], [7.0, 3.0]])
+    value, heading = score_places(field, np.zeros(2), 1.0, points, places, 4)
+    # From (5, 5) the first point is on the cell at heading 0; from (7, 3) at +90°; of two points one fits.
+    assert value.tolist() == [0.5, 0.0, 0.5]
+    assert heading[[0, 2]] == pytest.approx([0.0, math.pi / 2])
