@@ -33,6 +33,7 @@ SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_5
 LABELS = {"b100": "100 B", "k20": "20 kB", "k200": "200 kB", "m1": "1.2 MB", "m5": "5.5 MB"}
 PERIOD_S = {"b100": 0.01, "k20": 0.01, "k200": 0.02, "m1": 0.035, "m5": 0.07}
 FANOUT = 4
+QUIET_S = 0.5  # after so long without a message nothing more is expected
 DEBIAN_PYTHON = "/usr/bin/python3"
 
 NAMES = {
@@ -100,12 +101,12 @@ class Pair:
         """Sends and waits until everything that will come has come."""
         sent = self.pub.ask({"topic": topic, "count": count, "period_s": period_s, "seconds": seconds})
         got: list[dict[str, Any]] = [sub.ask() for sub in self.subs]
-        deadline = time.monotonic() + 2.0
-        while min(g["count"] for g in got) < sent["sent"] and time.monotonic() < deadline:
-            time.sleep(0.1)
+        quiet_s = time.monotonic() + QUIET_S
+        while min(g["count"] for g in got) < sent["sent"] and time.monotonic() < quiet_s:
+            time.sleep(0.05)
             more = [sub.ask() for sub in self.subs]
-            if not any(m["count"] for m in more):
-                break
+            if any(m["count"] for m in more):
+                quiet_s = time.monotonic() + QUIET_S
             got = [joined(g, m) for g, m in zip(got, more, strict=True)]
         return sent, got
 

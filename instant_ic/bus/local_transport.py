@@ -94,7 +94,7 @@ class LocalTransport:
         self.now_ns = now_ns
         self.steady_ns = steady_ns
         self.driver: int | None = None
-        self._orders = itertools.count()
+        self.next_order: Callable[[], int] = itertools.count().__next__  # place of a message in the order of arrival
         self._lock = threading.Lock()
         self._read_lock = threading.RLock()
         self._publishers: list[LocalPublisher] = []
@@ -122,10 +122,6 @@ class LocalTransport:
             self._waker = Waker(self)
             self._inputs.register(self._waker.fd, select.EPOLLIN)
         return self._waker
-
-    def next_order(self) -> int:
-        """Place of a message in the order of arrival."""
-        return next(self._orders)
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> LocalPublisher:
         """A publisher that readers find from now on.
