@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from instant_ic.bag.files import BagError, BagReader
+from instant_ic.bag import BagError, BagReader
 from instant_ic.geometry.poses import Pose2, pose2_from_matrix
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
 from instant_ic.msg import deserialize, pose_matrix, stamp_ns, transform_matrix
