@@ -32,6 +32,10 @@ def publish(args: argparse.Namespace) -> int:
     values = parse(args.values, full)
     build(full, values, time.time_ns())  # tells of values that do not fit
     _check_topic(topic, full, args.force)
+    if topic.endswith("/estop") and not values.get("data") and not args.force:
+        raise UserError(
+            f"{topic}: whoever set the emergency stop releases it, on the operator's page; --force does it from here", 2
+        )
     wanted = 1 if args.once else args.times
     readers = args.readers if args.readers is not None else int(wanted > 0)
     with Observer([], args.use_sim_time) as observer:

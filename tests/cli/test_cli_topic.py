@@ -169,6 +169,7 @@ def test_pub_reaches_the_node(ic, talker):
         (("/order", "Twits", "{}"), "did you mean 'Twist'?"),
         (("/order", "Bool", "{data: true}"), "/order is a geometry_msgs/msg/TwistStamped for talker"),
         (("/flag", "Bool", "true"), "must be a mapping such as '{data: ...}' (got 'true')"),
+        (("/operator/estop", "Bool", "{}"), "whoever set the emergency stop releases it"),
         (("/a-b", "Bool", "{data: true}"), "topic name '/a-b' is not legal"),
     ],
 )
