@@ -1,33 +1,44 @@
-"""Grid SLAM: CPU milliseconds a scan and the relation error on the Intel log, as JSON.
+"""Grid SLAM: accuracy and CPU time on the Intel log, on made-up buildings and on the simulated crawler, as JSON.
 
-python benchmarks/slam.py [FOLDER]        # the folder with intel.log.gz; default ../shared/data/slam2d
+python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
+
+Parts: ``box`` (720 beams in a room), ``long`` (the same for ever: does a scan cost more later?), ``intel``,
+``intel_seeds`` (five seeds of worse odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``. All with the
+default parameters. ``--data`` is the folder with intel.log.gz; default ../shared/data/slam2d.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
-from instant_ic.evaluation.slam import evaluate_log, read_relations, read_stamps
+from instant_ic.evaluation.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
+from instant_ic.evaluation.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
 from instant_ic.geometry.poses import compose2
-from instant_ic.slam import GridSlam, Scan
+from instant_ic.slam import GridSlam, Scan, SlamConfig
 from instant_ic.slam.backend import warm_up
-from instant_ic.slam.logs import read_log
+from instant_ic.slam.logs import LogEntry, read_log
+
+KEPT = (
+    "translation_mean_m", "translation_median_m", "translation_max_m", "rotation_mean_deg", "relations",
+    "online_translation_mean_m", "scans", "cpu_ms_per_scan_mean", "cpu_ms_per_scan_p99", "scan_thread_ms_mean",
+    "background_ms_per_scan_mean", "peak_rss_mb", "keyframes", "loops", "loops_refused", "updates",
+)  # fmt: skip
 
 
-def box_drive(scans: int = 600, beams: int = 720) -> dict[str, float]:
-    """CPU time with VLP-16-like scans: a drive in circles in a 10 m × 8 m room."""
+def room_drive(scans: int, beams: int = 720) -> list[dict[str, float]]:
+    """Circles in a 10 m × 8 m room, VLP-16-like scans: CPU milliseconds for each thousand scans."""
     warm_up()
     slam = GridSlam()
     rng = np.random.default_rng(0)
     pose = np.array([0.0, -2.5, 0.0])
     angles = -math.pi + 2 * math.pi / beams * np.arange(beams)
-    cpu_ms = []
+    scan_ms, all_ms, parts = [], [], []
     for index in range(scans):
         pose = compose2(pose, np.array([0.05, 0.0, 0.02]))
         direction = angles + pose[2]
@@ -39,23 +50,105 @@ def box_drive(scans: int = 600, beams: int = 720) -> dict[str, float]:
             )
         ranges = wall + 0.015 * rng.standard_normal(beams)
         scan = Scan(ranges, -math.pi, 2 * math.pi / beams, 0.3, 30.0, (index + 1) * 100_000_000)
-        begin = time.process_time()
+        begin = time.thread_time()
         slam.process(scan, pose)
-        cpu_ms.append(1e3 * (time.process_time() - begin))
-    return {"cpu_ms_per_scan_mean": float(np.mean(cpu_ms)), "cpu_ms_per_scan_p99": float(np.percentile(cpu_ms, 99))}
+        scanned = time.thread_time()
+        job = slam.background_job()
+        if job is not None:
+            slam.take_over(job())
+        scan_ms.append(1e3 * (scanned - begin))
+        all_ms.append(1e3 * (time.thread_time() - begin))
+        if len(scan_ms) == 1000 or index == scans - 1:
+            parts.append(
+                {
+                    "scans": index + 1,
+                    "cpu_ms_per_scan_mean": float(np.mean(all_ms)),
+                    "scan_thread_ms_p99": float(np.percentile(scan_ms, 99)),
+                    "keyframes": slam.figures()["keyframes"],  # type: ignore[dict-item]
+                }
+            )
+            scan_ms, all_ms = [], []
+    return parts
+
+
+def intel(
+    entries: list[LogEntry], relations: Relations, seed: int | None = None, backend: str = "graph"
+) -> dict[str, object]:
+    """The Intel log; ``seed`` makes its odometry worse."""
+    source = entries if seed is None else perturb_odometry(entries, seed)
+    report, _ = evaluate_log(source, relations, SlamConfig(backend=backend))
+    return {key: report[key] for key in KEPT if key in report}
+
+
+def worlds() -> dict[str, object]:
+    """Made-up buildings: largest and mean error of the online and of the final poses."""
+    out: dict[str, object] = {}
+    for name, made, laser, seed in (
+        ("ring of corridors, 210 m, twice and back, SICK 180°", ring(0), "sick180", 0),
+        ("ring of corridors, SICK 361 beams", ring(1), "sick361", 1),
+        ("rooms that look alike, VLP-16", cells(), "vlp16", 0),
+        ("office, SICK 8 m", office(4), "sick8m", 4),
+        ("office, SICK 180°", office(3), "sick180", 3),
+    ):
+        journey = drive(made[0], made[1], LASERS[laser], seed)
+        report, run = evaluate_log(journey.entries)
+        online, _ = trajectory_errors(run.online[:, 1:], journey.truth)
+        final, _ = trajectory_errors(run.trajectory[:, 1:], journey.truth)
+        wheels, _ = trajectory_errors(np.array([entry.odom_pose for entry in journey.entries]), journey.truth)
+        out[name] = {
+            "online_mean_m": float(online.mean()),
+            "online_max_m": float(online.max()),
+            "final_mean_m": float(final.mean()),
+            "final_max_m": float(final.max()),
+            "wheels_max_m": float(wheels.max()),
+            **{key: report[key] for key in KEPT if key in report},
+        }
+    return out
+
+
+def simulated() -> list[dict[str, object]]:
+    """Five round trips of the simulated crawler, 20 % slip."""
+    from instant_ic.evaluation.slam_sim import evaluate_round_trip, round_trip
+    from instant_ic.sim.worlds import make_world
+
+    world = make_world("corridor")
+    reports = [evaluate_round_trip(round_trip(world, 0.2, seed))[0] for seed in range(5)]
+    return [
+        {key: value for key, value in report.items() if "error" in key or key == "driven_m" or key in KEPT}
+        for report in reports
+    ]
 
 
 def main() -> None:
     """Print one JSON object."""
+    parts = ("box", "long", "intel", "intel_seeds", "intel_rbpf", "worlds", "sim")
+    parser = argparse.ArgumentParser(description="measures the grid SLAM")
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else default
-    report: dict[str, object] = {"box_720_beams": box_drive()}
-    if (folder / "intel.log.gz").is_file():
-        stamps = read_stamps(folder / "intel.exact_stamps")
-        relations = read_relations(folder / "intel.relations").at_stamps(stamps, 0.006)
-        report["intel"], _ = evaluate_log(read_log(folder / "intel.log.gz"), relations)
-    else:
-        report["intel"] = f"left out: {folder / 'intel.log.gz'} is missing"
+    parser.add_argument("--data", type=Path, default=default)
+    parser.add_argument("--only", nargs="+", choices=parts, default=parts)
+    args = parser.parse_args()
+    report: dict[str, object] = {}
+    if "box" in args.only:
+        report["box"] = room_drive(600)[-1]
+    if "long" in args.only:
+        report["long"] = room_drive(12000)
+    if any(name.startswith("intel") for name in args.only):
+        if (args.data / "intel.log.gz").is_file():
+            entries = list(read_log(args.data / "intel.log.gz"))
+            stamps = read_stamps(args.data / "intel.exact_stamps")
+            relations = read_relations(args.data / "intel.relations").at_stamps(stamps, 0.006)
+            if "intel" in args.only:
+                report["intel"] = intel(entries, relations)
+            if "intel_seeds" in args.only:
+                report["intel_seeds"] = [intel(entries, relations, seed) for seed in range(1, 6)]
+            if "intel_rbpf" in args.only:
+                report["intel_rbpf"] = intel(entries, relations, backend="rbpf")
+        else:
+            report["intel"] = f"left out: {args.data / 'intel.log.gz'} is missing"
+    if "worlds" in args.only:
+        report["worlds"] = worlds()
+    if "sim" in args.only:
+        report["sim"] = simulated()
     print(json.dumps(report, indent=2))
 
 
