@@ -189,6 +189,18 @@ def test_foxglove_bridge_329_stale_flood_after_a_stall(bus: Bus) -> None:
     assert reader.stats.lost == 0
 
 
+def test_zeromq_conflate_gives_a_piece_of_a_message(bus: Bus) -> None:
+    """The newest message, and the whole of it, when many were replaced on the way."""
+    out, reader = bus.publisher(qos=SENSOR), bus.reader(qos=SENSOR)
+    wait_for(lambda: out.subscriber_count == 1)
+    with reader.transport._read_lock:
+        for i in range(1, 101):
+            out.send(numbered(i, 90_000))  # through the socket, which takes it in parts
+    wait_for(lambda: reader.raw._queue and number(reader.raw._queue[-1]) == 100)
+    (message,) = reader.poll()
+    assert len(message.payload) == 90_000 and whole(message)
+
+
 def test_zeromq_second_bind_steals_the_path(bus: Bus) -> None:
     """A second stack in one run directory is refused in words; the first goes on."""
     out, reader = bus.publisher(), bus.reader()
