@@ -20,6 +20,11 @@ def _quiet(function: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
     return complete
 
 
+def offer(argument: Any, words: Callable[..., list[str]]) -> None:
+    """Has the shell complete an argument of a parser by one of the functions below."""
+    argument.completer = words
+
+
 @_quiet
 def topics(args: Any) -> Iterable[str]:
     """Topics that are published or subscribed."""
@@ -73,6 +78,14 @@ def launch_files(args: Any) -> Iterable[str]:
 
     shipped = [path.stem for path in paths.share_dir("launch").glob("*.yaml")]
     return sorted(shipped) + sorted(str(path) for path in Path().glob("*.yaml"))
+
+
+@_quiet
+def launch_arguments(args: Any) -> Iterable[str]:
+    """``key:=`` of the launch file that stands before on the command line."""
+    from instant_ic.launch.description import find_launch_file, read_arguments
+
+    return [f"{argument.name}:=" for argument in read_arguments(find_launch_file(args.file))]
 
 
 @_quiet

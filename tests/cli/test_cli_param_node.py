@@ -167,10 +167,17 @@ def test_run_mistakes(ic, tmp_path):
         ("ic param get talker inner.", {"inner.depth", "inner.share"}),
         ("ic node info t", {"talker "}),
         ("ic run grid_", {"grid_slam "}),
+        ("ic launch si", {"sim", "sim_robot"}),
+        ("ic launch sim console_", {"console_port:="}),
+        ("ic bag info dr", {"drive "}),
     ],
 )
-def test_completion(line, expected):
+def test_completion(line, expected, tmp_path, monkeypatch):
     """As the shell asks: argcomplete's protocol, and nothing heavy loaded on the way."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "metadata.yaml").touch()
+    found_file = tmp_path / "found"
     code = (
         "import sys; from instant_ic.cli.main import main\n"
         "import os; real = os._exit\n"
@@ -184,16 +191,13 @@ def test_completion(line, expected):
         "_ARGCOMPLETE": "1",
         "COMP_LINE": line,
         "COMP_POINT": str(len(line)),
-        "_ARGCOMPLETE_STDOUT_FILENAME": f"/tmp/ic_completion_{os.getpid()}",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(found_file),
         "IFS": "\v",
     }
     result = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
     )
-    with open(environment["_ARGCOMPLETE_STDOUT_FILENAME"]) as file:  # noqa: PTH123
-        found = set(file.read().split("\v"))
-    os.unlink(environment["_ARGCOMPLETE_STDOUT_FILENAME"])  # noqa: PTH108
-    assert found == expected, result.stderr
+    assert set(found_file.read_text().split("\v")) == expected, result.stderr
     assert "heavy: []" in result.stderr
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from instant_ic.cli import completion
 from instant_ic.cli.errors import UserError
 
 COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "split", "status")
@@ -89,7 +90,9 @@ def add_parser(subparsers: Any) -> None:
         "bag_run.play",
         "ic bag play drive --rate 2 --start 10",
     )
-    playing.add_argument("bag", metavar="BAG", help="folder, .mcap, .db3 or ROS 1 .bag file")
+    completion.offer(
+        playing.add_argument("bag", metavar="BAG", help="folder, .mcap, .db3 or ROS 1 .bag file"), completion.bags
+    )
     _topics(playing)
     playing.add_argument("-r", "--rate", type=float, default=1.0, help="2 plays twice as fast (default: %(default)s)")
     playing.add_argument("--start", type=_seconds, default=0.0, metavar="S", help="skip the beginning")
@@ -104,7 +107,7 @@ def add_parser(subparsers: Any) -> None:
     playing.add_argument("--wait-for", action="append", default=[], metavar="NODE", help="begin once it reads")
 
     looking = verb("info", "topics, types, counts, files and losses of a bag", "bag_look.info", "ic bag info drive")
-    looking.add_argument("bag", metavar="BAG")
+    completion.offer(looking.add_argument("bag", metavar="BAG"), completion.bags)
     looking.add_argument("--json", action="store_true", help="for programs")
 
     comparing = verb(
@@ -113,7 +116,7 @@ def add_parser(subparsers: Any) -> None:
         "bag_look.diff",
         "ic bag diff first second --stamp-tolerance 0.01 --tolerance 'ranges=0.01' --ignore-field header.stamp",
     )
-    comparing.add_argument("a", metavar="A")
+    completion.offer(comparing.add_argument("a", metavar="A"), completion.bags)
     comparing.add_argument("b", metavar="B")
     comparing.add_argument("--common", action="store_true", help="only topics that both bags have")
     tolerances(comparing)
@@ -149,13 +152,13 @@ def add_parser(subparsers: Any) -> None:
         "bag_look.recover",
         "ic bag recover broken -o saved",
     )
-    rescuing.add_argument("bag", metavar="BAG")
+    completion.offer(rescuing.add_argument("bag", metavar="BAG"), completion.bags)
     rescuing.add_argument("-o", "--output", default="", metavar="DIR", help="default: BAG_recovered")
 
     indexing = verb(
         "reindex", "writes a bag's metadata.yaml anew from its whole files", "bag_look.reindex", "ic bag reindex drive"
     )
-    indexing.add_argument("bag", metavar="BAG")
+    completion.offer(indexing.add_argument("bag", metavar="BAG"), completion.bags)
 
     snapping = verb(
         "snapshot",

@@ -18,9 +18,10 @@ def add_parser(subparsers: Any) -> None:
         description="Shows who publishes what to whom, as a tree, or as a picture with -o.",
         epilog="example: ic graph -o stack.svg",
     )
-    parser.add_argument(
-        "nodes", metavar="NODE", nargs="*", help="only these and their partners (default: all)"
-    ).completer = completion.nodes
+    completion.offer(
+        parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these and their partners (default: all)"),
+        completion.nodes,
+    )
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help=".svg, .png, .pdf, .dot (graphviz), .mmd (mermaid)"
     )

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli import completion
 from instant_ic.cli.errors import UserError
 
 
@@ -20,8 +21,16 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic launch sim console_port:=9000 record:=drive",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, fleet, replay")
-    parser.add_argument("arguments", nargs="*", metavar="KEY:=VALUE", help="arguments of the launch file")
+    completion.offer(
+        parser.add_argument(
+            "file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, fleet, replay"
+        ),
+        completion.launch_files,
+    )
+    completion.offer(
+        parser.add_argument("arguments", nargs="*", metavar="KEY:=VALUE", help="arguments of the launch file"),
+        completion.launch_arguments,
+    )
     parser.add_argument(
         "-s", "--show-args", "--show-arguments", action="store_true", help="list the file's arguments and end"
     )

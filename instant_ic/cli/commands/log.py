@@ -22,7 +22,7 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic log arbiter navigator --level warning -f",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("nodes", metavar="NODE", nargs="*", help="default: all").completer = completion.nodes
+    completion.offer(parser.add_argument("nodes", metavar="NODE", nargs="*", help="default: all"), completion.nodes)
     parser.add_argument(
         "-l", "--level", default="debug", metavar="LEVEL", help="this and worse: debug, info, warn, error"
     )

@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
         description="Tells what a node does: state, process, what it publishes and subscribes, at which rates.",
         epilog="example: ic node info grid_slam",
     )
-    info.add_argument("node", metavar="NODE").completer = completion.nodes
+    completion.offer(info.add_argument("node", metavar="NODE"), completion.nodes)
     info.set_defaults(func=show)
 
 

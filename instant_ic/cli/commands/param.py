@@ -34,7 +34,7 @@ def add_parser(subparsers: Any) -> None:
     def argument(added: argparse.ArgumentParser, *names: str, completer: Any = None, **options: Any) -> None:
         made = added.add_argument(*names, **options)
         if completer is not None:
-            made.completer = completer  # type: ignore[attr-defined]
+            completion.offer(made, completer)
 
     added = verb("list", "names of the parameters of one node, or of all", list_parameters, "list grid_slam")
     argument(added, "node", nargs="?", metavar="NODE", help="default: every node", completer=completion.nodes)

@@ -7,6 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+from instant_ic.cli import completion
 from instant_ic.cli.commands.bag import tolerances, topic_names
 from instant_ic.cli.errors import UserError
 
@@ -23,7 +24,7 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again "
         "-p grid_slam.field.resolution_m:=0.1",
     )
-    parser.add_argument("bag", metavar="BAG")
+    completion.offer(parser.add_argument("bag", metavar="BAG"), completion.bags)
     parser.add_argument("--nodes", required=True, metavar="A,B,...", help="nodes, in the order of their turns")
     parser.add_argument("-o", "--output", required=True, metavar="DIR", help="new bag")
     parser.add_argument(

@@ -19,9 +19,12 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic run grid_slam --params-file config/slam.yaml -p use_sim_time:=true -r /scan:=/front/scan",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "node", metavar="NODE", help="name of a node (a wrong one lists them all), or a Python file with a node"
-    ).completer = completion.programs
+    completion.offer(
+        parser.add_argument(
+            "node", metavar="NODE", help="name of a node (a wrong one lists them all), or a Python file with a node"
+        ),
+        completion.programs,
+    )
     parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGUMENTS", help="for the node")
     parser.set_defaults(func=run, leaves=True)
 

@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
 
     def topic(added: argparse.ArgumentParser, nargs: str | None = None) -> None:
         argument = added.add_argument("topic", metavar="TOPIC", nargs=nargs)
-        argument.completer = completion.topics  # type: ignore[attr-defined]
+        completion.offer(argument, completion.topics)
 
     added = verb("list", "names of the topics that are published or subscribed", list_topics, "ic topic list -t")
     added.add_argument("-t", "--show-types", action="store_true", help="with the type of each")
@@ -41,7 +41,7 @@ def add_parser(subparsers: Any) -> None:
 
     added = verb("find", "topics of a type", find, "ic topic find sensor_msgs/msg/Image")
     argument = added.add_argument("type", metavar="TYPE", help="full or short name")
-    argument.completer = completion.types  # type: ignore[attr-defined]
+    completion.offer(argument, completion.types)
 
     added = verb("info", "type, publishers and subscribers of a topic", info, "ic topic info -v /scan")
     topic(added)
@@ -85,7 +85,7 @@ def add_parser(subparsers: Any) -> None:
     added = verb("pub", "publishes messages", publish, "ic topic pub --once /flag std_msgs/msg/Bool '{data: true}'")
     topic(added)
     argument = added.add_argument("type", metavar="TYPE", help="full or short name, for example TwistStamped")
-    argument.completer = completion.types  # type: ignore[attr-defined]
+    completion.offer(argument, completion.types)
     added.add_argument(
         "values", metavar="YAML", nargs="?", default="{}",
         help="values of its fields; the others are zero; 'header: auto' and 'stamp: now' take the time",
