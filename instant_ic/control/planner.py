@@ -53,7 +53,7 @@ class PlannerConfig:
     footprint_padding: NotNegative = 0.02
     escape_radius_m: NotNegative = 0.6
     tolerance: NotNegative = 0.5
-    max_iterations: PositiveInt = 8000
+    max_iterations: PositiveInt = 5000
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -121,16 +121,17 @@ class HybridPlanner:
         grid = _Grid(self, costmap, before)
         goal_cost = int(costs[goal_row, goal_column])
         taken = goal_cost in (INSCRIBED, LETHAL) or (goal_cost == UNKNOWN and not self.config.allow_unknown)
-        to_go, reachable = grid.cost_to_go(goal_row, goal_column, row, column)
+        connected = grid.connected(row, column)
+        reachable = bool(connected[goal_row, goal_column])
         target = None if taken or outside or not reachable else goal
+        near = (goal_row, goal_column)
         if target is None:
             # The reachable place nearest to the goal stands in for it; no way ends in what was never seen.
-            from_start, _ = grid.cost_to_go(row, column, -1, -1)
-            near = grid.nearest(from_start, (row, column), (goal_row, goal_column))
-            to_go, _ = grid.cost_to_go(near[0], near[1], row, column)
+            near = grid.nearest(connected, (row, column), near)
             place = costmap.centres(np.array(near[0]), np.array(near[1]))
             target = np.array([place[0], place[1], np.nan])
             reachable = False
+        to_go = grid.cost_to_go(near[0], near[1], row, column)
         nodes, found, opened = grid.search(to_go, start, target)
         nodes = grid.smooth(nodes)
         poses, reverse = _resample(nodes, start, target if found else None)
@@ -206,8 +207,9 @@ class _Grid:
             unknown,
             1.0 - config.retrospective_gain,
         )
-        # The body in cells, at each heading and all over: posts inside the outline count too.
-        body = planner.footprint.points(0.9 * costmap.resolution, config.footprint_padding) / costmap.resolution
+        # The body in cells, at each heading and all over: posts inside the outline count too. With points 0.7 cells
+        # apart one lies in every cell whose middle is covered.
+        body = planner.footprint.points(0.7 * costmap.resolution, config.footprint_padding) / costmap.resolution
         body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
         yaw = 2.0 * math.pi * np.arange(self.bins) / self.bins
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
@@ -217,31 +219,42 @@ class _Grid:
         reach = planner.footprint.circumscribed_radius_m + 1.5 * config.footprint_padding
         self.reach = reach / costmap.resolution + 1.42
 
-    def cost_to_go(self, row: int, column: int, to_row: int, to_column: int) -> tuple[NDArray[np.float32], bool]:
-        """Cost in cells (H, W) of the point robot's way from each cell to one; and whether ``to`` is reached."""
-        escape = self.config.escape_radius_m / self.costmap.resolution
-        from_start = to_row < 0
-        start_row, start_column = (row, column) if from_start else (to_row, to_column)
-        costs: NDArray[np.float32] = _cost_to_go(
-            self.costmap.costs, self.weights, row, column, start_row, start_column, escape, from_start
-        )
-        return costs, from_start or bool(np.isfinite(costs[to_row, to_column]))
+    def connected(self, row: int, column: int) -> NDArray[np.bool_]:
+        """Cells (H, W) that the robot's centre can get to from one."""
+        import cv2
 
-    def nearest(
-        self, from_start: NDArray[np.float32], start: tuple[int, int], goal: tuple[int, int]
-    ) -> tuple[int, int]:
+        rows, columns = np.ogrid[: self.weights.shape[0], : self.weights.shape[1]]
+        away = np.hypot(rows - row, columns - column) * self.costmap.resolution
+        escape = self.config.escape_radius_m
+        costs = self.costmap.costs
+        open_ = (self.weights > 0) | ((costs == INSCRIBED) & (away <= escape))
+        open_ |= (costs == LETHAL) & (away <= 0.25 * escape)
+        open_[row, column] = True
+        _, labels = cv2.connectedComponents(open_.astype(np.uint8), connectivity=8)
+        reached: NDArray[np.bool_] = labels == labels[row, column]
+        return reached
+
+    def cost_to_go(self, row: int, column: int, start_row: int, start_column: int) -> NDArray[np.float32]:
+        """Cost in cells (H, W) of the point robot's way from where it may lead on from the start, to one cell."""
+        escape = self.config.escape_radius_m / self.costmap.resolution
+        costs: NDArray[np.float32] = _cost_to_go(
+            self.costmap.costs, self.weights, row, column, start_row, start_column, escape
+        )
+        return costs
+
+    def nearest(self, connected: NDArray[np.bool_], start: tuple[int, int], goal: tuple[int, int]) -> tuple[int, int]:
         """The reachable, known cell nearest to the goal in which the robot may face anywhere but along a wall.
 
         The start itself where none is nearer.
         """
         half = 0.5 * max(self.planner.footprint.length_m, self.planner.footprint.width_m)
         room = (half + self.config.footprint_padding) / self.costmap.resolution + 0.5
-        fits = np.isfinite(from_start) & (self.costmap.costs < INSCRIBED) & (self.clearance > room)
-        rows, columns = np.nonzero(fits)
+        rows, columns = np.nonzero(connected & (self.costmap.costs < INSCRIBED) & (self.clearance > room))
         if rows.size == 0:
             return start
         away = np.hypot(rows - goal[0], columns - goal[1])
-        best = np.lexsort((from_start[rows, columns], np.round(away, 6)))[0]
+        back = np.hypot(rows - start[0], columns - start[1])
+        best = np.lexsort((back, np.round(away, 6)))[0]
         if away[best] >= math.hypot(start[0] - goal[0], start[1] - goal[1]):
             return start
         return int(rows[best]), int(columns[best])
@@ -302,7 +315,10 @@ def _resample(
         part = (np.arange(1, count + 1) / count)[:, None]
         piece = np.empty((count, 3))
         piece[:, :2] = a[:2] + step * part
-        piece[:, 2] = b[2] if length > 1e-6 else a[2] + math.remainder(b[2] - a[2], 2 * math.pi) * part[:, 0]
+        # On a straight line the robot has turned before it drives; on an arc it turns on the way.
+        along = math.atan2(step[1], step[0]) + math.pi * b[3]
+        straight = length > 1e-6 and abs(math.remainder(b[2] - along, 2 * math.pi)) < 1e-3
+        piece[:, 2] = b[2] if straight else a[2] + math.remainder(b[2] - a[2], 2 * math.pi) * part[:, 0]
         pieces.append(piece)
         back += [bool(b[3]) and length > 1e-6] * count
     poses = np.concatenate(pieces)
@@ -347,9 +363,8 @@ def _cost_to_go(
     start_row: int,
     start_column: int,
     escape: float,
-    everywhere: bool,
 ) -> NDArray[np.float32]:
-    """Dijkstra from (row, column); unless ``everywhere``, only where a way to the robot's start may lead through.
+    """Dijkstra from (row, column), only where a way to the robot's start may lead through.
 
     That is where cost and straight distance to the start together are little more than the best way costs (A*).
 
@@ -362,7 +377,6 @@ def _cost_to_go(
     best[row, column] = 0.0
     queue = [(0.0, row * width + column)]
     bound = np.inf
-    guide = 0.0 if everywhere else LEAST_WEIGHT
     while len(queue) > 0:
         cost, cell = heapq.heappop(queue)
         if cost > bound:
@@ -371,7 +385,7 @@ def _cost_to_go(
         if closed[r, c]:
             continue
         closed[r, c] = True
-        if r == start_row and c == start_column and not everywhere:
+        if r == start_row and c == start_column:
             bound = 1.1 * cost + 15.0
         for dr in range(-1, 2):
             for dc in range(-1, 2):
@@ -390,7 +404,7 @@ def _cost_to_go(
                 new = best[r, c] + weight * np.float32(1.4142135 if dr != 0 and dc != 0 else 1.0)
                 if new < best[y, x]:
                     best[y, x] = new
-                    ahead = guide * math.hypot(y - start_row, x - start_column)
+                    ahead = LEAST_WEIGHT * math.hypot(y - start_row, x - start_column)
                     heapq.heappush(queue, (float(new + ahead), y * width + x))
     return best
 
@@ -625,8 +639,8 @@ def _search(
                     new += 2.0 * touching / body.shape[0] * 100.0
                 elif length != 0.0 and overlap[node] == 0:
                     # Half way too: a primitive is three cells long.
-                    half_x, half_y = 0.5 * (x + new_x), 0.5 * (y + new_y)
-                    if _overlap(costs, clearance, half_x, half_y, bodies[b]) > 0:
+                    turned = bodies[b] if turns[k] == 0 else _turned(body, (b + 0.5 * turns[k]) * per_bin)
+                    if _overlap(costs, clearance, 0.5 * (x + new_x), 0.5 * (y + new_y), turned) > 0:
                         continue
             best[key] = new
             if count == room:

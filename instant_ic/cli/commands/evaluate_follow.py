@@ -64,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
                 nonlocal contacts
                 contacts += episode.contacts + episode.people_contacts
                 progress.update(task, advance=1, description=f"driving, {contacts} contacts")
+                if not console.is_terminal:
+                    console.print(f"episode {episode.index}: {'reached' if episode.reached else episode.reason}")
 
             episodes = follow.evaluate(args.episodes, args.seed, args.jobs, tell, args.timeout)
     except (ValueError, RuntimeError, TimeoutError) as error:
