@@ -95,6 +95,7 @@ class _Imported:
     waiting: deque[Arrived] = field(default_factory=lambda: deque(maxlen=1000))
     last: dict[str, Arrived] = field(default_factory=dict)
     readers: int = 0
+    newest_ns: int = 0
 
 
 class ImportedTopics:
@@ -102,11 +103,12 @@ class ImportedTopics:
 
     Args:
         node: the bridge's node.
+        rules: topics to take, by name without namespace.
         on_trouble: called with topic and words when a topic cannot be published here.
     """
 
-    def __init__(self, node: Node[Any], on_trouble: Callable[[str, str], None]) -> None:
-        self._node, self._on_trouble = node, on_trouble
+    def __init__(self, node: Node[Any], rules: dict[str, TopicRule], on_trouble: Callable[[str, str], None]) -> None:
+        self._node, self._rules, self._on_trouble = node, rules, on_trouble
         self._topics: dict[str, _Imported] = {}
 
     def open(self, announce: Announce) -> _Imported:
@@ -131,6 +133,9 @@ class ImportedTopics:
             return
         with topic.lock:
             if topic.qos.latched:
+                if self._rules[announce.topic].shared and arrived.publish_ns < topic.newest_ns:
+                    return  # several hosts set it: the latest word holds, in whichever order the links bring them
+                topic.newest_ns = arrived.publish_ns
                 topic.last[announce.origin] = arrived
             if topic.publisher is None:
                 topic.waiting.append(arrived)

@@ -162,11 +162,14 @@ class Memory:
     Attributes:
         sent: channel → number of the last message that left.
         received: (the other's start, topic, publisher) → number of the last message that came.
+        latched: (the other's start, topic, publisher) → ``admitted_ns`` of the last latched value that was passed on; a
+            new link brings it again.
         counts_out, counts_in: by topic, over all links with this host.
     """
 
     sent: dict[int, int] = field(default_factory=dict)
     received: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    latched: dict[tuple[str, str, str], int] = field(default_factory=dict)
     counts_out: dict[str, TopicCounts] = field(default_factory=dict)
     counts_in: dict[str, TopicCounts] = field(default_factory=dict)
 
@@ -177,7 +180,7 @@ class _Incoming:
     rule: TopicRule
     counts: TopicCounts
     refused: str = ""
-    kept: Arrived | None = None  # latched, from a host that does not drive yet
+    kept: tuple[Arrived, int] | None = None  # latched, from a host that does not drive yet; with its admitted_ns
 
 
 class Session:
@@ -303,13 +306,11 @@ class Session:
         self.drives = drives
         if not drives:
             return []
-        kept = [incoming for incoming in self._incoming.values() if incoming.kept is not None]
         events: list[Event] = []
-        for incoming in kept:
-            assert incoming.kept is not None
-            incoming.counts.messages += 1
-            events.append(incoming.kept)
-            incoming.kept = None
+        for incoming in self._incoming.values():
+            if incoming.kept is not None:
+                events += self._deliver(incoming, *incoming.kept)
+                incoming.kept = None
         return events
 
     # -- clocks -----------------------------------------------------------------------------------
@@ -401,9 +402,9 @@ class Session:
             self.notify("role", f"this host may only watch {self.side.name} (role viewer)")
         self._next_ping_ns = self.up_ns
         # Starts of the other that are over: their numbers say nothing any more.
-        received = self.memory.received
-        for key in [key for key in received if key[0] != self.peer_instance]:
-            del received[key]
+        for known in (self.memory.received, self.memory.latched):
+            for key in [key for key in known if key[0] != self.peer_instance]:
+                del known[key]
         return [Up(self.peer_name)]
 
     def _announced(self, announce: Announce) -> list[Event]:
@@ -495,9 +496,20 @@ class Session:
         if not (self.drives or rule.shared):
             counts.not_driving += 1
             if announce.qos == "latched":
-                incoming.kept = arrived
+                incoming.kept = arrived, data.admitted_ns
             return []
+        return self._deliver(incoming, arrived, data.admitted_ns)
+
+    def _deliver(self, incoming: _Incoming, arrived: Arrived, admitted_ns: int) -> list[Event]:
+        announce, counts = incoming.announce, incoming.counts
+        if announce.qos == "latched":
+            # What a new link only brings again is no news: an emergency stop that was released long ago must not
+            # release the one that somebody else has set since.
+            key = (self.peer_instance, announce.topic, announce.origin)
+            if self.memory.latched.get(key) == admitted_ns:
+                return []
+            self.memory.latched[key] = admitted_ns
         counts.messages += 1
-        counts.bytes += len(payload)
+        counts.bytes += len(arrived.payload)
         counts.newest_age_ns = arrived.age_ns
         return [arrived]

@@ -82,7 +82,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         to_station, to_robot = parse_rules(config.to_station), parse_rules(config.to_robot)
         exports, imports = (to_station, to_robot) if listening else (to_robot, to_station)
         store = KeyStore(Path(config.keys).expanduser() if config.keys else None)
-        self.incoming = ImportedTopics(self, lambda topic, text: self.call_soon(self.trouble, topic, text))
+        self.incoming = ImportedTopics(self, imports, lambda topic, text: self.call_soon(self.trouble, topic, text))
         try:
             identity = store.identity()
             side = Side(identity.name, os.urandom(8).hex(), imports, type_hash)

@@ -59,6 +59,7 @@ class World:
         self.times = times or LinkTimes()
         self.numbers = itertools.count(1)
         self.channels = {}
+        self.items = []
         self.orders = itertools.count()
         self.connect()
 
@@ -82,6 +83,7 @@ class World:
         channel.sequence += 1
         stamp = self.clocks[who].wall_ns() if publish_ns is None else publish_ns
         item = Item(payload, stamp, self.clocks[who].mono_ns(), channel.sequence)
+        self.items.append(item)
         self.sessions[who].offer(channel, item)
 
     def run(self, seconds, step_ns=MS, each=None):

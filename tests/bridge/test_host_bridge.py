@@ -264,6 +264,51 @@ def test_clock_that_is_wrong_is_a_warning_with_what_to_do(offset_ms, rtt_ms, lev
     assert judge_clock(offset_ms, rtt_ms, 50.0) == (level, text)
 
 
+def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
+    hosts.host("robot")
+    hosts.host("station")
+    hosts.host("tablet")
+    a = hosts.bridge("robot")
+    stations = {name: hosts.bridge(name) for name in ("station", "tablet")}
+    hands = {name: hosts.neighbour(name, f"hand_{name}") for name in stations}
+    outs = {name: hand.publisher("/operator/estop", Bool, LATCHED) for name, hand in hands.items()}
+    ear = hosts.neighbour("robot", "ear")
+    heard = ear.listen("/operator/estop", LATCHED)
+
+    def stops():
+        return [deserialize(m.payload, m.type_name).data for m in heard]
+
+    wait_for(lambda: len(a.node.link.peers()) == 2, "both stations")
+    outs["station"].publish(Bool(data=True))
+    ear.wait(lambda: stops() == [True], "stop")
+    outs["station"].publish(Bool(data=False))
+    ear.wait(lambda: stops() == [True, False], "release")
+    outs["tablet"].publish(Bool(data=True))
+    ear.wait(lambda: stops() == [True, False, True], "the other's stop")
+    # The first station's link breaks and comes back: its old release is no news.
+    ended, broken_s = stations["station"].node.link, time.monotonic()
+    with ended._lock:
+        ended._connection.session.end("gone", "test", tell=True)
+        ended._flush()
+        ended._hang_up(0.0)
+
+    def back():
+        up_s = [peer.up_s for peer in a.node.link.peers() if peer.name == "station"]
+        return up_s and up_s[0] < time.monotonic() - broken_s
+
+    wait_for(back, "station with a new link")
+    ear.spin(0.5)
+    assert stops() == [True, False, True]
+    # The robot's bridge starts anew and is told by both, in whichever order: the latest holds.
+    port = a.node.link.port
+    a.close()
+    again = hosts.bridge("robot", name="second_bridge", listen=f"tcp://127.0.0.1:{port}")
+    wait_for(lambda: len(again.node.link.peers()) == 2, "both stations at the new bridge")
+    ear.wait(lambda: len(stops()) > 3, "stop from the new bridge")
+    ear.spin(0.5)
+    assert stops()[-1] is True
+
+
 def test_driver_is_handed_over_by_a_live_parameter(hosts):
     a, _ = pair(hosts)
     wait_for(lambda: a.node.link.driver == "station", "driver")

@@ -267,6 +267,30 @@ def test_what_a_broken_link_swallowed_is_counted_as_lost():
     assert world.memories["station"].counts_in[rule.topic].lost == 12
 
 
+def test_new_link_does_not_bring_an_old_latched_value_as_news():
+    """An emergency stop that was released before must not release one that somebody else has set since."""
+    estop = TopicRule("/operator/estop", lane="command", shared=True)
+    world = World([], [estop])
+    world.run(0.1)
+    world.publish("station", estop.topic, b"released", latched=True)
+    world.run(0.1)
+    assert [bytes(e.payload) for _, e in world.arrived("robot")] == [b"released"]
+
+    def link_anew():
+        world.connect()
+        world.run(0.1)
+        channel = world.channels[estop.topic, "node"]
+        world.sessions["station"].offer(channel, last)
+
+    last = world.items[-1]
+    link_anew()
+    world.run(0.1)
+    assert world.arrived("robot") == []
+    world.publish("station", estop.topic, b"set", latched=True)
+    world.run(0.1)
+    assert [bytes(e.payload) for _, e in world.arrived("robot")] == [b"set"]
+
+
 def test_silence_ends_the_link_on_both_sides():
     down, up = Way(), Way()
     world = World([STATE], down=down, up=up, times=LinkTimes(ping_s=0.25, timeout_s=1.0))
