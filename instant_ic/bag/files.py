@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import heapq
 import json
-import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
@@ -96,14 +95,20 @@ class BagReader:
         except (ReaderError, OSError) as error:
             hint = "not written by ROS 2; its CDR messages" if "rofile" in str(error) else "if it was cut"
             raise BagError(f"bag {path} cannot be read: {error}; {hint}: ic bag recover {path}") from None
-        except (struct.error, LookupError, TypeError, ValueError, AssertionError, EOFError) as error:
-            # A parser on bytes that are no bag.
+        except Exception as error:  # noqa: BLE001 - whatever a parser raises on bytes that are no bag
             raise BagError(
                 f"bag {path} cannot be read: {type(error).__name__}: {error}; if it was cut: ic bag recover {path}"
             ) from None
-        told = json.loads(self.custom.get(REPEATED, "{}"))
-        self._repeated: dict[str, Counter[str]] = {file: Counter(entry["topics"]) for file, entry in told.items()}
-        self._repeated_ns: dict[str, int] = {file: int(entry["stamp_ns"]) for file, entry in told.items()}
+        self._repeated: dict[str, Counter[str]] = {}
+        self._repeated_ns: dict[str, int] = {}
+        try:
+            for file, entry in json.loads(self.custom.get(REPEATED, "{}")).items():
+                self._repeated[file], self._repeated_ns[file] = Counter(entry["topics"]), int(entry["stamp_ns"])
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            self._reader.close()
+            raise BagError(
+                f"bag {path}: {REPEATED} in metadata.yaml is wrong ({error}): ic bag reindex {path}"
+            ) from None
 
     def __enter__(self) -> BagReader:
         """The reader itself."""
@@ -218,7 +223,7 @@ class BagReader:
                 for connection, stamp_ns, payload in raw:
                     qos = presets[connection.topic, connection.msgtype]
                     yield BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, qos)
-        except ReaderError as error:
+        except Exception as error:  # noqa: BLE001 - whatever a parser or decompressor raises on damaged bytes
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
 
     def decoder(self, topic: TopicSummary) -> Callable[[bytes], Any]:
