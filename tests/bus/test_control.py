@@ -256,6 +256,38 @@ def test_malformed_requests_are_refused(tuned, line, words):
     assert client.get()["rate_hz"] == 10.0
 
 
+def test_rerun_logging_does_not_block_the_control_loop(tuned):
+    """With a reader of /rosout that stands still, thousands of lines are logged and the node goes on."""
+    node, client = tuned
+    code = (
+        "import sys, time; from pathlib import Path; from instant_ic.bus import RELIABLE\n"
+        "from instant_ic.bus.local_transport import LocalTransport\n"
+        "t = LocalTransport(Path(sys.argv[1]), 'reader', time.time_ns)\n"
+        "t.subscribe('/rosout', None, RELIABLE, lambda: None); time.sleep(600)"
+    )
+    reader = subprocess.Popen([sys.executable, "-c", code, str(client.run_dir)])
+    try:
+        deadline = time.monotonic() + 40
+        while not node._rosout.subscriber_count and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert node._rosout.subscriber_count == 1
+        reader.send_signal(signal.SIGSTOP)
+        done = threading.Event()
+        (handler,) = [h for h in node.log.handlers if type(h).__name__ == "_RosoutHandler"]
+        record = {"levelno": logging.INFO, "levelname": "INFO", "msg": "x" * 200, "pathname": __file__}
+
+        def flood():
+            for _ in range(20_000):
+                handler.handle(logging.makeLogRecord(record))
+            done.set()
+
+        node.call_soon(flood)
+        assert done.wait(60), "the node waits for the reader of its log"
+    finally:
+        reader.kill()
+        reader.wait()
+
+
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),

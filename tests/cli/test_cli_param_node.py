@@ -120,7 +120,7 @@ def test_busy_node_is_told_and_nothing_is_changed(ic, tmp_path_factory, monkeypa
         assert ic("param", "get", "talker", "label")[1] == "hello\n"
 
 
-def test_own_file_runs_and_leaves_at_once(tmp_path_factory):
+def test_dora_2152_own_file_leaves_at_once_whatever_threads_are_left(tmp_path_factory):
     """``ic run my_node.py``: a thread that a library left behind does not keep the process (dora 2152)."""
     run_dir = tmp_path_factory.mktemp("r")
     file = run_dir / "my_node.py"

@@ -270,7 +270,7 @@ def test_json_and_csv_of_a_message():
     assert describe(build("String", {"data": "x" * 30}, 0), Style(length=2)) == f"data: {'x' * 20!r}... 30 characters"
 
 
-def test_losses_are_told_by_publisher(ic, tmp_path_factory, monkeypatch):
+def test_dora_515_3428_losses_are_told_by_publisher(ic, tmp_path_factory, monkeypatch):
     """dora 515, 3428: what a reader that stands still loses is counted, and says whose it was."""
     run_dir = tmp_path_factory.mktemp("r")
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
