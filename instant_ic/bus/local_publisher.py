@@ -98,6 +98,7 @@ class _Reader:
         self._queue: deque[_Outgoing] = deque()
         self._queue_bytes = self._queued_buffers = 0
         self._part: memoryview | None = None  # what is left of a frame that went out in part
+        self._part_fd: int | None = None
         self._skipped = 0
         self._incoming = b""
 
@@ -271,18 +272,9 @@ class _Reader:
             return
         total = len(head) + (0 if body is None else len(body))
         if sent < total:
-            if fd is not None and sent == 0:
-                self._unsent_fd(head, fd)
-                return
             rest = head[sent:] + bytes(body[max(0, sent - len(head)) :] if body is not None else b"")
-            self._part = memoryview(rest)
-            self.prompt = False
-
-    def _unsent_fd(self, head: bytes, fd: int) -> None:
-        """The socket is full: the frame with its descriptor goes out when it has room again."""
-        self._part, self._part_fd, self.prompt = memoryview(head), fd, False
-
-    _part_fd: int | None = None
+            self._part, self.prompt = memoryview(rest), False
+            self._part_fd = None if sent else fd  # it goes with the first byte
 
     def _send_part(self) -> None:
         assert self._part is not None
@@ -309,7 +301,7 @@ class _Reader:
         except BlockingIOError:
             return
         except OSError:  # epoll tells it too, and then the reader is closed
-            self.deaf = True
+            self._end()
 
 
 class LocalPublisher:
