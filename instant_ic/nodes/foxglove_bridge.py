@@ -11,6 +11,7 @@ from typing import Annotated
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bridge.commands import CommandGate, CommandLimits
 from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerSettings, is_loopback
+from instant_ic.bridge.topic_watch import TopicWatch
 from instant_ic.bus import OK, RELIABLE, WARN, Node, NodeError, main, registry
 from instant_ic.msg import ParameterEvent
 from instant_ic.ranges import Range, check_ranges
@@ -78,6 +79,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             server_time=self.use_sim_time,
         )
         self.gate = CommandGate(config.limits)
+        self._watch = TopicWatch(self.run_dir)
         choice = TopicChoice(config.topics, config.exclude)
         try:
             self.server = FoxgloveServer(self, self.run_dir, settings, choice.takes, self.gate)
@@ -112,7 +114,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             return
         nodes = registry.list_nodes(self.run_dir)
         self.server.parameters.nodes = tuple(node.name for node in nodes)
-        self.server.reconcile(registry.list_topics(self.run_dir), nodes)
+        self.server.reconcile(self._watch.topics(), nodes)
         refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
         words = f"{len(self.server.watched)} of {len(self.server.topics)} topics watched"
         self.diagnose("topics", OK, words, messages=self.server.count, megabytes=self.server.bytes / 1e6, **refused)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from instant_ic.bridge.commands import CommandGate, CommandLimits
+from instant_ic.bridge.topic_watch import TopicWatch
 from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing, parse_publish, parse_subscribe
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
@@ -79,6 +80,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             raise NodeError(f"--namespace {self.namespace}: for the names there set the parameter namespace instead")
         config = self.config
         self.gate = CommandGate(config.limits)
+        self._watch = TopicWatch(self.run_dir)
         self._lost = 0
         try:
             parse_subscribe(config.subscribe)
@@ -127,9 +129,9 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
 
     def look(self) -> None:
         """Follows what comes and goes."""
-        if self.session is None or self.run_dir is None:
+        if self.session is None:
             return
-        self.outgoing.reconcile(registry.list_topics(self.run_dir))
+        self.outgoing.reconcile(self._watch.topics())
         self.incoming.reconcile()
 
     def tell(self) -> None:

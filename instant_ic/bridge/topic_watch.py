@@ -1,0 +1,35 @@
+"""Looks at a run directory's topics often and cheaply."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+from ..bus import registry
+
+_FULL_LOOK_S = 1.0  # what a killed process leaves behind changes no folder
+
+
+class TopicWatch:
+    """The topics of a run directory, read anew only when a folder of theirs has changed, and once a second.
+
+    Args:
+        run_dir: the run directory.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._seen: list[tuple[str, int]] = []
+        self._next_full_look_s = 0.0
+        self._topics: list[registry.TopicInfo] = []
+
+    def topics(self) -> list[registry.TopicInfo]:
+        """Topics with a live publisher, by name."""
+        now = time.monotonic()
+        with os.scandir(self._run_dir / "topics") as folders:
+            seen = sorted((folder.name, folder.stat().st_mtime_ns) for folder in folders)
+        if seen != self._seen or now >= self._next_full_look_s:
+            self._seen, self._next_full_look_s = seen, now + _FULL_LOOK_S
+            self._topics = registry.list_topics(self._run_dir)
+        return self._topics

@@ -1,0 +1,36 @@
+"""Both gateways follow the registry by this."""
+
+import time
+
+from live_nodes import Neighbour, wait_for
+
+from instant_ic.bridge.topic_watch import TopicWatch
+from instant_ic.bus import registry
+from instant_ic.msg import Bool, String
+
+
+def names(topics):
+    return {t.topic: sorted((p.node, p.type_name) for p in t.publishers) for t in topics}
+
+
+def test_it_tells_what_the_registry_tells_at_once_and_reads_it_seldom(tmp_path_factory, monkeypatch):
+    run_dir = tmp_path_factory.mktemp("r")
+    one, two = Neighbour(run_dir, "one"), Neighbour(run_dir, "two")
+    try:
+        watch = TopicWatch(run_dir)
+        assert watch.topics() == []
+        one.publisher("/a", String)
+        assert names(watch.topics()) == {"/a": [("one", "std_msgs/msg/String")]}
+        two.publisher("/a", Bool)
+        assert names(watch.topics()) == {"/a": [("one", "std_msgs/msg/String"), ("two", "std_msgs/msg/Bool")]}
+        two.node.drop(two.node.publishers[0])
+        assert names(watch.topics()) == {"/a": [("one", "std_msgs/msg/String")]}
+        looks = []
+        real = registry.list_topics
+        monkeypatch.setattr(registry, "list_topics", lambda d: looks.append(d) or real(d))
+        started = time.monotonic()
+        wait_for(lambda: watch.topics() and len(looks) == 2, "full looks though nothing changes")
+        assert time.monotonic() - started > 0.5  # not at every call
+    finally:
+        one.close()
+        two.close()
