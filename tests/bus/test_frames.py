@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from local_bus import BYTES, LARGE, Bus, numbered, wait_for, whole
+from local_bus import BYTES, LARGE, Bus, number, numbered, wait_for, whole
 
 from instant_ic.bus import RELIABLE, SENSOR
 from instant_ic.bus.frame import DATA, GREETING, HEADER, HELLO, MAGIC, VERSION, FrameError, Hello, type_digest
@@ -211,3 +211,26 @@ def test_larger_and_larger_messages_reach_the_reader(bus: Bus) -> None:
         del message  # gives the buffer back
     assert len(out._pool.buffers) == 1
     assert len(next(iter(reader.raw._inlets.values()))[1]._mappings) == 1  # it let go of what was retired
+
+
+def test_descriptor_waits_with_its_frame_until_the_socket_has_room(bus: Bus) -> None:
+    """The socket is full just when a buffer goes out for the first time."""
+    out, reader = bus.publisher(), bus.reader()
+    wait_for(lambda: out.subscriber_count == 1)
+    (peer,) = out._readers.values()
+    sent = 0
+    with reader.transport._read_lock:
+        while peer.prompt:  # until a small message no longer goes out whole
+            sent += 1
+            out.send(numbered(sent, 5000))
+        with out._lock:
+            peer.flush()
+            assert peer._part is not None
+            peer._part = None  # as if the last byte that fits had been this one
+            sent -= 1
+            out._sequence -= 1
+            peer._queue.clear()
+        out.send(numbered(sent + 1, LARGE))
+        assert peer._part_fd is not None
+    wait_for(lambda: reader.poll() and number(reader.received[-1]) == sent + 1)
+    assert whole(reader.received[-1])
