@@ -133,8 +133,10 @@ class ImportedTopics:
             return
         with topic.lock:
             if topic.qos.latched:
-                if self._rules[announce.topic].shared and arrived.publish_ns < topic.newest_ns:
-                    return  # several hosts set it: the latest word holds, in whichever order the links bring them
+                if self._rules[announce.topic].shared:  # one state that several hosts set: only the latest word holds
+                    if arrived.publish_ns < topic.newest_ns:
+                        return
+                    topic.last.clear()
                 topic.newest_ns = arrived.publish_ns
                 topic.last[announce.origin] = arrived
             if topic.publisher is None:

@@ -5,6 +5,7 @@ import time
 import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
 
+from instant_ic.bridge import host_link
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_session import LinkTimes
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, NodeError, ParameterError, params, registry
@@ -286,11 +287,9 @@ def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
     outs["tablet"].publish(Bool(data=True))
     ear.wait(lambda: stops() == [True, False, True], "the other's stop")
     # The first station's link breaks and comes back: its old release is no news.
-    ended, broken_s = stations["station"].node.link, time.monotonic()
-    with ended._lock:
-        ended._connection.session.end("gone", "test", tell=True)
-        ended._flush()
-        ended._hang_up(0.0)
+    broken_s = time.monotonic()
+    with a.node.link._lock:
+        host_link._shut(next(c for c in a.node.link._connections() if c.peer.name == "station"))
 
     def back():
         up_s = [peer.up_s for peer in a.node.link.peers() if peer.name == "station"]
@@ -299,6 +298,12 @@ def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
     wait_for(back, "station with a new link")
     ear.spin(0.5)
     assert stops() == [True, False, True]
+    # A node that listens from now on gets the stop, and nobody a release.
+    late = hosts.neighbour("robot", "late").listen("/operator/estop", LATCHED)
+    hosts.running[-1].wait(lambda: late, "stop at the late reader")
+    ear.spin(0.5)
+    hosts.running[-1].spin(0.1)
+    assert texts(late) == [True] and stops() == [True, False, True]
     # The robot's bridge starts anew and is told by both, in whichever order: the latest holds.
     port = a.node.link.port
     a.close()
