@@ -16,6 +16,7 @@ import contextlib
 import json
 import os
 import shutil
+import signal
 import socket
 import statistics
 import subprocess
@@ -367,6 +368,7 @@ def main() -> int:
         help=", ".join(NAMES),
     )
     args = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the ROS master ends too
     started = time.monotonic()
 
     def note(text: str) -> None:
