@@ -63,11 +63,10 @@ class ControlServer:
     """
 
     def __init__(self, node: Node[Any], path: Path) -> None:
-        self.path = path
+        self.path = registry.check_socket_path(path)
         self._node = node
         self._slots = threading.BoundedSemaphore(MAX_CONNECTIONS)
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
-        registry.check_socket_path(path)
         try:
             path.unlink(missing_ok=True)
             self._listener.bind(str(path))

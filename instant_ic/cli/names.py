@@ -37,6 +37,14 @@ def unknown_topic(topic: str, known: Iterable[str]) -> str:
     return f"nobody publishes {topic} ({near(topic, known, 'ic topic list shows what there is')})"
 
 
+def nobody_runs() -> str:
+    """What is told where no node runs; stacks in folders of the run directory (a fleet's robots) are named."""
+    run_dir = paths.run_dir()
+    inside = [folder.parent for folder in sorted(run_dir.glob("*/nodes")) if registry.list_nodes(folder.parent)]
+    hint = f"; nodes run in {', '.join(map(str, inside))}: ic --run-dir {inside[0]} ..." if inside else ""
+    return f"no node runs in {run_dir}{hint}"
+
+
 def find_node(name: str) -> registry.NodeInfo:
     """A running node.
 
@@ -45,6 +53,8 @@ def find_node(name: str) -> registry.NodeInfo:
     """
     nodes = {node.name: node for node in registry.list_nodes(paths.run_dir())}
     if name.strip("/") not in nodes:
-        hint = near(name.strip("/"), nodes, f"running: {', '.join(nodes) or 'none'}")
+        if not nodes:
+            raise UserError(nobody_runs())
+        hint = near(name.strip("/"), nodes, f"running: {', '.join(nodes)}")
         raise UserError(f"node {name!r} does not run in {paths.run_dir()} ({hint})")
     return nodes[name.strip("/")]

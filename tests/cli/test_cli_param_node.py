@@ -109,6 +109,17 @@ def test_node_list_and_info(ic, talker):
     assert status == 1 and "node 'nobody' does not run" in error and "running: talker" in error
 
 
+def test_nobody_runs_here_but_in_a_folder_of_it(ic, talker, tmp_path, monkeypatch):
+    """A fleet's robots have run directories inside the launcher's: whoever looks there is told where to look."""
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(talker.parent))
+    for words in (("node", "list"), ("param", "list"), ("param", "get", "x", "y"), ("graph",), ("top",)):
+        status, out, error = ic(*words)
+        assert status == (words == ("node", "list")) ^ 1 and out == ""
+        assert f"no node runs in {talker.parent}; nodes run in" in error and f"{talker}" in error, words
+    monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
+    assert ic("node", "list") == (0, "", f"ic: no node runs in {tmp_path}\n")
+
+
 def test_busy_node_is_told_and_nothing_is_changed(ic, tmp_path_factory, monkeypatch):
     run_dir = tmp_path_factory.mktemp("r")
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))

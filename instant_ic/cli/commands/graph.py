@@ -41,12 +41,12 @@ def show(args: argparse.Namespace) -> int:
     from instant_ic.bus import registry
     from instant_ic.cli.graph import make_graph, tree, write
     from instant_ic.cli.heartbeats import hear
-    from instant_ic.cli.names import find_node
+    from instant_ic.cli.names import find_node, nobody_runs
 
     only = [find_node(name).name for name in args.nodes]
     infos = registry.list_nodes(paths.run_dir())
     if not infos:
-        raise UserError(f"no node runs in {paths.run_dir()}")
+        raise UserError(nobody_runs())
     graph = make_graph(infos, hear(paths.run_dir(), [info.name for info in infos]), only, args.all, args.tf)
     if args.output is None:
         print(tree(graph))

@@ -40,6 +40,7 @@ def list_nodes(args: argparse.Namespace) -> int:
 
     from instant_ic import paths
     from instant_ic.bus import registry
+    from instant_ic.cli.names import nobody_runs
 
     nodes = registry.list_nodes(paths.run_dir())
     if args.count_nodes:
@@ -52,7 +53,7 @@ def list_nodes(args: argparse.Namespace) -> int:
             f"{node.name:<{width}}  pid {node.pid:<7}  up {up_s:6.0f} s  {node.module}" if args.verbose else node.name
         )
     if not nodes:
-        print(f"ic: no node runs in {paths.run_dir()}", file=sys.stderr)
+        print(f"ic: {nobody_runs()}", file=sys.stderr)
     return 0
 
 

@@ -71,11 +71,11 @@ def list_parameters(args: argparse.Namespace) -> int:
     """Prints names (and values) by node, out of the registry: also where a node hangs."""
     from instant_ic import paths
     from instant_ic.bus import params, registry
-    from instant_ic.cli.names import find_node
+    from instant_ic.cli.names import find_node, nobody_runs
 
     nodes = [find_node(args.node)] if args.node else registry.list_nodes(paths.run_dir())
     if not nodes:
-        print(f"no node runs in {paths.run_dir()}")
+        raise UserError(nobody_runs())
     for node in nodes:
         print(f"{node.name}:")
         for key, value in sorted(params.flatten(node.params).items()):

@@ -54,12 +54,13 @@ def show(args: argparse.Namespace) -> int:
     from instant_ic.bus import registry
     from instant_ic.cli.errors import UserError
     from instant_ic.cli.heartbeats import Heartbeats
+    from instant_ic.cli.names import nobody_runs
     from instant_ic.cli.top import SORT_KEYS, Processes, as_json, expected_rate, make_rows, plain_table
 
     run_dir = paths.run_dir()
     processes = Processes()
     if not registry.list_nodes(run_dir):
-        raise UserError(f"no node runs in {run_dir}")
+        raise UserError(nobody_runs())
     with Heartbeats(run_dir) as heartbeats:
 
         def rows(seconds: float, until_all: bool = False) -> list[NodeRow]:
