@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from dataclasses import dataclass
@@ -90,7 +91,8 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     name = "bag_recorder"
     live_parameters = ("duration_s", "snapshot_after_s", "snapshot_on_estop")
     recorder: Recorder | None = None
-    _next_nodes_s = 0.0
+    _next_look_s = 0.0
+    _seen: tuple[tuple[str, int], ...] = ()
 
     def setup(self) -> None:
         """Makes the bag and starts looking for topics."""
@@ -141,11 +143,16 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     def _discover(self) -> None:
         assert self.recorder is not None and self.run_dir is not None
-        nodes: list[registry.NodeInfo] = []
-        if self.config.parameters and time.monotonic() >= self._next_nodes_s:
-            self._next_nodes_s = time.monotonic() + 2.0
-            nodes = registry.list_nodes(self.run_dir)
-        self.recorder.discover(registry.list_topics(self.run_dir), nodes)
+        due = time.monotonic() >= self._next_look_s
+        changed = _changes(self.run_dir / "topics")
+        # Reading every publisher's entry five times a second would cost more than recording them.
+        if due or changed != self._seen:
+            self._seen = changed
+            nodes: list[registry.NodeInfo] = []
+            if due:
+                self._next_look_s = time.monotonic() + 2.0
+                nodes = registry.list_nodes(self.run_dir) if self.config.parameters else []
+            self.recorder.discover(registry.list_topics(self.run_dir), nodes)
         self.recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
@@ -202,6 +209,15 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         if self.recorder.failed:
             self.log.error("not everything is in it: %s", self.recorder.error or "see the errors above")
             raise SystemExit(1)
+
+
+def _changes(topics: Path) -> tuple[tuple[str, int], ...]:
+    """Folders of topics with the times at which something came or went in them."""
+    try:
+        with os.scandir(topics) as entries:
+            return tuple(sorted((entry.name, entry.stat().st_mtime_ns) for entry in entries))
+    except OSError:  # one left in this moment, or nobody has published yet: the next look tells
+        return ()
 
 
 def _numbers(counts: dict[str, int]) -> str:
