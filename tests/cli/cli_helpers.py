@@ -7,18 +7,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from instant_ic.bus import registry
 
 TALKER = Path(__file__).with_name("cli_talker.py")
 
 
-def wait_until(condition: Callable[[], object], what: str, seconds: float = 40.0) -> None:
-    """Waits for a condition, and fails in words when it does not come."""
+def wait_until(condition: Callable[[], Any], what: str, seconds: float = 40.0) -> Any:
+    """Waits for a condition and gives its value; fails in words when it does not come."""
     deadline_s = time.monotonic() + seconds
-    while not condition():
+    while not (value := condition()):
         assert time.monotonic() < deadline_s, f"waited {seconds} s for {what}"
         time.sleep(0.02)
+    return value
 
 
 @contextlib.contextmanager

@@ -100,6 +100,7 @@ def test_dump_and_load(ic, tmp_path):
 def test_node_list_and_info(ic, talker):
     assert ic("node", "list")[:2] == (0, "talker\n") and ic("node", "list", "-c")[1] == "1\n"
     assert re.match(r"talker  pid \d+ +up +\d+ s  ", ic("node", "list", "-v")[1])
+    wait_until(lambda: re.search(r"/scan: .*, [\d.]+ Hz\n", ic("node", "info", "talker")[1]), "a heartbeat with rates")
     status, out, _ = ic("node", "info", "talker")
     assert status == 0 and "state: running\n" in out and re.search(r"process: \d+ % of a core, \d+ MB\n", out)
     assert re.search(r"threads: \d+", out)
