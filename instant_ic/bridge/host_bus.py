@@ -21,6 +21,9 @@ from .host_topics import TopicRule
 BRIDGES = ("instant_ic.nodes.host_bridge", "instant_ic.nodes.zenoh_gateway")
 """Nodes that publish here what was published elsewhere: it is not sent on, or it would come back."""
 
+OLD_NEWS_NS = 1_000_000_000
+"""Words on a shared state older than the latest by more than this are not taken; no clock error is so large."""
+
 
 class ExportedTopics:
     """What this host's nodes publish, given to the link; not what a bridge publishes here.
@@ -134,10 +137,11 @@ class ImportedTopics:
         with topic.lock:
             if topic.qos.latched:
                 if self._rules[announce.topic].shared:  # one state that several hosts set: only the latest word holds
-                    if arrived.publish_ns < topic.newest_ns:
+                    if arrived.born_ns < topic.newest_ns - OLD_NEWS_NS:
+                        self._node.log.warning("%s of %s is old news: left out", announce.topic, announce.origin)
                         return
                     topic.last.clear()
-                topic.newest_ns = arrived.publish_ns
+                topic.newest_ns = max(arrived.born_ns, topic.newest_ns)
                 topic.last[announce.origin] = arrived
             if topic.publisher is None:
                 topic.waiting.append(arrived)

@@ -30,14 +30,14 @@ class Item:
     Attributes:
         payload: CDR bytes.
         publish_ns: when it was published first.
-        admitted_ns: when the bridge got it, by its monotonic clock.
+        born_ns: when it was published, by this host's monotonic clock, which no setting of the time moves.
         sequence: its number, where the channel is queued; others get theirs when they leave.
         wall_time: ``publish_ns`` is the machine's time.
     """
 
     payload: bytes = field(repr=False)
     publish_ns: int
-    admitted_ns: int
+    born_ns: int
     sequence: int = 0
     wall_time: bool = True
 
@@ -276,7 +276,7 @@ class Outbox:
         for out in sorted(self._ready(name, now_ns), key=lambda out: out.turn):
             rule = out.channel.rule
             counts = self.counts[rule.topic]
-            while out.waiting and rule.max_age_s and now_ns - out.waiting[0].admitted_ns > rule.max_age_s * 1e9:
+            while out.waiting and rule.max_age_s and now_ns - out.waiting[0].born_ns > rule.max_age_s * 1e9:
                 counts.expired += 1
                 out.waiting.popleft()
             if not out.waiting:
@@ -312,7 +312,7 @@ class Outbox:
             out.channel.number,
             self._sequences[out.channel.number],
             item.publish_ns,
-            item.admitted_ns,
+            item.born_ns,
             now_ns,
             total,
             offset,

@@ -204,7 +204,9 @@ class HostLink(ABC):
             connections = self._connections()
             if not connections and not channel.latched:
                 return
-            item = Item(bytes(payload), publish_ns, time.monotonic_ns(), channel.sequence, wall_time)
+            # Both clocks of this host, at one moment: later its time of day may be set anew.
+            age_ns = max(0, time.time_ns() - publish_ns) if wall_time else 0
+            item = Item(bytes(payload), publish_ns, time.monotonic_ns() - age_ns, channel.sequence, wall_time)
             if channel.latched:
                 channel.last = item
             for connection in connections:

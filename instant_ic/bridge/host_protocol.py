@@ -239,7 +239,7 @@ class Data:
         channel: see :class:`Announce`.
         sequence: of the message, from 1; a gap is a loss.
         publish_ns: when it was published first.
-        admitted_ns: when the sending bridge got it, by its monotonic clock.
+        born_ns: the same by the sending host's monotonic clock.
         sent_ns: when this chunk leaves, by the same clock.
         total: bytes of the message.
         offset: where this chunk begins.
@@ -252,7 +252,7 @@ class Data:
     channel: int
     sequence: int
     publish_ns: int
-    admitted_ns: int
+    born_ns: int
     sent_ns: int
     total: int
     offset: int
@@ -271,7 +271,7 @@ class Data:
             self.offset,
             self.sequence,
             self.publish_ns,
-            self.admitted_ns,
+            self.born_ns,
             self.sent_ns,
         )
         return head + self.chunk
@@ -281,13 +281,13 @@ class Data:
         """The message of these bytes."""
         if len(data) < _DATA.size:
             raise ProtocolError(f"Data of {len(data)} bytes is too short")
-        _, flags, channel, total, offset, sequence, publish, admitted, sent = _DATA.unpack(data[: _DATA.size])
+        _, flags, channel, total, offset, sequence, publish, born, sent = _DATA.unpack(data[: _DATA.size])
         chunk = data[_DATA.size :]
         if len(chunk) > MAX_CHUNK or offset + len(chunk) > total or (len(chunk) == 0 and total > 0):
             raise ProtocolError(f"Data: {len(chunk)} bytes at {offset} of {total} cannot be")
         if flags >> 1 >= len(LANES):
             raise ProtocolError(f"Data: unknown lane {flags >> 1}")
-        return cls(channel, sequence, publish, admitted, sent, total, offset, chunk, flags >> 1, bool(flags & 1))
+        return cls(channel, sequence, publish, born, sent, total, offset, chunk, flags >> 1, bool(flags & 1))
 
 
 Message = Hello | Welcome | Bye | Announce | Refuse | Notice | Ping | Pong | Ack | Data

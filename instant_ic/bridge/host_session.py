@@ -126,14 +126,16 @@ class Arrived:
     Attributes:
         announce: topic, type, QoS, and who published it.
         payload: CDR bytes.
-        publish_ns: by this host's clock.
-        age_ns: since the other bridge got it.
+        publish_ns: when it was published, by this host's time of day.
+        age_ns: since it was published.
+        born_ns: the same by this host's monotonic clock; never in the future.
     """
 
     announce: Announce
     payload: bytes | bytearray = field(repr=False)
     publish_ns: int
     age_ns: int
+    born_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ class Memory:
     Attributes:
         sent: channel → number of the last message that left.
         received: (the other's start, topic, publisher) → number of the last message that came.
-        latched: (the other's start, topic, publisher) → ``admitted_ns`` of the last latched value that was passed on; a
+        latched: (the other's start, topic, publisher) → ``born_ns`` of the last latched value that was passed on; a
             new link brings it again.
         counts_out, counts_in: by topic, over all links with this host.
     """
@@ -180,7 +182,7 @@ class _Incoming:
     rule: TopicRule
     counts: TopicCounts
     refused: str = ""
-    kept: tuple[Arrived, int] | None = None  # latched, from a host that does not drive yet; with its admitted_ns
+    kept: tuple[Arrived, int] | None = None  # latched, from a host that does not drive yet; with its born_ns
 
 
 class Session:
@@ -223,6 +225,8 @@ class Session:
         self._peer_epoch_ns: int | None = None
         self._incoming: dict[int, _Incoming] = {}
         self._partial: dict[int, tuple[Data, bytearray]] = {}
+        self._early: list[tuple[_Incoming, Data, bytes | bytearray]] = []
+        self._early_bytes = 0
         self._replies: deque[Message] = deque()
         self._taken = [0] * len(LANES)
         self._ack: int | None = None
@@ -363,9 +367,11 @@ class Session:
                 return self._heard_clock(message.epoch_ns)
             case Pong():
                 sample = self.clock.add(message.echo_ns, message.arrived_ns, message.mono_ns, now)
+                events = self._heard_clock(message.epoch_ns)
                 if sample is not None:
                     self.outbox.window.observe(sample.rtt_ns, now)
-                return self._heard_clock(message.epoch_ns)
+                    events += self._release_early(now)
+                return events
             case Ack():
                 if not self.outbox.acked(message.taken, now - message.echo_ns, now):
                     raise ProtocolError(f"{message} acknowledges what was not sent")
@@ -450,7 +456,17 @@ class Session:
         payload = self._assemble(lane, data)
         if payload is None:
             return []
-        return self._whole(incoming, data, payload, now)
+        if self.clock.ready:
+            return self._whole(incoming, data, payload, now)
+        self._early.append((incoming, data, payload))  # its age is not known yet; the answer to our ping is on its way
+        self._early_bytes += len(payload) + DATA_OVERHEAD
+        if self._early_bytes > MAX_MESSAGE:
+            raise ProtocolError(f"{self._early_bytes} bytes came and no answer to a ping")
+        return []
+
+    def _release_early(self, now: int) -> list[Event]:
+        early, self._early = self._early, []
+        return [event for incoming, data, payload in early for event in self._whole(incoming, data, payload, now)]
 
     def _assemble(self, lane: int, data: Data) -> bytes | bytearray | None:
         """The whole message, when this was its last chunk."""
@@ -481,10 +497,10 @@ class Session:
         if last is not None and data.sequence > last + 1:
             counts.lost += data.sequence - last - 1
         self.memory.received[key] = data.sequence
-        # Our clock at the moment when the other bridge got the message.
-        age_ns = now - (data.admitted_ns - self.clock.offset_ns) if self.clock.ready else None
+        born_ns = min(data.born_ns - self.clock.offset_ns, now)  # by our monotonic clock
+        age_ns = now - born_ns
         rule = incoming.rule
-        if rule.max_age_s and (age_ns is None or age_ns > rule.max_age_s * 1e9):
+        if rule.max_age_s and age_ns > rule.max_age_s * 1e9:
             counts.expired += 1
             return []
         publish_ns = data.publish_ns
@@ -492,23 +508,23 @@ class Session:
             publish_ns -= offset
         if not 0 <= publish_ns < 1 << 63:
             raise ProtocolError(f"{announce.topic}: published at {publish_ns} ns cannot be")
-        arrived = Arrived(announce, payload, publish_ns, age_ns or 0)
+        arrived = Arrived(announce, payload, publish_ns, age_ns, born_ns)
         if not (self.drives or rule.shared):
             counts.not_driving += 1
             if announce.qos == "latched":
-                incoming.kept = arrived, data.admitted_ns
+                incoming.kept = arrived, data.born_ns
             return []
-        return self._deliver(incoming, arrived, data.admitted_ns)
+        return self._deliver(incoming, arrived, data.born_ns)
 
-    def _deliver(self, incoming: _Incoming, arrived: Arrived, admitted_ns: int) -> list[Event]:
+    def _deliver(self, incoming: _Incoming, arrived: Arrived, born_ns: int) -> list[Event]:
         announce, counts = incoming.announce, incoming.counts
         if announce.qos == "latched":
             # What a new link only brings again is no news: an emergency stop that was released long ago must not
             # release the one that somebody else has set since.
             key = (self.peer_instance, announce.topic, announce.origin)
-            if self.memory.latched.get(key) == admitted_ns:
+            if self.memory.latched.get(key) == born_ns:
                 return []
-            self.memory.latched[key] = admitted_ns
+            self.memory.latched[key] = born_ns
         counts.messages += 1
         counts.bytes += len(arrived.payload)
         counts.newest_age_ns = arrived.age_ns

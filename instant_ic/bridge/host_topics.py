@@ -20,7 +20,7 @@ class TopicRule:
         topic: its name, without namespace.
         rate_hz: most messages a second, newest first; 0 sends all.
         lane: rank, one of :data:`~.host_protocol.LANES`.
-        max_age_s: older than this it is dropped, on either side, and counted; 0 keeps it.
+        max_age_s: older than this since it was published it is dropped, on either side, and counted; 0 keeps it.
         shared: taken from every driver's host, not only from the one that drives.
     """
 

@@ -359,6 +359,18 @@ def test_stalled_link_brings_no_old_pictures_and_no_old_commands(ends, keys):
         assert a.link.counts()[0]["/camera"].superseded > 5
 
 
+def test_command_that_was_old_before_it_reached_the_bridge_is_dropped(ends, keys):
+    a = robot(ends, keys)
+    b = station(ends, keys, a.link.port)
+    linked(a, b)
+    b.link.offer(COMMAND.topic, "late", "std_msgs/msg/String", SENSOR, b"old", time.time_ns() - 400_000_000)
+    wait_for(lambda: b.link.counts()[0].get(COMMAND.topic) and b.link.counts()[0][COMMAND.topic].expired, "count")
+    b.link.offer(COMMAND.topic, "simulated", "std_msgs/msg/String", SENSOR, b"new", 5_000_000_000, wall_time=False)
+    wait_for(lambda: a.payloads(COMMAND.topic), "command by a simulated clock")
+    assert a.payloads(COMMAND.topic) == [b"new"]
+    assert a.of(Arrived)[-1].publish_ns == 5_000_000_000
+
+
 def test_two_stations_one_drives_and_the_other_is_told(ends, keys):
     allow(keys, "tablet")
     a = robot(ends, keys)

@@ -291,6 +291,35 @@ def test_new_link_does_not_bring_an_old_latched_value_as_news():
     assert [bytes(e.payload) for _, e in world.arrived("robot")] == [b"set"]
 
 
+def test_message_that_is_faster_than_the_clock_exchange_waits_for_it():
+    """Without the other's clock its age would be wrong by as much as the clocks differ."""
+    ahead = 5_000 * MS
+    estop = TopicRule("/operator/estop", lane="command", shared=True)
+    ways = [Way(delay_ns=30 * MS) for _ in range(2)]
+    world = World([], [estop], down=ways[0], up=ways[1], station_ahead_ns=ahead)
+    while not world.sessions["station"].up:
+        world.run(0.001)
+    said_ns = world.now
+    world.publish("station", estop.topic, b"set", latched=True)
+    world.run(0.2)
+    ((_, arrived),) = world.arrived("robot")
+    assert arrived.born_ns == pytest.approx(said_ns, abs=3 * MS)
+    assert arrived.publish_ns == pytest.approx(world.clocks["robot"].epoch_ns() + said_ns, abs=3 * MS)
+
+
+def test_step_of_our_own_clock_makes_no_message_older_than_the_last():
+    estop = TopicRule("/operator/estop", lane="command", shared=True)
+    world = World([], [estop])
+    world.run(0.2)
+    world.publish("station", estop.topic, b"before", latched=True)
+    world.run(0.1)
+    world.clocks["robot"].wall_ahead -= 3_600_000 * MS
+    world.publish("station", estop.topic, b"after", latched=True)
+    world.run(0.1)
+    (_, before), (_, after) = world.arrived("robot")
+    assert after.born_ns - before.born_ns == pytest.approx(100 * MS, abs=3 * MS)
+
+
 def test_silence_ends_the_link_on_both_sides():
     down, up = Way(), Way()
     world = World([STATE], down=down, up=up, times=LinkTimes(ping_s=0.25, timeout_s=1.0))
