@@ -245,9 +245,11 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
         for transport in pairs:
             result["latency"][transport] = {t: summary(latency[transport][t], sent[transport][t]) for t in topics}
         for transport in [t for t in pairs if t not in LATENCY_ONLY]:
-            with contextlib.suppress(RuntimeError):
+            try:
                 result["throughput"][transport] = flood(transport, address[transport], flood_s)
                 note(f"throughput, {transport}")
+            except RuntimeError as error:
+                note(f"{transport}: throughput not measured: {error}")
         fan = [t for t in pairs if t not in LATENCY_ONLY]
         gathered: dict[str, list[float]] = defaultdict(list)
         fan_sent: dict[str, int] = defaultdict(int)
