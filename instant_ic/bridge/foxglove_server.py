@@ -80,6 +80,7 @@ class ServerSettings:
         tls_cert, tls_key: files in PEM; with them the server speaks wss:// only.
         backlog: messages kept for a client that does not keep up; the oldest goes first.
         accept_operator: whether clients may drive and stop the robot.
+        set_parameters: whether clients may change parameters.
         server_time: whether to tell clients the time (for simulated time).
     """
 
@@ -90,6 +91,7 @@ class ServerSettings:
     tls_key: Path | None = None
     backlog: int = 32
     accept_operator: bool = False
+    set_parameters: bool = True
     server_time: bool = False
 
 
@@ -118,6 +120,7 @@ class FoxgloveServer:
         self._graph: tuple[Any, ...] | None = None
         self._newcomers: dict[str, float] = {}
         self.parameters = Parameters(run_dir)
+        self.may_set = settings.set_parameters
         self.commands = Commands(node, gate, self.status) if settings.accept_operator else None
         self.wake = threading.Event()
         self.count = 0
@@ -482,7 +485,8 @@ def _listener(server: FoxgloveServer) -> Any:
 
         def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
             wanted = {parameter.name: parameter.get_value() for parameter in parameters}
-            for words in server.parameters.set(wanted):
+            refused = server.parameters.set(wanted) if server.may_set else ["parameters can only be read here"]
+            for words in refused:
                 server.status(words)
             return self._parameters(list(wanted))
 

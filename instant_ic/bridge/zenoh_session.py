@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import queue
+import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -105,13 +106,13 @@ def load_config(
     except OSError as error:
         raise ZenohError(f"{path}: cannot be read: {error.strerror}") from None
     except package.ZError as error:
-        raise ZenohError(f"{path or 'defaults'}: not a Zenoh configuration: {error}") from None
+        raise ZenohError(f"{path or 'defaults'}: not a Zenoh configuration: {_words(error)}") from None
     for key, endpoints in (("connect/endpoints", connect), ("listen/endpoints", listen)):
         if endpoints:
             try:
                 config.insert_json5(key, json.dumps(list(endpoints)))
             except package.ZError as error:
-                raise ZenohError(f"{key} {list(endpoints)}: {error}") from None
+                raise ZenohError(f"{key} {list(endpoints)}: {_words(error)}") from None
     return config
 
 
@@ -151,8 +152,13 @@ def open_zenoh(config: Any) -> Any:
             f"Zenoh session: not open after {_OPEN_S:g} s; as a client it waits for its router: is it running?"
         ) from None
     if isinstance(session, package.ZError):
-        raise ZenohError(f"Zenoh session: {session}")
+        raise ZenohError(f"Zenoh session: {_words(session)}")
     return session
+
+
+def _words(error: Exception) -> str:
+    """An error of Zenoh without the places in its source code."""
+    return re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).strip()
 
 
 class RosSession:

@@ -34,6 +34,7 @@ class FoxgloveBridgeConfig:
         topics: topics to offer, names or patterns; empty offers all.
         exclude: names or patterns to leave out.
         accept_operator: whether clients may drive (/operator/cmd_vel) and stop (/operator/estop) the robot.
+        set_parameters: whether clients may change the nodes' parameters.
         limits: what their commands have to pass.
         discovery_period_s: how often to look for topics that come and go, s.
     """
@@ -47,6 +48,7 @@ class FoxgloveBridgeConfig:
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     accept_operator: bool = False
+    set_parameters: bool = True
     limits: CommandLimits = field(default_factory=CommandLimits)
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.25
 
@@ -76,6 +78,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             tls_key=Path(config.tls_key).expanduser() if config.tls_key else None,
             backlog=config.backlog,
             accept_operator=config.accept_operator,
+            set_parameters=config.set_parameters,
             server_time=self.use_sim_time,
         )
         self.gate = CommandGate(config.limits)
@@ -88,8 +91,9 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         scheme = "wss" if config.tls_cert else "ws"
         self.log.info("Foxglove: open %s://%s:%d", scheme, config.host, self.server.port)
         self.subscribe("/parameter_events", ParameterEvent, self.server.parameter_event, qos=RELIABLE)
-        if config.accept_operator and not is_loopback(config.host):
-            self.diagnose("operator", WARN, f"whoever reaches {config.host}:{self.server.port} can drive the robot")
+        may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
+        if may and not is_loopback(config.host):
+            self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {' and '.join(may)}")
         # A thread, not a timer: with simulated time the timers stand still while topics already come.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
         self._look_thread.start()

@@ -534,7 +534,18 @@ def test_a_port_in_use_and_wrong_files_are_told(tmp_path_factory):
 def test_default_is_this_machine_only_and_an_open_door_for_drivers_is_told(world):
     assert FoxgloveBridgeConfig().host == "127.0.0.1"
     node = world.bridge(host="0.0.0.0", accept_operator=True)
-    assert "can drive the robot" in node.diagnoses()["operator"][1]
+    assert "can drive the robot and change parameters" in node.diagnoses()["access"][1]
+
+
+def test_parameters_can_be_made_read_only(world, talker):
+    bridge = world.bridge(set_parameters=False)
+    client = world.client()
+    wait_for(lambda: "talker" in bridge.server.parameters.nodes, "the node")
+    client.texts.clear()
+    client.send(op="setParameters", parameters=[{"name": "/talker.rate_hz", "value": 5.0}], id="s")
+    assert "only be read" in client.until(lambda: client.text("status"), "the refusal")["message"]
+    answer = client.until(lambda: client.text("parameterValues"), "the present value")
+    assert [p["value"] for p in answer["parameters"]] == [2.0] and talker.config.rate_hz == 2.0
 
 
 def test_nothing_is_left_after_the_end(world):

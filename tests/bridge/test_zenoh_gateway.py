@@ -163,11 +163,12 @@ def test_independent_client_sees_our_topics_types_and_messages(world, sdk):
     wanted = {("/robot1/chatter", STRING), ("/robot1/scan", "sensor_msgs/msg/LaserScan")}
 
     def seen():
-        topics = {(topic, name) for topic, names in get_topic_names_and_types(0, **sdk) for name in names}
+        listed = get_topic_names_and_types(0, timeout=5.0, **sdk)
+        topics = {(topic, name) for topic, names in listed for name in names}
         return wanted <= topics
 
     wait_for(seen, "our topics in the client's list")
-    info = get_topic_info("/robot1/chatter", 0, verbose=True, **sdk)
+    info = wait_for(lambda: get_topic_info("/robot1/chatter", 0, timeout=5.0, verbose=True, **sdk), "the topic's info")
     (publisher,) = info.publishers
     assert (publisher.node_name, publisher.node_namespace.strip("/")) == ("talker", "robot1")
     assert publisher.type_hash == type_hash(STRING)
