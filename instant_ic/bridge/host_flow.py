@@ -195,7 +195,7 @@ class Outbox:
             late = now_ns - out.due_ns
             out.due_ns = out.due_ns + out.period_ns if late < out.period_ns else now_ns + out.period_ns
         if out.waiting:
-            held = out.period_ns and now_ns < out.due_ns  # it waited for its turn, not for the link
+            held = channel.latched and out.period_ns and now_ns < out.due_ns  # it waited for its turn, not for the link
             counts.thinned += bool(held)
             counts.superseded += not held
             out.waiting.clear()

@@ -201,6 +201,17 @@ def test_rate_limit_keeps_the_newest():
     assert world.memories["station"].counts_in[rule.topic].lost == 0
 
 
+def test_slow_link_below_the_rate_limit_is_told_apart_from_thinning():
+    rule = TopicRule("/lidar/points", rate_hz=5.0, lane="bulk")
+    world = World([rule], down=Way(rate=1e5), times=LinkTimes(timeout_s=10))
+    world.run(0.1)
+    world.run(10.0, each=every(100, lambda now: world.publish("robot", rule.topic, bytes(40_000))))
+    counts = world.sessions["robot"].outbox.counts[rule.topic]
+    assert counts.thinned == pytest.approx(50, abs=2)  # 10 a second, 5 asked for
+    assert counts.superseded == pytest.approx(25, abs=4)  # 100 kB a second carry 2.5 of 40 kB
+    assert counts.messages == pytest.approx(25, abs=3)
+
+
 def test_rate_limit_of_a_latched_topic_still_brings_the_last_value():
     rule = TopicRule("/map", rate_hz=1.0)
     world = World([rule])
