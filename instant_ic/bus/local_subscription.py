@@ -45,6 +45,7 @@ VIEWS_HELD = 4
 collects messages cannot take the publisher's buffers away."""
 
 RECEIVE_BYTES = 100_000  # a whole message that does not go through shared memory
+_LEAST_ROOM = 4096
 _VIEW_FROM_BYTES = 16_384
 _FDS_SPACE = socket.CMSG_SPACE(4 * 8)
 _FULL_LOOK_S = 1.0
@@ -66,6 +67,7 @@ class Inlet:
         self._header = (0, 0, 0, 0, 0)
         self._body: memoryview | None = None  # a large body that comes in pieces
         self._got = 0
+        self._room = _LEAST_ROOM
         self._fds: deque[int] = deque()
         self._mappings: dict[int, SharedMapping] = {}
         self._views: dict[int, weakref.ref[Any]] = {}
@@ -101,7 +103,7 @@ class Inlet:
                     return False
                 continue
             try:
-                data, ancillary, flags, _ = self._receive(RECEIVE_BYTES, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
+                data, ancillary, flags, _ = self._receive(self._room, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
             except BlockingIOError:
                 return True
             except OSError:  # ECONNRESET: it died with data of ours unread
@@ -114,10 +116,13 @@ class Inlet:
             count = len(data)
             if not count:
                 return False
+            full = count == self._room
+            # Room for as much as came last: much more would cost the allocator more than all the rest of this.
+            self._room = min(2 * count, RECEIVE_BYTES) if full else max(count + 256, _LEAST_ROOM)
             if self._rest:
                 data, self._rest = self._rest + data, b""
             self._parse(data)
-            if count < RECEIVE_BYTES and self._body is None and not ancillary:
+            if not full and self._body is None and not ancillary:
                 return True  # it was all there was
 
     def _parse(self, data: bytes) -> None:
