@@ -319,7 +319,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         """What the worker found; nothing of a map that has been given up since."""
         slam, outcome, fault = result
         if fault:
-            self.log.error("loop closing failed, the map stays as it is: %s", fault)
+            self.diagnose("loops", ERROR, f"loop closing failed and is off until the node starts again: {fault}")
         if slam is self.slam:
             slam.take_over(outcome)
 

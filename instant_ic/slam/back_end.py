@@ -248,7 +248,12 @@ class BackEnd:
         """The loops that, with this one, say the same often enough; else none, and it waits for others."""
         loop = self.config.loop
         here = candidate.edge.b
-        self._pending = [other for other in self._pending if here - other.edge.b <= PENDING_KEYFRAMES]
+        # A keyframe that was taken out meanwhile is no longer a node of the graph.
+        self._pending = [
+            other
+            for other in self._pending
+            if here - other.edge.b <= PENDING_KEYFRAMES and self._alive[[other.edge.a, other.edge.b]].all()
+        ]
         agreeing = [other for other in self._pending if self._consistent(other.edge, candidate.edge)]
         self._pending.append(candidate)
         ends = {other.edge.b for other in agreeing} | {here}

@@ -142,7 +142,7 @@ class LoopConfig:
     max_range_m: float = 20.0
     max_points: int = 250
     sigmas: float = 3.0
-    max_reach_m: float = 6.0
+    max_reach_m: float = 10.0
     max_reach_rad: float = 0.8
     min_score: float = 0.6
     min_shape: float = 0.05

@@ -134,6 +134,7 @@ class GridSlam:
         self.motion = MotionMonitor(self.config.motion)
         self._handed_over = 0
         self._busy = False
+        self._broken = False
         self._merged = 0
         self._edges: list[Edge] = []
         self.map_from_base: FloatArray = np.zeros(3)
@@ -245,7 +246,8 @@ class GridSlam:
         if not self.localized:
             return self._search_job()
         new = self.front_end.trajectory.keyframes[self._handed_over :]
-        if self._busy or not new or not self.config.loop.enabled or self.front_end.in_known_map:
+        off = self._broken or not self.config.loop.enabled or self.front_end.in_known_map
+        if self._busy or not new or off:
             return None
         self._busy, self._handed_over = True, self._handed_over + len(new)
         return lambda: self.back_end.update(new)
@@ -254,10 +256,12 @@ class GridSlam:
         """Take over what a background job found: corrected poses go into map_from_odom, never into odometry.
 
         Args:
-            outcome: of the job; None: it failed, and nothing changes.
+            outcome: of the job; None: it failed. Nothing changes then, and loops are closed no more, because what the
+                back end knows of the keyframes is not whole.
         """
         self._busy = False
         if outcome is None:
+            self._broken = self.localized
             return
         if isinstance(outcome, _Place):
             if outcome.found is not None and not self.localized:
@@ -352,7 +356,7 @@ class GridSlam:
 
     def finish(self) -> None:
         """After the last scan: optimise with all loops, and draw the map from the outcome."""
-        if not self.localized or self.front_end.in_known_map:
+        if not self.localized or self._broken or self.front_end.in_known_map:
             return
         new = self.front_end.trajectory.keyframes[self._handed_over :]
         if self.config.loop.enabled and self.front_end.trajectory.keyframes:

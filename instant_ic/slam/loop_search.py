@@ -21,6 +21,9 @@ from instant_ic.slam.scan import FloatArray
 POOL = 4
 """Cells of the field along a side of a pooled cell."""
 
+COARSE_POINTS = 100
+"""Of the query, in the wide search; all of them count in the close one."""
+
 
 @njit(cache=True)
 def pool(field, size):  # type: ignore[no-untyped-def]
@@ -158,8 +161,9 @@ class LoopSearch:
         coarse = POOL * resolution
         cells = max(1, math.ceil(reach_m / coarse))
         rotations = max(1, min(math.ceil(reach_rad / self.rotation_step_rad), int(math.pi / self.rotation_step_rad)))
+        few = points[:: max(1, len(points) // COARSE_POINTS)]
         volume = score_volume(
-            pool(field.values, POOL), field.origin, coarse, points, centre, cells, rotations, self.rotation_step_rad
+            pool(field.values, POOL), field.origin, coarse, few, centre, cells, rotations, self.rotation_step_rad
         )
         tops = peaks(volume, self.candidates, 1, 1)
         none = np.zeros(3)
@@ -169,7 +173,7 @@ class LoopSearch:
                 [(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * self.rotation_step_rad]
             )
             if close and volume[r, j, i] < close[0][0] - 0.1:
-                break  # a pooled score is an upper bound: nothing to come can be near the best
+                break  # a pooled score is about an upper bound: nothing to come can be near the best
             x, y, yaw, _ = correlate(
                 field.values, field.origin, resolution, points, start, POOL, 4, self.rotation_step_rad / 4, start,
                 none, 1.0, 1.0,

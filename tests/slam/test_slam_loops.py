@@ -11,7 +11,7 @@ from slam_planar_world import PlanarWorld, rectangle
 from instant_ic.evaluation.slam_worlds import LASERS, Drive, Laser, cells, drive, trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
-from instant_ic.slam.back_end import _chained, _reversed
+from instant_ic.slam.back_end import BackEnd, _Candidate, _chained, _reversed
 from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
 from instant_ic.slam.loop_search import LoopSearch, peaks, pool, score_volume, spread
@@ -119,6 +119,21 @@ def test_staying_in_one_room_does_not_add_keyframes_for_ever() -> None:
         assert metres.max() < 0.1
     added = counts[1] - counts[0]
     assert added < 0.5 * counts[0]
+
+
+def test_a_loop_that_waits_does_not_outlive_its_keyframe() -> None:
+    # A keyframe may be merged into another while a loop to it waits for others that agree.
+    back_end = BackEnd(SlamConfig())
+    slam, _ = run(drive(rectangle(-3, -3, 3, 3), [(0.0, 0.0), (2.0, 0.0)], COARSE, 0))
+    back_end.update(slam.front_end.trajectory.keyframes)
+    here = len(back_end) - 1
+    edges = [Edge(a, here - a, relative2(back_end.poses[a], back_end.poses[here - a]), np.eye(3), True) for a in (1, 2)]
+    for edge in edges:
+        assert back_end._confirm(_Candidate(edge, 0.0)) == []
+    back_end._alive[1] = False
+    last = Edge(0, here, relative2(back_end.poses[0], back_end.poses[here]), np.eye(3), True)
+    assert back_end._confirm(_Candidate(last, 50.0)) == []  # of three, one is gone
+    assert [c.edge for c in back_end._pending] == [edges[1], last]
 
 
 def field_of(walls: PlanarWorld, poses: list[tuple[float, float, float]]) -> LikelihoodField:

@@ -353,6 +353,8 @@ def test_a_fault_of_the_worker_is_told_and_the_scans_go_on(monkeypatch: pytest.M
     monkeypatch.setattr(rig.node.slam.back_end, "update", broken)
     rig.drive(0.4, 0.3, 20)
     assert len(rig.bus.messages("/pose")) == 21 and max(rig.pose_errors()) < 0.03
+    level, text, _ = rig.node.diagnoses()["loops"]
+    assert level == ERROR and "no more" in text
 
 
 def test_the_particle_filter_runs_in_the_same_node() -> None:
