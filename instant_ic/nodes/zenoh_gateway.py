@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal
 
 from instant_ic.bridge.commands import CommandGate, CommandLimits
 from instant_ic.bridge.topic_watch import TopicWatch
-from instant_ic.bridge.zenoh_gateway import COMMANDS, Incoming, Namespace, Outgoing, parse_publish, parse_subscribe
+from instant_ic.bridge.zenoh_incoming import Incoming
+from instant_ic.bridge.zenoh_outgoing import Outgoing
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
     SESSION_DEFAULTS,
@@ -18,6 +19,7 @@ from instant_ic.bridge.zenoh_session import (
     is_client,
     load_config,
 )
+from instant_ic.bridge.zenoh_topics import COMMANDS, Namespace, parse_publish, parse_subscribe
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.msg import MessageError
 from instant_ic.ranges import Range, check_ranges

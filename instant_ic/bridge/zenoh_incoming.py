@@ -1,0 +1,254 @@
+"""Topics of the ROS graph over Zenoh in a run directory."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..bus import ERROR, OK, Node, Publisher
+from ..bus.registry import RegistryError
+from ..msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
+from .commands import CommandGate, CommandRefused
+from .zenoh_format import Attachment, Token, TopicQoS
+from .zenoh_session import RosNode, RosSubscription
+from .zenoh_topics import COMMANDS, GRACE_S, Namespace, bus_qos, known_hash, parse_subscribe, takes
+
+_ACTED_ON = ("/operator/*", "/cmd_vel", "/nav/cmd_vel")
+"""Topics that move a robot: never brought in by a pattern."""
+
+_TF = "tf2_msgs/msg/TFMessage"
+
+
+class StaticTransforms:
+    """The union of ``/tf_static`` messages: a publisher keeps one latched value, the robot's nodes send one each."""
+
+    def __init__(self) -> None:
+        self._transforms: dict[str, Any] = {}
+
+    def merge(self, payload: bytes) -> bytes | memoryview:
+        """All transforms so far as one message, the newest of each child frame.
+
+        Raises:
+            MessageError: the bytes are no TFMessage.
+        """
+        for transform in deserialize(payload, _TF).transforms:
+            self._transforms[transform.child_frame_id] = transform
+        return serialize(message_type(_TF)(list(self._transforms.values())))
+
+
+@dataclass
+class _In:
+    """A topic that comes in."""
+
+    type_name: str
+    qos: TopicQoS
+    publisher: Publisher
+    own_publisher: bool
+    always: bool
+    subscription: RosSubscription | None = None
+    sources: set[tuple[str, int]] = field(default_factory=set)
+    gone_s: float | None = None
+
+
+class Incoming:
+    """Topics of the ROS graph, byte for byte, with the time at which they were published there.
+
+    Args:
+        node: the gateway's node.
+        namespace: where the topics stand there.
+        own: the gateway itself in the ROS graph.
+        subscribe: ``TOPIC``, ``PATTERN`` or ``TOPIC TYPE`` by the names here. With a type the topic is there at once;
+            else when a publisher of it appears.
+        commands: which of :data:`COMMANDS` may come in.
+        gate: what commands have to pass.
+
+    Raises:
+        ValueError: a type or a topic in the lists is wrong.
+    """
+
+    def __init__(
+        self,
+        node: Node[Any],
+        namespace: Namespace,
+        own: RosNode,
+        subscribe: Sequence[str],
+        commands: Sequence[str],
+        gate: CommandGate,
+    ) -> None:
+        self._node = node
+        self._namespace = namespace
+        self._gate = gate
+        self._gate_lock = threading.Lock()  # each subscription calls on its own thread
+        self._topics: dict[str, _In] = {}
+        self._refusing: set[str] = set()
+        self._count_before = 0
+        self._patterns, self._types = parse_subscribe(subscribe)
+        self._types.update({topic: COMMANDS[topic] for topic in commands})
+        self._commands = set(commands)
+        self._own = own
+        for topic, name in self._types.items():
+            self._open(topic, name, TopicQoS(latched=topic == "/operator/estop", depth=1), always=True)
+
+    @property
+    def topics(self) -> list[str]:
+        """Topics that come in now, by the names here."""
+        return sorted(self._topics)
+
+    @property
+    def count(self) -> int:
+        """Messages that came in, refused commands among them."""
+        held = [entry.subscription for entry in self._topics.values() if entry.subscription is not None]
+        return self._count_before + sum(subscription.count for subscription in held)
+
+    def lost_by(self) -> dict[str, dict[str, int]]:
+        """Topic → publisher's id → messages that never came."""
+        held = {topic: entry.subscription for topic, entry in self._topics.items()}
+        return {topic: dict(s.lost_by) for topic, s in held.items() if s is not None and s.lost_by}
+
+    def malformed(self) -> int:
+        """Messages without a readable attachment."""
+        return sum(entry.subscription.malformed for entry in self._topics.values() if entry.subscription is not None)
+
+    def on_token(self, token: Token, alive: bool) -> None:
+        """Follows the ROS graph; may be called from any thread."""
+        if token.kind == "MP":
+            self._node.call_soon(self._follow, token, alive)
+
+    def _follow(self, token: Token, alive: bool) -> None:
+        topic = self._namespace.to_local(token.topic)
+        if topic is None or not self.wants(topic):
+            return
+        source = (token.session, token.entity_id)
+        entry = self._topics.get(topic)
+        if not alive:
+            if entry is not None and source in entry.sources:
+                self._left(topic, entry, source)
+            return
+        if not self._same_type(topic, token, entry):
+            return
+        if entry is None or (token.qos.latched and not entry.qos.latched):
+            try:
+                entry = self._open(topic, token.type_name, token.qos, entry is not None and entry.always)
+            except RegistryError as error:
+                self._node.diagnose(f"in {topic}", ERROR, str(error))
+                return
+        entry.sources.add(source)
+        entry.gone_s = None
+
+    def wants(self, topic: str) -> bool:
+        """Whether a topic comes in as soon as somebody there publishes it."""
+        if topic in self._commands:
+            return True
+        return takes(self._patterns, topic) and not takes(_ACTED_ON, topic)
+
+    def _same_type(self, topic: str, token: Token, entry: _In | None) -> bool:
+        """Whether a publisher there sends what its topic carries here; tells if not."""
+        wanted = entry.type_name if entry is not None else token.type_name
+        who = f"{token.node} there sends {token.type_name}"
+        if token.type_name != wanted:
+            self._node.diagnose(f"in {topic}", ERROR, f"{who}, {wanted} expected; it is not brought in")
+            return False
+        if (ours := known_hash(wanted)) is None:
+            self._node.diagnose(f"in {topic}", ERROR, f"{who}, which is not known here; it is not brought in")
+            return False
+        if token.type_hash != ours:
+            self._node.diagnose(
+                f"in {topic}", ERROR, f"{who} by another definition ({token.type_hash}, ours is {ours}); not brought in"
+            )
+            return False
+        return True
+
+    def _open(self, topic: str, type_name: str, qos: TopicQoS, always: bool) -> _In:
+        """Brings a topic in, anew where it was in by another quality of service."""
+        sources: set[tuple[str, int]] = set()
+        if (old := self._topics.pop(topic, None)) is not None:
+            sources = old.sources
+            self._shut(old)
+        name = message_type(type_name).__msgtype__
+        # /heartbeat and its like the gateway sends itself; others' go out by the same publisher.
+        publisher = next((p for p in self._node.publishers if p.topic == topic), None)
+        own = publisher is not None
+        if publisher is None:
+            publisher = self._node.publisher_raw(topic, name, bus_qos(qos))
+        entry = self._topics[topic] = _In(name, qos, publisher, own, always, sources=sources)
+        handle = self._handler(topic, entry)
+        there = self._namespace.to_ros(topic)
+        entry.subscription = RosSubscription(self._own, there, name, type_hash(name), qos, handle)
+        self._node.log.debug("%s comes in as %s", there, topic)
+        return entry
+
+    def _handler(self, topic: str, entry: _In) -> Callable[[bytes, Attachment], None]:
+        publish = entry.publisher.publish_bytes
+        merge = StaticTransforms().merge if entry.qos.latched and entry.type_name == _TF else None
+
+        def plain(payload: bytes, attachment: Attachment) -> None:
+            if merge is None:
+                publish(payload, attachment.source_ns)
+                return
+            try:
+                publish(merge(payload), attachment.source_ns)
+            except MessageError as error:
+                self._tell(topic, ERROR, f"refused: {error}")
+
+        def command(payload: bytes, attachment: Attachment) -> None:
+            with self._gate_lock:
+                try:
+                    self._check(topic, entry, payload, attachment)
+                except CommandRefused as error:
+                    self._refusing.add(topic)
+                    self._tell(topic, ERROR, f"command refused: {error}")
+                    return
+                if topic in self._refusing:
+                    self._refusing.discard(topic)
+                    self._tell(topic, OK, "commands come in")
+                publish(payload, attachment.source_ns)
+
+        return command if topic in self._commands else plain
+
+    def _check(self, topic: str, entry: _In, payload: bytes, attachment: Attachment) -> None:
+        now_ns = time.time_ns()
+        try:
+            message = deserialize(payload, COMMANDS[topic])
+        except MessageError as error:
+            raise self._gate.refuse("not readable", str(error)) from None
+        if topic == "/operator/estop":
+            # A stop is never too old, and anybody may stop; only the release has to be fresh.
+            if not message.data:
+                self._gate.check_age(attachment.source_ns, now_ns)
+            return
+        if not entry.sources:
+            raise self._gate.refuse("no sender", "nobody in the ROS graph sends this topic, or not any more")
+        self._gate.check_age(attachment.source_ns, now_ns)
+        self._gate.check_drive(attachment.gid.hex()[:8], *twist_values(message), now_ns)
+
+    def _tell(self, topic: str, level: int, words: str) -> None:
+        self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)
+
+    def _left(self, topic: str, entry: _In, source: tuple[str, int]) -> None:
+        """A publisher there has left; with the last driver the robot stops."""
+        with self._gate_lock:  # a command of its that is still on its way must not come after the zero
+            entry.sources.remove(source)
+            if entry.sources:
+                return
+            entry.gone_s = time.monotonic()
+            if topic == "/operator/cmd_vel" and topic in self._commands:
+                # Not after the arbiter's time-out: at once.
+                entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns()))
+
+    def reconcile(self) -> None:
+        """Lets go of topics whose publishers have left for a while."""
+        now = time.monotonic()
+        for topic, entry in list(self._topics.items()):
+            if not entry.always and entry.gone_s is not None and now - entry.gone_s > GRACE_S:
+                self._shut(self._topics.pop(topic))
+                self._node.diagnose(f"in {topic}", OK, "has left")
+
+    def _shut(self, entry: _In) -> None:
+        if entry.subscription is not None:
+            entry.subscription.close()
+            self._count_before += entry.subscription.count
+        if not entry.own_publisher:
+            self._node.drop(entry.publisher)

@@ -1,0 +1,144 @@
+"""Topics of a run directory in the ROS graph over Zenoh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..bus import ERROR, RELIABLE, Node, QoS, Subscription
+from ..bus.qos import PRESETS
+from ..bus.registry import PublisherInfo, TopicInfo
+from ..bus.transport import Received
+from .zenoh_session import RosNode, RosPublisher, RosSession
+from .zenoh_topics import GRACE_S, Namespace, known_hash, parse_publish, ros_qos, takes
+
+
+@dataclass
+class _Out:
+    """A topic that goes out: one subscription here, a publisher there for each of its publishers."""
+
+    period_ns: int
+    subscription: Subscription | None = None
+    publishers: dict[str, RosPublisher] = field(default_factory=dict)
+    gone_s: dict[str, float] = field(default_factory=dict)
+    due_ns: dict[str, int] = field(default_factory=dict)
+
+
+class Outgoing:
+    """Topics of the run directory, byte for byte, under the names of the nodes that publish them.
+
+    Each publisher here has its own publisher there, so latched values of several nodes (``/tf_static``) are all kept
+    for late joiners, and ``ros2 node list`` shows the nodes themselves.
+
+    Args:
+        node: the gateway's node.
+        session: the Zenoh session.
+        namespace: where the topics stand there.
+        own: the gateway itself in the ROS graph.
+        publish: see :func:`parse_publish`; of several patterns that match, the first holds.
+
+    Attributes:
+        brought_in: tells whether a topic may come in by the same gateway; what it hands on does not go out again.
+        count, thinned: messages that went out, and that a rate limit left out.
+
+    Raises:
+        ValueError: a line of ``publish`` is wrong.
+    """
+
+    def __init__(
+        self, node: Node[Any], session: RosSession, namespace: Namespace, own: RosNode, publish: Sequence[str]
+    ) -> None:
+        self._node = node
+        self._session = session
+        self._own = own
+        self._namespace = namespace
+        self._periods = parse_publish(publish)
+        self._topics: dict[str, _Out] = {}
+        self._nodes: dict[str, RosNode] = {}
+        self.brought_in: Callable[[str], bool] = lambda topic: False
+        self.count = 0
+        self.thinned = 0
+
+    @property
+    def topics(self) -> list[str]:
+        """Topics that go out now."""
+        return sorted(self._topics)
+
+    def reconcile(self, present: Sequence[TopicInfo]) -> None:
+        """Takes up what has appeared and lets go of what has left for a while."""
+        now = time.monotonic()
+        live: dict[str, list[PublisherInfo]] = {}
+        for info in present:
+            publishers = [p for p in info.publishers if not self._came_in(info.topic, p.node)]
+            if publishers and takes(tuple(self._periods), info.topic):
+                live[info.topic] = publishers
+        for topic, publishers in live.items():
+            if (out := self._topics.get(topic)) is None:
+                period = next(p for pattern, p in self._periods.items() if takes((pattern,), topic))
+                out = self._topics[topic] = _Out(period)
+            for publisher in publishers:
+                self._mirror(topic, publisher.node, publisher.type_name, PRESETS.get(publisher.qos, RELIABLE))
+            if out.subscription is None:
+                qos = max((PRESETS.get(p.qos, RELIABLE) for p in publishers), key=lambda q: (q.latched, q.reliable))
+                out.subscription = self._node.subscribe_received(topic, self._forward, qos)
+        for topic, out in list(self._topics.items()):
+            here = {publisher.node for publisher in live.get(topic, ())}
+            for name in [name for name in out.publishers if name not in here]:
+                if now - out.gone_s.setdefault(name, now) > GRACE_S:
+                    out.publishers.pop(name).close()
+                    del out.gone_s[name]
+            for name in here:
+                out.gone_s.pop(name, None)
+            if not out.publishers:
+                if out.subscription is not None:
+                    self._node.drop(out.subscription)
+                del self._topics[topic]
+        used = {name for out in self._topics.values() for name in out.publishers}
+        for name in [name for name in self._nodes if name not in used]:
+            self._nodes.pop(name).close()
+
+    def _mirror(self, topic: str, node: str, type_name: str, qos: QoS) -> RosPublisher | None:
+        """The publisher there that stands for a node's publisher here."""
+        out = self._topics[topic]
+        if node not in out.publishers:
+            if (hash_ := known_hash(type_name)) is None:
+                self._node.diagnose(f"out {topic}", ERROR, f"{type_name} is not known here: it cannot go out")
+                return None
+            there = self._own if node == self._own.name else self._nodes.get(node)
+            if there is None:
+                there = self._nodes[node] = RosNode(self._session, self._namespace.ros, node)
+            name = self._namespace.to_ros(topic)
+            out.publishers[node] = RosPublisher(there, name, type_name, hash_, ros_qos(qos))
+            self._node.log.debug("%s of %s goes out as %s", topic, node, name)
+        return out.publishers[node]
+
+    def _came_in(self, topic: str, publisher: str) -> bool:
+        """Whether a publisher here only hands on what came from there: that must not go out again."""
+        return publisher == self._node.node_name and self.brought_in(topic)
+
+    def _forward(self, received: Received) -> None:
+        out = self._topics.get(received.topic)
+        if out is None or self._came_in(received.topic, received.publisher):
+            return
+        publisher = out.publishers.get(received.publisher)
+        if publisher is None and out.subscription is not None:  # heard before the next look at the registry
+            publisher = self._mirror(received.topic, received.publisher, received.type_name, out.subscription.raw.qos)
+        if publisher is None or self._early(out, received):
+            return
+        publisher.put(received.payload, received.publish_ns)
+        self.count += 1
+
+    def _early(self, out: _Out, received: Received) -> bool:
+        """Whether the rate limit leaves a message out; each publisher has its own."""
+        if not out.period_ns:
+            return False
+        due_ns = out.due_ns.get(received.publisher, 0)
+        if received.received_ns < due_ns:
+            self.thinned += 1
+            return True
+        # On the grid of periods, so that a limit of 3 Hz gives 3 Hz of a topic of 10 Hz; no burst after a pause.
+        start_ns = due_ns if received.received_ns - due_ns < out.period_ns else received.received_ns
+        out.due_ns[received.publisher] = start_ns + out.period_ns
+        return False
