@@ -1,13 +1,10 @@
-"""Sockets of the link: one TCP port, CURVE on it, the allow-list at its door; a thread of its own moves the bytes."""
+"""What both ends of the link share: topics out, events in, the thread that moves the bytes."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import logging
-import os
 import re
-import socket
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -17,25 +14,17 @@ from typing import Any
 
 import zmq
 from zmq.utils import z85
-from zmq.utils.monitor import parse_monitor_message
 
 from .host_flow import Channel, Item
-from .host_keys import AllowList, KeyFileError, KeyStore, Peer, fingerprint
-from .host_protocol import MAX_FRAME, Bye, Hello, ProtocolError, decode
-from .host_session import Ended, Event, LinkTimes, Memory, Session, Side, Up
+from .host_keys import AllowList, KeyFileError, KeyStore, Peer
+from .host_protocol import MAX_FRAME
+from .host_session import Event, LinkTimes, Memory, Session, Side
 from .host_topics import TopicCounts, TopicRule
 
-_ZAP = "inproc://zeromq.zap.01"
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+(%\w+)?\]|[A-Za-z0-9_.*-]+):(\d{1,5})\Z")
-_ALLOW_LIST_S = 0.25
-_STRANGER_S = 60.0
-_STRANGERS_A_MINUTE = 10
-_RETRY_S = 0.2
-_REFUSED_RETRY_S = 2.0
-_UNPROVED_RETRY_S = 0.7
-_GREETING_S = 4.0  # CURVE and the greeting take four round trips
-_IDLE_S = 0.1
-_RECEIVE_MOST = 200
+GREETING_S = 4.0  # CURVE and the greeting take four round trips
+IDLE_S = 0.1
+RECEIVE_MOST = 200
 
 log = logging.getLogger(__name__)
 
@@ -98,7 +87,7 @@ class PeerStatus:
 
 
 @dataclass
-class _Connection:
+class Connection:
     """A session and the way to it."""
 
     peer: Peer
@@ -245,7 +234,7 @@ class HostLink(ABC):
         with self._lock:
             return [self._status(connection) for connection in self._connections() if connection.session.up]
 
-    def _status(self, connection: _Connection) -> PeerStatus:
+    def _status(self, connection: Connection) -> PeerStatus:
         session, peer = connection.session, connection.peer
         offset_ns = session.wall_offset_ns
         return PeerStatus(
@@ -278,7 +267,7 @@ class HostLink(ABC):
     # -- the thread --------------------------------------------------------------------------------
 
     @abstractmethod
-    def _connections(self) -> list[_Connection]: ...
+    def _connections(self) -> list[Connection]: ...
 
     @abstractmethod
     def _open(self) -> None:
@@ -303,7 +292,7 @@ class HostLink(ABC):
                 poller = zmq.Poller()
                 for each in (self._wake_in, *self._sockets()):
                     poller.register(each, zmq.POLLIN)
-                poller.poll(int(max(0.0, min(wait_s, _IDLE_S)) * 1000))
+                poller.poll(int(max(0.0, min(wait_s, IDLE_S)) * 1000))
                 with self._lock:
                     self._woken = False
                     while int(self._wake_in.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
@@ -343,401 +332,16 @@ class HostLink(ABC):
         made.setsockopt(zmq.SNDHWM, 10_000)  # bytes on their way are limited by the sessions; this is for small answers
         made.setsockopt(zmq.RCVHWM, 10_000)
         made.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME)
-        made.setsockopt(zmq.HANDSHAKE_IVL, int(_GREETING_S * 1000))
+        made.setsockopt(zmq.HANDSHAKE_IVL, int(GREETING_S * 1000))
         made.setsockopt(zmq.HEARTBEAT_IVL, max(100, int(self.times.timeout_s * 1000)))
         made.setsockopt(zmq.HEARTBEAT_TIMEOUT, max(300, int(self.times.timeout_s * 3000)))
         made.setsockopt(zmq.CURVE_PUBLICKEY, z85.encode(self.identity.public_key))
         made.setsockopt(zmq.CURVE_SECRETKEY, z85.encode(self.identity.secret_key))
         return made
 
-    def _wait_s(self, connections: list[_Connection]) -> float:
+    def _wait_s(self, connections: list[Connection]) -> float:
         now = time.monotonic_ns()
-        return min((max(0, c.session.next_due_ns() - now) / 1e9 for c in connections), default=_IDLE_S)
-
-
-class ListeningLink(HostLink):
-    """The robot's end: many hosts may come, those of the allow-list are let in, one of them drives.
-
-    Args:
-        endpoint: ``tcp://0.0.0.0:7450``; port 0 takes a free one, told by ``port``.
-
-    See :class:`HostLink` for the others. ``wanted_driver`` names the host that is to drive; empty leaves it to who came
-    first.
-    """
-
-    def __init__(
-        self,
-        endpoint: str,
-        side: Side,
-        exports: dict[str, TopicRule],
-        store: KeyStore,
-        on_event: Callable[[LinkEvent], None],
-        times: LinkTimes | None = None,
-    ) -> None:
-        host, port = check_endpoint(endpoint, listening=True)
-        super().__init__(side, exports, store, on_event, times)
-        self._by_route: dict[bytes, _Connection] = {}
-        self._told: dict[tuple[str, str], tuple[float, int]] = {}
-        self.wanted_driver = ""
-        self._next_list_s = 0.0
-        self._list_problem = ""
-        self._leaving: list[tuple[float, _Connection]] = []
-        self._zap = self._context.socket(zmq.ROUTER)
-        self._zap.bind(_ZAP)  # before the door opens: without a keeper everybody would be let in
-        self._router = self._socket(zmq.ROUTER)
-        self._router.setsockopt(zmq.ROUTER_MANDATORY, 1)
-        self._router.setsockopt(zmq.CURVE_SERVER, 1)
-        self._router.setsockopt(zmq.ZAP_DOMAIN, b"instant_ic")
-        self._router.setsockopt(zmq.IPV6, int(host.startswith("[")))
-        try:
-            self._router.bind(f"tcp://{host}:{port if port else '*'}")
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise LinkError(f"cannot listen on {endpoint}: {error}; is another bridge running?") from None
-        self.endpoint = self._router.getsockopt_string(zmq.LAST_ENDPOINT)
-        self.port = int(self.endpoint.rpartition(":")[2])
-
-    def _connections(self) -> list[_Connection]:
-        return list(self._by_route.values())
-
-    def _sockets(self) -> list[zmq.Socket[bytes]]:
-        return [self._router, self._zap]
-
-    def _open(self) -> None:
-        self.allowed.refresh()
-        self._tell_list()
-
-    def _step(self) -> float:
-        with self._lock:
-            now = time.monotonic()
-            if now >= self._next_list_s:
-                self._next_list_s = now + _ALLOW_LIST_S
-                if self.allowed.refresh():
-                    self._cut_off_revoked()
-                self._tell_list()
-            self._answer_door()
-            self._receive()
-            for route, connection in list(self._by_route.items()):
-                self._handle(connection, connection.session.check())
-                self._send(route, connection)
-            self._choose_driver()
-            for due_s, connection in [entry for entry in self._leaving if entry[0] <= now]:
-                self._leaving.remove((due_s, connection))
-                _shut(connection)
-            return self._wait_s(self._connections())
-
-    def _farewell(self) -> None:
-        with self._lock:
-            for route, connection in list(self._by_route.items()):
-                self._handle(connection, connection.session.end("closing", f"{self.side.name} ends", tell=True))
-                self._send(route, connection)
-
-    # -- the door ----------------------------------------------------------------------------------
-
-    def _answer_door(self) -> None:
-        """The keeper (ZAP, RFC 27): libzmq asks it about everybody who proves a key."""
-        while int(self._zap.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            frames = self._zap.recv_multipart(zmq.NOBLOCK)
-            if len(frames) < 8:
-                continue
-            back, empty, version, request, _, address, _, mechanism = frames[:8]
-            key = frames[8] if mechanism == b"CURVE" and len(frames) == 9 else b""
-            known = self.allowed.get(key) if version == b"1.0" else None
-            if known is None:
-                self._turn_away(address.decode(errors="replace"), key)
-            code, text = (b"200", b"OK") if known is not None else (b"400", b"key is not allowed")
-            user = z85.encode(key) if known is not None else b""
-            self._zap.send_multipart([back, empty, version, request, code, text, user, b""])
-
-    def _turn_away(self, address: str, key: bytes) -> None:
-        """Told once a minute for each address and key, and ten times a minute in all, with the tries in between."""
-        self.strangers += 1
-        who = (address, fingerprint(key) if key else "without a key")
-        told_s, times = self._told.get(who, (-_STRANGER_S, 0))
-        now = time.monotonic()
-        if len(self._told) >= 1000:
-            self._told.clear()
-        lately = sum(now - other_s < _STRANGER_S for other_s, _ in self._told.values())
-        if now - told_s < _STRANGER_S or lately >= _STRANGERS_A_MINUTE:
-            self._told[who] = (told_s, times + 1)
-            return
-        self._told[who] = (now, 0)
-        self._emit("", Stranger(*who, times + 1))
-
-    def _cut_off_revoked(self) -> None:
-        for route, connection in list(self._by_route.items()):
-            peer = self.allowed.get(connection.peer.public_key)
-            if peer == connection.peer:
-                continue
-            reason = f"{self.side.name} no longer allows this host's key"
-            if peer is not None:  # its role or name is another one now: it comes back with it
-                reason = f"{self.side.name} has changed what this host may do"
-            events = connection.session.end("replaced" if peer else "revoked", reason, tell=True)
-            self._handle(connection, events)
-            self._send(route, connection)
-
-    def _tell_list(self) -> None:
-        problem = self.allowed.problem
-        if not problem and not len(self.allowed):
-            problem = "no host is allowed yet: run `ic keys list` there, and `ic keys allow NAME KEY` here"
-        if problem != self._list_problem:
-            self._list_problem = problem
-            self._emit("", Problem(problem))
-
-    # -- bytes -------------------------------------------------------------------------------------
-
-    def _receive(self) -> None:
-        for _ in range(_RECEIVE_MOST):
-            try:
-                frames = self._router.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
-                return
-            if len(frames) != 2:
-                continue
-            route, frame = frames[0].bytes, frames[1]
-            connection = self._by_route.get(route) or self._greet(route, frame)
-            if connection is not None:
-                self._handle(connection, connection.session.receive(frame.buffer))
-
-    def _greet(self, route: bytes, frame: zmq.Frame) -> _Connection | None:
-        """A connection that has said nothing yet: it must say Hello."""
-        # libzmq has proved the key; the list may have changed since it asked.
-        peer = self.allowed.get(z85.decode(str(frame.get("User-Id")).encode()))
-        try:
-            hello = isinstance(decode(frame.buffer), Hello)
-        except ProtocolError:
-            hello = False
-        if peer is None or not hello:
-            word = Bye("unknown", f"{self.side.name} knows no such link: greet again")
-            self._send_frame(route, word.encode())
-            return None
-        for old_route, old in list(self._by_route.items()):
-            if old.peer.public_key == peer.public_key:  # it has started anew, or lost a link that we had not missed yet
-                self._handle(old, old.session.end("replaced", "this key has made a newer link", tell=True))
-                self._send(old_route, old)
-        connection = _Connection(peer, self._new_session(peer, connecting=False, may_send=peer.role == "driver"))
-        connection.address = str(frame.get("Peer-Address"))
-        with contextlib.suppress(zmq.ZMQError):  # libzmq may be built without it: then its own heartbeats end the rest
-            connection.file = int(frame.get(zmq.SRCFD))
-            connection.remote = _remote_of(connection.file)
-        self._by_route[route] = connection
-        return connection
-
-    def _send(self, route: bytes, connection: _Connection) -> None:
-        for data in connection.session.outgoing():
-            if not self._send_frame(route, data):
-                self._handle(connection, connection.session.end("gone", "the connection broke"))
-                break
-        if connection.session.ended is not None and self._by_route.pop(route, None) is not None:
-            # The last word gets a moment to leave; nothing else goes in or out from now on.
-            self._leaving.append((time.monotonic() + 0.1, connection))
-
-    def _send_frame(self, route: bytes, data: bytes) -> bool:
-        try:
-            self._router.send_multipart([route, data], zmq.NOBLOCK)
-        except zmq.Again:
-            return False
-        except zmq.ZMQError as error:
-            if error.errno != zmq.EHOSTUNREACH:
-                raise
-            return False
-        return True
-
-    def _handle(self, connection: _Connection, events: list[Event]) -> None:
-        for event in events:
-            if isinstance(event, Up):
-                self._give_latched(connection.session)
-            self._emit(connection.peer.name, event)
-
-    # -- who drives --------------------------------------------------------------------------------
-
-    def _choose_driver(self) -> None:
-        """One host's commands at a time: the one that is wanted, else the first that came, until it leaves."""
-        drivers = [c for c in self._connections() if c.session.up and c.peer.role == "driver"]
-        wanted = [c for c in drivers if c.peer.name == (self.wanted_driver or c.peer.name)]
-        holder = min(wanted, key=lambda c: (not c.session.drives, c.session.up_ns), default=None)
-        who = holder.peer.name if holder is not None else f"only {self.wanted_driver}"
-        for each in drivers:
-            if each.session.drives != (each is holder):
-                self._handle(each, each.session.set_drives(each is holder))
-            text = "" if each is holder else f"{who} drives {self.side.name}; this host's commands are not taken"
-            if each.told != text:
-                each.told = text
-                each.session.notify("driver", text)
-
-    @property
-    def driver(self) -> str:
-        """Name of the host whose commands are taken; empty when there is none."""
-        with self._lock:
-            return next((c.peer.name for c in self._connections() if c.session.up and c.session.drives), "")
-
-
-class ConnectingLink(HostLink):
-    """The station's end: one robot, to which it comes back by itself.
-
-    Args:
-        endpoint: ``tcp://192.168.1.20:7450``.
-        peer: the robot in the allow-list, which says the key that it must prove.
-
-    See :class:`HostLink` for the others.
-    """
-
-    def __init__(
-        self,
-        endpoint: str,
-        peer: Peer,
-        side: Side,
-        exports: dict[str, TopicRule],
-        store: KeyStore,
-        on_event: Callable[[LinkEvent], None],
-        times: LinkTimes | None = None,
-    ) -> None:
-        check_endpoint(endpoint, listening=False)
-        super().__init__(side, exports, store, on_event, times)
-        self.endpoint = endpoint
-        self.peer = peer
-        self._connection: _Connection | None = None
-        self._dealer: zmq.Socket[bytes] | None = None
-        self._monitor: zmq.Socket[bytes] | None = None
-        self._next_try_s = 0.0
-        self._connected_s: float | None = None
-        self._problem = ""
-        self._failures = 0
-
-    def _connections(self) -> list[_Connection]:
-        return [self._connection] if self._connection is not None else []
-
-    def _sockets(self) -> list[zmq.Socket[bytes]]:
-        return [s for s in (self._dealer, self._monitor) if s is not None]
-
-    def _open(self) -> None:
-        self._say(f"no answer from {self.endpoint} yet")
-
-    def _dial(self) -> None:
-        dealer = self._socket(zmq.DEALER)
-        dealer.setsockopt(zmq.CURVE_SERVERKEY, z85.encode(self.peer.public_key))
-        dealer.setsockopt(zmq.RECONNECT_IVL, int(_RETRY_S * 1000))
-        dealer.setsockopt(zmq.CONNECT_TIMEOUT, 1000)  # a try that fell into a hole of the link is not waited for
-        dealer.setsockopt(zmq.IPV6, int("[" in self.endpoint))
-        self._monitor = dealer.get_monitor_socket()
-        dealer.connect(self.endpoint)
-        self._dealer = dealer
-        self._connected_s = None
-        session = self._new_session(self.peer, connecting=True)
-        self._connection = _Connection(self.peer, session, self.endpoint.removeprefix("tcp://"))
-        self._flush()
-
-    def _hang_up(self, wait_s: float) -> None:
-        """Nothing of the old connection is kept: what it still held would only be old."""
-        if self._dealer is not None:
-            with contextlib.suppress(zmq.ZMQError):
-                self._dealer.disable_monitor()
-            self._dealer.close(linger=0)
-        if self._monitor is not None:
-            self._monitor.close(linger=0)
-        self._dealer = self._monitor = self._connection = None
-        self._next_try_s = time.monotonic() + wait_s
-
-    def _step(self) -> float:
-        with self._lock:
-            now = time.monotonic()
-            if self._dealer is None:
-                if now < self._next_try_s:
-                    return self._next_try_s - now
-                self._dial()
-            self._watch()
-            self._receive()
-            connection = self._connection
-            if connection is None:
-                return 0.0
-            if connection.session.up:
-                self._handle(connection.session.check())
-                self._flush()
-            elif self._connected_s is not None and now - self._connected_s > _GREETING_S:
-                self._say(f"{self.endpoint} answers, but does not greet: is it a bridge?")
-                self._hang_up(_RETRY_S)
-            return self._wait_s(self._connections()) if connection.session.up else 0.05
-
-    def _farewell(self) -> None:
-        with self._lock:
-            if self._connection is not None and self._connection.session.up:
-                self._connection.session.end("closing", f"{self.side.name} ends", tell=True)
-                self._flush()
-            if self._dealer is not None:
-                self._dealer.disable_monitor()
-
-    def _watch(self) -> None:
-        """What libzmq tells of the connection: why it is refused is known only here."""
-        while self._monitor is not None and int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
-            report = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
-            kind, value = report["event"], report["value"]
-            up = self._connection is not None and self._connection.session.up
-            if kind == zmq.EVENT_CONNECTED:
-                self._connected_s = time.monotonic()
-            elif kind == zmq.EVENT_DISCONNECTED and up:
-                assert self._connection is not None
-                self._handle(self._connection.session.end("gone", "the connection broke"))
-            elif kind == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
-                mine = fingerprint(self.identity.public_key)
-                self._say(
-                    f"{self.peer.name} at {self.endpoint} does not allow this host's key {mine} (status {value}): "
-                    f"run there `ic keys allow {self.identity.name} KEY`, with the key that `ic keys list` shows here"
-                )
-                self._hang_up(_REFUSED_RETRY_S)
-            elif kind in (zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL):
-                self._failures += 1
-                if self._failures < 2:  # once may be a connection that broke in the middle of it
-                    self._hang_up(_RETRY_S)
-                    return
-                self._say(
-                    f"{self.endpoint} hangs up before it has proved the key of {self.peer.name} "
-                    f"({self.peer.fingerprint}): another machine, a new key (`ic keys list` there, "
-                    f"`ic keys allow {self.peer.name} KEY` here), or a network that breaks off"
-                )
-                self._hang_up(_UNPROVED_RETRY_S)
-            elif kind == zmq.EVENT_CONNECT_RETRIED and not up:
-                self._say(f"{self.endpoint} cannot be reached: is the robot's bridge running, is the address right?")
-
-    def _receive(self) -> None:
-        for _ in range(_RECEIVE_MOST):
-            if self._dealer is None or self._connection is None:
-                return
-            try:
-                frames = self._dealer.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
-                return
-            if len(frames) == 1:
-                self._handle(self._connection.session.receive(frames[0].buffer))
-
-    def _flush(self) -> None:
-        if self._connection is None or self._dealer is None:
-            return
-        for data in self._connection.session.outgoing():
-            try:
-                self._dealer.send(data, zmq.NOBLOCK)
-            except zmq.Again:
-                self._handle(self._connection.session.end("gone", "the link takes nothing any more"))
-                return
-
-    def _handle(self, events: list[Event]) -> None:
-        assert self._connection is not None
-        connection = self._connection
-        for event in events:
-            if isinstance(event, Up):
-                self._failures = 0
-                self._give_latched(connection.session)
-                self._say("")
-            self._emit(connection.peer.name, event)
-            if isinstance(event, Ended):
-                self._flush()  # a last word, where there is one
-                self._say(f"{connection.peer.name}: {event.reason}")
-                self._hang_up(_REFUSED_RETRY_S if event.code in ("version", "revoked", "replaced") else _RETRY_S)
-                return
-
-    def _say(self, problem: str) -> None:
-        if problem != self._problem:
-            self._problem = problem
-            self._emit("", Problem(problem))
+        return min((max(0, c.session.next_due_ns() - now) / 1e9 for c in connections), default=IDLE_S)
 
 
 def check_endpoint(endpoint: str, listening: bool) -> tuple[str, int]:
@@ -752,23 +356,3 @@ def check_endpoint(endpoint: str, listening: bool) -> tuple[str, int]:
         example = "tcp://0.0.0.0:7450" if listening else "tcp://192.168.1.20:7450"
         raise LinkError(f"{endpoint!r} is no address: it must look like {example}")
     return match[1], port
-
-
-def _remote_of(file: int) -> Any:
-    """The other end of a connection's file; None when it is gone."""
-    try:
-        with socket.socket(fileno=os.dup(file)) as copy:
-            return copy.getpeername()
-    except OSError:
-        return None
-
-
-def _shut(connection: _Connection) -> None:
-    """Cuts a connection off, so that its host hears of it at once and does not wait for its timeout."""
-    try:
-        with socket.socket(fileno=os.dup(connection.file)) as copy:
-            # libzmq may have closed it and the number may be somebody else's by now.
-            if connection.remote is not None and copy.getpeername() == connection.remote:
-                copy.shutdown(socket.SHUT_RDWR)
-    except OSError:
-        return

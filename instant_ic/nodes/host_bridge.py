@@ -11,19 +11,19 @@ from typing import Any
 
 from instant_ic.base.recent import RecentCount
 from instant_ic.bridge.host_bus import ExportedTopics, ImportedTopics
+from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyFileError, KeyStore
 from instant_ic.bridge.host_link import (
-    ConnectingLink,
     Failed,
     HostLink,
     LinkError,
     LinkEvent,
-    ListeningLink,
     PeerStatus,
     Problem,
     Stranger,
     check_endpoint,
 )
+from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Side, Up
 from instant_ic.bridge.host_topics import TopicCounts, parse_rules
 from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main

@@ -5,7 +5,7 @@ import time
 import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
 
-from instant_ic.bridge import host_link
+from instant_ic.bridge import host_listener
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_session import LinkTimes
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, NodeError, ParameterError, params, registry
@@ -289,7 +289,7 @@ def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
     # The first station's link breaks and comes back: its old release is no news.
     broken_s = time.monotonic()
     with a.node.link._lock:
-        host_link._shut(next(c for c in a.node.link._connections() if c.peer.name == "station"))
+        host_listener._shut(next(c for c in a.node.link._connections() if c.peer.name == "station"))
 
     def back():
         up_s = [peer.up_s for peer in a.node.link.peers() if peer.name == "station"]

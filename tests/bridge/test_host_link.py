@@ -10,16 +10,10 @@ import time
 import pytest
 import zmq
 
+from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
-from instant_ic.bridge.host_link import (
-    ConnectingLink,
-    Failed,
-    LinkError,
-    ListeningLink,
-    Problem,
-    Stranger,
-    check_endpoint,
-)
+from instant_ic.bridge.host_link import Failed, LinkError, Problem, Stranger, check_endpoint
+from instant_ic.bridge.host_listener import ListeningLink
 from instant_ic.bridge.host_protocol import VERSION, Hello
 from instant_ic.bridge.host_session import Arrived, Ended, LinkTimes, Side, Up
 from instant_ic.bridge.host_topics import TopicRule
