@@ -6,8 +6,6 @@ of its own.
 
 from __future__ import annotations
 
-import concurrent.futures
-import json
 import socket
 import threading
 import time
@@ -16,15 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, ParameterError, Publisher, Subscription
-from ..bus.control import ControlError, NodeControl
+from ..bus import ERROR, OK, WARN, Node, Subscription
 from ..bus.qos import PRESETS, RELIABLE
 from ..bus.registry import NodeInfo, TopicInfo
 from ..bus.transport import Received
-from ..msg import MessageError, deserialize, message_type, stamp_ns, twist_stamped, twist_values, typestore
-from .commands import CommandGate, CommandRefused
+from ..msg import MessageError, typestore
+from .commands import CommandGate
+from .foxglove_commands import Commands
+from .foxglove_parameters import Parameters
 
-_PARAMETER_TIMEOUT_S = 1.0
 _SETTLE_S = 0.1
 _PARAMETER_FIELDS = {
     1: "bool_value",
@@ -36,8 +34,6 @@ _PARAMETER_FIELDS = {
     8: "double_array_value",
     9: "string_array_value",
 }
-DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
-_COMMAND_TYPES = {DRIVE: ("TwistStamped", "Twist"), STOP: ("Bool",)}
 
 
 class FoxgloveError(RuntimeError):
@@ -301,158 +297,6 @@ class _Channel:
             self._node.drop(self.subscription)
             self.subscription = None
         self._channel.close()
-
-
-class Parameters:
-    """Parameters of all nodes of a run directory, as ``/node.key``; asked of the nodes themselves.
-
-    Args:
-        run_dir: the run directory.
-    """
-
-    def __init__(self, run_dir: Path) -> None:
-        self._run_dir = run_dir
-        self._pool = concurrent.futures.ThreadPoolExecutor(8, thread_name_prefix="parameters")
-        self.nodes: tuple[str, ...] = ()
-
-    def _control(self, node: str) -> NodeControl:
-        return NodeControl(self._run_dir, node, _PARAMETER_TIMEOUT_S)
-
-    def _of(self, node: str) -> tuple[dict[str, Any], str]:
-        try:
-            return {f"/{node}.{key}": value for key, value in self._control(node).get().items()}, ""
-        except (ControlError, ParameterError) as error:
-            return {}, str(error)
-
-    def get(self, names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-        """Values by name, of all parameters of all nodes without names; and which nodes did not answer, in words."""
-        nodes = {_split(name)[0] for name in names} if names else set(self.nodes)
-        values: dict[str, Any] = {}
-        silent = []
-        for found, words in self._pool.map(self._of, sorted(nodes)):
-            values.update(found)
-            silent += [words] if words else []
-        return {name: values[name] for name in names if name in values} if names else values, silent
-
-    def set(self, wanted: dict[str, Any]) -> list[str]:
-        """Changes parameters, those of one node together; returns what was refused, in words."""
-        by_node: dict[str, dict[str, Any]] = {}
-        for name, value in wanted.items():
-            node, key = _split(name)
-            by_node.setdefault(node, {})[key] = value
-        refused = []
-        for node, values in by_node.items():
-            try:
-                self._control(node).set(values)
-            except (ControlError, ParameterError) as error:
-                refused.append(f"{node}: {error}")
-        return refused
-
-    def close(self) -> None:
-        """Ends the threads."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-
-def _split(name: str) -> tuple[str, str]:
-    """``/node.group.key`` as node and key."""
-    node, _, key = name.strip("/").partition(".")
-    return node, key
-
-
-class Commands:
-    """Commands of clients: checked, then published as the console's would be.
-
-    Args:
-        node: publishes them.
-        gate: what they have to pass.
-        tell: words for the client.
-    """
-
-    def __init__(self, node: Node[Any], gate: CommandGate, tell: Callable[[str], None]) -> None:
-        self._node = node
-        self._gate = gate
-        self._tell = tell
-        self._lock = threading.Lock()
-        self._channels: dict[tuple[int, int], Any] = {}
-        self._told: set[str] = set()
-        self._drive: Publisher = node.publisher(DRIVE, message_type("TwistStamped"), SENSOR)
-        self._stop: Publisher = node.publisher(STOP, message_type("Bool"), LATCHED)
-
-    def advertised(self, client: int, channel: Any) -> None:
-        """A client is going to publish."""
-        kinds = _COMMAND_TYPES.get(channel.topic)
-        name = channel.schema_name.rsplit("/", 1)[-1]
-        if kinds is None or name not in kinds or channel.encoding not in ("cdr", "json"):
-            known = "; ".join(f"{topic} ({' or '.join(names)})" for topic, names in _COMMAND_TYPES.items())
-            self._tell(
-                f"{channel.topic} {channel.schema_name} {channel.encoding} is not taken; only {known}, cdr or json"
-            )
-            return
-        self._channels[client, channel.id] = channel
-
-    def unadvertised(self, client: int, channel_id: int) -> None:
-        """A client has left, or publishes no more: the robot it drove stands at once."""
-        channel = self._channels.pop((client, channel_id), None)
-        if channel is None or channel.topic != DRIVE:
-            return
-        with self._lock:
-            driving = self._gate.release(f"client {client}")
-        if driving:
-            self._drive.publish(twist_stamped(0.0, 0.0, self._node.clock.now_ns()))
-
-    def message(self, client: int, channel_id: int, data: bytes) -> None:
-        """A client's message."""
-        channel = self._channels.get((client, channel_id))
-        if channel is None:  # told at its advertisement
-            return
-        name = channel.schema_name.rsplit("/", 1)[-1]
-        try:
-            with self._lock:
-                if channel.topic == STOP:
-                    value = _json(data)["data"] if channel.encoding == "json" else deserialize(data, "Bool").data
-                    if not isinstance(value, bool):
-                        raise MessageError(f"data must be true or false (got {value!r})")
-                    self._stop.publish(message_type("Bool")(value))
-                    return
-                self._drive_by(client, name, channel.encoding, data)
-        except CommandRefused as error:
-            self._refused(f"command refused: {error}")
-        except (MessageError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON of any shape
-            self._refused(f"command refused: {channel.topic}: {type(error).__name__}: {error}")
-
-    def _drive_by(self, client: int, name: str, encoding: str, data: bytes) -> None:
-        now_ns = self._node.clock.now_ns()
-        sent_ns = 0
-        if encoding == "cdr":
-            message = deserialize(data, name)
-            v, w = twist_values(message)
-            sent_ns = stamp_ns(message) if name == "TwistStamped" else 0
-        else:
-            content = _json(data)
-            twist = content["twist"] if name == "TwistStamped" else content
-            v, w = float(twist["linear"]["x"]), float(twist["angular"]["z"])
-            stamp = content.get("header", {}).get("stamp", {})
-            sent_ns = int(stamp.get("sec", 0)) * 1_000_000_000 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
-        if sent_ns:  # a client without a clock (Foxglove's teleop panel) stamps nothing: its arrival counts
-            self._gate.check_age(sent_ns, now_ns)
-        self._gate.check_drive(f"client {client}", v, w, now_ns)
-        self._drive.publish(twist_stamped(v, w, sent_ns or now_ns))
-        if self._told:
-            self._told.clear()
-            self._node.call_soon(self._node.diagnose, "commands", OK, "commands come in")
-
-    def _refused(self, words: str) -> None:
-        if words not in self._told:
-            self._told.add(words)
-            self._tell(words)
-        self._node.call_soon(self._node.diagnose, "commands", ERROR, words)
-
-
-def _json(data: bytes) -> dict[str, Any]:
-    content = json.loads(data)
-    if not isinstance(content, dict):
-        raise MessageError("not a JSON object")
-    return content
 
 
 def _listener(server: FoxgloveServer) -> Any:

@@ -1,0 +1,69 @@
+"""Parameters of all nodes of a run directory under one roof."""
+
+from __future__ import annotations
+
+import concurrent.futures
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..bus import ParameterError
+from ..bus.control import ControlError, NodeControl
+
+_TIMEOUT_S = 1.0
+
+
+class Parameters:
+    """Parameters of all nodes of a run directory, as ``/node.key``; asked of the nodes themselves.
+
+    Args:
+        run_dir: the run directory.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._pool = concurrent.futures.ThreadPoolExecutor(8, thread_name_prefix="parameters")
+        self.nodes: tuple[str, ...] = ()
+
+    def _control(self, node: str) -> NodeControl:
+        return NodeControl(self._run_dir, node, _TIMEOUT_S)
+
+    def _of(self, node: str) -> tuple[dict[str, Any], str]:
+        try:
+            return {f"/{node}.{key}": value for key, value in self._control(node).get().items()}, ""
+        except (ControlError, ParameterError) as error:
+            return {}, str(error)
+
+    def get(self, names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
+        """Values by name, of all parameters of all nodes without names; and which nodes did not answer, in words."""
+        nodes = {_split(name)[0] for name in names} if names else set(self.nodes)
+        values: dict[str, Any] = {}
+        silent = []
+        for found, words in self._pool.map(self._of, sorted(nodes)):
+            values.update(found)
+            silent += [words] if words else []
+        return {name: values[name] for name in names if name in values} if names else values, silent
+
+    def set(self, wanted: dict[str, Any]) -> list[str]:
+        """Changes parameters, those of one node together; returns what was refused, in words."""
+        by_node: dict[str, dict[str, Any]] = {}
+        for name, value in wanted.items():
+            node, key = _split(name)
+            by_node.setdefault(node, {})[key] = value
+        refused = []
+        for node, values in by_node.items():
+            try:
+                self._control(node).set(values)
+            except (ControlError, ParameterError) as error:
+                refused.append(f"{node}: {error}")
+        return refused
+
+    def close(self) -> None:
+        """Ends the threads."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _split(name: str) -> tuple[str, str]:
+    """``/node.group.key`` as node and key."""
+    node, _, key = name.strip("/").partition(".")
+    return node, key
