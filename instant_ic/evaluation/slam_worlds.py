@@ -241,9 +241,7 @@ def office(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
         while xs[-1] < 27.0:
             xs.append(xs[-1] + float(rng.uniform(3.0, 5.0)))
         xs[-1] = 31.0
-        walls += _line(
-            -1.0, wall_y, 31.0, wall_y, [((a + b) / 2 - 0.5 + 1.0, 1.0) for a, b in itertools.pairwise(xs)]
-        )
+        walls += _line(-1.0, wall_y, 31.0, wall_y, [((a + b) / 2 - 0.5 + 1.0, 1.0) for a, b in itertools.pairwise(xs)])
         walls += [(-1.0, back_y, 31.0, back_y)] + [(x, wall_y, x, back_y) for x in xs]
         for a, b in itertools.pairwise(xs):
             for _ in range(3):
