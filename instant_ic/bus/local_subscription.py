@@ -49,6 +49,7 @@ _LEAST_ROOM = 4096
 _VIEW_FROM_BYTES = 16_384
 _FDS_SPACE = socket.CMSG_SPACE(4 * 8)
 _FULL_LOOK_S = 1.0
+_new = tuple.__new__  # what Received(...) ends in, without the call into Python between
 
 log = logging.getLogger(__name__)
 
@@ -121,6 +122,12 @@ class Inlet:
             self._room = min(2 * count, RECEIVE_BYTES) if full else max(count + 256, _LEAST_ROOM)
             if self._rest:
                 data, self._rest = self._rest + data, b""
+            elif count >= HEADER.size and not full:
+                kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(data)
+                if kind == DATA and size + HEADER.size == count:  # one whole message: the usual case
+                    payload = data[HEADER.size :] if size < _VIEW_FROM_BYTES else memoryview(data)[HEADER.size :]
+                    self._deliver(self, sequence, skipped, publish_ns, payload)
+                    return True
             self._parse(data)
             if not full and self._body is None and not ancillary:
                 return True  # it was all there was
@@ -325,8 +332,9 @@ class LocalSubscription:
             self._refuse(inlet)
             return
         steady = self._steady_ns()
-        message = Received(
-            self.topic, inlet.type_name, payload, publish_ns, self._now_ns(), self._next_order(), node, steady
+        message = _new(
+            Received,
+            (self.topic, inlet.type_name, payload, publish_ns, self._now_ns(), self._next_order(), node, steady),
         )
         with self._lock:
             queue = self._queue
