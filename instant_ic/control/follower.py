@@ -22,9 +22,6 @@ from .planner import Plan
 CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
 """Of the lookahead: the carrot comes nearer where the arc to it would touch something."""
 
-CREEP_M_S = 0.1
-"""Where even the nearest carrot's arc grazes a cell."""
-
 
 @dataclass(frozen=True)
 class FollowerConfig:
@@ -159,8 +156,7 @@ class PathFollower:
             if self._arc_is_free(pose, sign * curvature, sign * length, costmap):
                 break
         else:
-            # Cells are coarser than the collision monitor's points: it decides whether there is room.
-            v = min(v, CREEP_M_S)
+            return FollowerCommand((0.0, 0.0), "blocked")
         self._rotating = False
         radius = 1.0 / abs(curvature) if curvature != 0.0 else math.inf
         v *= min(1.0, radius / c.regulated_linear_scaling_min_radius)
