@@ -51,7 +51,7 @@ def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
 @pytest.mark.parametrize("box", [BOX, (2.2, -0.6, 3.0, 0.1), (2.5, -1.2, 3.0, 0.1)])
 def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped: bool) -> None:
     made = loop(box, mapped)
-    drive(made, 20.0, FORWARD)
+    drive(made, 23.0, FORWARD)
     assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
     virtual = [f for f in made.frames if f.decision.mode == Mode.VIRTUAL]
     # The v-bot starts at the r-bot's pose and goes straight through; the r-bot goes round.
