@@ -322,9 +322,11 @@ def main():
         run = globals()[transport + "_sub"](topics, address, receiver)
 
         def serve():
-            for _ in sys.stdin:
-                answer({**receiver.collect(), "cpu_s": time.process_time()})
-            os._exit(0)
+            try:
+                for _ in sys.stdin:
+                    answer({**receiver.collect(), "cpu_s": time.process_time()})
+            finally:  # whatever the main thread is doing
+                os._exit(0)
 
         threading.Thread(target=serve, daemon=True).start()
         answer("ready")
