@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
 from instant_ic.slam.config import FieldConfig, LoopConfig, SlamConfig
@@ -40,6 +41,7 @@ class Outcome:
     Attributes:
         count: keyframes that it knows.
         poses: of these (count, 3); None: not changed.
+        alive: which of them have not been taken out, positions in growing order.
         drift: covariance of the last one in the map (3, 3).
         map: drawn anew from all of them; None: not.
         merged: keyframes taken out, each with the one that stands for it and its pose there (3,).
@@ -48,6 +50,7 @@ class Outcome:
 
     count: int
     poses: FloatArray | None
+    alive: NDArray[np.intp]
     drift: FloatArray
     map: OccupancyMap | None
     merged: list[tuple[int, int, FloatArray]]
@@ -119,7 +122,9 @@ class BackEnd:
         drift = self._drifts[-1] if self._drifts else np.zeros((3, 3))
         redrawn = self._redraw(last) if changed or last else None
         merged, self._merged = self._merged, []
-        return Outcome(len(self), self.poses.copy() if changed else None, drift, redrawn, merged, list(self.edges))
+        poses = self.poses.copy() if changed else None
+        alive = np.flatnonzero(self._alive[: len(self)])
+        return Outcome(len(self), poses, alive, drift, redrawn, merged, list(self.edges))
 
     def load(self, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
         """Begin with a saved graph; its first keyframe stays where it is."""

@@ -271,8 +271,8 @@ class GridSlam:
         keyframes = self.front_end.trajectory.keyframes
         if outcome.poses is not None:
             moved = correction(keyframes[outcome.count - 1].map_from_base, outcome.poses[-1])
-            for keyframe, pose in zip(keyframes, outcome.poses, strict=False):
-                keyframe.map_from_base = pose
+            for k in outcome.alive:
+                keyframes[k].map_from_base = outcome.poses[k]
             for keyframe in keyframes[outcome.count :]:
                 keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
             self.front_end.redraw()
