@@ -39,7 +39,11 @@ def test_nobody_imports_a_node():
 
 
 def test_geometry_msg_and_bus_import_only_downwards():
-    allowed = {"geometry": {"geometry"}, "msg": {"msg", "geometry"}, "bus": {"bus", "msg", "geometry", "paths", "ranges"}}
+    allowed = {
+        "geometry": {"geometry"},
+        "msg": {"msg", "geometry"},
+        "bus": {"bus", "msg", "geometry", "paths", "ranges"},
+    }
     for folder, targets in allowed.items():
         for file in (PACKAGE / folder).rglob("*.py"):
             wrong = {i for i in imports(file) if len(i.split(".")) > 1 and i.split(".")[1] not in targets}

@@ -186,6 +186,11 @@ class _Reader:
         """Whether something is still to be sent."""
         return not (self.gone or self.deaf) and (self._part is not None or bool(self._queue))
 
+    @property
+    def untaken(self) -> int:
+        """How many messages of a queue are still to be sent; who wants the newest only loses none."""
+        return len(self._queue) + (self._part is not None) if self.waiting and self.depth > 1 else 0
+
     def close(self) -> None:
         """Lets go of the connection and of all that was lent to it."""
         self.gone, self.prompt = True, False
@@ -454,6 +459,11 @@ class LocalPublisher:
                     reader.flush()
             time.sleep(0.002)
         with self._lock:
+            untaken = sum(reader.untaken for reader in self._readers.values())
+            if untaken:  # no later message will show the readers this gap
+                log.warning(
+                    "%s ends with %d messages that its readers were too slow to take: lost", self.topic, untaken
+                )
             for reader in list(self._readers.values()):
                 self._drop(reader)
             self._pool.close()

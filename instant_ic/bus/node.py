@@ -330,9 +330,11 @@ class Node(Generic[ConfigT]):
 
         return self._subscribe(topic, None, forward, qos)
 
-    def subscribe_received(self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE) -> Subscription:
-        """As :meth:`subscribe_raw` with all that is known of a message, its publisher too; for bridges."""
-        return self._subscribe(topic, None, callback, qos)
+    def subscribe_received(
+        self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE, message_class: Any = None
+    ) -> Subscription:
+        """As :meth:`subscribe_raw` with all that is known of a message, its publisher too; of one type where given."""
+        return self._subscribe(topic, type_name(message_class) if message_class else None, callback, qos)
 
     def drop(self, item: Publisher | Subscription) -> None:
         """Ends a publisher or a subscription while the node goes on, as a bridge does when a topic leaves."""

@@ -33,6 +33,8 @@ WALL_M = 0.10
 PERSON_M = 0.22
 """Radius of a person."""
 KINDS = ("wall", "box", "low", "hanging")
+BLIND_M = LIDAR_HEIGHT_M / math.tan(math.radians(15.0))
+"""Nearer than this the lowest beam of a standing VLP-16 does not reach the floor."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,13 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
         # What stands in the start or in the goal is taken away.
         start = np.array([*rng.uniform([0.8, 0.8], size - 0.8), rng.uniform(-math.pi, math.pi)])
         goal = rng.uniform([0.8, 0.8], size - 0.8)
+        # A robot that has driven to its start has seen what is low round it. One that is put there has not: no beam
+        # reaches that, and nobody could drive by it.
         clear = np.array(
-            [k == 0 or min(_away(s, start[:2]), _away(s, goal)) > 0.6 for s, k in zip(every, kinds, strict=True)]
+            [
+                k == 0 or (_away(s, start[:2]) > (BLIND_M if KINDS[k] == "low" else 0.6) and _away(s, goal) > 0.6)
+                for s, k in zip(every, kinds, strict=True)
+            ]
         )
         every, kept = every[clear], np.array(kinds)[clear]
         if min(_away(s, p) for s in walls for p in (start[:2], goal)) < 0.6:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
+from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
 from instant_ic.control.heights import SortedPoints, sort_points
@@ -30,6 +31,7 @@ from instant_ic.msg import (
     TwistStamped,
     VspaceStatus,
     cloud_array,
+    deserialize,
     grid_array,
     grid_message,
     header,
@@ -91,6 +93,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.costmap_sent_ns: int | None = None
         self.camera_ns: int | None = None
         self.estop = False
+        self.stopped_by: tuple[str, int] = ("", 0)  # who asked last for the emergency stop, and when
         self.ticks = 0
 
         self.cmd_vel = self.publisher("/cmd_vel", TwistStamped, qos=SENSOR)
@@ -110,7 +113,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.nav = self.latest("/nav/cmd_vel", TwistStamped, max_age_s=10.0)
         self.vspace = self.latest("/vspace/status", VspaceStatus, max_age_s=60.0, qos=LATCHED)
         self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
-        self.subscribe("/operator/estop", Bool, self.on_estop, qos=LATCHED)
+        self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
         # Only its age matters: the picture is never decoded here.
         self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
         _ = self.tf  # listens from now on
@@ -146,8 +149,17 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def on_walls(self, walls: WallMap) -> None:
         self.walls = walls
 
-    def on_estop(self, message: Bool) -> None:
-        self.estop = bool(message.data)
+    def on_estop(self, received: Received) -> None:
+        """The latest word of any client holds.
+
+        Several clients each have a latched value, and after a restart of this node these come in any order: an old
+        release of one client must not end the stop of another.
+        """
+        if deserialize(received.payload, received.type_name).data:
+            self.estop = True
+            self.stopped_by = (received.publisher, max(received.publish_ns, self.stopped_by[1]))
+        elif received.publisher == self.stopped_by[0] or received.publish_ns > self.stopped_by[1]:
+            self.estop = False
         self.tick()  # not at the next timer: now
 
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:

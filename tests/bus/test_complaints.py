@@ -3,9 +3,11 @@
 import errno
 import gc
 import os
+import re
 import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -18,6 +20,7 @@ from local_bus import BYTES, LARGE, Bus, number, numbered, wait_for, whole
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, QoS, RegistryError, registry
 from instant_ic.bus.clock import SystemClock
+from instant_ic.bus.frame import GREETING, HEADER, MAGIC, VERSION
 from instant_ic.bus.node import Node
 from instant_ic.msg import Image, deserialize, image_array, image_message
 
@@ -311,6 +314,26 @@ def test_message_of_another_type_is_refused_counted_and_named(bus: Bus, caplog: 
     assert reader.poll() == []
     assert "/x: node sender sends std_msgs/msg/Bool, std_msgs/msg/String expected" in caplog.text
     assert caplog.text.count("refused and counted") == 1  # told once, not with every message
+
+
+def test_dora_515_a_publisher_that_ends_tells_what_its_readers_were_too_slow_to_take(
+    bus: Bus, caplog: pytest.LogCaptureFixture
+) -> None:
+    """No later message will show the gap."""
+    out = bus.publisher()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sleeper:  # takes nothing
+        sleeper.connect(str(registry.topic_publishers(bus.run_dir, "/x")[0].socket))
+        sleeper.send(GREETING.pack(MAGIC, VERSION, True, 1000))
+        wait_for(lambda: out.subscriber_count == 1)
+        for k in range(60):
+            out.send(numbered(k, 50_000))
+        out.close()
+        sleeper.settimeout(10.0)
+        taken = 0
+        while data := sleeper.recv(1 << 20):
+            taken += len(data)
+    untaken = int(re.search(r"ends with (\d+) messages that its readers were too slow", caplog.text)[1])
+    assert 60 - untaken == taken // (50_000 + HEADER.size)
 
 
 def test_no_memory_for_a_buffer_sends_through_the_socket_and_tells(bus: Bus, caplog: pytest.LogCaptureFixture) -> None:

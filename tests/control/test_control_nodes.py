@@ -12,6 +12,7 @@ from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor
 
 from instant_ic.bus import OK, WARN, params
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.bus.transport import Received
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
     POINT_DTYPE,
@@ -31,6 +32,7 @@ from instant_ic.msg import (
     pose_matrix,
     pose_message,
     scan_message,
+    serialize,
     to_time,
     transform_message,
     twist_stamped,
@@ -70,8 +72,9 @@ class Stack:
         static = draw_map(walls, (-2, -1.2, 14, 1.2))
         self.bus = LockstepBus(start_ns=1_000_000_000_000)
         self.base = Base()
-        for node in (VirtualRobotNode, NavigatorNode, ArbiterNode):
+        for node in (VirtualRobotNode, NavigatorNode):
             self.bus.add(node)
+        self.arbiter = self.bus.add(ArbiterNode)
         self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
         lidar = np.eye(4)
         lidar[2, 3] = 0.6
@@ -221,6 +224,21 @@ def test_emergency_stop_acts_at_once_and_holds() -> None:
     stack.bus.publish("/operator/estop", Bool(data=False), latched=True)
     assert stack.drive(1.0, (0.4, 0.0))[-1].mode == ControlState.STOPPED  # the key is still down
     assert stack.drive(0.5, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+@pytest.mark.parametrize("release_first", [True, False])
+def test_an_old_release_of_one_client_does_not_end_the_emergency_stop_of_another(release_first: bool) -> None:
+    """As after a restart of the arbiter, when the latched values of all clients come in any order."""
+    stack = Stack(np.zeros((0, 2, 2)))
+    stop, release = (
+        Received("/operator/estop", "std_msgs/msg/Bool", bytes(serialize(Bool(data=data))), stamp, 0, 0, node)
+        for data, stamp, node in ((True, 2_000, "console"), (False, 1_000, "host_bridge"))
+    )
+    for received in (release, stop) if release_first else (stop, release):
+        stack.arbiter.on_estop(received)
+    assert stack.arbiter.estop
+    stack.arbiter.on_estop(release._replace(publish_ns=3_000))  # its latest word
+    assert not stack.arbiter.estop
 
 
 def test_the_robot_stands_when_the_navigator_or_the_vbot_dies() -> None:
