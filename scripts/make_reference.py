@@ -18,7 +18,13 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "docs" / "reference.md"
-CALLS = {"publisher": "gives", "subscribe": "takes", "latest": "takes"}
+CALLS = {
+    "publisher": "gives",
+    "subscribe": "takes",
+    "latest": "takes",
+    "subscribe_raw": "takes",
+    "subscribe_received": "takes",
+}
 
 
 def node_class(module: types.ModuleType) -> Any:
@@ -41,7 +47,10 @@ def topics(source: str) -> dict[str, dict[str, str]]:
         if name in CALLS and len(arguments) >= 2 and isinstance(arguments[0], ast.Constant):
             topic = arguments[0].value
             if isinstance(topic, str) and topic.startswith("/"):
-                found[CALLS[name]][topic] = ast.unparse(arguments[1])
+                kind = arguments[1]
+                if name in ("subscribe_raw", "subscribe_received"):  # its bytes are handed on, or read by the callback
+                    kind = next((k.value for k in call.keywords if k.arg == "message_class"), ast.Name("bytes"))
+                found[CALLS[name]][topic] = ast.unparse(kind)
         elif name == "tf_broadcast":
             found["gives"]["/tf"] = "TFMessage"
         elif name == "tf_broadcast_static":
