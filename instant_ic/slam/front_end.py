@@ -17,6 +17,8 @@ from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
 RECOVERY_MARGIN = 0.1
 """By so much must the score of the wide search exceed that of the first one."""
+START_KEYFRAMES = 4
+"""So many keyframes a robot may take from where it stands at the start."""
 
 
 KNOWN_MAP_STEP_M = 2.0
@@ -143,7 +145,7 @@ class FrontEnd:
         if self.in_known_map:
             if math.hypot(*(match.pose[:2] - self._drawn_at)) > KNOWN_MAP_STEP_M:
                 self._draw_known(match.pose)
-        elif self._moved(match.pose):
+        elif self._moved(match.pose) or self._first_was_poor(match, status):
             added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
         return Track(match.pose, match.covariance, match.score, status, added)
 
@@ -178,6 +180,13 @@ class FrontEnd:
         turn = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
         self._covariance = self._covariance + turn @ np.diag(guess.sigma**2) @ turn.T
         return self._covariance
+
+    def _first_was_poor(self, match: Match, status: TrackStatus) -> bool:
+        """Whether a robot that still stands where it began sees more than its map has: half a revolution, no odometry
+        yet. It would search far and wide at each scan until it moves.
+        """
+        few = len(self.trajectory) < START_KEYFRAMES
+        return few and status is TrackStatus.TRACKED and match.score < self.config.match.recovery_score
 
     def _moved(self, pose: FloatArray) -> bool:
         last = self.trajectory.keyframes[-1].map_from_base
