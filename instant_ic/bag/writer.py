@@ -64,8 +64,6 @@ class BagWriter:
         self.max_bytes = max_bytes
         self.max_duration_ns = int(max_duration_s * 1e9)
         self.bytes = 0
-        self.not_written = 0
-        """Messages given to it that a full disk left no place for."""
         self.unknown_types: dict[str, str] = {}
         """Type → topic of what is recorded without its definition, which nobody here knows."""
         self._topics: dict[Topic, tuple[QoS, Schema]] = {}
@@ -295,13 +293,12 @@ class BagWriter:
         counts = part.file.counts
         part.info.counts = {topic: counts[channel] for topic, channel in part.channels.items()}
         part.info.start_ns, part.info.end_ns = part.file.span_ns
-        if lost := part.given - part.info.count:
+        if part.given > part.info.count:
             on_disk = {
                 topic: sum(n for t, n in part.info.counts.items() if t[0] == topic) for topic in part.info.repeated
             }
             part.info.repeated = {t: min(n, on_disk[t]) for t, n in part.info.repeated.items() if on_disk[t]}
             self._unsure = True
-            self.not_written += lost - (part.repeats - sum(part.info.repeated.values()))
         self._done.append(part.info)
 
     def _write_metadata(self) -> None:

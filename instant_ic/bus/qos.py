@@ -21,11 +21,6 @@ class QoS:
     latched: bool = False
     reliable: bool = False
 
-    @property
-    def high_water_mark(self) -> int:
-        """Messages that ZeroMQ may hold on each side while the reader's thread is kept from running."""
-        return max(self.depth, 32)
-
 
 SENSOR = QoS("sensor", depth=1)
 """Newest only: a slow node works on the newest message, never on a queue of old ones."""

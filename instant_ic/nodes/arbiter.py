@@ -267,8 +267,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if (stamp_ns(scan), points_ns) == self.taken:
             return
         try:
-            map_from_lidar = self.tf.lookup("map", scan.header.frame_id, stamp_ns(scan))
+            # SLAM's correction changes slowly and comes later than the scan: the newest is good for it.
             map_from_odom = self.tf.lookup("map", "odom")
+            map_from_lidar = map_from_odom @ self.tf.lookup("odom", scan.header.frame_id, stamp_ns(scan))
         except TransformError as error:
             self.diagnose("costmap", WARN, f"costmap stands still: {error}")
             return

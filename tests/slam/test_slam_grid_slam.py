@@ -115,6 +115,20 @@ def test_the_first_pose_is_odometrys() -> None:
     assert np.array_equal(result.map_from_base, start)
 
 
+def test_a_poor_first_scan_is_made_up_for_where_the_robot_stands() -> None:
+    """Half a revolution, as a LiDAR gives that has just been switched on: the rest must not be looked for for ever."""
+    drive = Drive(box_room())
+    drive.stamp_ns += STEP_NS
+    whole = drive.world.scan(drive.true, drive.stamp_ns, noise_m=0.015)
+    half = np.where(np.arange(len(whole.ranges)) < 400, whole.ranges, np.inf)
+    drive.slam.process(Scan(half, whole.angle_min, whole.angle_increment, 0.3, 30.0, drive.stamp_ns), np.zeros(3))
+    drive.go(0.0, 0.0, 20)
+    assert drive.results[0].score < drive.slam.config.match.recovery_score
+    assert [result.keyframe_added for result in drive.results] == [True] + [False] * 19
+    assert min(result.score for result in drive.results[1:]) > 0.85
+    assert max(error for error, _ in drive.errors) < 0.02
+
+
 def test_keyframes_come_with_motion_only() -> None:
     drive = Drive(box_room())
     drive.go(0.0, 0.0, 20)
