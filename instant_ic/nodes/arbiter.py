@@ -152,14 +152,28 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def on_estop(self, received: Received) -> None:
         """The latest word of any client holds.
 
-        Several clients each have a latched value, and after a restart of this node these come in any order: an old
-        release of one client must not end the stop of another.
+        Several clients each have a latched value, and after a restart of this node or of a bridge these come in any
+        order: an old release of one client must not end the stop of another.
         """
+        publisher, stopped_ns = self.stopped_by
         if deserialize(received.payload, received.type_name).data:
             self.estop = True
-            self.stopped_by = (received.publisher, max(received.publish_ns, self.stopped_by[1]))
-        elif received.publisher == self.stopped_by[0] or received.publish_ns > self.stopped_by[1]:
+            same = (
+                received.publisher == publisher
+            )  # also after its clock was set back: its stop and release go together
+            self.stopped_by = (
+                received.publisher,
+                received.publish_ns if same else max(received.publish_ns, stopped_ns),
+            )
+        elif received.publish_ns >= stopped_ns:
             self.estop = False
+        elif self.estop:
+            self.log.warning(
+                "emergency stop: a release by %s is older than the stop by %s and not heeded; if a clock was set back, "
+                "press stop and release again",
+                received.publisher,
+                publisher,
+            )
         self.tick()  # not at the next timer: now
 
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
