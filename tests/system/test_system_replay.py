@@ -116,7 +116,9 @@ def test_depth_gets_its_scale_and_makes_fit_keyframes(replayed: tuple[Path, Path
 def test_live_replay_ends_with_the_bag(tmp_path: Path) -> None:
     record = tmp_path / "again"
     with tempfile.TemporaryDirectory(prefix="ic-") as run_dir:
-        done = ic("launch", "replay", f"bag:={BAG}", "packets:=true", f"record:={record}", run_dir=Path(run_dir))
+        done = ic(
+            "launch", "replay", f"bag:={BAG}", "packets:=true", "rate:=0.5", f"record:={record}", run_dir=Path(run_dir)
+        )
         left = list(Path(run_dir).glob("topics/*/*.sock"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "Traceback" not in done.stdout
