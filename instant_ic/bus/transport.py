@@ -1,4 +1,4 @@
-"""What a node needs of a transport; ZeroMQ and the lockstep bus implement it."""
+"""What a node needs of a transport; the local and the lockstep bus implement it."""
 
 from __future__ import annotations
 

@@ -233,6 +233,8 @@ class _Actions:
         self.declared.append(argument)
         if name in self.given:
             value = self.given[name]
+            if kind == "path" and value and self.depth == 0:  # from the command line: as the shell completes it
+                value = str(Path(value).expanduser().absolute())
         elif argument.default is not None:
             value = argument.default
         else:

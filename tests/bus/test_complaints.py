@@ -28,7 +28,7 @@ HERE = Path(__file__).parent
 PICTURE = (1080, 1700, 3)  # 5.5 MB
 
 
-def test_rclpy_763_slow_images_in_python(bus: Bus) -> None:
+def test_rclpy_763_rmw_fastrtps_757_slow_images_in_python(bus: Bus) -> None:
     """A picture is copied once: into the memory that its readers look at."""
     node = Node[None](None, bus.node("sender"), SystemClock(), "sender")
     out = node.publisher("/picture", Image, SENSOR)

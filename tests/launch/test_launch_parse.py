@@ -298,6 +298,18 @@ def test_arguments_have_types_and_choices(tmp_path: Path, program: Path) -> None
     assert read_launch_file(file).values["bag"] == ""  # an empty default may stay empty
 
 
+def test_a_path_of_the_command_line_is_the_shells_not_the_files(
+    tmp_path: Path, program: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    (tmp_path / "there").mkdir()
+    file = write(tmp_path / "there", "launch:\n- arg: {name: bag, type: path, default: lies_beside}\n")
+    monkeypatch.chdir(here)
+    assert read_launch_file(file, {"bag": "drive"}).values["bag"] == str(here / "drive")
+    assert read_launch_file(file).values["bag"] == "lies_beside"
+
+
 def test_wrong_values_of_arguments_are_told_once_each_at_the_arguments_line(tmp_path: Path, program: Path) -> None:
     file = write(tmp_path, TYPED)
     found = problems_of(file, port="x", rate="quick", dry="maybe", mode="medium", ros="c")
