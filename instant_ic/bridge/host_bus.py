@@ -13,6 +13,7 @@ from typing import Any
 from ..bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
 from ..bus.qos import PRESETS
 from ..bus.transport import Received, TransportError
+from ..msg import MessageError, deserialize
 from .host_link import HostLink
 from .host_protocol import Announce
 from .host_session import Arrived
@@ -22,7 +23,9 @@ BRIDGES = ("instant_ic.nodes.host_bridge", "instant_ic.nodes.zenoh_gateway")
 """Nodes that publish here what was published elsewhere: it is not sent on, or it would come back."""
 
 OLD_NEWS_NS = 1_000_000_000
-"""Words on a shared state older than the latest by more than this are not taken; no clock error is so large."""
+"""Words on a shared state older than the latest by more than this are not taken; no clock error is so large. A false
+Bool has no such grace: which of a release and a stop came first is then uncertain, and the stop must hold.
+"""
 
 
 class ExportedTopics:
@@ -85,6 +88,15 @@ class ExportedTopics:
             self._on_trouble(name, str(error))
 
 
+def _releases(arrived: Arrived) -> bool:
+    """Whether a word on a shared state is that of a released emergency stop."""
+    kind = arrived.announce.type_name
+    try:
+        return kind == "std_msgs/msg/Bool" and not deserialize(arrived.payload, kind).data
+    except MessageError:  # no word at all; who reads it here refuses it and tells
+        return False
+
+
 def _fields(qos: QoS) -> tuple[str, bool, bool]:
     return qos.name, qos.latched, qos.reliable
 
@@ -137,7 +149,8 @@ class ImportedTopics:
         with topic.lock:
             if topic.qos.latched:
                 if self._rules[announce.topic].shared:  # one state that several hosts set: only the latest word holds
-                    if arrived.born_ns < topic.newest_ns - OLD_NEWS_NS:
+                    grace_ns = 0 if _releases(arrived) else OLD_NEWS_NS
+                    if arrived.born_ns < topic.newest_ns - grace_ns:
                         self._node.log.warning("%s of %s is old news: left out", announce.topic, announce.origin)
                         return
                     topic.last.clear()

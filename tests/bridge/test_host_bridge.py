@@ -1,14 +1,18 @@
 """The bridge's node between two run directories of one machine: two hosts, as far as the bus can tell."""
 
 import time
+from dataclasses import dataclass, replace
 
 import pytest
 from live_nodes import LiveNode, Neighbour, wait_for
 
 from instant_ic.bridge import host_listener
+from instant_ic.bridge.host_bus import ImportedTopics
 from instant_ic.bridge.host_keys import KeyStore, Peer
-from instant_ic.bridge.host_session import LinkTimes
-from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, NodeError, ParameterError, params, registry
+from instant_ic.bridge.host_protocol import Announce
+from instant_ic.bridge.host_session import Arrived, LinkTimes
+from instant_ic.bridge.host_topics import TopicRule
+from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, params, registry
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import Bool, String, TFMessage, TwistStamped, deserialize, serialize, twist_stamped
 from instant_ic.nodes.host_bridge import HostBridgeConfig, HostBridgeNode, judge_clock
@@ -263,6 +267,45 @@ def test_diagnoses_tell_link_clock_topics_and_door(hosts):
 )
 def test_clock_that_is_wrong_is_a_warning_with_what_to_do(offset_ms, rtt_ms, level, text):
     assert judge_clock(offset_ms, rtt_ms, 50.0) == (level, text)
+
+
+@dataclass(frozen=True)
+class NoConfig:
+    pass
+
+
+class Importer(Node[NoConfig]):
+    name = "importer"
+
+    def setup(self):
+        rules = {"/operator/estop": TopicRule("/operator/estop", lane="command", shared=True)}
+        self.incoming = ImportedTopics(self, rules, lambda topic, text: pytest.fail(text))
+
+
+@pytest.mark.parametrize("release_ms", [100, 999, 1000])
+@pytest.mark.parametrize("stop_first", [True, False])
+def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_first, release_ms):
+    """A restarted bridge hears the latched values of all stations in any order; the stop is of 1000 ms."""
+    bus = LockstepBus()
+    importer = bus.add(Importer)
+    words = [
+        Arrived(Announce(1, "/operator/estop", origin, Bool.__msgtype__, "", "latched"), payload, born_ns, 0, born_ns)
+        for origin, payload, born_ns in (
+            ("tablet", bytes(serialize(Bool(data=True))), 1_000_000_000),
+            ("station", bytes(serialize(Bool(data=False))), release_ms * 1_000_000 - 1),
+            ("broken", b"\x00", 1_000_000_000),
+        )
+    ]
+    importer.incoming.open(words[0].announce)
+    bus.advance(0.1)
+    for word in words[:2] if stop_first else words[1::-1]:
+        importer.incoming.take(word)
+    assert bus.last("/operator/estop").data is True
+    later = replace(words[1], born_ns=1_000_000_001)
+    importer.incoming.take(later)
+    assert bus.last("/operator/estop").data is False  # the latest word
+    importer.incoming.take(replace(words[2], born_ns=1_000_000_002))  # as it came: whoever reads it tells
+    assert bus.records("/operator/estop")[-1].payload == b"\x00"
 
 
 def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
