@@ -1,0 +1,124 @@
+"""Pictures and depth from files: what the commands read.
+
+Depth as PNG of 16 bits (millimetres), ``.npy``, ``.npz`` (key ``depth``) and OpenEXR (all three metres).
+"""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr")
+PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
+_BEYOND_M = 1e4
+"""Renderers write such values (inf, 1e10) where a ray meets nothing."""
+_EXR_CHANNELS = ("depth", "Depth", "Z", "depth.Z", "ViewLayer.Depth.Z", "V", "depth.V", "Y", "R")
+
+
+class DepthFileError(ValueError):
+    """A file that holds no depth or no picture; the message names it and says why."""
+
+
+def load_picture(path: str | Path) -> NDArray[np.uint8]:
+    """A picture as (H, W, 3) uint8 RGB.
+
+    Raises:
+        DepthFileError: missing, or no picture.
+    """
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(_content(path), np.uint8), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise DepthFileError(f"{path}: not a readable picture ({', '.join(s[1:] for s in PICTURE_SUFFIXES)})")
+    return np.ascontiguousarray(picture[..., ::-1], np.uint8)
+
+
+def load_depth(path: str | Path) -> NDArray[np.float32]:
+    """Depth (H, W) float32 in metres, 0 = unknown: also what is not finite, not above 0, or 10 km and farther.
+
+    Raises:
+        DepthFileError: missing, damaged, of another kind or shape, or without any known depth.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in DEPTH_SUFFIXES:
+        raise DepthFileError(f"{path}: depth is read from {', '.join(DEPTH_SUFFIXES)}, not {kind or 'a bare name'!r}")
+    content = _content(path)
+    if kind == ".png":
+        values = _png(path, content)
+    elif kind == ".exr":
+        values = _exr(path)
+    else:
+        values = _numpy(path)
+    values = np.squeeze(values) if values.ndim == 3 and 1 in values.shape else values
+    if values.ndim != 2 or min(values.shape) < 2:
+        raise DepthFileError(f"{path}: depth must be (H, W) (got {values.shape})")
+    values = values.astype(np.float32)
+    values[~(np.isfinite(values) & (values > 0) & (values < _BEYOND_M))] = 0  # NaN compares false
+    if not values.any():
+        raise DepthFileError(f"{path}: no known depth in it: all values are 0, negative or not finite")
+    return values
+
+
+def _content(path: str | Path) -> bytes:
+    try:
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise DepthFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if not content:
+        raise DepthFileError(f"{path}: the file is empty")
+    return content
+
+
+def _png(path: Path, content: bytes) -> NDArray[Any]:
+    import cv2
+
+    values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise DepthFileError(f"{path}: not a readable PNG")
+    if values.dtype != np.uint16 or values.ndim != 2:
+        channels = 1 if values.ndim == 2 else values.shape[2]
+        raise DepthFileError(
+            f"{path}: depth as PNG has one channel of 16 bits, millimetres "
+            f"(got {channels} of {8 * values.dtype.itemsize} bits: a picture of depth?)"
+        )
+    return values * np.float32(1e-3)
+
+
+def _numpy(path: Path) -> NDArray[Any]:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if path.suffix.lower() == ".npz":
+            with loaded:
+                if "depth" not in loaded:
+                    raise DepthFileError(f"{path}: no key 'depth' (has: {', '.join(loaded.files) or 'nothing'})")
+                loaded = loaded["depth"]
+    except DepthFileError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DepthFileError(f"{path}: not a readable numpy file: {error}") from error
+    if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
+        raise DepthFileError(f"{path}: must hold an array of numbers, metres (got {getattr(loaded, 'dtype', 'none')})")
+    return loaded
+
+
+def _exr(path: Path) -> NDArray[Any]:
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError) as error:  # a damaged part is left out with a warning, then it is missing
+        raise DepthFileError(f"{path}: not a readable OpenEXR file: {error}") from error
+    if len(channels) == 1:
+        return next(iter(channels.values()))
+    name = next((n for n in _EXR_CHANNELS if n in channels), None)
+    if name is None:
+        raise DepthFileError(f"{path}: which channel is depth? Has {', '.join(channels)}; name it Z")
+    if name == "R" and not all(np.array_equal(channels["R"], channels.get(c, channels["R"])) for c in "GB"):
+        raise DepthFileError(f"{path}: its channels R, G, B differ: this is a picture, not depth")
+    return channels[name]

@@ -1,0 +1,125 @@
+"""Depth and pictures from files: each format, each way a file can be wrong."""
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+
+from instant_ic.depth.files import DepthFileError, load_depth, load_picture
+
+DEPTH = np.linspace(0.5, 9.5, 8 * 16, dtype=np.float32).reshape(8, 16)
+DEPTH[2, 3] = 0
+
+
+def write_exr(path, channels):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(str(path))
+
+
+def written(tmp_path, kind):
+    path = tmp_path / f"depth.{kind.split('-')[0]}"
+    if kind == "png":
+        cv2.imwrite(str(path), np.rint(DEPTH * 1000).astype(np.uint16))
+    elif kind == "npy":
+        np.save(path, DEPTH.astype(np.float64)[..., None])  # a trailing axis of one is dropped
+    elif kind == "npz":
+        np.savez_compressed(path, depth=DEPTH, other=np.zeros(3))
+    elif kind == "exr-z":
+        write_exr(path, {"Z": DEPTH, "A": np.ones_like(DEPTH)})
+    elif kind == "exr-half":
+        write_exr(path, {"Y": DEPTH.astype(np.float16)})
+    else:
+        write_exr(path, {"RGB": np.dstack([DEPTH] * 3)})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "error_m"), [("png", 0.00051), ("npy", 0), ("npz", 0), ("exr-z", 0), ("exr-half", 0.005), ("exr-rgb", 0)]
+)
+def test_depth_is_read_in_metres(tmp_path, kind, error_m):
+    depth = load_depth(written(tmp_path, kind))
+    assert depth.dtype == np.float32
+    assert depth.shape == (8, 16)
+    assert depth[2, 3] == 0
+    assert np.abs(depth - DEPTH).max() <= error_m
+
+
+def test_what_is_no_distance_is_unknown(tmp_path):
+    depth = DEPTH.copy()
+    depth[0, :5] = [np.nan, np.inf, -np.inf, -1, 1e10]
+    np.save(tmp_path / "depth.npy", depth)
+    loaded = load_depth(tmp_path / "depth.npy")
+    assert not loaded[0, :5].any()
+    assert np.array_equal(loaded[1:], DEPTH[1:])
+
+
+def _bad(tmp_path, name):
+    path = tmp_path / name
+    if name == "eight.png":
+        cv2.imwrite(str(path), np.zeros((8, 16), np.uint8))
+    elif name == "colour.png":
+        cv2.imwrite(str(path), np.zeros((8, 16, 3), np.uint16))
+    elif name == "nan.npy":
+        np.save(path, np.full((8, 16), np.nan))
+    elif name == "flat.npy":
+        np.save(path, np.ones(8))
+    elif name == "text.npy":
+        np.save(path, np.array([["a"]]))
+    elif name == "objects.npy":
+        np.save(path, np.array([{}], object), allow_pickle=True)
+    elif name == "key.npz":
+        np.savez(path, range=DEPTH)
+    elif name == "rgb.exr":
+        write_exr(path, {"RGB": np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)})
+    elif name == "names.exr":
+        write_exr(path, {"left": DEPTH, "right": DEPTH})
+    elif name == "cut.exr":
+        good = tmp_path / "good.exr"
+        write_exr(good, {"Z": np.random.default_rng(0).random((64, 128)).astype(np.float32)})
+        path.write_bytes(good.read_bytes()[:9000])
+    elif name.startswith("empty"):
+        path.write_bytes(b"")
+    elif name != "missing.npy":
+        path.write_bytes(b"this is no depth")
+    return path
+
+
+BAD = {
+    "missing.npy": "No such file",
+    "empty.png": "empty",
+    "depth.pfm": "read from",
+    "eight.png": "8 bits",
+    "colour.png": "got 3 of 16",
+    "junk.png": "not a readable PNG",
+    "junk.npy": "not a readable numpy",
+    "junk.npz": "not a readable numpy",
+    "junk.exr": "not a readable OpenEXR",
+    "cut.exr": "not a readable OpenEXR",
+    "nan.npy": "no known depth",
+    "flat.npy": r"must be \(H, W\)",
+    "text.npy": "numbers",
+    "objects.npy": "not a readable numpy",
+    "key.npz": "has: range",
+    "rgb.exr": "differ",
+    "names.exr": "left, right",
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_named_with_its_fault(tmp_path, name):
+    path = _bad(tmp_path, name)
+    with pytest.raises(DepthFileError, match=BAD[name]) as caught:
+        load_depth(path)
+    assert str(path) in str(caught.value)
+
+
+def test_pictures_come_as_rgb_or_with_the_fault(tmp_path):
+    picture = np.zeros((4, 8, 3), np.uint8)
+    picture[..., 0] = 200  # red
+    cv2.imwrite(str(tmp_path / "red.png"), picture[..., ::-1])
+    assert np.array_equal(load_picture(tmp_path / "red.png"), picture)
+    (tmp_path / "junk.jpg").write_bytes(b"\xff\xd8 no")
+    for name, words in (("junk.jpg", "not a readable picture"), ("none.jpg", "No such file")):
+        with pytest.raises(DepthFileError, match=words):
+            load_picture(tmp_path / name)
