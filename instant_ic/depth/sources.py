@@ -1,0 +1,156 @@
+"""Where depth comes from: the network scaled by the LiDAR, the LiDAR alone, or both fused. Arrays in, arrays out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..ranges import check_ranges
+from .fusion import FusionConfig, fuse
+from .lidar_depth import LidarDepthConfig, LidarStructure
+from .scaler import DepthScaler, ScaleFit, ScalerConfig, nearest_points
+
+Floats = NDArray[np.floating]
+SOURCES = ("network", "lidar", "fused")
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Where depth comes from, and how.
+
+    Attributes:
+        source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both.
+        scaler: how the network's depth is scaled.
+        lidar: how depth is made from points alone.
+        fusion: how both are brought together.
+    """
+
+    source: str = "fused"
+    scaler: ScalerConfig = field(default_factory=ScalerConfig)
+    lidar: LidarDepthConfig = field(default_factory=LidarDepthConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+
+    def __post_init__(self) -> None:
+        if self.source not in SOURCES:
+            raise ValueError(f"source must be one of {', '.join(SOURCES)} (got {self.source!r})")
+        check_ranges(self)
+
+
+@dataclass(frozen=True)
+class DepthResult:
+    """Depth of one picture.
+
+    Attributes:
+        depth_m: (H, W) float32 radial metres, 0 = unknown.
+        sigma: (H, W) float32 relative standard deviation, inf where unknown.
+        ok: false: do not trust ``depth_m``; ``message`` says why.
+        scale, shift: of the network's depth, see ``scaler.ScaleFit``; 1 and 0 for ``lidar``.
+        quality: share of points whose range agrees with ``depth_m``, 0..1.
+        relative_sigma: one robust number for the picture: median of ``sigma`` over its known pixels.
+        points: number of points compared.
+        message: for people.
+        source: what ``depth_m`` was made from.
+    """
+
+    depth_m: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    ok: bool
+    scale: float
+    shift: float
+    quality: float
+    relative_sigma: float
+    points: int
+    message: str
+    source: str
+
+
+class DepthSource:
+    """Makes depth of a picture's network estimate and the LiDAR points of the same moment."""
+
+    def __init__(self, config: SourceConfig | None = None) -> None:
+        self.config = config or SourceConfig()
+
+    @property
+    def config(self) -> SourceConfig:
+        """May be set anew at any time."""
+        return self._config
+
+    @config.setter
+    def config(self, config: SourceConfig) -> None:
+        self._config = config
+        self.scaler = DepthScaler(config.scaler)
+        self.structure = LidarStructure(config.lidar)
+
+    def estimate(
+        self,
+        raw: Floats | None,
+        points: Floats,
+        up: Floats,
+        camera_height_m: float | None,
+        rgb: NDArray[np.uint8] | None = None,
+        size: tuple[int, int] = (256, 512),
+    ) -> DepthResult:
+        """Depth of one picture.
+
+        Args:
+            raw: (H, W) the network's depth in its own unit, 0 = unknown; None is allowed for ``lidar`` alone.
+            points: (N, 3) LiDAR points in the camera's frame at the picture's time, metres.
+            up: (3,) gravity's up in the camera's frame.
+            camera_height_m: of the camera over the floor; None where it is not known.
+            rgb: (H, W, 3) uint8 the picture; edges of it guide the fusion.
+            size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
+
+        Raises:
+            ValueError: arrays of other shapes, or no ``raw`` where the source needs it.
+        """
+        config = self.config
+        if config.source == "lidar":
+            return self._lidar(points, up, camera_height_m, raw.shape if raw is not None else size)
+        if raw is None:
+            raise ValueError(f"source {config.source} needs the network's depth")
+        fit = self.scaler.fit(raw, points)
+        if config.source == "network" or config.scaler.method == "as_estimated":
+            return _of_fit(fit)
+        built = self.structure.estimate(points, up, camera_height_m, raw.shape)
+        if not fit.ok or built.message:
+            return _of_fit(fit)
+        depth, sigma = fuse(fit.depth_m, fit.relative_sigma, built.depth_m, built.sigma, config.fusion)
+        quality = agreement(depth, points, config.scaler)
+        return replace(
+            _of_fit(fit), depth_m=depth, sigma=sigma, quality=quality, relative_sigma=_median(sigma), source="fused"
+        )
+
+    def _lidar(self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int]) -> DepthResult:
+        built = self.structure.estimate(points, up, camera_height_m, size)
+        ok = not built.message
+        quality = agreement(built.depth_m, points, self.config.scaler) if ok else 0.0
+        return DepthResult(
+            built.depth_m, built.sigma, ok, 1.0, 0.0, quality,
+            _median(built.sigma), built.points, built.message or f"{built.points} points, LiDAR alone", "lidar",
+        )  # fmt: skip
+
+
+def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
+    """Share of points (N, 3) within ``config.agreement`` of the depth (H, W) at their pixels."""
+    points = points[np.isfinite(points).all(axis=1)]
+    rows, columns, range_m = nearest_points(points, depth_m.shape[1], depth_m.shape[0])
+    inside = (range_m >= config.min_range_m) & (range_m <= config.max_range_m)
+    rows, columns, range_m = rows[inside], columns[inside], range_m[inside]
+    if len(rows) == 0:
+        return 0.0
+    return float((np.abs(depth_m[rows, columns] - range_m) <= config.agreement * range_m).mean())
+
+
+def _median(sigma: Floats) -> float:
+    known = sigma[np.isfinite(sigma)]
+    return float(np.median(known)) if len(known) else float("inf")
+
+
+def _of_fit(fit: ScaleFit) -> DepthResult:
+    sigma = np.where(fit.depth_m > 0, np.float32(fit.relative_sigma), np.float32(np.inf)).astype(np.float32)
+    return DepthResult(
+        fit.depth_m, sigma, fit.ok, fit.scale, fit.shift, fit.quality, fit.relative_sigma, fit.points, fit.message,
+        "network",
+    )  # fmt: skip
