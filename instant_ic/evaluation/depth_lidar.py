@@ -161,7 +161,9 @@ def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
     return np.where(apart, np.where(share < 0.5, a, b), (1 - share) * a + share * b)
 
 
-def _bridge_unknown(profile: Floats, torn: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.bool_]]:
+def _bridge_unknown(
+    profile: NDArray[np.float64], torn: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Unknown pixels get the known one above (first: below), torn from it: a beam that passes there has no end."""
     known = profile > 0
     row = np.where(known, np.arange(len(profile))[:, None], -1)
