@@ -9,7 +9,8 @@ from .config import (
     VirtualSpaceConfig,
 )
 from .prior import KeyframeError
-from .space import NotReadyError, State, Status, TrainStats, View, VirtualSpace
+from .space import NotReadyError, State, Status, TrainStats, VirtualSpace
+from .view import View
 
 __all__ = [
     "FieldConfig",

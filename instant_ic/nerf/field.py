@@ -96,13 +96,15 @@ class Scene:
 @dataclass(frozen=True)
 class Rays:
     """A view's rays: ``origin`` (3,) float32 map frame; ``directions`` (P, 3) float32 unit vectors, map frame;
-    ``axial`` (P,) depth along the view's axis per metre along the ray; ``shape`` (height, width).
+    ``axial`` (P,): the depth times it has an inverse that is linear over a plane in the picture (depth along the view's
+    axis per metre along the ray); ``shape`` (height, width); ``stride``: between so many pixels it may be interpolated.
     """
 
     origin: Floats
     directions: Floats
     axial: Floats
     shape: tuple[int, int]
+    stride: int = 4
 
 
 class Device(Protocol):

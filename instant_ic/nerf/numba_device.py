@@ -22,7 +22,8 @@ from .field import (
 )
 
 FIRST_STRIDE = 4
-"""Every so many pixels the rays are traced, the rest only where those between differ; a power of two, 1 traces all."""
+"""Every so many pixels the rays are traced, or ``Rays.stride`` where that is less, the rest only where those between
+differ; a power of two, 1 traces all."""
 DEPTH_TOLERANCE = 0.08
 """Neighbours further apart than this share are traced, not interpolated."""
 
@@ -132,11 +133,10 @@ class NumbaDevice:
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)
         index = np.arange(height * width, dtype=np.int32).reshape(height, width)
-        self._march(
-            drawn, rays, index[:: self.first_stride, :: self.first_stride].reshape(-1).copy(), depth, confidence
-        )
+        stride = min(self.first_stride, rays.stride)
+        self._march(drawn, rays, index[::stride, ::stride].reshape(-1).copy(), depth, confidence)
         listed = np.empty(height * width, np.int32)
-        stride = self.first_stride // 2
+        stride //= 2
         while stride >= 1:
             count = march.interpolate_depth(
                 depth.reshape(height, width),

@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import perspective_directions
+from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, sample_equirect
 
 from .config import VirtualSpaceConfig
 from .field import Device, FieldParameters, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
-from .prior import KeyframeError, PanoramaPrior, fill_holes, prepare
-
-MIN_VIEW, MAX_VIEW = 16, 4096
+from .prior import KeyframeError, PanoramaPrior, prepare
+from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
 
 
 class State(enum.IntEnum):
@@ -69,18 +68,6 @@ class Status:
     device: str
 
 
-@dataclass(frozen=True)
-class View:
-    """A picture of the space: ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) radial, 0 where unknown; ``confidence``
-    (H, W): 1 where the keyframe has seen the place, 0.5 where it has but its depth was filled from around, 0 where it
-    has not (``rgb`` is continued from the surroundings there).
-    """
-
-    rgb: NDArray[np.uint8]
-    depth_m: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-
-
 class NotReadyError(RuntimeError):
     """Asked for training or a picture before the first keyframe."""
 
@@ -114,7 +101,6 @@ class VirtualSpace:
         self._scene: Scene | None = None
         self._shown: _Shown | None = None
         self._rng = np.random.default_rng(self.config.train.seed)
-        self._directions: dict[tuple[int, int, float], NDArray[np.float32]] = {}
         self._reset_run(refresh=False)
 
     def _reset_run(self, refresh: bool) -> None:
@@ -158,8 +144,9 @@ class VirtualSpace:
             lattice = self._scene.lattice
         elif self._scene is not None:
             self._device.load(FieldParameters.random(config.field, config.train.seed))
-        self._scene = Scene(prior, lattice, occupancy)
-        self._device.set_scene(self._scene)
+        scene = Scene(prior, lattice, occupancy)
+        self._device.set_scene(scene)
+        self._scene = scene
         self._reset_run(refresh)
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
@@ -235,36 +222,50 @@ class VirtualSpace:
             NotReadyError: no keyframe yet.
             ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
         """
+        check_size(width, height)
+        return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
+
+    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
+        """A panorama, ``width`` × ``width / 2``. Raises as ``render``."""
+        check_size(width, width // 2)
+        if width % 2:
+            raise ValueError(f"a panorama's width must be even (got {width})")
+        return self._view(equirect_rays(checked_pose(map_from_camera), width), "equirect")
+
+    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View:
+        """Six faces of 90°, (6, size, size), in the order of ``geometry.projections.CUBE_FACES``. Raises as ``render``.
+
+        What is not known is continued across the faces' edges.
+        """
+        check_size(size, size)
+        pose, faces = checked_pose(map_from_camera), []
+        round_about: View | None = None
+        for rotation in CUBE_FACES.values():
+            turned = pose.copy()
+            turned[:3, :3] = pose[:3, :3] @ rotation
+            face = self._view(perspective_rays(turned, size, size, math.pi / 2), "cube")
+            unseen = face.confidence == 0
+            if unseen.any():
+                round_about = round_about or self.render_equirect(pose, min(4 * size, MAX_VIEW))
+                directions = perspective_directions(size, size, math.pi / 2)[unseen] @ rotation.T.astype(np.float32)
+                face.rgb[unseen] = np.rint(sample_equirect(round_about.rgb, directions))
+            faces.append(face)
+        rgb, depth, confidence = (
+            np.stack([getattr(f, key) for f in faces]) for key in ("rgb", "depth_m", "confidence")
+        )
+        return View(rgb, depth, confidence, "cube")
+
+    def _view(self, rays: Rays, projection: str) -> View:
         if self._scene is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
-        if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
-            raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
-        pose = np.asarray(map_from_camera, np.float64)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError("pose of the view must be a finite 4x4 matrix")
-        rays = self._view_rays(pose, width, height, fov_rad)
+        height, width = rays.shape
         psnr_db, frozen = (self._psnr_db, None) if self._shown is None else (self._shown.psnr_db, self._shown.frozen)
         share = self.config.picture.panorama_share(psnr_db)
         colour, depth, confidence = self._device.draw(rays, share, frozen)
-        image = colour.reshape(height, width, 3)
-        depth = depth.reshape(height, width)
-        confidence = confidence.reshape(height, width)
-        if np.any(confidence == 0):
-            # What is not known is continued from around it, more from the far side than from the near: it opens up
-            # behind the nearer surface.
-            image = fill_holes(image, confidence > 0, weight=depth * depth)
+        depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
+        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence)
-
-    def _view_rays(self, pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
-        key = (width, height, round(fov_rad, 6))
-        if key not in self._directions:
-            self._directions.clear()
-            self._directions[key] = perspective_directions(width, height, fov_rad).reshape(-1, 3)
-        directions = self._directions[key]
-        axial = 1 / np.linalg.norm(directions, axis=1)
-        turned = (directions * axial[:, None]) @ pose[:3, :3].T.astype(np.float32)
-        return Rays(pose[:3, 3].astype(np.float32), np.ascontiguousarray(turned), axial, (height, width))
+        return View(rgb, depth, confidence, projection)
 
     def parameters(self) -> FieldParameters:
         """A copy of the field's present parameters."""

@@ -11,20 +11,19 @@ from instant_ic.geometry.projections import CUBE_FACES
 from instant_ic.nerf import (
     FieldConfig,
     TrainConfig,
-    VirtualSpace,
-    VirtualSpaceConfig,
     box_room,
     kernels,
     march,
     reference,
 )
 from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.field import FieldParameters, Lattice, Rays, Scene
+from instant_ic.nerf.field import FieldParameters, Lattice, Scene
 from instant_ic.nerf.numba_device import NumbaDevice
 from instant_ic.nerf.occupancy import build_occupancy
 from instant_ic.nerf.prior import prepare
 from instant_ic.nerf.reference import TorchField
 from instant_ic.nerf.torch_device import TorchDevice, torch_prior
+from instant_ic.nerf.view import perspective_rays
 
 F = np.float32
 FOCUS = np.array([0.3, 0.2, -0.5, 0.01], F)  # pixels of 1 cm a metre: levels of 1 cm and less fade away
@@ -206,8 +205,7 @@ def test_rendering_agrees_with_the_reference(scene, share):
     torch_device = TorchDevice(field_config, train, "cpu")
     torch_device.load(device.parameters())
     torch_device.set_scene(scene)
-    space = VirtualSpace(VirtualSpaceConfig(device="cpu", field=field_config, train=train))
-    rays: Rays = space._view_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 48, 32, 1.5)
+    rays = perspective_rays(pose_matrix(0.6, -0.5, 0, yaw=0.2), 48, 32, 1.5)
     expected_colour, expected_depth, expected_confidence = torch_device.draw(rays, share)
     device.first_stride = 1
     colour, depth, confidence = device.draw(rays, share)
@@ -244,7 +242,7 @@ def test_the_march_by_hand():
     prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
     scene = Scene(prior, Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
-    rays = VirtualSpace(VirtualSpaceConfig(device="cpu", field=config))._view_rays(np.eye(4), 32, 16, 1.0)
+    rays = perspective_rays(np.eye(4), 32, 16, 1.0)
     for distance in (-1.0, 1.0):
         p = FieldParameters.random(config, 1)
         p.w2[...], p.b2[...] = 0, [0.1, 0.2, 0.3, distance]

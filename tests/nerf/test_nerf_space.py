@@ -22,6 +22,7 @@ from instant_ic.nerf import (
 from instant_ic.nerf.config import GeometryConfig
 from instant_ic.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.nerf.prior import area_average, fill_holes, prepare, torn_quads
+from instant_ic.nerf.view import perspective_rays
 from instant_ic.nerf.warm_up import warm_up
 
 CONFIG = VirtualSpaceConfig(
@@ -77,7 +78,7 @@ def test_what_no_picture_has_seen_has_no_confidence(space):
     pose = pose_matrix(x=2.0, y=-1.0, yaw=1.0)
     width, height, fov = 160, 90, 1.5
     view, truth = space.render(pose, width, height, fov), box_room.perspective(pose, width, height, fov)
-    rays = space._view_rays(pose, width, height, fov)
+    rays = perspective_rays(pose, width, height, fov)
     points = rays.origin + truth.depth_m.reshape(-1, 1) * rays.directions
     away = points - CAMERA[:3, 3]
     distance = np.linalg.norm(away, axis=1)

@@ -1,0 +1,113 @@
+"""Pictures of the space: what they hold, and the rays of each projection."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.projections import equirect_directions, perspective_directions
+
+from .field import Floats, Rays
+from .prior import fill_holes
+
+MIN_VIEW, MAX_VIEW = 16, 4096
+"""Pixels a side."""
+_STRIDE_RAD = 0.025
+"""In an equirect picture the inverse depth of a plane is linear between pixels no further apart than about this."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture of the space; of a cube map all arrays have a leading axis of six, in the order of ``CUBE_FACES``.
+
+    Attributes:
+        rgb: (H, W, 3) uint8; what is not known is continued from around it.
+        depth_m: (H, W) along the ray, 0 where it meets nothing.
+        confidence: (H, W): 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled from
+            around, 0 where none has: unknown.
+        projection: ``perspective``, ``equirect`` or ``cube``.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    projection: str = "perspective"
+
+    @property
+    def opacity(self) -> NDArray[np.float32]:
+        """1 where the ray meets a surface, seen or not, else 0, (H, W): surfaces are met or missed, never half."""
+        return (self.depth_m > 0).astype(np.float32)
+
+    @property
+    def mean_confidence(self) -> float:
+        """Mean over the picture; of an equirect picture by solid angle."""
+        if self.projection != "equirect":
+            return float(self.confidence.mean())
+        height = self.confidence.shape[0]
+        weight = np.sin((np.arange(height) + 0.5) * (math.pi / height))
+        return float(self.confidence.mean(axis=1) @ weight / weight.sum())
+
+
+def check_size(width: int, height: int) -> None:
+    """Raises ValueError for a picture that is too small or too large to draw."""
+    if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
+        raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
+
+
+def checked_pose(map_from_camera: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The pose as float64; ValueError where it is none."""
+    pose = np.asarray(map_from_camera, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError("pose of the view must be a finite 4x4 matrix")
+    return pose
+
+
+@functools.lru_cache(maxsize=2)
+def _perspective(width: int, height: int, fov_rad: float) -> tuple[Floats, Floats]:
+    directions = perspective_directions(width, height, fov_rad).reshape(-1, 3)
+    axial = 1 / np.linalg.norm(directions, axis=1)
+    return directions * axial[:, None], axial
+
+
+@functools.lru_cache(maxsize=1)
+def _equirect(width: int, height: int) -> tuple[Floats, Floats]:
+    return equirect_directions(width, height).reshape(-1, 3), np.ones(width * height, np.float32)
+
+
+def _turned(pose: NDArray[np.float64], directions: Floats, axial: Floats, shape: tuple[int, int], stride: int) -> Rays:
+    turned = np.ascontiguousarray(directions @ pose[:3, :3].T.astype(np.float32))
+    return Rays(pose[:3, 3].astype(np.float32), turned, axial, shape, stride)
+
+
+def perspective_rays(pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
+    """Rays of a pinhole picture along the camera's x axis."""
+    return _turned(pose, *_perspective(width, height, round(fov_rad, 6)), (height, width), 4)
+
+
+def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
+    """Rays of a panorama, ``width`` × ``width / 2``."""
+    pixels = _STRIDE_RAD / (2 * math.pi / width)
+    stride = 4 if pixels >= 4 else 2 if pixels >= 2 else 1
+    return _turned(pose, *_equirect(width, width // 2), (width // 2, width), stride)
+
+
+def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: bool = False) -> Floats:
+    """Continues what is not known from around it, more from the far side than from the near: it opens up behind the
+    nearer surface.
+
+    Args:
+        image: (H, W, 3); depth_m, confidence: (H, W).
+        wraps: the left edge is the right edge's neighbour, as in a panorama.
+    """
+    if np.all(confidence > 0):
+        return image
+    if not wraps:
+        return fill_holes(image, confidence > 0, weight=depth_m * depth_m)
+    width = image.shape[1]
+    side = width // 4
+    around = np.r_[width - side : width, 0:width, 0:side]
+    return continue_unseen(image[:, around], depth_m[:, around], confidence[:, around])[:, side : side + width]
