@@ -148,27 +148,28 @@ _FLOORS = ("lino", "lino:1", "planks", "planks:1", "carpet", "floor_tiles", "flo
 _CEILINGS = ("ceiling_tiles", "paint", "white", "roughcast")
 
 
-def _tint(rng: np.random.Generator, lowest: float) -> tuple[float, float, float]:
+def tint(rng: np.random.Generator, lowest: float) -> tuple[float, float, float]:
     base = rng.uniform(lowest, 1.1)
     colour = np.clip(base * (1 + rng.normal(0, 0.08, 3)), 0.05, 1.15)
     return float(colour[0]), float(colour[1]), float(colour[2])
 
 
-def _random_finish(rng: np.random.Generator) -> Finish:
-    trim = Material("wood", 1.0, _tint(rng, 0.4)) if rng.random() < 0.6 else Material("white", 1.0, _tint(rng, 0.5))
+def random_finish(rng: np.random.Generator) -> Finish:
+    trim = Material("wood", 1.0, tint(rng, 0.4)) if rng.random() < 0.6 else Material("white", 1.0, tint(rng, 0.5))
     return Finish(
-        Material(str(rng.choice(_WALLS)), float(rng.uniform(1.2, 2.6)), _tint(rng, 0.55)),
-        Material(str(rng.choice(_FLOORS)), float(rng.uniform(1.6, 3.0)), _tint(rng, 0.5)),
-        Material(str(rng.choice(_CEILINGS)), float(rng.uniform(1.8, 3.0)), _tint(rng, 0.8)),
-        replace(trim, tint=_tint(rng, 0.3)) if rng.random() < 0.75 else None,
+        Material(str(rng.choice(_WALLS)), float(rng.uniform(1.2, 2.6)), tint(rng, 0.55)),
+        Material(str(rng.choice(_FLOORS)), float(rng.uniform(1.6, 3.0)), tint(rng, 0.5)),
+        Material(str(rng.choice(_CEILINGS)), float(rng.uniform(1.8, 3.0)), tint(rng, 0.8)),
+        replace(trim, tint=tint(rng, 0.3)) if rng.random() < 0.75 else None,
         trim,
     )
 
 
-def _plan(rng: np.random.Generator, building: Building) -> list[Zone]:
-    """Zones of one of five kinds of floor plan; the first holds the spawn point at its centre."""
-    kind = rng.choice(["room", "hall", "corridor", "corner", "crossing"], p=[0.28, 0.12, 0.26, 0.18, 0.16])
-    finish, height = _random_finish(rng), float(rng.uniform(2.3, 3.4))
+def plan(rng: np.random.Generator, building: Building, kind: str = "") -> list[Zone]:
+    """Zones of one of five kinds of floor plan (empty: drawn); the first holds the spawn point at its centre."""
+    drawn = rng.choice(["room", "hall", "corridor", "corner", "crossing"], p=[0.28, 0.12, 0.26, 0.18, 0.16])
+    kind = kind or str(drawn)
+    finish, height = random_finish(rng), float(rng.uniform(2.3, 3.4))
     wall = float(rng.uniform(0.1, 0.25))
     u = rng.uniform
 
@@ -184,7 +185,7 @@ def _plan(rng: np.random.Generator, building: Building) -> list[Zone]:
         first = zone(-w / 2, -d / 2, w / 2, d / 2, h=height)
         zones = [first]
         for side in rng.permutation(list(SIDES))[: int(rng.integers(0, 3))]:
-            zones.append(_side_room(rng, building, first, str(side), wall))
+            zones.append(side_room(rng, building, first, str(side), wall))
         return zones
     width, length = u(1.6, 3.2), u(7, 18)
     start = u(-length + 2.0, -2.0)
@@ -205,11 +206,11 @@ def _plan(rng: np.random.Generator, building: Building) -> list[Zone]:
     for side in ("north", "south"):
         for low, high in building.free_runs(first, side, 0.4):
             if high - low > 2.5 and rng.random() < 0.6:
-                zones.append(_side_room(rng, building, first, side, wall, (low, high)))
+                zones.append(side_room(rng, building, first, side, wall, (low, high)))
     return zones
 
 
-def _side_room(
+def side_room(
     rng: np.random.Generator,
     building: Building,
     zone: Zone,
@@ -236,11 +237,11 @@ def _side_room(
         "east": (zone.x1 + wall, ends[0], zone.x1 + wall + depth, ends[1]),
         "west": (zone.x0 - wall - depth, ends[0], zone.x0 - wall, ends[1]),
     }[side]
-    finish = _random_finish(rng) if rng.random() < 0.7 else zone.finish
+    finish = random_finish(rng) if rng.random() < 0.7 else zone.finish
     return building.add(Zone(*rect, height=float(rng.uniform(2.3, max(2.4, zone.height))), finish=finish))
 
 
-def _decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
+def decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
     """Pictures, windows and shut doors on the free parts of a zone's walls."""
     for side in SIDES:
         for low, high in building.free_runs(zone, side, 0.2):
@@ -256,7 +257,7 @@ def _decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
                     at += width + 0.3
                 elif choice < 0.33 and zone.height > 2.2:
                     building.closed_door(
-                        zone, side, at + 0.55, int(rng.integers(0, 4)), Material("door", 0, _tint(rng, 0.5))
+                        zone, side, at + 0.55, int(rng.integers(0, 4)), Material("door", 0, tint(rng, 0.5))
                     )
                     at += 1.15
                 elif choice < 0.6:
@@ -314,8 +315,8 @@ def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tup
 def _piece(
     rng: np.random.Generator, build: "furniture.WorldBuilder", at: tuple[float, float], yaw: float, height: float
 ) -> None:
-    cloth = Material("fabric", 0.5, _tint(rng, 0.15))
-    wood = Material("wood", float(rng.uniform(0.6, 1.2)), _tint(rng, 0.4))
+    cloth = Material("fabric", 0.5, tint(rng, 0.15))
+    wood = Material("wood", float(rng.uniform(0.6, 1.2)), tint(rng, 0.4))
     choice = rng.choice(["table", "chair", "bookcase", "cabinet", "sofa", "boxes", "block"])
     if choice == "table":
         furniture.table(
@@ -331,7 +332,7 @@ def _piece(
             float(rng.uniform(0.6, 1.2)),
             min(height - 0.1, float(rng.uniform(0.7, 2.0))),
         )
-        furniture.cabinet(build, at, yaw, size, wood if rng.random() < 0.5 else Material("metal", 0.8, _tint(rng, 0.4)))
+        furniture.cabinet(build, at, yaw, size, wood if rng.random() < 0.5 else Material("metal", 0.8, tint(rng, 0.4)))
     elif choice == "sofa":
         furniture.sofa(build, at, yaw, cloth, float(rng.uniform(0.9, 1.4)))
     elif choice == "boxes":
@@ -343,7 +344,7 @@ def _piece(
             float(rng.uniform(0.3, min(height - 0.1, 2.4))),
         )
         texture = str(rng.choice(["white", "concrete", "metal", "wood", "brick"]))
-        build.box(at, size, 0.0, yaw, side=Material(texture, 1.0, _tint(rng, 0.4)))
+        build.box(at, size, 0.0, yaw, side=Material(texture, 1.0, tint(rng, 0.4)))
 
 
 def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World:
@@ -356,13 +357,13 @@ def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World
     """
     rng = np.random.default_rng([23, seed])
     building = Building()
-    zones = _plan(rng, building)
+    zones = plan(rng, building)
     first = zones[0]
     along = first.x1 - first.x0 > 6.5 and first.y1 - first.y0 < 3.5
     spawn = (0.0, 0.0, 0.0) if along else (*first.centre, 0.0)
     for zone in zones:
         building.lamps(zone, float(rng.uniform(1.8, 3.6)), float(rng.uniform(2.5, 6.0)), bool(rng.random() < 0.5))
-        _decorate(rng, building, zone)
+        decorate(rng, building, zone)
         _furnish(rng, building, zone, (spawn[0], spawn[1]) if zone is first else None)
     world = building.world(f"random:{seed}", spawn, light_cell_m, rays)
     # Exposure differs from room to room as with a real camera.
