@@ -17,18 +17,20 @@ class DepthMetrics:
 
     Attributes:
         mre: mean of |d - t| / t.
-        mae: mean of |d - t|, metres.
-        rmse: root of the mean of (d - t)², metres.
+        mae_m: mean of |d - t|, metres.
+        rmse_m: root of the mean of (d - t)², metres.
         delta1: share of pixels with max(d/t, t/d) < 1.25; ``delta2`` with 1.25², ``delta3`` with 1.25³.
+        scale_error_median: |median of d / t - 1|, how wrong the scale of the whole map is.
         pixels: number of valid pixels.
     """
 
     mre: float
-    mae: float
-    rmse: float
+    mae_m: float
+    rmse_m: float
     delta1: float
     delta2: float
     delta3: float
+    scale_error_median: float
     pixels: int
 
     def as_dict(self) -> dict[str, float]:
@@ -36,11 +38,22 @@ class DepthMetrics:
         return {key: round(value, 5) for key, value in asdict(self).items()}
 
 
-def depth_metrics(predicted: Floats, truth: Floats, valid: NDArray[np.bool_] | None = None) -> DepthMetrics:
+def depth_metrics(
+    predicted: Floats,
+    truth: Floats,
+    valid: NDArray[np.bool_] | None = None,
+    weights: Floats | None = None,
+) -> DepthMetrics:
     """Compares two depth maps of the same shape, metres.
 
     A pixel counts where the truth is finite and positive, and ``valid`` where given. A prediction that is not
     positive or not finite counts as 0 m: a full relative error and no hit in any delta.
+
+    Args:
+        predicted, truth: of one shape, usually (H, W).
+        valid: same shape; False leaves a pixel out.
+        weights: how much each pixel counts, of a shape that broadcasts to theirs; by default all the same. For an
+            equirect picture by solid angle: ``solid_angle_weights(height)[:, None]``.
 
     Raises:
         ValueError: the shapes differ or no pixel is valid.
@@ -50,23 +63,36 @@ def depth_metrics(predicted: Floats, truth: Floats, valid: NDArray[np.bool_] | N
     usable = np.isfinite(truth) & (truth > 0)
     if valid is not None:
         usable &= valid
-    count = int(usable.sum())
-    if count == 0:
+    w = np.broadcast_to(1.0 if weights is None else weights, truth.shape)[usable].astype(np.float64)
+    count = len(w)
+    if count == 0 or not w.sum() > 0:
         raise ValueError("no valid pixel in the truth")
+    w = w / w.sum()
     t = truth[usable].astype(np.float64)
     d = predicted[usable].astype(np.float64)
     d = np.where(np.isfinite(d) & (d > 0), d, 0.0)
     error = np.abs(d - t)
     ratio = np.maximum(d / t, t / np.maximum(d, 1e-9))
     return DepthMetrics(
-        mre=float((error / t).mean()),
-        mae=float(error.mean()),
-        rmse=float(np.sqrt((error**2).mean())),
-        delta1=float((ratio < 1.25).mean()),
-        delta2=float((ratio < 1.25**2).mean()),
-        delta3=float((ratio < 1.25**3).mean()),
+        mre=float(w @ (error / t)),
+        mae_m=float(w @ error),
+        rmse_m=float(np.sqrt(w @ error**2)),
+        delta1=float(w @ (ratio < 1.25)),
+        delta2=float(w @ (ratio < 1.25**2)),
+        delta3=float(w @ (ratio < 1.25**3)),
+        scale_error_median=abs(_median(d / t, w) - 1),
         pixels=count,
     )
+
+
+def _median(values: Floats, weights: Floats) -> float:
+    """Weighted median: mean of the values where the weights below are just under and just over one half."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    half = 0.5 * total[-1]
+    tie = 1e-9 * total[-1]
+    low, high = np.searchsorted(total, half - tie), np.searchsorted(total, half + tie)
+    return 0.5 * float(values[order[low]] + values[order[min(high, len(order) - 1)]])
 
 
 def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
