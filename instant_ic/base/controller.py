@@ -1,7 +1,6 @@
 """Drives the base at a fixed rate: newest command in, odometry and health out, stop when in doubt."""
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -11,6 +10,7 @@ from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry
 from instant_ic.base.roboclaw import LinkError, Roboclaw, SerialPort, Status, open_serial
 
+from ..pace import current
 from ..ranges import Positive, Range, check_ranges
 
 
@@ -213,12 +213,13 @@ class ControllerThread(threading.Thread):
     def run(self) -> None:
         """Step until `end`; the motors are stopped however it ends."""
         fault: BaseException | None = None
-        due_s = time.monotonic()
+        pace = current()
+        due_s = pace.steady_s()
         try:
             # By a grid of times, so that what a step takes does not slow the rate; steps missed are left out.
-            while not self._end.wait(max(0.0, due_s - time.monotonic())):
+            while not self._end.wait(pace.wait_s(max(0.0, due_s - pace.steady_s()))):
                 self._on_state(self._controller.step())
-                due_s = max(due_s + self._period_s, time.monotonic())
+                due_s = max(due_s + self._period_s, pace.steady_s())
         except BaseException as error:  # noqa: BLE001 - handed to on_end; the motors must stop first
             fault = error
         self._on_end(fault, self._controller.close())

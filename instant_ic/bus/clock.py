@@ -10,6 +10,8 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
+from .. import pace
+
 
 class Clock(Protocol):
     """Source of a node's time."""
@@ -24,15 +26,15 @@ class Clock(Protocol):
 
 
 class SystemClock:
-    """The machine's clock."""
+    """The machine's clock, at this process's pace (:mod:`instant_ic.pace`)."""
 
     def now_ns(self) -> int:
         """Nanoseconds since the epoch."""
-        return time.time_ns()
+        return pace.current().now_ns()
 
     def steady_ns(self) -> int:
         """Time that goes on evenly when the machine's clock is set."""
-        return time.monotonic_ns()
+        return pace.current().steady_ns()
 
 
 class ManualClock:

@@ -28,6 +28,7 @@ from ..msg import (
     transform_message,
     type_name,
 )
+from ..pace import current
 from . import params
 from .clock import Clock, JumpDetector, ManualClock
 from .parameter_event import TOPIC as PARAMETER_EVENTS
@@ -574,7 +575,7 @@ class Node(Generic[ConfigT]):
             if self._timers:
                 due = (self._timers[0][0] - self.clock.steady_ns()) / 1e9
                 # Simulated time may run slower or faster than the machine's: its timers are looked at often.
-                wait = min(wait, 0.01 if self.use_sim_time else due)
+                wait = min(wait, 0.01 if self.use_sim_time else current().wait_s(due))
             if self._soon:
                 continue
             self._wake.wait(max(0.0, wait))

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .. import paths
+from .. import pace, paths
 from ..msg import MessageError
 from . import params, registry
 from .clock import Clock, ManualClock, SystemClock
@@ -146,9 +146,10 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
     run_dir = args.run_dir or paths.run_dir()
     try:
+        pace.use(pace.read(run_dir))
         transport = LocalTransport(run_dir, args.name, clock.now_ns, clock.steady_ns)
         claim = registry.Claim(run_dir / "nodes" / args.name, f"node {args.name}")
-    except registry.RegistryError as error:
+    except (registry.RegistryError, pace.PaceError) as error:
         log.error("%s", error)
         return 1
     node = node_class(config, transport, clock, args.name, args.namespace, remaps, use_sim_time=process.use_sim_time)

@@ -15,6 +15,7 @@ from instant_ic.camera.config import ThetaConfig
 from instant_ic.camera.jpeg import JpegError, jpeg_size
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.pace import current
 
 NEVER = 65535
 """Value of sleepDelay and offDelay with which the camera does not sleep or switch itself off."""
@@ -155,7 +156,7 @@ class ThetaClient:
                 "POST",
                 "/osc/commands/execute",
                 {"name": "camera.getLivePreview"},
-                timeout=(self.config.connect_timeout_s, self.config.read_timeout_s),
+                timeout=(self.config.connect_timeout_s, current().wait_s(self.config.read_timeout_s)),
                 stream=True,
             )
             kind = response.headers.get("Content-Type", "")
@@ -280,7 +281,7 @@ class ThetaCamera(Camera):
         response = self._response
         if response is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
-        deadline = time.monotonic() + self.config.read_timeout_s
+        deadline = time.monotonic() + current().wait_s(self.config.read_timeout_s)
         while True:
             if time.monotonic() > deadline:
                 fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""

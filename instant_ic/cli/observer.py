@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
-from instant_ic import paths
+from instant_ic import pace, paths
 from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.clock import Clock, ManualClock, SystemClock
 from instant_ic.bus.local_transport import LocalTransport
@@ -39,6 +39,10 @@ class Observer:
         self.topics = list(dict.fromkeys(absolute(name) for name in names))
         self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
         self._run_dir = run_dir or paths.run_dir()
+        try:
+            pace.use(pace.read(self._run_dir))
+        except pace.PaceError as error:
+            raise registry.RegistryError(str(error)) from error
         self._ready = threading.Event()
         self.transport = LocalTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
         try:

@@ -111,7 +111,10 @@ def footprint_clearance(pose: NDArray[np.float64], box: tuple[float, float, floa
 
 @contextlib.asynccontextmanager
 async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float, str], Any]]:
-    """Runs the observer's callbacks beside asyncio code; gives ``await until(condition, timeout_s, what)``."""
+    """Runs the observer's callbacks beside asyncio code; gives ``await until(condition, timeout_s, what)``.
+
+    Time-outs are seconds of the stack's time.
+    """
     failure: list[BaseException] = []
 
     async def run() -> None:
@@ -127,7 +130,7 @@ async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float
     task = asyncio.create_task(run())
 
     async def until(condition: Callable[[], Any], timeout_s: float, what: str) -> Any:
-        deadline = asyncio.get_running_loop().time() + timeout_s
+        deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
         while not (value := condition()):
             if failure:
                 raise failure[0]
@@ -167,10 +170,10 @@ async def drive_through_obstacle(
         async with ConsoleClient(console_url) as console:
 
             async def drive_until(condition: Callable[[], Any], timeout_s: float, what: str) -> None:
-                deadline = asyncio.get_running_loop().time() + timeout_s
+                deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
                 while True:
                     console.drive(speed_mps, 0.0)
-                    left = deadline - asyncio.get_running_loop().time()
+                    left = (deadline - asyncio.get_running_loop().time()) * stack.pace
                     await until(lambda: condition() or recorder.mode == control.STOPPED, max(left, 0.0), what)
                     if condition():
                         return
@@ -188,6 +191,6 @@ async def drive_through_obstacle(
             await console.stop()
             await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
             console.drive(speed_mps, 0.0)
-            await asyncio.sleep(1.5)
+            await asyncio.sleep(1.5 / stack.pace)
             await console.stop()
-            await asyncio.sleep(1.0)
+            await asyncio.sleep(1.0 / stack.pace)

@@ -20,6 +20,9 @@ from ..bus.clock import SystemClock
 from ..bus.local_transport import LocalTransport
 
 T = TypeVar("T")
+_ENOUGH_PER_S = 33e6
+"""Turns of an empty loop a second, on each of two cores, from which on a stack runs in real time with room to spare."""
+_SLOWEST_PACE = 0.1
 
 
 class StackError(RuntimeError):
@@ -70,6 +73,21 @@ def observer(run_dir: Path) -> Iterator[Observer]:
         watching.close()
 
 
+def machine_pace() -> float:
+    """A pace at which this machine can run a whole simulated stack, however slow or busy it is: 1.0 at most.
+
+    Two processes count for a second and a half: what a core does alone for a moment tells little of what two do all
+    the time.
+    """
+    count = (
+        "import time\nn, began = 0, time.perf_counter()\n"
+        "while time.perf_counter() - began < 1.5:\n for _ in range(100_000): pass\n n += 1\nprint(n)"
+    )
+    counters = [subprocess.Popen([sys.executable, "-c", count], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    slowest_per_s = min(int(counter.communicate(timeout=60)[0]) for counter in counters) * 1e5 / 1.5
+    return min(1.0, max(_SLOWEST_PACE, slowest_per_s / _ENOUGH_PER_S))
+
+
 class Stack:
     """Starts a launch file in a run directory of its own.
 
@@ -79,6 +97,7 @@ class Stack:
         arguments: launch arguments.
         log_path: where the launcher's output goes (default: ``RUN_DIR/launch.log``).
         prefix: command that starts the launcher, as ``ip netns exec NAME``.
+        pace: of the stack's time, see :mod:`instant_ic.pace`.
 
     Example::
 
@@ -94,12 +113,14 @@ class Stack:
         arguments: dict[str, Any],
         log_path: Path | None = None,
         prefix: Sequence[str] = (),
+        pace: float = 1.0,
     ) -> None:
         self.launch_file = launch_file
         self.run_dir = run_dir
         self.arguments = dict(arguments)
         self.log_path = log_path or run_dir / "launch.log"
         self.prefix = list(prefix)
+        self.pace = pace
         self.process: subprocess.Popen[bytes] | None = None
         self.observer: Observer
 
@@ -107,10 +128,11 @@ class Stack:
         """Starts the launcher and the observer."""
         self.run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         words = [f"{key}:={_word(value)}" for key, value in self.arguments.items()]
+        launch = [self.launch_file, *words, f"--pace={self.pace:g}"]
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)}
         with self.log_path.open("wb") as log:
             self.process = subprocess.Popen(
-                [*self.prefix, sys.executable, "-m", "instant_ic.cli.main", "launch", self.launch_file, *words],
+                [*self.prefix, sys.executable, "-m", "instant_ic.cli.main", "launch", *launch],
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
@@ -138,10 +160,15 @@ class Stack:
     def wait_for(self, condition: Callable[[], T], timeout_s: float, what: str) -> T:
         """Runs the observer's callbacks until the condition is true, and returns its value.
 
+        Args:
+            condition: what is waited for.
+            timeout_s: seconds of the stack's time, as a slow machine needs longer.
+            what: what it is, for the error.
+
         Raises:
             StackError: time is up, or the launcher ended.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s / self.pace
         while True:
             self.observer.spin_once()
             if value := condition():

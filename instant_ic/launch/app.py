@@ -18,18 +18,21 @@ from instant_ic.launch.rundir import StackLock
 from instant_ic.launch.screen import Row, Screen, View
 from instant_ic.launch.supervisor import Supervisor
 from instant_ic.launch.topics import nominal_rate
+from instant_ic.pace import Pace
+from instant_ic.pace import write as write_pace
 
 _VIEW_PERIOD_S = 0.5
 _WAITING_LINES = 2000  # lines that a terminal may be behind
 
 
-def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None = None) -> int:
+def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None = None, pace: Pace | None = None) -> int:
     """Starts everything, shows how it is, stops it.
 
     Args:
         description: what to start.
         run_dir: run directory; made if missing, with those of the groups in it.
         live: table of the nodes below the lines; default where standard output is a terminal.
+        pace: of the stack's time; default the machine's.
 
     Returns:
         Exit status, see :meth:`Supervisor.run`.
@@ -43,11 +46,14 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
             registry.prepare(folder)
             locks.enter_context(StackLock(folder, description.file.name))
             registry.sweep(folder)
+            write_pace(folder, pace or Pace())
         output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
         status = 1
         try:
             count = f"{len(description.nodes)} node{'' if len(description.nodes) == 1 else 's'}"
             output.event(f"{count} of {description.file}, run directory {run_dir}")
+            if pace is not None and not pace.real:
+                output.event(f"time goes at {pace.factor:g} of the machine's: for simulated devices only")
             status = Supervisor(
                 description.nodes,
                 run_dir,

@@ -3,13 +3,13 @@
 import selectors
 import socket
 import struct
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
 from instant_ic.lidar.packets import DATA_PACKET_BYTES
+from instant_ic.pace import current
 
 _SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
 """Linux's number; Python 3.11 does not name it."""
@@ -162,5 +162,5 @@ def _stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
     for level, kind, data in ancillary:
         if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS and len(data) >= _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack_from(data)
-            return int(seconds * 1_000_000_000 + nanoseconds)
-    return time.time_ns()
+            return current().stamp_ns(int(seconds * 1_000_000_000 + nanoseconds))
+    return current().now_ns()

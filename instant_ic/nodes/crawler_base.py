@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from instant_ic.msg import (
     twist_values,
     type_name,
 )
+from instant_ic.pace import current
 from instant_ic.ranges import NotNegative, Positive, Range, check_ranges
 
 _TWISTS = {type_name(Twist): False, type_name(TwistStamped): True}
@@ -77,6 +79,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def setup(self) -> None:
         """Topics, and the loop that talks to the controller."""
         self.thread: ControllerThread | None = None
+        self.refuse_pace()
         self.controller = BaseController(self.config, self.clock.now_ns, type(self).open_port)
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
@@ -97,6 +100,20 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             on_end=lambda fault, unstopped: self.call_soon(self.on_end, fault, unstopped),
         )
         self.thread.start()
+
+    def refuse_pace(self) -> None:
+        """A real base in slow motion would be stopped late: only the simulator's, in the run directory, may be.
+
+        Raises:
+            NodeError: the stack's time is not the machine's, and the port is not the simulator's.
+        """
+        pace, folder = current(), self.run_dir
+        if pace.real or (folder is not None and Path(self.config.roboclaw.port).is_relative_to(folder)):
+            return
+        raise NodeError(
+            f"the stack runs at pace {pace.factor:g}, for simulated devices only, and {self.config.roboclaw.port} is "
+            f"not the simulator's (in {folder}): start without --pace"
+        )
 
     def on_command(self, topic: str, name: str, payload: bytes | memoryview, published_ns: int) -> None:
         """Hand a command on, unless it is too old or no twist."""

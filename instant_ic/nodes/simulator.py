@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy.typing as npt
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.lidar.capture import CaptureError
 from instant_ic.msg import Bool, Odometry, odometry_message
+from instant_ic.pace import current
 from instant_ic.paths import run_dir
 from instant_ic.sim.capture_replay import CaptureReplay
 from instant_ic.sim.roboclaw import RoboClawServer
@@ -62,7 +62,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         self._told: tuple[bool | None, int] = (None, 0)
         self._skipped = 0
         try:
-            self.simulation = Simulation(config, start_ns=time.time_ns())
+            self.simulation = Simulation(config, start_ns=self.clock.now_ns())
             self._warm_up()
             self._open_devices()
         except (ValueError, OSError, CaptureError) as error:
@@ -114,16 +114,16 @@ class SimulatorNode(Node[SimulatorConfig]):
         return self.simulation.panorama(width, height).rgb
 
     def _run(self) -> None:
-        """Keeps simulated time with the machine's (own thread)."""
-        simulation = self.simulation
-        offset = time.monotonic() - simulation.time_s
-        simulation.start_ns = time.time_ns() - round(simulation.time_s * 1e9)
+        """Keeps simulated time with the stack's (own thread)."""
+        simulation, pace = self.simulation, current()
+        offset = pace.steady_s() - simulation.time_s
+        simulation.start_ns = pace.now_ns() - round(simulation.time_s * 1e9)
         try:
             while not self._stopped.is_set():
-                wanted = time.monotonic() - offset
+                wanted = pace.steady_s() - offset
                 lag = wanted - simulation.time_s
                 if lag < _STEP_S:
-                    time.sleep(_STEP_S - lag)
+                    pace.sleep(_STEP_S - lag)
                     continue
                 if lag > _MOST_BEHIND_S:
                     # The machine stood still: the robot did too, and the devices fall silent rather than hurry.
@@ -163,7 +163,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         if behind > 0:
             self.diagnose("pace", WARN, f"the machine is too slow: the world stood still for {behind:.2f} s")
         else:
-            self.diagnose("pace", OK, "real time")
+            self.diagnose("pace", OK, "real time" if current().real else f"{current().factor:g} of real time")
         if isinstance(self.scanner, Vlp16Server):
             lost, self._skipped = self.scanner.skipped - self._skipped, self.scanner.skipped
             level, text = (

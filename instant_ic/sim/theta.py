@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.pace import current
+
 log = logging.getLogger(__name__)
 
 #: Formats of the live preview (facts: Z1, firmware 2.21.1): width, height, frames a second.
@@ -180,18 +182,18 @@ class ThetaServer:
     def _make_frames(self) -> None:
         import cv2
 
-        due = time.monotonic()
+        due = current().steady_s()
         made, period_s = 0, 0.0
         while True:
             with self._changed:
                 while self._viewers == 0 and not self._stopping:
                     self.rate_hz, made = 0.0, 0
                     self._changed.wait(1.0)
-                    due = time.monotonic()
+                    due = current().steady_s()
                 if self._stopping:
                     return
                 width, height, promised = self._format
-            began = time.monotonic()
+            began = current().steady_s()
             rgb = self.source(width, height)
             if self.config.noise > 0:
                 grain = self._rng.normal(0, self.config.noise, rgb.shape[:2]).astype(np.float32)
@@ -209,9 +211,9 @@ class ThetaServer:
                 self._changed.notify_all()
             period = 1.0 / min(self.config.rate, promised)
             # A camera whose picture takes too long shows fewer, never old ones.
-            due = max(due + period, time.monotonic())
+            due = max(due + period, current().steady_s())
             self._sleep(due)
-            took = time.monotonic() - began
+            took = current().steady_s() - began
             made += 1
             period_s = took if made == 1 else 0.8 * period_s + 0.2 * took
             # The first pictures come late for many reasons; a rate is told once it means something.
@@ -219,9 +221,10 @@ class ThetaServer:
                 self.rate_hz = 1 / period_s
 
     def _sleep(self, until: float) -> None:
+        """Until a time of the stack's steady clock."""
         with self._changed:
-            while not self._stopping and (left := until - time.monotonic()) > 0:
-                self._changed.wait(left)
+            while not self._stopping and (left := until - current().steady_s()) > 0:
+                self._changed.wait(current().wait_s(left))
 
     def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
         """Number and JPEG of the newest picture after number ``after``; None when none came in time or at the end."""

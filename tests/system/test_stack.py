@@ -18,7 +18,7 @@ from rosbags.highlevel import AnyReader
 
 from instant_ic.bus import registry
 from instant_ic.evaluation.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
-from instant_ic.evaluation.stack import Stack, free_ports, processes_of
+from instant_ic.evaluation.stack import Stack, free_ports, machine_pace, processes_of
 from instant_ic.msg import ControlState
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import corridor_world
@@ -48,7 +48,7 @@ def outcome(tmp_path_factory):
     bag = tmp_path_factory.mktemp("drive") / "bag"
     ports = free_ports()
     try:
-        with Stack("sim.yaml", run_dir, {**ports, "record": bag}) as stack:
+        with Stack("sim.yaml", run_dir, {**ports, "record": bag}, pace=machine_pace()) as stack:
             recorder = DriveRecorder(stack)
             url = f"http://127.0.0.1:{ports['console_port']}/"
             asyncio.run(drive_through_obstacle(stack, recorder, url, beyond_x_m=5.6))

@@ -41,6 +41,13 @@ def add_parser(subparsers: Any) -> None:
         "--no-check", action="store_true", help="start without checking the nodes' parameters first; they do it too"
     )
     parser.add_argument("--plain", action="store_true", help="plain lines also in a terminal")
+    parser.add_argument(
+        "--pace",
+        type=float,
+        default=1.0,
+        metavar="X",
+        help="let a simulated stack's time go at X of the machine's: 0.5 is half as fast, for a slow machine",
+    )
     parser.add_argument("--run-dir", type=Path, default=None, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
     parser.set_defaults(func=run)
     parse = parser.parse_known_args
@@ -60,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
     """Reads, checks and runs the file."""
     from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
+    from instant_ic.pace import Pace, PaceError
 
     try:
         file = find_launch_file(args.file)
@@ -68,6 +76,10 @@ def run(args: argparse.Namespace) -> int:
     if args.show_args:
         _show(file.name, read_arguments(file), read_arguments(file, included=True))
         return 0
+    try:
+        pace = Pace.from_now(args.pace)
+    except PaceError as error:
+        raise UserError(f"--{error}", 2) from None
     values: dict[str, str] = {}
     for word in args.arguments:
         name, separator, value = word.partition(":=")
@@ -89,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     from instant_ic.launch.app import run_stack
 
-    return run_stack(description, run_dir, False if args.plain else None)
+    return run_stack(description, run_dir, False if args.plain else None, pace)
 
 
 def _show(name: str, arguments: Sequence[Any], included: Sequence[Any]) -> None:
