@@ -9,6 +9,7 @@ from .config import (
     VirtualSpaceConfig,
 )
 from .prior import KeyframeError
+from .saved import SpaceFileError
 from .space import NotReadyError, State, Status, TrainStats, VirtualSpace
 from .view import View
 
@@ -19,6 +20,7 @@ __all__ = [
     "NotReadyError",
     "PictureConfig",
     "ReadinessConfig",
+    "SpaceFileError",
     "State",
     "Status",
     "TrainConfig",

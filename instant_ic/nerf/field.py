@@ -138,8 +138,8 @@ class Device(Protocol):
             frozen: what ``freeze`` gave, or the present field.
         """
 
-    def parameters(self) -> FieldParameters:
-        """A copy of the present parameters."""
+    def parameters(self, frozen: Any = None) -> FieldParameters:
+        """A copy of the present parameters, or of the frozen ones."""
 
 
 @dataclass

@@ -160,6 +160,6 @@ class NumbaDevice:
         )  # fmt: skip
         depth[pixels] *= rays.axial[pixels]
 
-    def parameters(self) -> FieldParameters:
-        p = self._p
+    def parameters(self, frozen: DrawnField | None = None) -> FieldParameters:
+        p = self._p if frozen is None else frozen.parameters
         return FieldParameters(p.table.copy(), *(a.copy() for a in p.network()))

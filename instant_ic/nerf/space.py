@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import math
 import time
@@ -19,6 +20,7 @@ from .config import VirtualSpaceConfig
 from .field import Device, FieldParameters, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
+from .saved import Progress, SavedSpace, read, write
 from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
 
 
@@ -76,9 +78,9 @@ class NotReadyError(RuntimeError):
 class _Shown:
     """The space of the keyframe before the newest, drawn until that is learnt well enough."""
 
-    prior: PanoramaPrior
+    scene: Scene
     frozen: Any
-    psnr_db: float
+    progress: Progress
 
 
 class VirtualSpace:
@@ -115,7 +117,7 @@ class VirtualSpace:
     def keyframe(self) -> PanoramaPrior | None:
         """The keyframe that pictures show."""
         if self._shown is not None:
-            return self._shown.prior
+            return self._shown.scene.prior
         return None if self._scene is None else self._scene.prior
 
     def set_keyframe(
@@ -137,7 +139,7 @@ class VirtualSpace:
         occupancy = build_occupancy(prior, config.geometry)
         lattice = Lattice.for_prior(prior, config.field)
         if self._scene is not None and self._ready_iterations:
-            self._shown = _Shown(self._scene.prior, self._device.freeze(), self._psnr_db)
+            self._shown = _Shown(self._scene, self._device.freeze(), self._progress)
         refresh = self._scene is not None and self._scene.lattice.suits(lattice)
         if refresh:
             assert self._scene is not None
@@ -259,8 +261,8 @@ class VirtualSpace:
         if self._scene is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         height, width = rays.shape
-        psnr_db, frozen = (self._psnr_db, None) if self._shown is None else (self._shown.psnr_db, self._shown.frozen)
-        share = self.config.picture.panorama_share(psnr_db)
+        progress, frozen = (self._progress, None) if self._shown is None else (self._shown.progress, self._shown.frozen)
+        share = self.config.picture.panorama_share(progress.psnr_db)
         colour, depth, confidence = self._device.draw(rays, share, frozen)
         depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
@@ -270,6 +272,57 @@ class VirtualSpace:
     def parameters(self) -> FieldParameters:
         """A copy of the field's present parameters."""
         return self._device.parameters()
+
+    @property
+    def _progress(self) -> Progress:
+        schedule = self._schedule
+        return Progress(
+            self._psnr_db, schedule.iteration, schedule.refresh, self._ready_iterations, self._train_seconds
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Saves the space that pictures show as one ``.npz`` file; ``path`` is that or a folder. Returns the file.
+
+        The optimiser's moments are not in it: training that goes on from a file starts them anew.
+
+        Raises:
+            NotReadyError: no keyframe yet.
+            OSError: the file cannot be written; an older one stays as it was.
+        """
+        if self._scene is None:
+            raise NotReadyError("no keyframe yet: there is nothing to save")
+        scene, progress, frozen = self._scene, self._progress, None
+        if self._shown is not None:
+            scene, progress, frozen = self._shown.scene, self._shown.progress, self._shown.frozen
+        parameters = self._device.parameters(frozen)
+        return write(path, SavedSpace(self.config, parameters, scene.lattice, (scene.prior,), progress))
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
+        """The space of a file (or of the folder it lies in). Its pictures have the same bits as before, on the CPU.
+
+        Args:
+            path: what ``save`` was given.
+            device: as in ``VirtualSpaceConfig``; the file's own where None.
+
+        Raises:
+            SpaceFileError: missing, damaged, foreign, or of a newer version.
+        """
+        saved = read(path)
+        space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
+        (prior,) = saved.priors
+        scene = Scene(prior, saved.lattice, build_occupancy(prior, saved.config.geometry))
+        space._device.load(saved.parameters)
+        space._device.set_scene(scene)
+        space._scene = scene
+        progress = saved.progress
+        space._schedule = Schedule(saved.config.train, progress.refresh, progress.iteration)
+        space._psnr_db, space._train_seconds = progress.psnr_db, progress.train_seconds
+        space._colour_error = 10 ** (-progress.psnr_db / 10)
+        space._ready_iterations = progress.ready_iterations
+        # Rays that were not drawn before, the same at each loading.
+        space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
+        return space
 
 
 def make_device(config: VirtualSpaceConfig) -> Device:

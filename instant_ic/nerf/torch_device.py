@@ -127,5 +127,6 @@ class TorchDevice:
         reference.mix_panorama(prior, origin, directions, depth, confidence, share, colour)
         return colour, depth, confidence
 
-    def parameters(self) -> FieldParameters:
-        return FieldParameters(*(p.detach().cpu().numpy().copy() for p in self._field.parameters()))
+    def parameters(self, frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None) -> FieldParameters:
+        field = self._field if frozen is None else frozen[0]
+        return FieldParameters(*(p.detach().cpu().numpy().copy() for p in field.parameters()))
