@@ -1,0 +1,177 @@
+"""The newest panorama, warped by its depth: a view without any training, and what the field has to beat.
+
+The panorama's depth picture is a mesh, torn at depth edges, drawn into a z-buffer; colours come from the panorama at
+its full resolution, averaged over each pixel's footprint; what opens is continued from the farther side.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import GeometryConfig
+from .field import Floats, Rays
+from .prior import PanoramaPrior, area_average, prepare
+from .view import View, check_size, checked_pose, continue_unseen, perspective_rays
+
+TORN_RATIO = 0.05
+"""Neighbouring depths that differ by more than this share, off one plane, are an edge."""
+BLUR = 0.65
+"""Share of a pixel that a colour is averaged over; trilinear look-up blurs by itself (as in ``sim.render``)."""
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """A panorama at full, half, quarter... size, area-averaged.
+
+    Attributes:
+        texels: rows of all levels one after another, (N, 3) uint8.
+        start: first texel of each level, (levels,) int64.
+        sizes: height and width of each level, (levels, 2) int64.
+    """
+
+    texels: NDArray[np.uint8]
+    start: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, rgb: NDArray[np.uint8]) -> Pyramid:
+        """Of a panorama (H, 2 H, 3); levels as long as both sides can be halved, down to 8 rows."""
+        levels = [rgb]
+        while levels[-1].shape[0] >= 16 and levels[-1].shape[0] % 2 == 0:
+            height, width = levels[-1].shape[:2]
+            levels.append(area_average(levels[-1], height // 2, width // 2))
+        sizes = np.array([level.shape[:2] for level in levels], np.int64)
+        start = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int64)
+        return cls(np.concatenate([level.reshape(-1, 3) for level in levels]), start, sizes)
+
+    def look_up(
+        self, camera_from_map: Floats, rays: Rays, depth: Floats, wanted: Floats, share: float, colour: Floats
+    ) -> None:
+        """Mixes the panorama's colour into that of a view's surfaces, averaged over each pixel's footprint.
+
+        Args:
+            camera_from_map: of the panorama, (4, 4) float32.
+            rays: of the view; depth: along them, (P,), 0 where nothing is met.
+            wanted: (P,) over 0 where a colour is wanted.
+            share: of the panorama in the result, 0..1.
+            colour: in and out, (P, 3) in 0..1.
+        """
+        from . import warp_kernels
+
+        places = np.empty((len(depth), 2), np.float32)
+        warp_kernels.panorama_places(camera_from_map, rays.origin, rays.directions, depth, *self.sizes[0], places)
+        warp_kernels.look_up(
+            self.texels,
+            self.start,
+            self.sizes,
+            places,
+            *rays.shape,
+            np.float32(BLUR),
+            wanted,
+            np.float32(share),
+            colour,
+        )
+
+
+class PanoramaWarp:
+    """A panorama with depth that can be seen from elsewhere.
+
+    Example:
+        >>> warp = PanoramaWarp(rgb, depth_m, map_from_camera)               # doctest: +SKIP
+        >>> warp.render(pose, 320, 180, fov_rad=1.57).rgb
+    """
+
+    def __init__(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        panorama_width: int = 4096,
+    ) -> None:
+        """Checks and takes a keyframe.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good.
+        """
+        config = GeometryConfig(torn_ratio=TORN_RATIO)
+        self._take(prepare(rgb, depth_m, map_from_camera, 0.0, config, panorama_width))
+
+    @classmethod
+    def of_prior(cls, prior: PanoramaPrior) -> PanoramaWarp:
+        """Of a keyframe that has been made ready already."""
+        warp = cls.__new__(cls)
+        warp._take(prior)
+        return warp
+
+    def _take(self, prior: PanoramaPrior) -> None:
+        self.prior = prior
+        self.pyramid = Pyramid.of(prior.rgb)
+        self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)
+        height, width = prior.inverse_depth.shape
+        # A row more above and below closes the mesh at the poles.
+        self._inverse, self._known = (
+            np.ascontiguousarray(np.concatenate([a[:1], a, a[-1:]])) for a in (prior.inverse_depth, prior.known)
+        )
+        none = np.zeros((1, width), np.uint8)
+        # The last row's own quads reach down to the pole, where nothing is torn.
+        self._torn = np.concatenate([none, prior.torn[:-1], none, none])
+        self._halves = _half_step_directions(width, height)
+        self._directions = np.ascontiguousarray(self._halves[::2, ::2])
+        self._vertices = np.empty((height + 2, width, 3), np.float32)
+        self._outside = np.empty((height + 2, width), np.uint8)
+
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
+        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+
+        Confidence is 1 where the panorama has seen the place, 0.5 where its depth was filled from around, 0 elsewhere.
+
+        Raises:
+            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+        """
+        from . import warp_kernels
+
+        check_size(width, height)
+        pose = checked_pose(map_from_camera)
+        rays = perspective_rays(pose, width, height, fov_rad)
+        half = np.float32(math.tan(fov_rad / 2))
+        view_from_camera = (np.linalg.inv(pose) @ self.prior.map_from_camera).astype(np.float32)
+        nearness = np.zeros((height, width), np.float32)
+        marks = np.zeros((height, width), np.uint8)
+        warp_kernels.place_vertices(
+            self._inverse, self._directions, view_from_camera, half, np.float32(height / width),
+            self._vertices, self._outside,
+        )  # fmt: skip
+        warp_kernels.draw_mesh(
+            self._vertices, self._outside, self._inverse, self._torn, self._known, self._halves,
+            view_from_camera, half, nearness, marks,
+        )  # fmt: skip
+        depth = np.zeros((height, width), np.float32)
+        np.divide(1 / rays.axial.reshape(height, width), nearness, out=depth, where=nearness > 0)
+        confidence = np.array([0, 0.5, 1, 0], np.float32)[marks]
+        colour = np.zeros((height * width, 3), np.float32)
+        self.pyramid.look_up(self._camera_from_map, rays, depth.reshape(-1), confidence.reshape(-1), 1.0, colour)
+        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence)
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        return View(rgb, depth, confidence)
+
+
+def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:
+    """Unit directions at every half pixel of a panorama with a row more above and below, (2 height + 3, 2 width, 3).
+
+    Entry (2 v + 2, 2 u) is pixel (v, u)'s own; rows beyond a pole are the pole.
+    """
+    azimuth = math.pi - (np.arange(2 * width) + 1) * (math.pi / width)
+    elevation = math.pi / 2 - (np.arange(-2, 2 * height + 1) + 1) * (math.pi / (2 * height))
+    elevation = np.clip(elevation, -math.pi / 2, math.pi / 2)
+    flat = np.cos(elevation)[:, None]
+    directions = np.empty((2 * height + 3, 2 * width, 3), np.float32)
+    directions[..., 0] = flat * np.cos(azimuth)
+    directions[..., 1] = flat * np.sin(azimuth)
+    directions[..., 2] = np.sin(elevation)[:, None]
+    return directions

@@ -1,0 +1,134 @@
+"""The panorama warped by its depth, against exact pictures of a box room and values worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.evaluation.pictures import psnr_db
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.nerf import KeyframeError, box_room
+from instant_ic.nerf.warp import PanoramaWarp, Pyramid
+
+FOV = math.pi / 2
+
+
+@pytest.fixture(scope="module")
+def room():
+    camera = pose_matrix(0.3, -0.2, 0.1, 0.4)
+    return camera, box_room.panorama(camera, 128)
+
+
+@pytest.fixture(scope="module")
+def warp(room):
+    camera, picture = room
+    return PanoramaWarp(picture.rgb, picture.depth_m, camera)
+
+
+def test_from_the_panoramas_own_place_nothing_is_missing(room, warp):
+    camera, _ = room
+    for yaw in (0.0, 2.0, math.pi):
+        pose = camera @ pose_matrix(yaw=yaw)
+        view, truth = warp.render(pose, 96, 54, FOV), box_room.perspective(pose, 96, 54, FOV)
+        assert view.confidence.min() == 1
+        assert psnr_db(view.rgb, truth.rgb) > 27
+        assert np.median(np.abs(view.depth_m / truth.depth_m - 1)) < 1e-3
+
+
+def test_the_poles_are_closed(room, warp):
+    camera, _ = room
+    for pitch in (math.pi / 2, -math.pi / 2):
+        view = warp.render(camera @ pose_matrix(pitch=pitch), 64, 64, FOV)
+        assert view.confidence.min() == 1
+
+
+def test_from_aside_it_is_the_rooms_picture(room, warp):
+    camera, _ = room
+    pose = camera @ pose_matrix(0.6, 0.4, 0.0, -0.3)
+    view, truth = warp.render(pose, 96, 54, FOV), box_room.perspective(pose, 96, 54, FOV)
+    turned = pose.copy()
+    turned[:3, 3] = camera[:3, 3]
+    assert psnr_db(view.rgb, truth.rgb) > 24 > psnr_db(warp.render(turned, 96, 54, FOV).rgb, truth.rgb) + 4
+    seen = view.confidence == 1
+    assert seen.mean() > 0.9
+    assert np.median(np.abs(view.depth_m[seen] / truth.depth_m[seen] - 1)) < 5e-3
+
+
+def test_behind_the_box_is_unknown_and_continued(warp):
+    # The box stands at (1.6..2.2, 0.4..1.1); from here one looks past it at the wall that it hid.
+    pose = pose_matrix(0.3, 1.5, 0.1, -0.1)
+    view = warp.render(pose, 96, 54, FOV)
+    hidden = view.confidence == 0
+    assert 0.02 < hidden.mean() < 0.4
+    assert view.rgb[hidden].max() > 30  # continued, not black
+
+
+def test_a_sphere_by_hand():
+    """All at 2 m, seen from 1 m ahead: 1 m in front, 3 m behind, √3 m to the side."""
+    rgb = np.zeros((64, 128, 3), np.uint8)
+    rgb[:, :64] = 200
+    warp = PanoramaWarp(rgb, np.full((64, 128), 2.0), np.eye(4))
+    for yaw, metres in ((0.0, 1.0), (math.pi, 3.0), (math.pi / 2, math.sqrt(3))):
+        view = warp.render(pose_matrix(1.0, yaw=yaw), 33, 33, FOV)
+        assert view.depth_m[16, 16] == pytest.approx(metres, rel=2e-3)
+        assert view.confidence.min() == 1
+    ahead = warp.render(pose_matrix(1.0), 33, 33, FOV)
+    assert ahead.rgb[16, 4, 0] == 200  # columns run clockwise: left of the centre lies ahead's left
+    assert ahead.rgb[16, 28, 0] == 0
+
+
+def test_from_outside_backs_are_unknown():
+    rgb = np.zeros((64, 128, 3), np.uint8)
+    rgb[::2] = 200
+    warp = PanoramaWarp(rgb, np.full((64, 128), 2.0), np.eye(4))
+    view = warp.render(pose_matrix(-5.0), 64, 64, 0.5)
+    assert view.confidence.max() == 0
+    assert (view.depth_m > 0).mean() > 0.9
+
+
+def test_a_wall_that_passes_through_the_views_plane_is_drawn_up_to_the_edge():
+    """A view 4 cm off a wall: triangles with a corner behind the view are drawn, not dropped."""
+    camera = pose_matrix()
+    picture = box_room.panorama(camera, 64)
+    warp = PanoramaWarp(picture.rgb, picture.depth_m, camera)
+    view = warp.render(pose_matrix(0.0, 1.96, 0.0), 64, 36, 2.0)
+    assert (view.confidence[:, :8] == 1).mean() > 0.95
+
+
+def test_fine_stripes_become_grey_in_a_small_picture():
+    """Stripes of one panorama pixel under view pixels of many: their mean, 100, and no moiré."""
+    rgb = np.zeros((512, 1024, 3), np.uint8)
+    rgb[:, ::2] = 200
+    warp = PanoramaWarp(rgb, np.full((32, 64), 3.0), np.eye(4))
+    view = warp.render(np.eye(4), 32, 18, FOV)
+    assert abs(view.rgb.astype(int) - 100).max() <= 2
+
+
+def test_a_pyramid_halves_by_area():
+    rgb = np.arange(16 * 32 * 3, dtype=np.uint32).reshape(16, 32, 3).astype(np.uint8)
+    pyramid = Pyramid.of(rgb)
+    assert pyramid.sizes.tolist() == [[16, 32], [8, 16]]
+    assert pyramid.start.tolist() == [0, 16 * 32]
+    first = rgb[:2, :2].reshape(4, 3).astype(float).mean(axis=0)
+    assert pyramid.texels[16 * 32] == pytest.approx(first, abs=0.51)
+
+
+def test_unknown_depth_is_filled_and_said(room):
+    camera, picture = room
+    depth = picture.depth_m.copy()
+    depth[:, 120:136] = 0  # ahead
+    view = PanoramaWarp(picture.rgb, depth, camera).render(camera, 96, 54, FOV)
+    assert np.all(view.confidence[:, 46:50] == 0.5)
+    assert np.all(view.confidence[:, :30] == 1)
+
+
+def test_what_is_no_keyframe_or_view_is_refused(room, warp):
+    camera, picture = room
+    with pytest.raises(KeyframeError, match="not finite"):
+        PanoramaWarp(picture.rgb, np.full((64, 128), np.nan), camera)
+    with pytest.raises(KeyframeError, match="one colour"):
+        PanoramaWarp(np.zeros_like(picture.rgb), picture.depth_m, camera)
+    with pytest.raises(ValueError, match="pixels a side"):
+        warp.render(camera, 8, 8, FOV)
+    with pytest.raises(ValueError, match="finite"):
+        warp.render(np.full((4, 4), np.nan), 64, 36, FOV)
