@@ -1,4 +1,12 @@
-"""The little that has to be known of a JPEG without decoding it (ITU-T T.81, annex B)."""
+"""The little that has to be known of a JPEG without decoding it (ITU-T T.81, annex B), and decoding it small."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 SOI = b"\xff\xd8"
 EOI = b"\xff\xd9"
@@ -51,3 +59,36 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
             break
         at += 2 + length
     raise JpegError("has no frame header")
+
+
+def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Decodes to (H, W, 3) uint8 RGB of at least the size that is needed.
+
+    The decoder makes the picture 2, 4 or 8 times smaller where that is still enough: it then computes that much less of
+    the inverse cosine transform. The size is rounded up.
+
+    Raises:
+        JpegError: it cannot be decoded.
+    """
+    import cv2
+    import numpy as np
+
+    flag = cv2.IMREAD_COLOR
+    try:
+        full_width, full_height = jpeg_size(bytes(data[:65536]))
+    except JpegError:  # a PNG perhaps
+        full_width, full_height = 0, 0
+    for n, reduced in (
+        (2, cv2.IMREAD_REDUCED_COLOR_2),
+        (4, cv2.IMREAD_REDUCED_COLOR_4),
+        (8, cv2.IMREAD_REDUCED_COLOR_8),
+    ):
+        if full_width >= n * width and full_height >= n * height:
+            flag = reduced
+    try:
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
+    except cv2.error:  # no bytes at all
+        bgr = None
+    if bgr is None:
+        raise JpegError("cannot be decoded")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

@@ -13,85 +13,84 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import equirect_directions
 
 from .manifest import ManifestError, ModelManifest, load_manifest, manifest_path
+from .providers import OpenSession, open_session
 
 DEFAULT_MODEL = "slicenet_small.onnx"
 MAX_GAIN = 2.5
 """A picture's brightness is changed by this factor at most, up or down."""
+INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
+
+
+class InferenceError(RuntimeError):
+    """The network did not come to its end; the text says why."""
 
 
 class DepthModel:
     """A depth network ready to run.
+
+    Attributes:
+        manifest: its interface.
+        provider: ``tensorrt``, ``cuda`` or ``cpu``: what runs it.
+        notes: why a faster provider was not taken, a line each.
 
     Example:
         >>> model = DepthModel.load("models/slicenet_small.onnx")      # doctest: +SKIP
         >>> depth = model.estimate(panorama)   # (H, W, 3) uint8 RGB -> (256, 512) float32, metres  # doctest: +SKIP
     """
 
-    def __init__(self, session: Any, manifest: ModelManifest) -> None:
+    def __init__(self, opened: OpenSession, manifest: ModelManifest, where: str | Path = "") -> None:
         self.manifest = manifest
-        self._session = session
-        self._input = session.get_inputs()[0].name
-        outputs = [output.name for output in session.get_outputs()]
-        if manifest.mask_output and manifest.mask_output not in outputs:
-            raise ManifestError(
-                f"{manifest.model}: no output {manifest.mask_output!r} for the mask (has: {', '.join(outputs)})"
-            )
-        depth_outputs = [name for name in outputs if name != manifest.mask_output]
-        if not depth_outputs:
-            raise ManifestError(f"{manifest.model}: no output besides the mask")
-        self._outputs = depth_outputs[:1] + ([manifest.mask_output] if manifest.mask_output else [])
-        shape = session.get_inputs()[0].shape
-        expected = [1, 3, manifest.input_height, manifest.input_width]
-        if len(shape) != 4 or any(isinstance(a, int) and a != b for a, b in zip(shape, expected, strict=True)):
-            raise ManifestError(f"{manifest.model}: takes an input of shape {shape}, the manifest says {expected}")
-        self._radial_factor: NDArray[np.float32] | None = None
-        if manifest.geometry == "planar":
-            directions = np.abs(equirect_directions(manifest.input_width, manifest.input_height))
-            self._radial_factor = 1.0 / directions.max(axis=-1)
+        self.provider = opened.provider
+        self.notes = opened.notes
+        self._where = where or manifest.model
+        self._session = opened.session
+        self._input, self._dtype = self._check_input()
+        self._outputs = self._check_outputs()
+        self._run_options: Any = None
+        self._radial: NDArray[np.float32] | None = None
 
     @classmethod
-    def load(cls, path: str | Path, threads: int = 2, providers: list[str] | None = None) -> DepthModel:
+    def load(cls, path: str | Path, threads: int = 2, provider: str = "auto") -> DepthModel:
         """Opens a model by its ``.onnx`` or its manifest.
 
         Args:
             path: the model or the manifest beside it.
             threads: CPU threads of one inference. The result does not depend on the time of day or on load.
-            providers: onnxruntime execution providers; by default CUDA where it is available, then the CPU.
+            provider: ``auto`` (the fastest that works), ``tensorrt``, ``cuda`` or ``cpu``. What does not work falls
+                back to the next; :attr:`provider` and :attr:`notes` tell.
 
         Raises:
             ManifestError: manifest or model is missing or they do not fit each other.
+            ValueError: no such provider, ``threads`` < 1.
         """
-        import onnxruntime
-
         manifest_file = manifest_path(path)
         manifest = load_manifest(manifest_file)
         model_file = manifest_file.parent / manifest.model
         if not model_file.is_file():
             raise ManifestError(f"{manifest_file}: model {model_file} does not exist")
-        if threads < 1:
-            raise ValueError(f"threads must be 1 or more (got {threads})")
-        content = model_file.read_bytes()
-        if manifest.sha256 and hashlib.sha256(content).hexdigest() != manifest.sha256:
-            raise ManifestError(f"{model_file}: SHA-256 differs from the manifest's; the file is damaged or another")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.use_deterministic_compute = True
-        # Idle workers sleep: the rest of the stack runs on the same cores.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 3
-        available = onnxruntime.get_available_providers()
-        chosen = providers or [p for p in ("CUDAExecutionProvider", "CPUExecutionProvider") if p in available]
+        if manifest.sha256:
+            with model_file.open("rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()
+            if found != manifest.sha256:
+                raise ManifestError(f"{model_file}: SHA-256 differs from the manifest's: the file is damaged or "
+                                    f"another (got {found})")  # fmt: skip
         try:
-            session = onnxruntime.InferenceSession(content, options, providers=chosen)
+            opened = open_session(model_file, threads, provider)
+        except ValueError:
+            raise
         except Exception as error:  # onnxruntime's exceptions share no public base
             raise ManifestError(f"{model_file}: onnxruntime cannot load it: {error}") from error
-        return cls(session, manifest)
+        return cls(opened, manifest, model_file)
 
     @property
-    def provider(self) -> str:
-        """The execution provider that runs it: ``CPUExecutionProvider`` or ``CUDAExecutionProvider``."""
-        return str(self._session.get_providers()[0])
+    def inputs(self) -> list[tuple[str, str, list[Any]]]:
+        """Name, type and shape of the network's inputs."""
+        return [(a.name, a.type, list(a.shape)) for a in self._session.get_inputs()]
+
+    @property
+    def outputs(self) -> list[tuple[str, str, list[Any]]]:
+        """Name, type and shape of the network's outputs."""
+        return [(a.name, a.type, list(a.shape)) for a in self._session.get_outputs()]
 
     def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Depth in the model's own unit (metres for metric models), radial, 0 = unknown.
@@ -100,41 +99,143 @@ class DepthModel:
             rgb: equirect panorama of any size, (H, W, 3) uint8.
 
         Returns:
-            (input_height, input_width) float32. Metric and scale-invariant depth is cut to the manifest's range.
+            (h, 2h) float32 with the rows of the network's output. Metric depth is cut to the manifest's range.
+            Relative depth and disparity are shifted where they are not positive, since their shift is free.
 
         Raises:
             ValueError: not such an array.
+            ManifestError: the outputs are not what the manifest says.
+            InferenceError: the network failed, or :meth:`cancel` ended it.
+        """
+        import onnxruntime
+
+        feeds = {self._input: self.prepare(rgb)}
+        self._run_options = options = onnxruntime.RunOptions()
+        try:
+            outputs = self._session.run(self._outputs, feeds, options)
+        except Exception as error:  # onnxruntime's exceptions share no public base
+            raise InferenceError(f"{self.manifest.name} on {self.provider}: {error}") from error
+        finally:
+            self._run_options = None
+        return self._finish(*outputs)
+
+    def cancel(self) -> None:
+        """Ends the inference that runs in another thread at its next layer; nothing where none runs."""
+        if (options := self._run_options) is not None:
+            options.terminate = True
+
+    def prepare(self, rgb: NDArray[np.uint8]) -> NDArray[Any]:
+        """The network's input, (1, 3, h, w) or (1, h, w, 3): resized by area averaging, then normalised.
+
+        Raises:
+            ValueError: ``rgb`` is not (H, W, 3) uint8.
         """
         manifest = self.manifest
-        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
             raise ValueError(f"rgb must be (H, W, 3) uint8 (got {rgb.shape} {rgb.dtype})")
-        feeds = {self._input: self.prepare(rgb)}
-        outputs = self._session.run(self._outputs, feeds)
-        size = (manifest.input_height, manifest.input_width)
-        depth = np.asarray(outputs[0], np.float32).reshape(size) * np.float32(manifest.output_scale)
-        if self._radial_factor is not None:
-            depth *= self._radial_factor
-        unknown = ~np.isfinite(depth)
-        if manifest.output_kind in ("metric", "scale_invariant"):
-            depth = np.clip(depth, manifest.min_range_m, manifest.max_range_m)
-        if manifest.mask_output:
-            unknown |= np.asarray(outputs[1]).reshape(size) <= 0.5
-        depth[unknown] = 0.0
-        return depth
-
-    def prepare(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The network's input, (1, 3, h, w) float32: resized by area averaging, then normalised."""
-        manifest = self.manifest
         size = (manifest.input_width, manifest.input_height)
         if (rgb.shape[1], rgb.shape[0]) != size:
             shrinks = rgb.shape[1] >= size[0] and rgb.shape[0] >= size[1]
             rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
+        levels = np.arange(256, dtype=np.float32)
         if manifest.brightness:
             gain = np.clip(manifest.brightness / max(float(rgb.mean()), 1.0), 1 / MAX_GAIN, MAX_GAIN)
-            rgb = cv2.convertScaleAbs(
-                np.ascontiguousarray(rgb), alpha=float(gain)
-            )  # saturates at 255, as a camera does
-        picture = rgb[..., ::-1] if manifest.channels == "bgr" else rgb
+            levels = np.minimum(np.round(levels * gain), 255).astype(np.float32)  # saturates, as a camera does
+        # A byte has 256 values, so all arithmetic goes into a table: (256, 1, 3), the channels in the network's order.
         mean, std = np.array(manifest.mean, np.float32), np.array(manifest.std, np.float32)
-        values = (picture.astype(np.float32) * np.float32(manifest.input_scale) - mean) / std
-        return np.ascontiguousarray(values.transpose(2, 0, 1)[None])
+        table = (levels[:, None, None] * np.float32(manifest.input_scale) - mean) / std
+        picture = rgb[..., ::-1] if manifest.channels == "bgr" else rgb
+        values = cv2.LUT(
+            np.ascontiguousarray(picture), table.astype(np.uint8 if self._dtype is np.uint8 else np.float32)
+        )
+        if manifest.input_layout == "nchw":
+            values = np.stack(cv2.split(values))
+        return np.ascontiguousarray(values[None], dtype=self._dtype)
+
+    def _finish(self, output: Any, mask: Any = None) -> NDArray[np.float32]:
+        """Network's outputs → depth as :meth:`estimate` gives it."""
+        manifest = self.manifest
+        depth = self._plane(output, self._outputs[0], points=manifest.output_form == "points")
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if manifest.output_form == "inverse":
+                depth = np.where(depth > 0, 1 / depth, 0)
+            depth = (depth * np.float32(manifest.output_scale)).astype(np.float32)
+        if mask is not None:
+            above = (self._plane(mask, self._outputs[1]) > manifest.mask_threshold).astype(np.uint8)
+            if above.shape != depth.shape:
+                above = np.asarray(cv2.resize(above, depth.shape[::-1], interpolation=cv2.INTER_NEAREST))
+            depth[(above == 1) == (manifest.mask_means == "invalid")] = np.nan
+        rows, columns = depth.shape
+        if columns != 2 * rows:  # the pixels of a panorama are square; no averages over depth edges
+            depth = np.asarray(cv2.resize(depth, (2 * rows, rows), interpolation=cv2.INTER_NEAREST))
+        if manifest.geometry == "planar":
+            if self._radial is None or self._radial.shape != depth.shape:
+                self._radial = 1.0 / np.abs(equirect_directions(2 * rows, rows)).max(axis=-1)
+            depth *= self._radial
+        known = np.isfinite(depth)
+        if manifest.output_kind in ("relative", "disparity"):
+            low, high = (depth[known].min(), depth[known].max()) if known.any() else (1.0, 1.0)
+            if low <= 0:
+                depth += max(float(high - low), 1e-6) * np.float32(1e-3) - low
+        else:
+            known &= depth > 0
+            if manifest.output_kind == "metric":
+                depth = np.clip(depth, manifest.min_range_m, manifest.max_range_m)
+        depth[~known] = 0.0
+        return depth
+
+    def _plane(self, values: Any, name: str, points: bool = False) -> NDArray[np.float32]:
+        """An output without its axes of one element, (h, w); the length of the vectors where it holds points."""
+        array = np.asarray(values)
+        found = array.shape
+        array = array.reshape([length for length in found if length != 1]).astype(np.float32)
+        if points and array.ndim == 3 and 3 in (array.shape[0], array.shape[-1]):
+            array = np.linalg.norm(array, axis=0 if array.shape[0] == 3 else -1)
+        if array.ndim != 2 or min(array.shape) < 8 or not 1.5 <= array.shape[1] / array.shape[0] <= 2.5:
+            wanted = "3 coordinates a pixel" if points else "one number a pixel"
+            names = ", ".join(a[0] for a in self.outputs)
+            raise ManifestError(f"{self._where}: output {name!r} is {list(found)}; {wanted} of a panorama is needed "
+                                f"(depth_output names one of {names}; see output_form)")  # fmt: skip
+        return array
+
+    def _check_input(self) -> tuple[str, type]:
+        manifest, inputs = self.manifest, self.inputs
+        if len(inputs) != 1:
+            names = ", ".join(a[0] for a in inputs)
+            raise ManifestError(f"{self._where}: takes {len(inputs)} inputs ({names}); only the picture can be given")
+        name, kind, shape = inputs[0]
+        if kind not in INPUT_TYPES:
+            raise ManifestError(f"{self._where}: input {name!r} is {kind}; one of {', '.join(INPUT_TYPES)} is needed")
+        dtype = INPUT_TYPES[kind]
+        if dtype is np.uint8 and (manifest.input_scale, manifest.mean, manifest.std) != (1.0, (0.0,) * 3, (1.0,) * 3):
+            raise ManifestError(f"{self._where}: input {name!r} takes bytes: the manifest must say input_scale 1, mean "
+                                "0, std 1")  # fmt: skip
+        size = [manifest.input_height, manifest.input_width]
+        layouts = {"nchw": [1, 3, *size], "nhwc": [1, *size, 3]}
+        if not _fits(shape, expected := layouts[manifest.input_layout]):
+            hint = next((f"; its input_layout is {other}" for other, s in layouts.items() if _fits(shape, s)), "")
+            raise ManifestError(f"{self._where}: takes an input of shape {shape}, the manifest says {expected}{hint}")
+        return name, dtype
+
+    def _check_outputs(self) -> list[str]:
+        manifest = self.manifest
+        names = [name for name, _, _ in self.outputs]
+        for key in ("depth_output", "mask_output"):
+            name, purpose = getattr(manifest, key), key.split("_")[0]
+            if name and name not in names:
+                raise ManifestError(f"{self._where}: no output {name!r} for the {purpose} (has: {', '.join(names)})")
+        depth = manifest.depth_output or next((name for name in names if name != manifest.mask_output), "")
+        if not depth:
+            raise ManifestError(f"{self._where}: no output besides the mask")
+        chosen = [depth, manifest.mask_output] if manifest.mask_output else [depth]
+        for name, _, shape in self.outputs:
+            if name in chosen and all(isinstance(length, int) and length > 0 for length in shape):
+                self._plane(
+                    np.broadcast_to(np.float32(0), shape), name, name == depth and manifest.output_form == "points"
+                )
+        return chosen
+
+
+def _fits(shape: list[Any], expected: list[int]) -> bool:
+    """Whether a network's input shape, with text or None for what is open, takes ``expected``."""
+    return len(shape) == 4 and all(not isinstance(a, int) or a == b for a, b in zip(shape, expected, strict=True))
