@@ -42,20 +42,20 @@ def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
 
 def save_view_strip(path: Path, rows: Sequence[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
     """Rows of (label, rendered view, the photo's own crop), side by side."""
-    figure, axes = _figure(len(rows), 2, (10.0, 2.95 * len(rows)))
+    figure, axes = new_figure(len(rows), 2, (10.0, 2.95 * len(rows)))
     for (label, view, crop), (left, right) in zip(rows, axes, strict=True):
         for axis, picture, title in ((left, view, f"virtual space, {label}"), (right, crop, "photo")):
             axis.imshow(picture)
             axis.set_title(title, fontsize=9)
             axis.set_axis_off()
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.float32], title: str) -> None:
     """The panorama above its depth in colours with a scale in metres; unknown depth is grey."""
     import matplotlib
 
-    figure, axes = _figure(2, 1, (9.0, 9.4))
+    figure, axes = new_figure(2, 1, (9.0, 9.4))
     axes[0, 0].imshow(panorama)
     axes[0, 0].set_axis_off()
     known = np.ma.masked_less_equal(depth_m, 0)
@@ -65,7 +65,7 @@ def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.floa
     axes[1, 0].set_axis_off()
     axes[1, 0].set_title(title, fontsize=9)
     figure.colorbar(drawn, ax=axes[1, 0], orientation="horizontal", label="m", fraction=0.05, pad=0.03)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def save_map(
@@ -77,7 +77,7 @@ def save_map(
     paths: dict[str, NDArray[np.float64]] | None = None,
 ) -> None:
     """An occupancy grid (−1 unknown, 0..100) with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
-    figure, axes = _figure(1, 1, (7.0, 7.0))
+    figure, axes = new_figure(1, 1, (7.0, 7.0))
     axis = axes[0, 0]
     # Three tones by where the evidence points, a little by how strong it is: one look of a standing robot is weak
     # evidence everywhere, and would be grey on grey.
@@ -102,10 +102,11 @@ def save_map(
     axis.set_ylabel("y, m")
     if robot is not None or paths:
         axis.legend(fontsize=8)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, NDArray[Any]]:
+def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, NDArray[Any]]:
+    """A figure of ``size`` inches and its axes (rows, columns); it draws without a display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -114,6 +115,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, ND
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def _save(figure: Any, path: Path) -> None:
+def save_figure(figure: Any, path: Path) -> None:
+    """Writes a figure, and its folder where there is none."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
