@@ -127,9 +127,37 @@ def plane_height(z: Floats, across_m: Floats, columns: NDArray[np.intp], bin_m: 
     if pair.sum() < 20:
         return None
     heights = 0.5 * (z[1:] + z[:-1])[pair]
+    # Nothing is seen through a floor or a ceiling; a table has points on both sides.
+    sign = 1.0 if heights.mean() > 0 else -1.0
+    heights = heights[sign * heights > np.quantile(sign * z, 0.98) - 0.2]
+    if len(heights) < 20:
+        return None
     bins = ((heights - heights.min()) / bin_m).astype(np.intp)
     best = int(np.convolve(np.bincount(bins), np.ones(3), "same").argmax())
     return float(np.median(heights[np.abs(bins - best) <= 1]))
+
+
+_AROUND = [(row, column) for row in (-2, -1, 0, 1, 2) for column in (-2, -1, 1, 2)]
+
+
+def lonely(measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], alike: float = 0.12) -> Floats:
+    """Which points (N,) nothing around them confirms: dust, mixed pixels, mirrors.
+
+    Args:
+        measured: (H, W) ranges, 0 where no point is.
+        rows, columns: (N,) the pixels with points.
+        alike: two ranges are alike when they differ by less than this share.
+    """
+    height, width = measured.shape
+    own = measured[rows, columns]
+    there = np.zeros(len(rows), np.int32)
+    same = np.zeros(len(rows), np.int32)
+    for row, column in _AROUND:
+        other = measured[np.clip(rows + row, 0, height - 1), (columns + column) % width]
+        there += other > 0
+        same += np.abs(other - own) < alike * own
+    # A point that is wrong along its beam shows elsewhere in the camera's picture, often with nothing around it.
+    return (same < 2) & (float(np.median(there)) >= 4)
 
 
 @lru_cache(maxsize=4)
@@ -213,8 +241,14 @@ class LidarStructure:
         rows, columns, range_m = nearest_points(level, width, height)
         elevation = (np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)).astype(np.float32)[:, None]
         cos, sin = np.cos(elevation), np.sin(elevation)
+        tan = sin / cos
         hit = np.zeros((height, width), np.float32)  # horizontal range; inf on floor and ceiling
         flat = np.zeros((height, width), bool)
+        measured = np.zeros((height, width), np.float32)
+        measured[rows, columns] = range_m
+        alone = lonely(measured, rows, columns)
+        measured[rows[alone], columns[alone]] = 0
+        rows, columns, range_m = rows[~alone], columns[~alone], range_m[~alone]
         z = range_m * sin[rows, 0]
         # A row's own height is half a pixel wide, which far away is more than the tolerance.
         slack = config.floor_tolerance_m + range_m * (np.pi / height)
@@ -225,8 +259,6 @@ class LidarStructure:
             level_point |= z > ceiling - slack
         hit[rows, columns] = range_m * cos[rows, 0]
         flat[rows, columns] = level_point
-        measured = np.zeros((height, width), np.float32)
-        measured[rows, columns] = range_m
 
         some = hit > 0
         columns_used = _bridge(np.any(some, axis=0), round(config.max_gap_deg / 360 * width))
@@ -255,27 +287,39 @@ class LidarStructure:
             wall[where] = value[where]
             origin[where] = how
 
+        # Up to its top a column is known where the LiDAR's uppermost ring came back; else what is above is taken from
+        # the nearest column where it did.
+        whole = _reaches_top(np.where(some, hit, 0) * ~flat, sin / cos)
+        donor = _bridge(whole, round(config.max_gap_deg / 360 * width))
+        first = np.where(some.any(axis=0), some.argmax(axis=0), 0)
+        crown = np.where(donor >= 0, hit[first[donor], donor], 0)
+        wall_top = np.where(whole, r_below, crown)
         put(same, r_above * (1 - share) + r_below * share, Origin.BETWEEN)
         put(both & ~same, np.where(nearer_above, r_above, r_below), Origin.EDGE)
         put(w_above & f_below, r_above, Origin.DOWN)
         put(w_below & f_above & (elevation > 0), r_below, Origin.UP)
         # Something low with floor seen over it: its top is somewhere between.
         put(w_below & f_above & (elevation <= 0) & ~nearer_above, r_below, Origin.EDGE)
-        put(w_below & ~has_above, r_below, Origin.UP)
+        put(w_below & ~has_above & (wall_top > 0), wall_top, Origin.UP)
         put(w_above & ~has_below, r_above, Origin.DOWN)
 
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = np.where(wall > 0, wall / cos, np.inf)
+            # A level surface between two points of one height: a table, a bench.
+            h_above, h_below = r_above * tan[np.maximum(above, 0), 0], r_below * tan[np.minimum(below, height - 1), 0]
+            plate = both & ~same & (h_above < -0.15) & (np.abs(h_above - h_below) < 0.05)
+            depth = np.where(plate, 0.5 * (h_above + h_below) / sin, depth)
+            origin[plate] = Origin.BETWEEN
             if floor is not None:
                 to_floor = np.where(sin < 0, floor / -sin, np.inf)
                 origin[to_floor < depth] = Origin.FLOOR
                 depth = np.minimum(depth, to_floor)
             top, how = (ceiling, Origin.CEILING) if ceiling is not None else (ceiling_guess, Origin.ASSUMED)
             if top is None and floor is not None:
-                top = max(config.ceiling_height_m - floor, float(z[~level_point].max(initial=0.1)))
+                top = max(config.ceiling_height_m - floor, _upper(z[~level_point]))
             if top is not None:
                 # Never lower than what was seen upright in this column: there the ceiling is higher.
-                seen = np.where(some & ~flat, hit * (sin / cos), 0).max(axis=0)
+                seen = _middle(np.where(some & ~flat, hit * (sin / cos), 0).max(axis=0))
                 to_top = np.where(
                     (sin > 0) & ((wall > 0) | (flat & (hit * sin > 0)).any(axis=0)),
                     np.maximum(top, seen + 0.05) / sin,
@@ -294,7 +338,8 @@ class LidarStructure:
         never = columns_used < 0
         if never.any():
             ground = to_floor[:, 0] if floor is not None else np.full(height, np.inf)
-            ground = np.where(ground <= config.max_range_m, ground, 0)[:, None]
+            # Nothing came back: open, or too near to be measured. Only what the robot stands on is sure.
+            ground = np.where(ground * cos[:, 0] <= config.min_range_m, ground, 0)[:, None]
             depth[:, never] = ground
             origin[:, never] = np.where(ground > 0, Origin.FLOOR, Origin.UNKNOWN)
         gap_rad = np.minimum(gap, height) * (np.pi / height)
@@ -313,6 +358,39 @@ _SIGMA = np.array(
 def structure_sigma(origin: NDArray[np.uint8], gap_rad: Floats) -> NDArray[np.float32]:
     """Relative standard deviation (H, W) of pixels of an ``Origin`` whose next point is ``gap_rad`` away."""
     return np.hypot(_SIGMA[origin, 0], _SIGMA[origin, 1] * gap_rad.astype(np.float32))
+
+
+def _upper(z: Floats) -> float:
+    """Height under which nearly all of the points' heights (N,) lie, at least 0.1 m."""
+    return max(0.1, float(np.quantile(z, 0.995))) if len(z) else 0.1
+
+
+def _reaches_top(hit: Floats, tan: Floats) -> NDArray[np.bool_]:
+    """Columns (W,) whose uppermost upright point lies where the LiDAR's uppermost ring runs.
+
+    Args:
+        hit: (H, W) horizontal ranges of upright points, 0 where none is.
+        tan: (H, 1) tangent of each row's elevation.
+    """
+    some = hit > 0
+    there = some.any(axis=0)
+    row = some.argmax(axis=0)
+    across = hit[row, np.arange(hit.shape[1])]
+    z = across * tan[row, 0]
+    use = there.copy()
+    line = np.zeros(2)
+    # The ring is a line in range and height; what ends below it is left out by and by.
+    for slack in (np.inf, 0.3, 0.15):
+        use = there & (z > line[0] + line[1] * across - slack)
+        if use.sum() < 10 or np.ptp(across[use]) < 0.2:
+            return there
+        line = np.polynomial.polynomial.polyfit(across[use], z[use], 1)
+    return np.asarray(there & (z > line[0] + line[1] * across - 0.1 - 0.03 * across))
+
+
+def _middle(values: Floats, reach: int = 3) -> Floats:
+    """Median over neighbouring columns (W,), which wrap."""
+    return np.asarray(np.median([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
 
 
 def _bridge(seen: NDArray[np.bool_], most: int) -> NDArray[np.intp]:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ranges import check_ranges
-from .fusion import FusionConfig, fuse
-from .lidar_depth import LidarDepthConfig, LidarStructure
+from .fusion import FusionConfig, ceiling_height, fuse
+from .lidar_depth import LidarDepthConfig, LidarStructure, _rays
 from .scaler import DepthScaler, ScaleFit, ScalerConfig, nearest_points
 
 Floats = NDArray[np.floating]
@@ -113,13 +113,18 @@ class DepthSource:
         fit = self.scaler.fit(raw, points)
         if config.source == "network" or config.scaler.method == "as_estimated":
             return _of_fit(fit)
-        built = self.structure.estimate(points, up, camera_height_m, raw.shape)
+        rise = _rays(*raw.shape) @ (np.asarray(up, np.float32) / np.float32(np.linalg.norm(up)))
+        top = ceiling_height(fit.depth_m, rise)
+        built = self.structure.estimate(points, up, camera_height_m, raw.shape, None if top is None else top[0])
         if not fit.ok or built.message:
             return _of_fit(fit)
-        depth, sigma = fuse(fit.depth_m, fit.relative_sigma, built.depth_m, built.sigma, config.fusion)
-        quality = agreement(depth, points, config.scaler)
+        fused = fuse(fit.depth_m, fit.relative_sigma, built.depth_m, built.origin, config.fusion)
         return replace(
-            _of_fit(fit), depth_m=depth, sigma=sigma, quality=quality, relative_sigma=_median(sigma), source="fused"
+            _of_fit(fit),
+            depth_m=fused.depth_m,
+            sigma=fused.sigma,
+            relative_sigma=_median(fused.sigma),
+            source="fused",
         )
 
     def _lidar(self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int]) -> DepthResult:
