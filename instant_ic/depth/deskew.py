@@ -24,8 +24,8 @@ def points_at(
         time_s: (N,) seconds after ``start_ns``.
         start_ns: stamp of the cloud.
         camera_from_lidar: pose of the LiDAR at a time (ns) in the camera's frame at the picture's time.
-        slices: poses a revolution; points between two share the nearer one. At 10 Hz and 1 rad/s twelve leave
-            an error under 0.25 degrees.
+        slices: stretches between poses of a revolution; a point between two poses is blended from where both put it.
+            At 10 Hz and 2 rad/s twelve leave 0.04 mm at 1 m.
 
     Returns:
         (M, 3) float64 points in the camera's frame, in the order given.
@@ -36,10 +36,13 @@ def points_at(
         return measured
     first, last = float(time_s.min()), float(time_s.max())
     width = max((last - first) / slices, 1e-9)
-    index = np.minimum(((time_s - first) / width).astype(np.intp), slices - 1)
+    place = np.minimum((time_s - first) / width, slices)
+    index = np.minimum(place.astype(np.intp), slices - 1)
+    poses = [camera_from_lidar(start_ns + round((first + k * width) * 1e9)) for k in range(slices + 1)]
     moved = np.empty_like(measured)
-    for number in np.unique(index):
-        chosen = index == number
-        middle_ns = start_ns + round((first + (number + 0.5) * width) * 1e9)
-        moved[chosen] = transform_points(camera_from_lidar(middle_ns), measured[chosen])
+    for k in np.unique(index):
+        chosen = index == k
+        share = (place[chosen] - k)[:, None]
+        before, after = (transform_points(pose, measured[chosen]) for pose in poses[k : k + 2])
+        moved[chosen] = (1 - share) * before + share * after
     return moved

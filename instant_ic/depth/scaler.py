@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_pixels
+from instant_ic.ranges import NotNegative, Positive, Range, Share, check_ranges
 
-from ..ranges import NotNegative, Positive, Range, Share, check_ranges
+from .scale_rules import (
+    MIN_VALUES,
+    Floats,
+    ScaleError,
+    consensus_scale,
+    max_ratio_scale,
+    median_ratio_scale,
+    ransac_line,
+    sector_factors,
+    solid_angle_quantile,
+)
+from .visibility import hidden, nearest_points, on_depth_edge
 
-Floats = NDArray[np.floating]
-MIN_VALUES = 20
-METHODS = ("max_ratio", "median_ratio", "as_estimated")
+METHODS = ("max_ratio", "median_ratio", "ransac", "sector", "as_estimated")
 MAXIMA = ("lidar", "image")
 OUTPUT_KINDS = ("metric", "scale_invariant", "relative", "disparity")
-
-
-class ScaleError(ValueError):
-    """No scale can be found; the text says why."""
+SECTOR_REACH = 0.35
+"""A point farther off than a factor e**0.35 has no say in its sector: glass, a doorway, an outlier."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +35,11 @@ class ScalerConfig:
     """How depth is scaled.
 
     Attributes:
-        method: ``median_ratio`` (median of range over depth at the points) or ``max_ratio`` (the paper's rule).
-            Only for ``metric`` and ``scale_invariant`` depth; the others get a robust line. ``as_estimated`` takes
-            the metres of a ``metric`` model unseen, for pictures and LiDAR from different places; never for driving.
+        method: ``median_ratio`` (median of range over depth at the points), ``ransac`` (the scale that most points
+            agree on), ``sector`` (that, and a smooth factor over azimuth) or ``max_ratio`` (the paper's rule).
+            ``relative`` and ``disparity`` depth gets scale and shift by RANSAC under any of them. ``as_estimated``
+            takes the metres of a ``metric`` model unseen, for pictures and LiDAR from different places; never for
+            driving.
         maxima: where ``max_ratio`` takes the depth's maximum: ``lidar``, over the directions that the LiDAR sees, or
             ``image``, over the whole picture by solid angle.
         confidence: quantile that stands for the maximum (paper: 99.5 %).
@@ -40,13 +48,17 @@ class ScalerConfig:
         max_range_m: farther points are left out, and scaled depth is cut there.
         min_points: fewer points in the picture give no scale.
         min_azimuth_deg: points in fewer degrees of azimuth give no scale.
+        sector_deg: width of the sectors of ``sector``; 360 is a multiple of it.
+        sector_points: a sector with so many points gets half of its own correction, with more the more.
         agreement: a point agrees when scaled depth and range differ by no more than this share of the range.
         min_quality: a smaller share of agreeing points makes the fit not ok.
+        max_rival: the fit is not ok when a quite different scale has more than this share of the points that the
+            scale has: half of a room behind glass, or a mirror.
         min_scale, max_scale: a scale outside makes the fit not ok (``metric`` and ``scale_invariant``).
         assumed_sigma: relative standard deviation that is told of depth taken ``as_estimated``, which nobody measured.
     """
 
-    method: str = "median_ratio"
+    method: str = "sector"
     maxima: str = "lidar"
     confidence: Annotated[float, Range(0.5, 1)] = 0.995
     output_kind: str = "metric"
@@ -54,8 +66,11 @@ class ScalerConfig:
     max_range_m: Positive = 16.0
     min_points: Annotated[int, Range(MIN_VALUES)] = 300
     min_azimuth_deg: Annotated[float, Range(0, 360)] = 90.0
+    sector_deg: Annotated[float, Range(5, 90)] = 15.0
+    sector_points: Positive = 30.0
     agreement: Annotated[float, Range(above=0, below=1)] = 0.15
     min_quality: Share = 0.25
+    max_rival: Annotated[float, Range(above=0, high=1)] = 0.7
     min_scale: Positive = 0.05
     max_scale: Positive = 20.0
     assumed_sigma: Annotated[float, Range(above=0, high=1)] = 0.2
@@ -65,6 +80,8 @@ class ScalerConfig:
             if getattr(self, key) not in allowed:
                 raise ValueError(f"{key} must be one of {', '.join(allowed)} (got {getattr(self, key)!r})")
         check_ranges(self)
+        if abs(360.0 / self.sector_deg - round(360.0 / self.sector_deg)) > 1e-6:
+            raise ValueError(f"360 must be a multiple of sector_deg (got {self.sector_deg})")
         if not self.min_range_m < self.max_range_m:
             raise ValueError(f"min_range_m must be under max_range_m (got {self.min_range_m}, {self.max_range_m})")
         if not self.min_scale < self.max_scale:
@@ -79,13 +96,14 @@ class ScaleFit:
 
     Attributes:
         ok: false: do not trust ``depth_m``; ``message`` says why.
-        scale: metres per unit of depth; for ``disparity``, inverse metres per unit.
+        scale: metres per unit of depth; for ``disparity``, inverse metres per unit. Of the whole picture.
         shift: metres (``relative``) or inverse metres (``disparity``) added after scaling; else 0.
         depth_m: (H, W) float32 scaled radial depth, 0 = unknown.
         quality: share of points whose range agrees with the scaled depth, 0..1.
         relative_sigma: one standard deviation of (depth - range) / range, robust; inf where nothing was compared.
         points: number of points compared.
         message: for people.
+        scale_field: (H, W) factor on top of scale and shift in each direction (``sector``); None: one everywhere.
     """
 
     ok: bool
@@ -96,114 +114,7 @@ class ScaleFit:
     relative_sigma: float
     points: int
     message: str
-
-
-def project_points(points: Floats, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-    """Projects points (N, 3) in the camera's frame onto an equirect picture.
-
-    Returns:
-        ``u, v`` index coordinates (see ``geometry.projections.equirect_pixels``) and the range in metres, each (N,).
-    """
-    u, v = equirect_pixels(points, width, height)
-    return u, v, np.linalg.norm(points, axis=-1)
-
-
-def nearest_points(points: Floats, width: int, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Rows, columns and ranges of the nearest point in each pixel that has one.
-
-    The LiDAR hangs elsewhere than the camera and sees behind things; of two points in one pixel the nearer is the
-    one that the camera sees.
-    """
-    u, v, range_m = project_points(points, width, height)
-    rows = np.clip(np.rint(v).astype(np.intp), 0, height - 1)
-    columns = np.rint(u).astype(np.intp) % width
-    pixel = rows * width + columns
-    order = np.lexsort((range_m, pixel))
-    first = np.ones(len(order), bool)
-    first[1:] = pixel[order[1:]] != pixel[order[:-1]]
-    kept = order[first]
-    return rows[kept], columns[kept], range_m[kept]
-
-
-def max_ratio_scale(depth: Floats, range_m: Floats, confidence: float = 0.995) -> float:
-    """Scale that brings the largest depth to the largest range (paper, equation of section IV.C).
-
-    Args:
-        depth: estimated depth, any shape and unit; values that are not positive and finite are left out.
-        range_m: LiDAR ranges in metres, any shape; likewise.
-        confidence: quantile that stands for the maximum, which keeps outliers out.
-
-    Returns:
-        Metres per unit of depth.
-
-    Raises:
-        ScaleError: fewer than ``MIN_VALUES`` usable values on either side.
-    """
-    usable = [_positive(values, name) for values, name in ((depth, "depth"), (range_m, "range"))]
-    largest_depth, largest_range = (float(np.quantile(values, confidence)) for values in usable)
-    return largest_range / largest_depth
-
-
-def median_ratio_scale(depth: Floats, range_m: Floats) -> float:
-    """Median of range over depth, pairs of the same direction, both (N,).
-
-    Raises:
-        ScaleError: fewer than ``MIN_VALUES`` usable pairs.
-    """
-    usable = np.isfinite(depth) & (depth > 0) & np.isfinite(range_m) & (range_m > 0)
-    return float(np.median(_positive(range_m[usable] / depth[usable], "pairs of range and depth")))
-
-
-def robust_line(x: Floats, y: Floats, iterations: int = 20) -> tuple[float, float]:
-    """Slope and offset of y = slope x + offset with Huber weights, both (N,).
-
-    Raises:
-        ScaleError: too few values, or x does not vary.
-    """
-    if len(x) < MIN_VALUES:
-        raise ScaleError(f"only {len(x)} values, {MIN_VALUES} are needed")
-    x, y = x.astype(np.float64), y.astype(np.float64)
-    if np.ptp(x) < 1e-9:
-        raise ScaleError("the estimated depth is the same everywhere")
-    weights = np.ones_like(x)
-    slope = offset = 0.0
-    for _ in range(iterations):
-        mean_x, mean_y = np.average(x, weights=weights), np.average(y, weights=weights)
-        spread = float((weights * (x - mean_x) ** 2).sum())
-        if spread < 1e-12:
-            raise ScaleError("the estimated depth is the same at every point that agrees")
-        slope = float((weights * (x - mean_x) * (y - mean_y)).sum()) / spread
-        offset = float(mean_y - slope * mean_x)
-        residual = np.abs(y - slope * x - offset)
-        cut = max(1.345 * 1.4826 * float(np.median(residual)), 1e-9)
-        weights = np.minimum(1.0, cut / np.maximum(residual, 1e-12))
-    return slope, offset
-
-
-def solid_angle_quantile(depth: Floats, confidence: float) -> float:
-    """Quantile of the known depth of an equirect picture (H, W), each pixel counted by its solid angle.
-
-    Raises:
-        ScaleError: fewer than ``MIN_VALUES`` known pixels.
-    """
-    height, width = depth.shape
-    elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
-    weights = np.broadcast_to(np.cos(elevation)[:, None], (height, width))
-    known = np.isfinite(depth) & (depth > 0)
-    if int(known.sum()) < MIN_VALUES:
-        raise ScaleError(f"only {int(known.sum())} usable values of depth, {MIN_VALUES} are needed")
-    values, counts = depth[known], weights[known]
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(counts[order])
-    place = int(np.searchsorted(total, confidence * total[-1]))
-    return float(values[order[min(place, len(order) - 1)]])
-
-
-def _positive(values: Floats, name: str) -> Floats:
-    usable = values[np.isfinite(values) & (values > 0)]
-    if len(usable) < MIN_VALUES:
-        raise ScaleError(f"only {len(usable)} usable values of {name}, {MIN_VALUES} are needed")
-    return usable
+    scale_field: NDArray[np.float32] | None = None
 
 
 class DepthScaler:
@@ -249,30 +160,54 @@ class DepthScaler:
     def _fit(self, depth: Floats, points: Floats) -> ScaleFit:
         config = self.config
         rows, columns, range_m = self._visible(points, *depth.shape)
-        at_points = depth[rows, columns]
-        known = np.isfinite(at_points) & (at_points > 0)
-        if int(known.sum()) < config.min_points:
-            raise ScaleError(f"{int(known.sum())} LiDAR points fall on known depth, {config.min_points} are needed")
-        at_points, range_m = at_points[known], range_m[known]
-        scale, shift, apply = self._line(depth, at_points, range_m)
-        scaled = apply(at_points)
+        usable = _is_known(depth[rows, columns])
+        if int(usable.sum()) < config.min_points:
+            raise ScaleError(f"{int(usable.sum())} LiDAR points fall on known depth, {config.min_points} are needed")
+        usable &= ~on_depth_edge(depth, rows, columns)
+        if int(usable.sum()) < config.min_points:
+            raise ScaleError(
+                f"{int(usable.sum())} LiDAR points fall off the depth's edges, {config.min_points} are needed"
+            )
+        rows, columns, range_m = rows[usable], columns[usable], range_m[usable]
+        self._check_azimuth(columns, depth.shape[1])
+        scale, shift = self._line(depth, depth[rows, columns], range_m)
+        if scale <= 0:
+            raise ScaleError(f"depth falls where the range grows (slope {scale:.3g})")
+        metres = self._metres(depth, scale, shift)
+        field = self._field(metres, rows, columns, range_m) if config.method == "sector" else None
+        if field is not None:
+            metres = metres * field
+        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
+        return self._judged(metres, rows, columns, range_m, scale, shift, line, field)
+
+    def _judged(
+        self,
+        metres: Floats,
+        rows: NDArray[np.intp],
+        columns: NDArray[np.intp],
+        range_m: Floats,
+        scale: float,
+        shift: float,
+        line: str,
+        field: NDArray[np.float32] | None,
+    ) -> ScaleFit:
+        """The fit with its quality; ``ok`` where nothing speaks against it."""
+        config = self.config
+        scaled = metres[rows, columns]
         error = np.where(np.isfinite(scaled), (scaled - range_m) / range_m, np.inf)
         quality = float((np.abs(error) <= config.agreement).mean())
         finite = error[np.isfinite(error)]
         sigma = 1.4826 * float(np.median(np.abs(finite))) if len(finite) else float("inf")
-        problem = self._problem(scale, quality)
-        line = f"scale {scale:.3f}" + (f", shift {shift:.3f}" if shift else "")
         message = f"{line}: {quality:.0%} of {len(range_m)} points within {config.agreement:.0%}"
+        behind = float((error < -1 / 3).mean())
+        if behind > 0.15:
+            message += f", {behind:.0%} far behind the depth (glass, a mirror, a doorway?)"
+        problem = self._problem(scale, quality, scaled, range_m)
+        if problem:
+            message = f"{problem}; {message}"
         return ScaleFit(
-            ok=not problem,
-            scale=scale,
-            shift=shift,
-            depth_m=self._clean(apply(depth)),
-            quality=quality,
-            relative_sigma=sigma,
-            points=len(range_m),
-            message=f"{problem}; {message}" if problem else message,
-        )
+            not problem, scale, shift, self._clean(metres), quality, sigma, len(range_m), message, field
+        )  # fmt: skip
 
     def _visible(self, points: Floats, height: int, width: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
         config = self.config
@@ -284,49 +219,67 @@ class DepthScaler:
                 f"{len(points)} LiDAR points between {config.min_range_m} and {config.max_range_m} m, "
                 f"{config.min_points} are needed"
             )
-        rows, columns, range_m = nearest_points(points, width, height)
-        covered = len(np.unique(columns * 120 // width)) * 3.0
-        if covered < config.min_azimuth_deg:
-            raise ScaleError(
-                f"LiDAR points cover {covered:.0f} deg of azimuth, {config.min_azimuth_deg:.0f} are needed"
-            )
+        rows, columns, range_m = nearest_points(points[~hidden(points)], width, height)
+        self._check_azimuth(columns, width)
         return rows, columns, range_m
 
-    def _line(
-        self, depth: Floats, at_points: Floats, range_m: Floats
-    ) -> tuple[float, float, Callable[[Floats], Floats]]:
-        """Scale, shift and the function from the model's unit to metres (not finite where there is none)."""
+    def _check_azimuth(self, columns: NDArray[np.intp], width: int) -> None:
+        covered, needed = len(np.unique(columns * 120 // width)) * 3.0, self.config.min_azimuth_deg
+        if covered < needed:
+            raise ScaleError(f"LiDAR points cover {covered:.0f} deg of azimuth, {needed:.0f} are needed")
+
+    def _line(self, depth: Floats, at_points: Floats, range_m: Floats) -> tuple[float, float]:
+        """Scale and shift between the model's unit and metres (inverse metres for ``disparity``)."""
         config = self.config
         if config.output_kind == "relative":
-            slope, offset = robust_line(at_points, range_m)
-            return slope, offset, lambda d: np.where(_is_known(d), slope * d + offset, np.nan)
+            return ransac_line(at_points, range_m, config.agreement * range_m)[:2]
         if config.output_kind == "disparity":
-            slope, offset = robust_line(at_points, 1.0 / range_m)
-
-            def to_metres(d: Floats) -> Floats:
-                inverse = np.where(_is_known(d), slope * d + offset, np.nan)
-                # Beyond the longest range the line's offset says nothing any more.
-                return 1.0 / np.maximum(inverse, 1.0 / config.max_range_m)
-
-            return slope, offset, to_metres
+            return ransac_line(at_points, 1.0 / range_m, config.agreement / range_m)[:2]
         if config.method == "median_ratio":
-            scale = median_ratio_scale(at_points, range_m)
-        elif config.maxima == "lidar":
-            scale = max_ratio_scale(at_points, range_m, config.confidence)
-        else:
-            largest = float(np.quantile(range_m, config.confidence))
-            scale = largest / solid_angle_quantile(depth, config.confidence)
-        return scale, 0.0, lambda d: np.where(_is_known(d), scale * d, np.nan)
+            return median_ratio_scale(at_points, range_m), 0.0
+        if config.method in ("ransac", "sector"):
+            return consensus_scale(at_points, range_m, config.agreement).scale, 0.0
+        if config.maxima == "lidar":
+            return max_ratio_scale(at_points, range_m, config.confidence), 0.0
+        largest = float(np.quantile(range_m, config.confidence))
+        return largest / solid_angle_quantile(depth, config.confidence), 0.0
 
-    def _problem(self, scale: float, quality: float) -> str:
+    def _metres(self, depth: Floats, scale: float, shift: float) -> NDArray[np.float64]:
+        """Depth (H, W) in metres, not finite where it is unknown."""
+        line = np.where(_is_known(depth), scale * depth.astype(np.float64) + shift, np.nan)
+        if self.config.output_kind == "disparity":
+            # Beyond the longest range the line's offset says nothing any more.
+            return np.asarray(1.0 / np.maximum(line, 1.0 / self.config.max_range_m))
+        return np.asarray(line)
+
+    def _field(
+        self, metres: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], range_m: Floats
+    ) -> NDArray[np.float32]:
+        """Factor (H, W) of each direction by the points near the scale; towards the poles it goes to 1."""
+        height, width = metres.shape
+        ratio = np.log(range_m / metres[rows, columns])
+        near = np.abs(ratio) <= SECTOR_REACH
+        azimuth = np.pi - (np.arange(width) + 0.5) * (2 * np.pi / width)
+        centres, factors = sector_factors(
+            azimuth[columns[near]], ratio[near], self.config.sector_deg, self.config.sector_points
+        )
+        of_columns = np.interp(azimuth, centres, factors, period=2 * np.pi)
+        elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
+        return np.exp(np.cos(elevation)[:, None] * of_columns[None, :]).astype(np.float32)
+
+    def _problem(self, scale: float, quality: float, scaled: Floats, range_m: Floats) -> str:
+        """Why the fit is not to be trusted; empty where it is."""
         config = self.config
-        if config.output_kind in ("metric", "scale_invariant"):
-            if not config.min_scale <= scale <= config.max_scale:
-                return f"scale {scale:.3g} is outside {config.min_scale} to {config.max_scale}"
-        elif scale <= 0:
-            return f"depth falls where the range grows (slope {scale:.3g})"
+        if config.output_kind in ("metric", "scale_invariant") and not config.min_scale <= scale <= config.max_scale:
+            return f"scale {scale:.3g} is outside {config.min_scale} to {config.max_scale}"
         if quality < config.min_quality:
             return f"only {quality:.0%} of the points agree, {config.min_quality:.0%} are needed"
+        found = consensus_scale(scaled, range_m, config.agreement)
+        if found.rival_share > config.max_rival * found.share:
+            return (
+                f"two scales fit: {found.share:.0%} of the points stand for {scale * found.scale:.3g}, "
+                f"{found.rival_share:.0%} for {scale * found.rival_scale:.3g}"
+            )
         return ""
 
     def _clean(self, depth: Floats) -> NDArray[np.float32]:

@@ -1,0 +1,213 @@
+"""Rules that find the scale between estimated depth and LiDAR ranges (paper, section IV.C). numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.floating]
+MIN_VALUES = 20
+
+
+class ScaleError(ValueError):
+    """No scale can be found; the text says why."""
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """A scale that many pairs agree on.
+
+    Attributes:
+        scale: metres per unit of depth.
+        share: of the pairs that agree with it, 0..1.
+        rival_scale, rival_share: the next best scale that shares no pair with it; share 0 where there is none.
+    """
+
+    scale: float
+    share: float
+    rival_scale: float
+    rival_share: float
+
+
+def max_ratio_scale(depth: Floats, range_m: Floats, confidence: float = 0.995) -> float:
+    """Scale that brings the largest depth to the largest range (paper, equation of section IV.C).
+
+    Args:
+        depth: estimated depth, any shape and unit; values that are not positive and finite are left out.
+        range_m: LiDAR ranges in metres, any shape; likewise.
+        confidence: quantile that stands for the maximum, which keeps outliers out.
+
+    Returns:
+        Metres per unit of depth.
+
+    Raises:
+        ScaleError: fewer than ``MIN_VALUES`` usable values on either side.
+    """
+    usable = [_positive(values, name) for values, name in ((depth, "depth"), (range_m, "range"))]
+    largest_depth, largest_range = (float(np.quantile(values, confidence)) for values in usable)
+    return largest_range / largest_depth
+
+
+def log_ratios(depth: Floats, range_m: Floats) -> NDArray[np.float64]:
+    """log(range / depth) of pairs of the same direction, both (N,); pairs that are not positive are left out.
+
+    Raises:
+        ScaleError: fewer than ``MIN_VALUES`` usable pairs.
+    """
+    usable = np.isfinite(depth) & (depth > 0) & np.isfinite(range_m) & (range_m > 0)
+    ratios = range_m[usable].astype(np.float64) / depth[usable]
+    return np.log(_positive(ratios, "pairs of range and depth"))
+
+
+def median_ratio_scale(depth: Floats, range_m: Floats) -> float:
+    """Median of range over depth, pairs of the same direction, both (N,).
+
+    Raises:
+        ScaleError: fewer than ``MIN_VALUES`` usable pairs.
+    """
+    return float(np.exp(np.median(log_ratios(depth, range_m))))
+
+
+def consensus_scale(depth: Floats, range_m: Floats, tolerance: float = 0.15) -> Consensus:
+    """Scale that most pairs agree on within a factor 1 + ``tolerance``: RANSAC with every hypothesis, by sorting.
+
+    Then refined to the median of the pairs that agree. Pairs through glass or a mirror, and whatever else is far
+    off, have no say however far off they are.
+
+    Args:
+        depth, range_m: pairs of the same direction, both (N,).
+        tolerance: relative.
+
+    Raises:
+        ScaleError: fewer than ``MIN_VALUES`` usable pairs.
+    """
+    ratios = np.sort(log_ratios(depth, range_m))
+    width = 2 * np.log1p(tolerance)
+    low, high = _fullest(ratios, width)
+    centre = float(np.median(ratios[low:high]))
+    for _ in range(3):
+        near = ratios[np.abs(ratios - centre) <= width / 2]
+        centre = float(np.median(near))
+    share = float((np.abs(ratios - centre) <= width / 2).mean())
+    rival_scale, rival_share = np.exp(centre), 0.0
+    # More than a whole window away: the flanks of one crowd are no second one.
+    for others in (ratios[ratios < centre - width], ratios[ratios > centre + width]):
+        if len(others):
+            low, high = _fullest(others, width)
+            if (high - low) / len(ratios) > rival_share:
+                rival_scale, rival_share = np.exp(np.median(others[low:high])), (high - low) / len(ratios)
+    return Consensus(float(np.exp(centre)), share, float(rival_scale), float(rival_share))
+
+
+def _fullest(values: NDArray[np.float64], width: float) -> tuple[int, int]:
+    """Bounds of the window of a width that holds the most of sorted values (N,), N >= 1."""
+    ends = np.searchsorted(values, values + width, side="right")
+    first = int(np.argmax(ends - np.arange(len(values))))
+    return first, int(ends[first])
+
+
+def ransac_line(
+    x: Floats, y: Floats, tolerance: Floats, trials: int = 400, seed: int = 0
+) -> tuple[float, float, NDArray[np.bool_]]:
+    """Line y = slope x + offset that most pairs agree on, refined by least squares over those that do.
+
+    Args:
+        x, y: pairs, both (N,).
+        tolerance: how far each y may lie from the line, (N,); residuals are weighted by its inverse.
+        trials: pairs of points that are tried.
+        seed: of the choice of pairs, so that the same input gives the same line.
+
+    Returns:
+        Slope, offset, and which pairs agree, (N,).
+
+    Raises:
+        ScaleError: fewer than ``MIN_VALUES`` pairs, or x does not vary.
+    """
+    if len(x) < MIN_VALUES:
+        raise ScaleError(f"only {len(x)} values, {MIN_VALUES} are needed")
+    x, y, tolerance = (np.asarray(values, np.float64) for values in (x, y, tolerance))
+    if np.ptp(x) < 1e-9:
+        raise ScaleError("the estimated depth is the same everywhere")
+    rng = np.random.default_rng(seed)
+    some = rng.permutation(len(x))[:1500]  # enough to rank the hypotheses
+    a, b = rng.integers(0, len(x), (2, trials))
+    usable = np.abs(x[a] - x[b]) > 0.02 * np.ptp(x)
+    if not usable.any():
+        raise ScaleError("the estimated depth is the same nearly everywhere")
+    a, b = a[usable], b[usable]
+    slopes = (y[a] - y[b]) / (x[a] - x[b])
+    offsets = y[a] - slopes * x[a]
+    misses = np.abs(slopes[:, None] * x[some] + offsets[:, None] - y[some]) / tolerance[some]
+    # Truncated squares rather than a bare count (MSAC): of two lines with as many inliers the closer one wins.
+    best = int(np.argmin((np.minimum(misses, 1.0) ** 2).sum(axis=1)))
+    slope, offset = float(slopes[best]), float(offsets[best])
+    inliers = np.abs(slope * x + offset - y) <= tolerance
+    for _ in range(10):
+        if inliers.sum() < MIN_VALUES or np.ptp(x[inliers]) < 1e-9:
+            raise ScaleError("no line through depth and range has enough points that agree")
+        weights = 1.0 / tolerance[inliers]
+        design = np.column_stack([x[inliers], np.ones(int(inliers.sum()))]) * weights[:, None]
+        slope, offset = (float(value) for value in np.linalg.lstsq(design, y[inliers] * weights, rcond=None)[0])
+        again = np.abs(slope * x + offset - y) <= tolerance
+        if (again == inliers).all():
+            break
+        inliers = again
+    return slope, offset, inliers
+
+
+def sector_factors(
+    azimuth_rad: Floats, log_ratio: Floats, sector_deg: float, trust_points: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Smooth factor over azimuth by which depth is still off in each direction.
+
+    Each sector's median is shrunk to no correction by n / (n + ``trust_points``), then smoothed around the circle
+    with a Gaussian of half a sector's width: where there are few points or none, the global scale stays.
+
+    Args:
+        azimuth_rad: of the pairs, (N,).
+        log_ratio: log of range over scaled depth of the pairs, (N,).
+        sector_deg: width of a sector, 360 is a multiple of it.
+        trust_points: number of points at which a sector's own median counts half.
+
+    Returns:
+        Azimuths (K,) of the sectors' centres, rising in (-pi, pi), and log factors there (K,).
+    """
+    count = round(360.0 / sector_deg)
+    sector = np.floor((np.asarray(azimuth_rad, np.float64) + np.pi) * (count / (2 * np.pi))).astype(np.intp) % count
+    shrunk = np.zeros(count)
+    for k in np.unique(sector):
+        own = log_ratio[sector == k]
+        shrunk[k] = np.median(own) * len(own) / (len(own) + trust_points)
+    apart = np.minimum(np.arange(count), count - np.arange(count))
+    kernel = np.exp(-0.5 * (apart / 0.5) ** 2)
+    smooth = np.asarray(np.fft.ifft(np.fft.fft(shrunk) * np.fft.fft(kernel / kernel.sum())).real, np.float64)
+    centres: NDArray[np.float64] = (np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi
+    return centres, smooth
+
+
+def solid_angle_quantile(depth: Floats, confidence: float) -> float:
+    """Quantile of the known depth of an equirect picture (H, W), each pixel counted by its solid angle.
+
+    Raises:
+        ScaleError: fewer than ``MIN_VALUES`` known pixels.
+    """
+    height, width = depth.shape
+    elevation = np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)
+    weights = np.broadcast_to(np.cos(elevation)[:, None], (height, width))
+    known = np.isfinite(depth) & (depth > 0)
+    if int(known.sum()) < MIN_VALUES:
+        raise ScaleError(f"only {int(known.sum())} usable values of depth, {MIN_VALUES} are needed")
+    values, counts = depth[known], weights[known]
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(counts[order])
+    place = int(np.searchsorted(total, confidence * total[-1]))
+    return float(values[order[min(place, len(order) - 1)]])
+
+
+def _positive(values: Floats, name: str) -> Floats:
+    usable = values[np.isfinite(values) & (values > 0)]
+    if len(usable) < MIN_VALUES:
+        raise ScaleError(f"only {len(usable)} usable values of {name}, {MIN_VALUES} are needed")
+    return usable

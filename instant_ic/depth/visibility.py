@@ -1,0 +1,80 @@
+"""Which LiDAR points the camera sees, and in which pixel: the two hang in different places. numpy only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.projections import equirect_pixels
+
+Floats = NDArray[np.floating]
+Indices = NDArray[np.intp]
+CELL_DEG = 1.0
+
+
+def project_points(points: Floats, width: int, height: int) -> tuple[Floats, Floats, Floats]:
+    """Projects points (N, 3) in the camera's frame onto an equirect picture.
+
+    Returns:
+        ``u, v`` index coordinates (see ``geometry.projections.equirect_pixels``) and the range in metres, each (N,).
+    """
+    u, v = equirect_pixels(points, width, height)
+    return u, v, np.linalg.norm(points, axis=-1)
+
+
+def pixels_of(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
+    """Rows, columns and ranges in metres, each (N,), of points (N, 3) in the camera's frame."""
+    u, v, range_m = project_points(points, width, height)
+    rows = np.clip(np.rint(v).astype(np.intp), 0, height - 1)
+    return rows, np.rint(u).astype(np.intp) % width, range_m
+
+
+def nearest_points(points: Floats, width: int, height: int) -> tuple[Indices, Indices, Floats]:
+    """Rows, columns and ranges of the nearest point in each pixel that has one.
+
+    Of two points in one pixel the nearer is the one that the camera sees.
+    """
+    rows, columns, range_m = pixels_of(points, width, height)
+    pixel = rows * width + columns
+    order = np.lexsort((range_m, pixel))
+    first = np.ones(len(order), bool)
+    first[1:] = pixel[order[1:]] != pixel[order[:-1]]
+    kept = order[first]
+    return rows[kept], columns[kept], range_m[kept]
+
+
+def hidden(points: Floats, margin: float = 0.25, cell_deg: float = CELL_DEG) -> NDArray[np.bool_]:
+    """True (N,) for points (N, 3) in the camera's frame that the camera probably does not see.
+
+    A point is hidden when two others in its own or in one of the eight neighbouring cells of ``cell_deg`` are nearer
+    by more than ``margin`` of the range; one alone may be an outlier. Rings lie two degrees apart, so one pixel alone
+    would let the wall behind a table show between two rings on its top. On a floor seen from 1.2 m the range changes
+    by less than that from cell to cell up to about 7 m; farther out some visible points are lost, which costs nothing
+    but points.
+    """
+    height = max(round(180.0 / cell_deg), 1)
+    rows, columns, range_m = pixels_of(points, 2 * height, height)
+    cell = (rows + 1) * (2 * height) + columns
+    order = np.lexsort((range_m, cell))
+    start = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    second = start[np.diff(start, append=len(order)) > 1] + 1
+    nearest = np.full((height + 2, 2 * height), np.inf)
+    nearest.reshape(-1)[cell[order[second]]] = range_m[order[second]]
+    nearest = np.minimum(np.minimum(nearest[:-2], nearest[1:-1]), nearest[2:])
+    nearest = np.minimum(np.minimum(np.roll(nearest, 1, axis=1), nearest), np.roll(nearest, -1, axis=1))
+    return np.asarray(nearest[rows, columns] < (1 - margin) * range_m)
+
+
+def on_depth_edge(depth: Floats, rows: Indices, columns: Indices, ratio: float = 1.25) -> NDArray[np.bool_]:
+    """True (N,) where known depth (H, W) differs by more than ``ratio`` within the 3 x 3 pixels around a pixel.
+
+    There a point may belong to either side, and a network's edge is blurred or a pixel off.
+    """
+    height, width = depth.shape
+    around = np.stack(
+        [depth[np.clip(rows + i, 0, height - 1), (columns + j) % width] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    )
+    known = np.isfinite(around) & (around > 0)
+    low = np.where(known, around, np.inf).min(axis=0)
+    high = np.where(known, around, 0.0).max(axis=0)
+    return np.asarray(high > ratio * low)
