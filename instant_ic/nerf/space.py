@@ -74,6 +74,10 @@ class NotReadyError(RuntimeError):
     """Asked for training or a picture before the first keyframe."""
 
 
+class DeviceError(RuntimeError):
+    """The device that was asked for is not there."""
+
+
 @dataclass(frozen=True)
 class _Shown:
     """The space of the keyframe before the newest, drawn until that is learnt well enough."""
@@ -329,7 +333,7 @@ def make_device(config: VirtualSpaceConfig) -> Device:
     """The device that ``config.device`` asks for.
 
     Raises:
-        RuntimeError: CUDA was asked for and torch finds none.
+        DeviceError: CUDA was asked for and torch finds none.
     """
     if config.device == "cuda" or (config.device == "auto" and _may_have_cuda()):
         import torch
@@ -339,7 +343,7 @@ def make_device(config: VirtualSpaceConfig) -> Device:
 
             return TorchDevice(config.field, config.train, "cuda")
         if config.device == "cuda":
-            raise RuntimeError("device is cuda, but torch finds no CUDA device; use auto or cpu")
+            raise DeviceError("device is cuda, but torch finds no CUDA device; use auto or cpu")
     if config.device != "torch-cpu":
         try:
             from .numba_device import NumbaDevice

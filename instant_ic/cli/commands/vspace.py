@@ -1,0 +1,428 @@
+"""``ic vspace``: a virtual space from one panorama: trained, drawn, exported, flown through."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import re
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..arguments import positive, positive_int
+from ..errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from instant_ic.nerf import View, VirtualSpace, VirtualSpaceConfig
+
+PREVIEW = "preview.png"
+PREVIEW_S = 1.0
+_SIZES = {"perspective": (640, 360), "equirect": (1024, 512), "cube": (512, 512)}
+_TRUE_SIGMA, _MODEL_SIGMA = 0.02, 0.1
+_LITTLE = 0.1
+"""Under this share of known pixels a picture is hardly more than a guess."""
+
+
+def numbers(text: str) -> list[float]:
+    """``x,y,z,yaw``: metres and degrees."""
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 4 or not all(map(math.isfinite, values)):
+        raise argparse.ArgumentTypeError(f"must be x,y,z,yaw: four numbers, metres and degrees (got {text!r})")
+    return values
+
+
+def size(text: str) -> tuple[int, int]:
+    """``640x360``."""
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"must look like 640x360 (got {text!r})")
+    return int(match[1]), int(match[2])
+
+
+def degrees(text: str) -> float:
+    """A field of view."""
+    value = float(text)
+    if not 1 <= value <= 170:
+        raise argparse.ArgumentTypeError(f"must lie in 1..170 degrees (got {text})")
+    return value
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds ``vspace`` to the ``ic`` command."""
+    parser = subparsers.add_parser(
+        "vspace",
+        help="a virtual space from one panorama",
+        description="Trains a virtual space from one panorama and looks at it (docs/nerf.md). Poses are relative to "
+        "the panorama's camera: x forward, where its centre column looks, y left, z up, metres; yaw in degrees, "
+        "counter-clockwise.",
+        epilog="example: ic vspace train room.jpg -o room && ic vspace render room --pose 0.5,0,0,30 -o view.png",
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    _add_train(verbs)
+    _add_render(verbs)
+    _add_export(verbs)
+    _add_video(verbs)
+    info = verbs.add_parser("info", help="what is in a saved space", description="Tells what is in a saved space.")
+    _folder(info)
+    info.set_defaults(func=info_)
+    for verb in verbs.choices.values():
+        # "--pose -1,0,0,90" is no option: argparse itself knows only single negative numbers.
+        verb._negative_number_matcher = re.compile(r"-[\d.]")
+
+
+def _folder(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("space", type=Path, metavar="DIR", help="folder that ic vspace train has made")
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda", "torch-cpu"), help="(default: as it was trained)")
+
+
+def _add_train(verbs: Any) -> None:
+    parser = verbs.add_parser(
+        "train",
+        help="learn a panorama",
+        description="Learns one panorama and saves the space in a folder. A picture from 0.5 m ahead lies in it "
+        f"({PREVIEW}) and is renewed each second meanwhile. Ctrl-C ends early: what is learnt is saved.",
+        epilog="example: ic vspace train room.jpg --depth room_depth.png --seconds 10 -o room",
+    )
+    parser.add_argument("panorama", type=Path, help="equirect picture, twice as wide as high")
+    depth = parser.add_mutually_exclusive_group()
+    depth.add_argument("--depth", type=Path, metavar="D", help="its radial depth: PNG of 16 bits in mm; .npy, .npz "
+                       "(key depth) or .exr in m; 0 or not finite: unknown")  # fmt: skip
+    depth.add_argument("--model", type=Path, metavar="M", help="depth model, ONNX or manifest (default: the shipped "
+                       "one, whose metres are an estimate: no LiDAR scales them here)")  # fmt: skip
+    parser.add_argument("--depth-sigma", type=positive, metavar="SHARE", help="standard deviation of the depth against "
+                        f"it (default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)")  # fmt: skip
+    length = parser.add_mutually_exclusive_group()
+    length.add_argument("--seconds", type=positive, metavar="S", help="train for about so long")
+    length.add_argument("--iterations", type=positive_int, metavar="N", help="train so many iterations (default: 600)")
+    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda", "torch-cpu"), help="(%(default)s)")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder, made when absent")
+    parser.set_defaults(func=train)
+
+
+def _add_picture(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--fov", type=degrees, default=90.0, metavar="DEG", help="horizontal (%(default)g degrees)")
+    parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: " +
+                        ", ".join(f"{name} {w}x{h}" for name, (w, h) in _SIZES.items()) + ")")  # fmt: skip
+
+
+def _add_render(verbs: Any) -> None:
+    parser = verbs.add_parser(
+        "render",
+        help="draw a picture of a space",
+        description="Draws a picture of a saved space. A cube map is one row of faces: front, left, back, right, up, "
+        "down.",
+        epilog="example: ic vspace render room --pose 0.5,-0.2,0,30 --fov 90 --size 640x360 -o view.png",
+    )
+    _folder(parser)
+    parser.add_argument("--pose", type=numbers, default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
+    parser.add_argument("--projection", choices=tuple(_SIZES), default="perspective", help="(%(default)s)")
+    _add_picture(parser)
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="PNG", help="picture to write")
+    parser.add_argument(
+        "--depth", type=Path, metavar="FILE", help="also write the depth: .png (16 bits, mm) or .npy (m)"
+    )
+    parser.add_argument(
+        "--confidence", type=Path, metavar="PNG", help="also write what is known: white seen, black not"
+    )
+    parser.set_defaults(func=render)
+
+
+def _add_export(verbs: Any) -> None:
+    parser = verbs.add_parser(
+        "export",
+        help="write the surfaces as PLY",
+        description="Writes the surfaces that the panorama has seen as binary PLY, in the frame of the space.",
+        epilog="example: ic vspace export room --mesh room.ply",
+    )
+    _folder(parser)
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument("--points", type=Path, metavar="OUT.ply", help="coloured points")
+    kind.add_argument("--mesh", type=Path, metavar="OUT.ply", help="coloured triangles, torn at depth edges")
+    parser.add_argument("--width", type=positive_int, default=1024, help="points round the horizon (%(default)s)")
+    parser.set_defaults(func=export)
+
+
+def _add_video(verbs: Any) -> None:
+    parser = verbs.add_parser(
+        "video",
+        help="fly through a space",
+        description="Writes a flight through a saved space as MP4, a smooth curve through the waypoints.",
+        epilog="example: ic vspace video room --path 0,0,0,0 1,0,0,0 1,0.3,0,90 -o flight.mp4",
+    )
+    _folder(parser)
+    parser.add_argument("--path", type=numbers, nargs="+", metavar="x,y,z,yaw", help="two waypoints or more; the "
+                        "heading turns by the yaws' difference (default: ahead, back and once round)")  # fmt: skip
+    parser.add_argument("--seconds", type=positive, default=8.0, metavar="S", help="(%(default)g)")
+    parser.add_argument("--fps", type=positive, default=25.0, help="pictures a second (%(default)g)")
+    _add_picture(parser)
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.mp4", help="video to write")
+    parser.set_defaults(func=video)
+
+
+# -- the commands --------------------------------------------------------------------------------------
+
+
+def train(args: argparse.Namespace) -> int:
+    """``ic vspace train``."""
+    from instant_ic.depth.files import load_depth, load_picture
+    from instant_ic.nerf import KeyframeError, VirtualSpaceConfig
+    from instant_ic.nerf.warm_up import warm_up
+
+    from ..progress import progress
+
+    rgb = load_picture(args.panorama)
+    if args.depth:
+        depth, sigma = load_depth(args.depth), args.depth_sigma or _TRUE_SIGMA
+    else:
+        depth, sigma = estimated_depth(args.model, rgb), args.depth_sigma or _MODEL_SIGMA
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{args.out}: cannot make the folder: {error.strerror}") from error
+    config = VirtualSpaceConfig(device=args.device)
+    began = time.monotonic()
+    warm_up(config)
+    if time.monotonic() - began > 5:
+        print("the kernels were compiled; that is done once", file=sys.stderr)
+    try:
+        space = _space(config, rgb, depth, sigma, args)
+    except KeyframeError as error:
+        raise UserError(f"{args.panorama}{f' with {args.depth}' if args.depth else ''}: {error}") from error
+    with progress("training") as tell:
+        ended = _train(space, args, tell)
+    file = space.save(args.out)
+    status = space.status
+    print(f"{'ended early: ' if ended else ''}{status.iterations} iterations in {status.train_seconds:.1f} s on "
+          f"{status.device}, {status.psnr_db:.1f} dB on the panorama's own rays; depth known in "
+          f"{(depth > 0).mean():.0%}, fit to show up to {status.ready_radius_m:.1f} m; wrote {file}")  # fmt: skip
+    return 0
+
+
+def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Depth of a panorama in the model's own metres; says so."""
+    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+    from instant_ic.paths import shipped_file
+
+    loaded = DepthModel.load(model or shipped_file("models", DEFAULT_MODEL))
+    kind = loaded.manifest.output_kind
+    if kind not in ("metric", "scale_invariant"):
+        raise UserError(f"{model}: its {kind} depth has no metres without a LiDAR; give --depth, or a metric model")
+    print(f"no --depth: the metres are {loaded.manifest.name}'s estimate, not measured", file=sys.stderr)
+    return loaded.estimate(rgb)
+
+
+def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args: argparse.Namespace) -> VirtualSpace:
+    """A space with the panorama as its keyframe, and a schedule as long as asked for."""
+    import numpy as np
+
+    from instant_ic.nerf import VirtualSpace
+
+    iterations = args.iterations or config.train.iterations
+    if args.seconds:
+        trial = VirtualSpace(config)
+        trial.set_keyframe(rgb, depth, np.eye(4), sigma)
+        iterations = max(10, int(1e3 * args.seconds * 5 / trial.train(iterations=5).elapsed_ms))
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, iterations=iterations))
+    space = VirtualSpace(config)
+    space.set_keyframe(rgb, depth, np.eye(4), sigma)
+    return space
+
+
+def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
+    """Trains to the end, telling how far it is; whether it was ended early by the user."""
+    from instant_ic.geometry.poses import pose_matrix
+
+    preview = args.out / PREVIEW
+    shown, total = 0.0, space.config.train.iterations
+    deadline = 1.2 * args.seconds if args.seconds else math.inf
+    try:
+        while not space.status.converged and space.status.train_seconds < deadline:
+            space.train(budget_ms=200)
+            tell(space.status.iterations / total)
+            if time.monotonic() - shown >= PREVIEW_S or space.status.converged:
+                write_picture(preview, space.render(pose_matrix(x=0.5), *_SIZES["perspective"], math.pi / 2).rgb)
+                shown = time.monotonic()
+    except KeyboardInterrupt:
+        return True
+    return False
+
+
+def open_space(args: argparse.Namespace) -> VirtualSpace:
+    """The saved space that a command is about."""
+    from instant_ic.nerf import VirtualSpace
+
+    return VirtualSpace.load(args.space, args.device)
+
+
+def placed(space: VirtualSpace, pose: list[float]) -> NDArray[np.float64]:
+    """The pose in the space's map of a pose relative to the panorama's camera, yaw in degrees."""
+    from instant_ic.geometry.poses import pose_matrix
+
+    assert space.keyframe is not None
+    x, y, z, yaw = pose
+    return space.keyframe.map_from_camera @ pose_matrix(x, y, z, yaw=math.radians(yaw))
+
+
+def render(args: argparse.Namespace) -> int:
+    """``ic vspace render``."""
+    import numpy as np
+
+    space = open_space(args)
+    width, height = args.size or _SIZES[args.projection]
+    pose = placed(space, args.pose)
+    try:
+        if args.projection == "perspective":
+            view = space.render(pose, width, height, math.radians(args.fov))
+        elif args.projection == "equirect":
+            if width != 2 * height:
+                raise UserError(f"--size of a panorama is twice as wide as high (got {width}x{height})", 2)
+            view = space.render_equirect(pose, width)
+        else:
+            if width != height:
+                raise UserError(f"--size of a cube map is that of one square face (got {width}x{height})", 2)
+            view = space.render_cube(pose, width)
+    except ValueError as error:
+        raise UserError(f"--size: {error}", 2) from error
+    write_picture(args.out, _row(view.rgb))
+    if args.depth:
+        write_depth(args.depth, _row(view.depth_m))
+    if args.confidence:
+        write_picture(args.confidence, (255 * _row(view.confidence)).astype(np.uint8))
+    _warn_of_the_unknown(view, space, args.pose)
+    print(f"{view.mean_confidence:.0%} of the picture is known; wrote {args.out}")
+    return 0
+
+
+def _row(faces: NDArray) -> NDArray:
+    """A cube map's faces beside each other; any other picture as it is."""
+    import numpy as np
+
+    return np.concatenate(list(faces), axis=1) if len(faces) == 6 else faces
+
+
+def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> None:
+    radius, away = space.status.ready_radius_m, math.dist(pose[:3], (0, 0, 0))
+    if view.mean_confidence < _LITTLE:
+        print(f"warning: the panorama has seen hardly anything of this view ({view.mean_confidence:.0%}): "
+              "it is continued from around, or black", file=sys.stderr)  # fmt: skip
+    elif away > radius > 0:
+        print(f"warning: {away:.1f} m from the panorama's place; the space is fit to show up to {radius:.1f} m",
+              file=sys.stderr)  # fmt: skip
+
+
+def export(args: argparse.Namespace) -> int:
+    """``ic vspace export``."""
+    from instant_ic.nerf.export import surface, write_ply
+
+    space, out = open_space(args), args.points or args.mesh
+    try:
+        found = surface(space, args.width)
+    except ValueError as error:
+        raise UserError(f"--width: {error}", 2) from error
+    _write(out, lambda: write_ply(out, found, mesh=args.mesh is not None))
+    triangles = f" and {len(found.triangles)} triangles" if args.mesh else ""
+    print(f"wrote {out}: {len(found.points)} points{triangles}")
+    return 0
+
+
+def video(args: argparse.Namespace) -> int:
+    """``ic vspace video``."""
+    import cv2
+
+    from instant_ic.nerf.export import default_flight, flight
+
+    from ..progress import progress
+
+    if args.out.suffix.lower() != ".mp4":
+        raise UserError(f"{args.out}: the video is an .mp4", 2)
+    space = open_space(args)
+    waypoints = [(x, y, z, math.radians(yaw)) for x, y, z, yaw in args.path or []]
+    try:
+        poses = flight(waypoints or default_flight(space.status.ready_radius_m), round(args.seconds * args.fps))
+    except ValueError as error:
+        raise UserError(f"--path: {error}", 2) from error
+    width, height = args.size or _SIZES["perspective"]
+    if width % 2 or height % 2:
+        raise UserError(f"--size of a video is even (got {width}x{height})", 2)
+    assert space.keyframe is not None
+    writer, known = None, 0.0
+    with progress("drawing") as tell:
+        for number, pose in enumerate(poses):
+            try:
+                view = space.render(space.keyframe.map_from_camera @ pose, width, height, math.radians(args.fov))
+            except ValueError as error:
+                raise UserError(f"--size: {error}", 2) from error
+            if writer is None:
+                writer = cv2.VideoWriter(str(args.out), cv2.VideoWriter.fourcc(*"mp4v"), args.fps, (width, height))
+                if not writer.isOpened():
+                    raise UserError(f"{args.out}: cannot be written")
+            writer.write(view.rgb[..., ::-1])
+            known += view.mean_confidence / len(poses)
+            tell((number + 1) / len(poses))
+    assert writer is not None
+    writer.release()
+    print(f"wrote {args.out}: {len(poses)} pictures, {known:.0%} known")
+    return 0
+
+
+def info_(args: argparse.Namespace) -> int:
+    """``ic vspace info``."""
+    from instant_ic.nerf.saved import read, space_file
+
+    saved = read(args.space)
+    field, progress = saved.config.field, saved.progress
+    fit = "fit to show" if progress.ready_iterations else "not fit to show yet"
+    print(f"{space_file(args.space)}: {progress.iteration} iterations in {progress.train_seconds:.1f} s, "
+          f"{progress.psnr_db:.1f} dB; {fit}")  # fmt: skip
+    print(f"field: {field.levels} levels x {field.features} features, 2^{field.log2_table} entries, "
+          f"network {field.levels * field.features}-{field.hidden}-4")  # fmt: skip
+    for prior in saved.priors:
+        height, width = prior.rgb.shape[:2]
+        x, y, z = prior.map_from_camera[:3, 3]
+        print(f"keyframe: panorama {width} x {height} at ({x:.2f}, {y:.2f}, {z:.2f}) m, depth known in "
+              f"{prior.known.mean():.0%}, median {prior.median_depth_m:.2f} m")  # fmt: skip
+    return 0
+
+
+# -- files ---------------------------------------------------------------------------------------------
+
+
+def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
+    """Writes RGB or grey by the file's suffix, whole or not at all."""
+    import cv2
+
+    try:
+        done, content = cv2.imencode(path.suffix or ".png", picture[..., ::-1] if picture.ndim == 3 else picture)
+    except cv2.error:
+        done = False
+    if not done:
+        raise UserError(f"{path}: pictures are written as .png or .jpg", 2)
+    part = path.with_name(f".{path.name}.part")
+    _write(path, lambda: (part.write_bytes(content.tobytes()), part.replace(path)))
+
+
+def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
+    """Writes depth as PNG of 16 bits in millimetres or as ``.npy`` in metres."""
+    import numpy as np
+
+    if path.suffix == ".npy":
+        _write(path, lambda: np.save(path, depth_m))
+    elif path.suffix == ".png":
+        write_picture(path, np.rint(np.clip(1000 * depth_m, 0, 65535)).astype(np.uint16))
+    else:
+        raise UserError(f"{path}: depth is written as .png (16 bits, mm) or .npy (m)", 2)
+
+
+def _write(path: Path, write: Any) -> None:
+    try:
+        write()
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
