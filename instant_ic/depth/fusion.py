@@ -60,34 +60,86 @@ def ceiling_height(depth_m: Floats, rise: Floats, least_m: float = 0.3) -> tuple
     return float(np.exp(middle)), spread * float(np.exp(middle))
 
 
-def correction(ratio: Floats, weight: Floats, config: FusionConfig, prior: float = 0.02) -> NDArray[np.float32]:
-    """Smooth field (H, W) through log ratios (H, W) that count by ``weight`` (H, W); 0 far from any.
+@dataclass(frozen=True)
+class Corrected:
+    """A network's depth, corrected by points.
 
-    Weighted mean over a Gaussian around each pixel, twice: the second time what is far from the first counts little.
+    Attributes:
+        depth_m: (H, W) metres, 0 = unknown.
+        wrong: (H, W) share of the points around each pixel that are still plainly off.
+        sigma: relative standard deviation at the points that are not.
     """
-    height, width = ratio.shape
-    small = (max(width // 4, 8), max(height // 4, 4))
+
+    depth_m: NDArray[np.float32]
+    wrong: NDArray[np.float32]
+    sigma: float
+
+
+def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corrected:
+    """Corrects scaled network depth (H, W) by ranges (H, W) at some pixels, 0 elsewhere: a smooth field of factors.
+
+    The field is the weighted mean of the log ratios over a Gaussian around each pixel, 1 far from any point; the
+    second time what is far from the first counts little.
+    """
+    height, width = network_m.shape
+    seen = (measured_m > 0) & (network_m > 0)
+    ratio = np.zeros((height, width), np.float32)
+    ratio[seen] = np.clip(np.log(measured_m[seen] / network_m[seen]), -0.7, 0.7)
+    small = (width // 4, height // 4)
     sigma = (config.across_deg * small[0] / 360, config.along_deg * small[1] / 180)
     pad = int(3 * sigma[0]) + 1
 
     def blurred(values: Floats) -> NDArray[np.float32]:
+        """At a quarter of the resolution."""
         coarse = cv2.resize(values.astype(np.float32), small, interpolation=cv2.INTER_AREA)
         wide = cv2.copyMakeBorder(coarse, 0, 0, pad, pad, cv2.BORDER_WRAP)
-        smooth = cv2.GaussianBlur(wide, (0, 0), sigma[0], None, sigma[1], cv2.BORDER_REFLECT)[:, pad:-pad]
-        wide = cv2.copyMakeBorder(smooth, 0, 0, 2, 2, cv2.BORDER_WRAP)
-        grown = cv2.resize(wide, (width + 4 * width // small[0], height), interpolation=cv2.INTER_LINEAR)
-        cut = (grown.shape[1] - width) // 2
-        return np.asarray(grown[:, cut : cut + width], np.float32)
+        return cv2.GaussianBlur(wide, (0, 0), sigma[0], None, sigma[1], cv2.BORDER_REFLECT)[:, pad:-pad]
 
-    field = np.zeros(ratio.shape, np.float32)
-    for first in (True, False):
-        robust = weight if first else weight / (1 + ((ratio - field) / 0.1) ** 2) ** 2
-        field = blurred(robust * ratio) / (blurred(robust) + np.float32(prior))
-    return field
+    def grown(coarse: Floats) -> NDArray[np.float32]:
+        wide = cv2.copyMakeBorder(coarse, 0, 0, 1, 1, cv2.BORDER_WRAP)
+        return cv2.resize(wide, (width + 8, height), interpolation=cv2.INTER_LINEAR)[:, 4:-4]
+
+    weight = seen.astype(np.float32)
+    near = blurred(weight)
+    field = grown(blurred(ratio) / (near + np.float32(0.005)))
+    robust = weight / (1 + ((ratio - field) / 0.1) ** 2) ** 2
+    field = grown(blurred(robust * ratio) / (blurred(robust) + np.float32(0.005)))
+    left = np.abs(ratio - field)[seen]
+    inside = left[left < 0.25]
+    spread = 1.4826 * float(np.median(inside)) if len(inside) else 0.25
+    bad = np.zeros((height, width), np.float32)
+    bad[seen] = left > 0.25
+    share = float((left > 0.25).mean()) if len(left) else 1.0
+    wrong = grown((blurred(bad) + np.float32(0.01) * share) / (near + np.float32(0.01)))
+    depth = np.where(network_m > 0, network_m * np.exp(field), 0).astype(np.float32)
+    return Corrected(depth, wrong, max(spread, 0.02))
 
 
-#: How far off (log) structure of each ``Origin`` is typically, where it is not plainly wrong.
-_STRUCTURE = np.array([9.0, 0.02, 0.03, 0.2, 0.08, 0.1, 0.02, 0.03, 0.08], np.float32)
+@dataclass(frozen=True)
+class Trust:
+    """What is known beforehand of structure of one ``Origin``.
+
+    Attributes:
+        sigma: relative standard deviation where it is right.
+        nearer, farther: share of the pixels where what is there is plainly nearer, or farther, than the structure.
+    """
+
+    sigma: float
+    nearer: float
+    farther: float
+
+
+TRUST = {
+    Origin.UNKNOWN: Trust(9.0, 0.5, 0.5),
+    Origin.BEAM: Trust(0.012, 0.001, 0.001),
+    Origin.BETWEEN: Trust(0.012, 0.001, 0.001),
+    Origin.EDGE: Trust(0.05, 0.02, 0.3),
+    Origin.UP: Trust(0.02, 0.001, 0.03),
+    Origin.DOWN: Trust(0.02, 0.001, 0.03),
+    Origin.FLOOR: Trust(0.005, 0.001, 0.001),
+    Origin.CEILING: Trust(0.01, 0.01, 0.001),
+    Origin.ASSUMED: Trust(0.02, 0.01, 0.001),
+}
 
 
 @dataclass(frozen=True)
@@ -99,27 +151,41 @@ class Fused:
 
 
 def fuse(
-    network_m: Floats, network_sigma: float, structure_m: Floats, origin: NDArray[np.uint8], config: FusionConfig
+    network_m: Floats,
+    wrong: Floats,
+    network_sigma: float,
+    structure_m: Floats,
+    origin: NDArray[np.uint8],
 ) -> Fused:
-    """Fuses scaled network depth (H, W) with LiDAR structure (H, W) and its ``Origin`` (H, W); 0 is unknown.
+    """Fuses corrected network depth with LiDAR structure, pixel by pixel.
 
-    ``network_sigma`` is the relative standard deviation of the network at the points.
+    Where both agree the mean counts by precision; where they do not, one of the two is taken: the structure, unless
+    it is likelier wrong in this way than the network is wrong at all.
+
+    Args:
+        network_m: (H, W) metres, corrected by the points; 0 is unknown.
+        wrong: (H, W) share of the points around each pixel at which the network is plainly wrong.
+        network_sigma: relative standard deviation of the network where it is not.
+        structure_m: (H, W) metres; 0 is unknown.
+        origin: (H, W) how the structure came about.
     """
+    sigma_s, nearer, farther = (
+        np.array([getattr(TRUST[each], name) for each in Origin], np.float32)[origin]
+        for name in ("sigma", "nearer", "farther")
+    )
     known_n, known_s = network_m > 0, structure_m > 0
     both = known_n & known_s
     n = np.log(np.where(known_n, network_m, 1.0)).astype(np.float32)
     s = np.log(np.where(known_s, structure_m, 1.0)).astype(np.float32)
-    seen = both & ((origin == Origin.BEAM) | (origin == Origin.BETWEEN))
-    ratio = np.where(seen, np.clip(s - n, -0.7, 0.7), 0).astype(np.float32)
-    n = n + np.where(known_n, correction(ratio, seen.astype(np.float32), config), 0)
-    sigma_n = np.float32(max(network_sigma, 0.05))
-    sigma_s = _STRUCTURE[origin]
-    w_n = known_n / sigma_n**2
-    off = np.where(both, (s - n) / np.hypot(sigma_s, sigma_n), 0)
-    w_s = known_s / sigma_s**2
-    w_s = np.where(both & (origin != Origin.BEAM) & (origin != Origin.BETWEEN), w_s / (1 + (off / 3) ** 4), w_s)
+    off = np.where(both, n - s, 0)
+    conflict = both & (np.abs(off) > 3 * np.hypot(sigma_s, np.float32(network_sigma)))
+    likely = np.where(off > 0, farther, nearer) * (1 - wrong)
+    takes_network = conflict & (likely > wrong * (1 - nearer - farther))
+    w_n = (known_n & (~conflict | takes_network)) / np.float32(network_sigma) ** 2
+    w_s = (known_s & ~takes_network) / sigma_s**2
     total = w_n + w_s
     known = total > 0
-    depth = np.where(known, np.exp((w_n * n + w_s * s) / np.maximum(total, 1e-9)), 0.0)
-    sigma = np.where(known, 1 / np.sqrt(np.maximum(total, 1e-9)), np.inf)
+    total = np.maximum(total, 1e-9)
+    depth = np.where(known, np.exp((w_n * n + w_s * s) / total), 0.0)
+    sigma = np.where(known, 1 / np.sqrt(total), np.inf)
     return Fused(depth.astype(np.float32), sigma.astype(np.float32))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import equirect_directions, equirect_pixels
 
 from ..ranges import NotNegative, Positive, Range, check_ranges
-from .scaler import nearest_points
+from .visibility import project_points
 
 Floats = NDArray[np.floating]
 _NONE = 1 << 20
@@ -160,6 +160,23 @@ def lonely(measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], 
     return (same < 2) & (float(np.median(there)) >= 4)
 
 
+def _confirmed(
+    points: Floats, size: tuple[int, int]
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]:
+    """Of points (N, 3) the nearest in each pixel, without the lonely ones: index, row, column and range, each (M,)."""
+    u, v, range_m = project_points(points, size[1], size[0])
+    rows = np.clip(np.rint(v).astype(np.intp), 0, size[0] - 1)
+    columns = np.rint(u).astype(np.intp) % size[1]
+    nearest = np.full(size, -1, np.intp)
+    far_first = np.argsort(-range_m, kind="stable")
+    nearest[rows[far_first], columns[far_first]] = far_first
+    kept = nearest[nearest >= 0]
+    measured = np.zeros(size, np.float32)
+    measured[rows[kept], columns[kept]] = range_m[kept]
+    kept = kept[~lonely(measured, rows[kept], columns[kept])]
+    return kept, rows[kept], columns[kept], range_m[kept]
+
+
 @lru_cache(maxsize=4)
 def _rays(height: int, width: int) -> NDArray[np.float32]:
     return equirect_directions(width, height)
@@ -211,44 +228,50 @@ class LidarStructure:
                 nothing, np.full(size, np.inf, np.float32), nothing.astype(np.uint8), len(level), camera_height_m, None,
                 words,
             )  # fmt: skip
-        across = np.hypot(level[:, 0], level[:, 1])
-        column = np.rint(equirect_pixels(level, width, height)[0]).astype(np.intp) % width
+        kept, rows, columns, range_m = _confirmed(level, size)
+        z, across = level[kept, 2], np.hypot(level[kept, 0], level[kept, 1])
         floor = camera_height_m
         if floor is None:
-            lower = level[:, 2] < -0.2
-            found = plane_height(level[lower, 2], across[lower], column[lower])
+            lower = z < -0.2
+            found = plane_height(z[lower], across[lower], columns[lower])
             floor = None if found is None else -found
-        upper = level[:, 2] > 0.4
-        ceiling = plane_height(level[upper, 2], across[upper], column[upper])
-        depth, sigma, origin = self._columns(level, height, width, floor, ceiling, ceiling_m)
+        upper = z > 0.4
+        ceiling = plane_height(z[upper], across[upper], columns[upper])
+        depth, sigma, origin = self._columns((rows, columns, range_m), size, floor, ceiling, ceiling_m)
         if abs(turn[2, 2]) < 1 - 1e-6:
             u, v = equirect_pixels(_rays(height, width) @ turn.T.astype(np.float32), width, height)
             rows, columns = np.clip(np.rint(v).astype(np.intp), 0, height - 1), np.rint(u).astype(np.intp) % width
             depth, sigma, origin = depth[rows, columns], sigma[rows, columns], origin[rows, columns]
         return LidarDepth(depth, sigma, origin, len(level), floor, ceiling)
 
+    def ranges(self, points: Floats, size: tuple[int, int]) -> NDArray[np.float32]:
+        """Range (H, W) in each pixel of the camera's picture that a confirmed point (N, 3) falls into, else 0."""
+        distance = np.linalg.norm(points, axis=1)
+        with np.errstate(invalid="ignore"):
+            inside = (distance >= self.config.min_range_m) & (distance <= self.config.max_range_m)
+        _, rows, columns, range_m = _confirmed(points[inside], size)
+        picture = np.zeros(size, np.float32)
+        picture[rows, columns] = range_m
+        return picture
+
     def _columns(
         self,
-        level: Floats,
-        height: int,
-        width: int,
+        hits: tuple[NDArray[np.intp], NDArray[np.intp], Floats],
+        size: tuple[int, int],
         floor: float | None,
         ceiling: float | None,
         ceiling_guess: float | None,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
         """The structure column by column, in a level picture."""
         config = self.config
-        rows, columns, range_m = nearest_points(level, width, height)
+        (rows, columns, range_m), (height, width) = hits, size
+        measured = np.zeros(size, np.float32)
+        measured[rows, columns] = range_m
         elevation = (np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)).astype(np.float32)[:, None]
         cos, sin = np.cos(elevation), np.sin(elevation)
         tan = sin / cos
         hit = np.zeros((height, width), np.float32)  # horizontal range; inf on floor and ceiling
         flat = np.zeros((height, width), bool)
-        measured = np.zeros((height, width), np.float32)
-        measured[rows, columns] = range_m
-        alone = lonely(measured, rows, columns)
-        measured[rows[alone], columns[alone]] = 0
-        rows, columns, range_m = rows[~alone], columns[~alone], range_m[~alone]
         z = range_m * sin[rows, 0]
         # A row's own height is half a pixel wide, which far away is more than the tolerance.
         slack = config.floor_tolerance_m + range_m * (np.pi / height)

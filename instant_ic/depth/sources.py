@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ranges import check_ranges
-from .fusion import FusionConfig, ceiling_height, fuse
+from .fusion import FusionConfig, ceiling_height, correct, fuse
 from .lidar_depth import LidarDepthConfig, LidarStructure, _rays
-from .scaler import DepthScaler, ScaleFit, ScalerConfig, nearest_points
+from .scaler import DepthScaler, ScaleFit, ScalerConfig
+from .visibility import nearest_points
 
 Floats = NDArray[np.floating]
 SOURCES = ("network", "lidar", "fused")
@@ -113,12 +114,16 @@ class DepthSource:
         fit = self.scaler.fit(raw, points)
         if config.source == "network" or config.scaler.method == "as_estimated":
             return _of_fit(fit)
-        rise = _rays(*raw.shape) @ (np.asarray(up, np.float32) / np.float32(np.linalg.norm(up)))
-        top = ceiling_height(fit.depth_m, rise)
-        built = self.structure.estimate(points, up, camera_height_m, raw.shape, None if top is None else top[0])
-        if not fit.ok or built.message:
+        if not fit.ok:
             return _of_fit(fit)
-        fused = fuse(fit.depth_m, fit.relative_sigma, built.depth_m, built.origin, config.fusion)
+        measured = self.structure.ranges(points, raw.shape)
+        network = correct(fit.depth_m, measured, config.fusion)
+        rise = _rays(*raw.shape) @ (np.asarray(up, np.float32) / np.float32(np.linalg.norm(up)))
+        top = ceiling_height(network.depth_m, rise)
+        built = self.structure.estimate(points, up, camera_height_m, raw.shape, None if top is None else top[0])
+        if built.message:
+            return _of_fit(fit)
+        fused = fuse(network.depth_m, network.wrong, network.sigma, built.depth_m, built.origin)
         return replace(
             _of_fit(fit),
             depth_m=fused.depth_m,
