@@ -1,0 +1,123 @@
+"""``ic evaluate depth``: panoramas with true depth through each source of depth; see ``evaluate``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+
+
+def add_kind(kinds: Any) -> None:
+    """Adds ``depth`` to ``ic evaluate``."""
+    parser = kinds.add_parser(
+        "depth",
+        help="depth of panoramas against the truth",
+        description=(
+            "Estimates the depth of level 360° panoramas as the robot does and compares it with the truth: MRE, MAE, "
+            "RMSE, δ1 to δ3, error of the scale, time; for each image and in the mean, before and after scaling. "
+            "Prints JSON. Without --depth nothing is compared: --plot and --side show what the depth looks like."
+        ),
+        epilog="example: ic evaluate depth rgb/ --depth depth/ --lidar --outliers 0.05 --json out.json --plot out.png",
+    )
+    parser.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1): files or folders")
+    parser.add_argument("--depth", type=Path, nargs="+", default=[], metavar="GT",
+                        help="true radial depth: files or a folder, same stems as the images; PNG of 16 bits in "
+                        "millimetres, .npy, .npz (key depth) or .exr in metres; 0 = unknown")  # fmt: skip
+    parser.add_argument(
+        "--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)"
+    )
+    parser.add_argument("--source", choices=("network", "lidar", "fused"),
+                        help="where depth comes from (default: fused with --lidar, else network)")  # fmt: skip
+    parser.add_argument(
+        "--lidar", action="store_true", help="a simulated VLP-16 measures the truth and scales the depth"
+    )
+    parser.add_argument("--lidar-height", type=float, default=0.6, metavar="M",
+                        help="above the floor (default: %(default)g m)")  # fmt: skip
+    parser.add_argument("--camera-height", type=float, default=1.2, metavar="M",
+                        help="above the floor (default: %(default)g m)")  # fmt: skip
+    parser.add_argument("--noise", type=float, default=0.02, metavar="M", help="of a range (default: %(default)g m)")
+    parser.add_argument("--outliers", type=float, default=0.0, metavar="SHARE",
+                        help="of the LiDAR's points, 0 to 1 (default: %(default)g)")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="of noise and outliers (default: %(default)s)")
+    parser.add_argument("--method", default="", metavar="RULE",
+                        help="of scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)")  # fmt: skip
+    parser.add_argument("--max-depth", type=float, metavar="M", help="leave out truth farther than this")
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads of the model (default: %(default)s)")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="sheet of image, prediction, truth and error")
+    parser.add_argument(
+        "--side", type=Path, metavar="OUT.png", help="sheet of the point clouds, from the side and above"
+    )
+    parser.set_defaults(func=evaluate_depth)
+
+
+def evaluate_depth(args: argparse.Namespace) -> int:
+    """Runs ``ic evaluate depth``; returns the exit status."""
+    from ...depth.files import DepthFileError, load_depth, load_picture
+    from ...depth.manifest import ManifestError
+    from ...depth.model import DEFAULT_MODEL, DepthModel
+    from ...evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, report
+    from ...evaluation.depth_files import PairError, find_pictures, pair, unit_warning
+    from ...evaluation.depth_pictures import Sheets
+    from ...paths import shipped_file
+    from ..progress import progress
+
+    for file in (args.json, args.plot, args.side):
+        if file is not None and not file.parent.is_dir():
+            raise UserError(f"{file}: there is no folder {file.parent}", 2)
+    if args.lidar and not args.depth:
+        raise UserError("--lidar measures the true depth: give --depth too", 2)
+    if args.source not in (None, "network") and not args.lidar:
+        raise UserError(f"--source {args.source} needs LiDAR points: give --depth and --lidar too", 2)
+    try:
+        lidar = LidarSettings(args.lidar_height, args.noise, args.outliers, args.seed) if args.lidar else None
+        source = args.source or ("fused" if lidar else "network")
+        settings = Settings(source, lidar, args.camera_height, args.method, args.max_depth)
+        model = None
+        if source != "lidar":
+            model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads)
+        evaluator = Evaluator(settings, model)
+        pictures = find_pictures(args.images)
+        pairs = pair(pictures, args.depth) if args.depth else [(picture, None) for picture in pictures]
+    except (DepthEvaluationError, ManifestError, PairError, FileNotFoundError, ValueError) as error:
+        raise UserError(f"evaluate depth: {error}") from None
+
+    sheets = [Sheets(file, side) for file, side in ((args.plot, False), (args.side, True)) if file is not None]
+    rows: list[dict[str, Any]] = []
+    errors: list[dict[str, str]] = []
+    warnings: list[str] = []
+    with progress("depth") as tell:
+        for done, (image, truth) in enumerate(pairs):
+            tell(done / len(pairs))
+            try:
+                if args.depth and truth is None:
+                    raise PairError(f"{image}: no depth file of this stem")
+                truth_m = load_depth(truth) if truth is not None else None
+                warning = unit_warning(truth_m) if truth_m is not None else ""
+                if warning:
+                    warnings.append(f"{truth}: {warning}")
+                scored = evaluator.score(image.name, load_picture(image), truth_m)
+            except (PairError, DepthFileError, DepthEvaluationError) as error:
+                errors.append({"name": image.name, "error": str(error)})
+                continue
+            rows.append(scored.as_dict() | {"image": str(image), "truth": str(truth) if truth else None})
+            for sheet in sheets:
+                sheet.add(scored)
+        tell(1.0)
+    for sheet in sheets:
+        sheet.close()
+    figures = report(rows, settings, evaluator.model)
+    figures |= {"errors": errors, "warnings": warnings, "pictures": [str(p) for sheet in sheets for p in sheet.written]}
+    text = json.dumps(figures, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    sys.stdout.write(text + "\n")
+    for line in warnings:
+        print(f"ic evaluate depth: warning: {line}", file=sys.stderr)
+    for entry in errors:
+        print(f"ic evaluate depth: {entry['error']}", file=sys.stderr)
+    return 1 if errors else 0
