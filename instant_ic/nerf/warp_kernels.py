@@ -236,7 +236,7 @@ def look_up(texels, level_start, sizes, places, height, width, blur, wanted, sha
             minor = blur * math.sqrt(max(mean - half, np.float32(0)))
             taps = min(max(math.ceil(major / max(minor, np.float32(1)) - np.float32(0.25)), 1), MAX_TAPS)
             level = math.log2(max(minor, major / np.float32(taps), np.float32(1)))
-            level = min(level, np.float32(sizes.shape[0] - 1))
+            level = min(float(level), float(sizes.shape[0] - 1))
             low = int(level)
             mix = level - np.float32(low)
             # Direction of the longer axis.

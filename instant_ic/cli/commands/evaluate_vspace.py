@@ -1,0 +1,138 @@
+"""``ic evaluate vspace``: how good the virtual space looks away from the panorama, against simpler ways."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+
+
+def add_kind(kinds: Any) -> None:
+    """Adds ``vspace`` to ``ic evaluate``."""
+    parser = kinds.add_parser(
+        "vspace",
+        help="pictures of the virtual space against the truth, by distance and training time",
+        description=(
+            "Takes a panorama in a simulated world, makes each source ready, and compares its pictures with the "
+            "world's own at distances from the panorama: PSNR and SSIM. Sources: ours (the shipped depth model, scaled "
+            "by a simulated LiDAR, and the field), true-depth (the same with the world's depth: the ceiling), no-depth "
+            "(colours alone), no-scale (the model's depth as it comes), panorama (turned, no depth), depth-warp, "
+            "point-warp and true-warp (the panorama warped by depth), mesh (the world scanned at another time)."
+        ),
+        epilog=(
+            "example: ic evaluate vspace --world corridor --path straight --sources ours,panorama,depth-warp "
+            "--json vspace.json --plot vspace.png"
+        ),
+    )
+    parser.add_argument("--world", required=True, metavar="W", help="corridor, random:SEED, or a mesh file (.glb, ...)")
+    parser.add_argument("--path", default="straight,curve", help="straight, curve, or both (default: %(default)s)")
+    parser.add_argument(
+        "--sources", default="ours,no-depth,no-scale,panorama,depth-warp,mesh", help="default: %(default)s"
+    )
+    parser.add_argument("--start", metavar="X,Y,YAW", help="place of the last panorama, metres and degrees")
+    parser.add_argument("--seconds", type=float, default=8.0, metavar="S", help="CPU s of training (default: 8)")
+    parser.add_argument("--times", metavar="S,S,...", help="training times at which ours is measured too")
+    parser.add_argument("--size", default="640x360", metavar="WxH", help="of the pictures (default: %(default)s)")
+    parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="horizontal (default: 90)")
+    parser.add_argument("--panorama-width", type=int, default=2048, metavar="PX", help="default: %(default)s")
+    parser.add_argument("--keyframes", type=int, default=1, metavar="K", help="each 1 m behind the next (default: 1)")
+    parser.add_argument("--step", type=float, default=0.25, metavar="M", help="between distances (default: 0.25)")
+    parser.add_argument("--reach", type=float, default=4.0, metavar="M", help="longest distance (default: 4)")
+    parser.add_argument(
+        "--depth-source", choices=("network", "lidar", "fused"), default="fused", help="of ours (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write the curves here")
+    parser.add_argument("--strip", type=Path, metavar="OUT.png", help="write pictures at 0.5, 1, 2 and 3 m here")
+    parser.set_defaults(func=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Runs ``ic evaluate vspace``; returns the exit status."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.table import Table
+
+    from ...evaluation import vspace
+
+    for file in (args.json, args.plot, args.strip):
+        if file is not None and not file.parent.is_dir():
+            raise UserError(f"{file}: there is no folder {file.parent}", 2)
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    try:
+        settings = vspace.Settings(
+            paths=_words(args.path),
+            sources=_words(args.sources),
+            seconds=args.seconds,
+            times=tuple(_numbers(args.times, "--times")) if args.times else (),
+            size=_size(args.size),
+            fov_deg=args.fov,
+            panorama_width=args.panorama_width,
+            keyframes=args.keyframes,
+            step_m=args.step,
+            reach_m=args.reach,
+            depth_source=args.depth_source,
+            seed=args.seed,
+        )
+        start = _start(args.start) if args.start else None
+        with Progress(*columns, console=console) as progress:
+            task = progress.add_task("starting", total=None)
+
+            def tell(words: str, done: int, total: int) -> None:
+                progress.update(task, description=words, completed=done, total=total)
+
+            report = vspace.evaluate(args.world, settings, start, tell)
+    except ValueError as error:
+        raise UserError(f"ic evaluate vspace: {error}", 2) from error
+    figures = report.figures()
+    if args.json:
+        args.json.write_text(json.dumps(figures, indent=2) + "\n")
+    if args.plot or args.strip:
+        from ...evaluation.vspace_plot import save_plot, save_strip
+
+        if args.plot:
+            save_plot(args.plot, report)
+        if args.strip:
+            save_strip(args.strip, report)
+    for key, label in (("psnr_db", "PSNR, dB"), ("ssim", "SSIM")):
+        for path, sources in report.table(key).items():
+            distances = sorted({distance for values in sources.values() for distance in values if distance % 0.5 == 0})
+            table = Table("m", *(f"{distance:g}" for distance in distances), title=f"{label}, {path}")
+            for source, values in sources.items():
+                table.add_row(source, *(f"{values[d]:.3g}" if d in values else "" for d in distances))
+            console.print(table)
+    sys.stdout.write(json.dumps({key: figures[key] for key in ("world", "depth", "mean", "verdict")}, indent=2) + "\n")
+    return 0
+
+
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    try:
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise ValueError(f"{option} must be numbers with commas between (got {text!r})") from error
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels (got {text!r})")
+    return int(width), int(height)
+
+
+def _start(text: str) -> tuple[float, float, float]:
+    import math
+
+    numbers = _numbers(text, "--start")
+    if len(numbers) != 3:
+        raise ValueError(f"--start must be x,y,yaw in metres and degrees (got {text!r})")
+    return numbers[0], numbers[1], math.radians(numbers[2])
