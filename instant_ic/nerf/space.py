@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +19,13 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, sample_equirect
 
 from .config import VirtualSpaceConfig
-from .field import Device, FieldParameters, Lattice, Rays, Scene, Schedule
+from .field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
 from .saved import Progress, SavedSpace, read, write
 from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
+
+T = TypeVar("T")
 
 
 class State(enum.IntEnum):
@@ -68,6 +72,8 @@ class Status:
     """How far from the keyframe a view is fit to show."""
     converged: bool
     device: str
+    warning: str = ""
+    """What is not as it should be with the device; empty when all is well."""
 
 
 class NotReadyError(RuntimeError):
@@ -104,6 +110,7 @@ class VirtualSpace:
     def __init__(self, config: VirtualSpaceConfig | None = None) -> None:
         self.config = config or VirtualSpaceConfig()
         self._device = make_device(self.config)
+        self._warning = ""
         self._scene: Scene | None = None
         self._shown: _Shown | None = None
         self._rng = np.random.default_rng(self.config.train.seed)
@@ -143,7 +150,8 @@ class VirtualSpace:
         occupancy = build_occupancy(prior, config.geometry)
         lattice = Lattice.for_prior(prior, config.field)
         if self._scene is not None and self._ready_iterations:
-            self._shown = _Shown(self._scene, self._device.freeze(), self._progress)
+            frozen = self._on_device(lambda device: device.freeze())
+            self._shown = _Shown(self._scene, frozen, self._progress)
         refresh = self._scene is not None and self._scene.lattice.suits(lattice)
         if refresh:
             assert self._scene is not None
@@ -151,7 +159,13 @@ class VirtualSpace:
         elif self._scene is not None:
             self._device.load(FieldParameters.random(config.field, config.train.seed))
         scene = Scene(prior, lattice, occupancy)
-        self._device.set_scene(scene)
+        try:
+            self._on_device(lambda device: device.set_scene(scene))
+        except Exception:
+            if not refresh:  # the old parameters are gone
+                self._scene, self._shown = None, None
+                self._reset_run(refresh=False)
+            raise
         self._scene = scene
         self._reset_run(refresh)
 
@@ -169,7 +183,7 @@ class VirtualSpace:
         shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
         while not self._schedule.finished and done < limit:
             uniform = self._rng.random(shape, np.float32)
-            colour, distance = self._device.step(uniform, *self._schedule.rates())
+            colour, distance = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
             self._schedule.iteration += 1
             done += 1
             distance_error = math.sqrt(distance)
@@ -212,6 +226,7 @@ class VirtualSpace:
             ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
             converged=self._scene is not None and self._schedule.finished,
             device=self._device.name,
+            warning=self._warning,
         )
 
     def _ready_radius_m(self) -> float:
@@ -265,13 +280,33 @@ class VirtualSpace:
         if self._scene is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         height, width = rays.shape
-        progress, frozen = (self._progress, None) if self._shown is None else (self._shown.progress, self._shown.frozen)
-        share = self.config.picture.panorama_share(progress.psnr_db)
-        colour, depth, confidence = self._device.draw(rays, share, frozen)
+
+        def draw(device: Device) -> tuple[Floats, Floats, Floats]:
+            shown = self._shown
+            psnr_db, frozen = (self._psnr_db, None) if shown is None else (shown.progress.psnr_db, shown.frozen)
+            return device.draw(rays, self.config.picture.panorama_share(psnr_db), frozen)
+
+        colour, depth, confidence = self._on_device(draw)
         depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
         return View(rgb, depth, confidence, projection)
+
+    def _on_device(self, call: Callable[[Device], T]) -> T:
+        """Calls; a GPU without memory is left for the CPU where ``device`` is ``auto``, with what is learnt."""
+        try:
+            return call(self._device)
+        except RuntimeError as error:
+            if type(error).__name__ != "OutOfMemoryError" or self.config.device != "auto":
+                raise
+            self._warning = f"{self._device.name} is out of memory; on the CPU from now on ({error})"
+        parameters = self._device.parameters()
+        self._device = make_device(dataclasses.replace(self.config, device="cpu"))
+        self._device.load(parameters)
+        self._shown = None  # its copy lies on the device that is left
+        if self._scene is not None:
+            self._device.set_scene(self._scene)
+        return call(self._device)
 
     def parameters(self) -> FieldParameters:
         """A copy of the field's present parameters."""
@@ -327,6 +362,10 @@ class VirtualSpace:
         # Rays that were not drawn before, the same at each loading.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space
+
+
+def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:
+    return device.step(uniform, *rates)
 
 
 def make_device(config: VirtualSpaceConfig) -> Device:

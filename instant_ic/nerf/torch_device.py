@@ -67,17 +67,14 @@ class TorchDevice:
         self._steps = 0
 
     def set_scene(self, scene: Scene) -> None:
-        self._prior = torch_prior(scene, self._device)
-        grid = scene.occupancy
-        self._grid = TorchGrid(
-            torch.from_numpy(grid.distance).to(self._device),
-            torch.from_numpy(grid.origin).to(self._device),
-            grid.cell_m,
-        )
-        self._field.cells_per_m = torch.from_numpy(scene.lattice.cells_per_m).to(self._device)
-        self._field.origin = torch.from_numpy(scene.lattice.origin).to(self._device)
-        self._field.focus = torch.from_numpy(scene.focus).to(self._device)
-        self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
+        grid, lattice = scene.occupancy, scene.lattice
+        arrays = (grid.distance, grid.origin, lattice.cells_per_m, lattice.origin, scene.focus)
+        # All that needs memory comes first: where there is none, the old scene stays whole.
+        prior = torch_prior(scene, self._device)
+        distance, corner, cells_per_m, origin, focus = (torch.from_numpy(a).to(self._device) for a in arrays)
+        moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
+        self._prior, self._grid, self._moments = prior, TorchGrid(distance, corner, grid.cell_m), moments
+        self._field.cells_per_m, self._field.origin, self._field.focus = cells_per_m, origin, focus
         self._steps = 0
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:

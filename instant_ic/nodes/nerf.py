@@ -243,6 +243,8 @@ class NerfNode(Node[NerfConfig]):
         self.job = None
         kind = outcome.job.kind
         self.status = outcome.status
+        if self.status is not None and self.status.warning:
+            self.diagnose("device", WARN, self.status.warning)
         if outcome.error is not None:
             self.on_error(kind, outcome.error)
         elif kind == "keyframe":
@@ -267,7 +269,8 @@ class NerfNode(Node[NerfConfig]):
             self.publish_status()
         else:
             self.diagnose(kind, ERROR, words)
-        self.fault(f"virtual space, {kind}", error)
+        if type(error).__name__ != "OutOfMemoryError":  # that is no bug, and is told
+            self.fault(f"virtual space, {kind}", error)
 
     def on_keyframe_taken(self, outcome: Outcome) -> None:
         keyframe = outcome.job.message

@@ -142,6 +142,30 @@ def test_a_bad_keyframe_is_refused_and_the_old_space_stays(bus, message, words):
     assert bus.last("/vspace/view").keyframe_id == 1
 
 
+def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
+    import torch
+
+    bus.publish("/keyframe", keyframe_message(1), latched=True)
+    bus.advance(0.3)
+    node = next(n for n in bus.nodes if isinstance(n, NerfNode))
+    device = node.space._device
+    whole = device.step
+
+    def no_memory(*args):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    device.step = no_memory  # "cpu" was asked for: as with "cuda", there is no other device to turn to
+    bus.advance(0.6)
+    status = bus.last("/vspace/status")
+    assert status.state == 3
+    assert "out of memory" in status.message
+    assert diagnosis(bus, "vspace")[0] == 2
+    device.step = whole
+    bus.publish("/keyframe", keyframe_message(2), latched=True)
+    bus.advance(2.0)
+    assert bus.last("/vspace/status").state == READY
+
+
 def test_a_new_keyframe_replaces_the_old_without_a_gap(bus):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.advance(2.0)

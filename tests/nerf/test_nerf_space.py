@@ -267,6 +267,53 @@ def test_cuda_without_a_gpu_says_so():
         VirtualSpace(VirtualSpaceConfig(device="cuda"))
 
 
+SMALL = dataclasses.replace(
+    CONFIG, device="auto", field=FieldConfig(log2_table=10), train=TrainConfig(ray_columns=32, ray_rows=16)
+)
+
+
+def no_memory(*args):
+    import torch
+
+    raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB")
+
+
+@pytest.mark.parametrize("call", ["step", "draw", "set_scene", "freeze"])
+def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monkeypatch):
+    monkeypatch.setattr("instant_ic.nerf.space._may_have_cuda", lambda: False)
+    ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1))  # so that the old one is frozen
+    space, whole = trained(6, ready), trained(6, ready)
+    monkeypatch.setattr(space._device, call, no_memory)
+    assert not space.status.warning
+    for s in (space, whole):
+        if call in ("set_scene", "freeze"):
+            refreshed(s)
+        s.train(iterations=4)
+    views = [s.render(CAMERA, 64, 36, 1.5) for s in (space, whole)]
+    assert psnr_db(views[0].rgb, views[1].rgb) > (20 if call == "step" else 40)  # in a step Adam's moments start anew
+    assert "out of memory" in space.status.warning
+    assert space.status.iterations == whole.status.iterations
+
+
+def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(monkeypatch):
+    import torch
+
+    space = trained(6, dataclasses.replace(SMALL, device="cpu"))  # any device that was asked for by name
+    before = space.render(CAMERA, 64, 36, 1.5)
+    with monkeypatch.context() as patch:
+        patch.setattr(space._device, "set_scene", no_memory)
+        with pytest.raises(torch.OutOfMemoryError):
+            refreshed(space)
+        assert np.array_equal(space.render(CAMERA, 64, 36, 1.5).rgb, before.rgb)  # the old space is whole
+        picture = box_room.panorama(CAMERA, 192)
+        with pytest.raises(torch.OutOfMemoryError):
+            space.set_keyframe(picture.rgb, 5 * picture.depth_m, CAMERA, 0.02)  # starts anew: nothing of it is left
+        assert space.status.state == State.EMPTY
+    refreshed(space)
+    assert space.train(iterations=3).psnr_db > 5
+    assert space.status.state == State.TRAINING
+
+
 def test_warm_up_leaves_nothing_to_compile():
     from instant_ic.nerf import kernels, march
 

@@ -198,8 +198,9 @@ def train(args: argparse.Namespace) -> int:
         raise UserError(f"{args.panorama}{f' with {args.depth}' if args.depth else ''}: {error}") from error
     with progress("training") as tell:
         ended = _train(space, args, tell)
-    file = space.save(args.out)
-    status = space.status
+    file, status = space.save(args.out), space.status
+    if status.warning:
+        print(f"warning: {status.warning}", file=sys.stderr)
     print(f"{'ended early: ' if ended else ''}{status.iterations} iterations in {status.train_seconds:.1f} s on "
           f"{status.device}, {status.psnr_db:.1f} dB on the panorama's own rays; depth known in "
           f"{(depth > 0).mean():.0%}, fit to show up to {status.ready_radius_m:.1f} m; wrote {file}")  # fmt: skip
@@ -241,15 +242,17 @@ def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
     from instant_ic.geometry.poses import pose_matrix
 
     preview = args.out / PREVIEW
-    shown, total = 0.0, space.config.train.iterations
+    next_preview, total = 0.0, space.config.train.iterations
     deadline = 1.2 * args.seconds if args.seconds else math.inf
     try:
         while not space.status.converged and space.status.train_seconds < deadline:
             space.train(budget_ms=200)
             tell(space.status.iterations / total)
-            if time.monotonic() - shown >= PREVIEW_S or space.status.converged:
+            begin = time.monotonic()
+            if begin >= next_preview or space.status.converged:
                 write_picture(preview, space.render(pose_matrix(x=0.5), *_SIZES["perspective"], math.pi / 2).rgb)
-                shown = time.monotonic()
+                took = time.monotonic() - begin
+                next_preview = begin + max(PREVIEW_S, 4 * took)  # on a slow machine training comes first
     except KeyboardInterrupt:
         return True
     return False
