@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import equirect_directions, equirect_pixels
 
-from ..ranges import NotNegative, Positive, Range, check_ranges
+from ..ranges import NotNegative, Positive, Range, Share, check_ranges
 from .visibility import project_points
 
 Floats = NDArray[np.floating]
-_NONE = 1 << 20
+Indices = NDArray[np.intp]
 
 
 class Origin(IntEnum):
@@ -46,6 +46,9 @@ class LidarDepthConfig:
         min_range_m: points nearer than this to the camera are left out (the robot itself).
         max_range_m: farther points are left out; what lies farther is unknown.
         min_points: fewer points give no depth.
+        min_azimuth_deg: points in fewer degrees of azimuth: the depth is not fit.
+        max_under_floor: a larger share of points under the floor: height or tilt of the camera is wrong, or stairs go
+            down; not fit.
         max_gap_deg: an azimuth without any return is bridged up to this width; a wider one is open: unknown.
         ceiling_height_m: of the ceiling over the floor, where no point was seen on it.
         floor_tolerance_m: a point this near the floor's plane belongs to the floor.
@@ -56,6 +59,8 @@ class LidarDepthConfig:
     min_range_m: NotNegative = 0.4
     max_range_m: Positive = 40.0
     min_points: Annotated[int, Range(20)] = 300
+    min_azimuth_deg: Annotated[float, Range(0, 360)] = 90.0
+    max_under_floor: Share = 0.1
     max_gap_deg: Annotated[float, Range(0, 90)] = 8.0
     ceiling_height_m: Positive = 2.7
     floor_tolerance_m: Positive = 0.08
@@ -73,21 +78,26 @@ class LidarDepth:
 
     Attributes:
         depth_m: (H, W) float32 radial metres, 0 = unknown.
-        sigma: (H, W) float32 relative standard deviation, inf where unknown.
         origin: (H, W) uint8, an ``Origin`` each.
+        gap_rad: (H, W) float32 angle to the next point above or below; pi where there is none.
         points: number of points used.
         camera_height_m: of the camera over the floor, given or found; None where neither.
         ceiling_height_m: of the ceiling over the camera, found from points; None where no ceiling was seen.
-        message: why there is no depth; empty where there is.
+        message: why ``depth_m`` is not to be trusted; empty where it is.
     """
 
     depth_m: NDArray[np.float32]
-    sigma: NDArray[np.float32]
     origin: NDArray[np.uint8]
+    gap_rad: NDArray[np.float32]
     points: int
     camera_height_m: float | None
     ceiling_height_m: float | None
     message: str = ""
+
+    @property
+    def sigma(self) -> NDArray[np.float32]:
+        """(H, W) float32 relative standard deviation, inf where unknown."""
+        return structure_sigma(self.origin, self.gap_rad)
 
 
 def level_from_camera(up: Floats) -> NDArray[np.float64]:
@@ -140,7 +150,9 @@ def plane_height(z: Floats, across_m: Floats, columns: NDArray[np.intp], bin_m: 
 _AROUND = [(row, column) for row in (-2, -1, 0, 1, 2) for column in (-2, -1, 1, 2)]
 
 
-def lonely(measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], alike: float = 0.12) -> Floats:
+def lonely(
+    measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], alike: float = 0.12
+) -> NDArray[np.bool_]:
     """Which points (N,) nothing around them confirms: dust, mixed pixels, mirrors.
 
     Args:
@@ -157,7 +169,7 @@ def lonely(measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], 
         there += other > 0
         same += np.abs(other - own) < alike * own
     # A point that is wrong along its beam shows elsewhere in the camera's picture, often with nothing around it.
-    return (same < 2) & (float(np.median(there)) >= 4)
+    return np.asarray((same < 2) & (float(np.median(there)) >= 4))
 
 
 def _confirmed(
@@ -178,7 +190,8 @@ def _confirmed(
 
 
 @lru_cache(maxsize=4)
-def _rays(height: int, width: int) -> NDArray[np.float32]:
+def rays(height: int, width: int) -> NDArray[np.float32]:
+    """``equirect_directions``, kept."""
     return equirect_directions(width, height)
 
 
@@ -211,23 +224,15 @@ class LidarStructure:
         """
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points must be (N, 3) (got {points.shape})")
-        config = self.config
         turn = level_from_camera(up)
-        level = np.asarray(points, np.float64) @ turn.T
-        distance = np.linalg.norm(level, axis=1)
-        with np.errstate(invalid="ignore"):
-            level = level[(distance >= config.min_range_m) & (distance <= config.max_range_m)]
-        height, width = size
-        if len(level) < config.min_points:
-            nothing = np.zeros(size, np.float32)
+        level = self._usable(points) @ turn.T
+        if len(level) < self.config.min_points:
             words = (
-                f"{len(level)} LiDAR points between {config.min_range_m} and {config.max_range_m} m, "
-                f"{config.min_points} are needed"
+                f"{len(level)} LiDAR points between {self.config.min_range_m} and {self.config.max_range_m} m, "
+                f"{self.config.min_points} are needed"
             )
-            return LidarDepth(
-                nothing, np.full(size, np.inf, np.float32), nothing.astype(np.uint8), len(level), camera_height_m, None,
-                words,
-            )  # fmt: skip
+            nothing = np.zeros(size, np.float32), np.zeros(size, np.uint8), np.full(size, np.pi, np.float32)
+            return LidarDepth(*nothing, len(level), camera_height_m, None, words)
         kept, rows, columns, range_m = _confirmed(level, size)
         z, across = level[kept, 2], np.hypot(level[kept, 0], level[kept, 1])
         floor = camera_height_m
@@ -237,139 +242,190 @@ class LidarStructure:
             floor = None if found is None else -found
         upper = z > 0.4
         ceiling = plane_height(z[upper], across[upper], columns[upper])
-        depth, sigma, origin = self._columns((rows, columns, range_m), size, floor, ceiling, ceiling_m)
-        if abs(turn[2, 2]) < 1 - 1e-6:
-            u, v = equirect_pixels(_rays(height, width) @ turn.T.astype(np.float32), width, height)
-            rows, columns = np.clip(np.rint(v).astype(np.intp), 0, height - 1), np.rint(u).astype(np.intp) % width
-            depth, sigma, origin = depth[rows, columns], sigma[rows, columns], origin[rows, columns]
-        return LidarDepth(depth, sigma, origin, len(level), floor, ceiling)
+        building = _Building(self.config, rows, columns, range_m, size, floor, ceiling, ceiling_m)
+        depth, origin, gap_rad = building.fill()
+        if turn[2, 2] < 1 - 1e-6:
+            u, v = equirect_pixels(rays(*size) @ turn.T.astype(np.float32), size[1], size[0])
+            where = np.clip(np.rint(v).astype(np.intp), 0, size[0] - 1), np.rint(u).astype(np.intp) % size[1]
+            depth, origin, gap_rad = depth[where], origin[where], gap_rad[where]
+        return LidarDepth(
+            depth, origin, gap_rad, len(level), floor, ceiling, self._problem(z, range_m, columns, size[1], floor)
+        )
 
     def ranges(self, points: Floats, size: tuple[int, int]) -> NDArray[np.float32]:
         """Range (H, W) in each pixel of the camera's picture that a confirmed point (N, 3) falls into, else 0."""
-        distance = np.linalg.norm(points, axis=1)
-        with np.errstate(invalid="ignore"):
-            inside = (distance >= self.config.min_range_m) & (distance <= self.config.max_range_m)
-        _, rows, columns, range_m = _confirmed(points[inside], size)
         picture = np.zeros(size, np.float32)
+        _, rows, columns, range_m = _confirmed(self._usable(points), size)
         picture[rows, columns] = range_m
         return picture
 
-    def _columns(
+    def _usable(self, points: Floats) -> NDArray[np.float64]:
+        distance = np.linalg.norm(points, axis=1)
+        with np.errstate(invalid="ignore"):
+            inside = (distance >= self.config.min_range_m) & (distance <= self.config.max_range_m)
+        return np.asarray(points[inside], np.float64)
+
+    def _problem(self, z: Floats, range_m: Floats, columns: NDArray[np.intp], width: int, floor: float | None) -> str:
+        """Why the structure is not to be trusted; empty where it is."""
+        covered, needed = len(np.unique(columns * 120 // width)) * 3.0, self.config.min_azimuth_deg
+        if covered < needed:
+            return f"LiDAR points cover {covered:.0f} deg of azimuth, {needed:.0f} are needed"
+        under = 0.0 if floor is None else float((z < -floor - 0.15 - 0.02 * range_m).mean())
+        if under > self.config.max_under_floor:
+            return (
+                f"{under:.0%} of the points lie under the floor ({floor:.2f} m under the camera): "
+                "height or tilt of the camera is wrong, or stairs go down"
+            )
+        return ""
+
+
+class _Building:
+    """The structure in a level picture, column by column.
+
+    Attributes:
+        hit: (H, W) horizontal range of the point in each pixel, 0 without one.
+        flat: (H, W) the point is of the floor or the ceiling.
+    """
+
+    def __init__(
         self,
-        hits: tuple[NDArray[np.intp], NDArray[np.intp], Floats],
+        config: LidarDepthConfig,
+        rows: NDArray[np.intp],
+        columns: NDArray[np.intp],
+        range_m: Floats,
         size: tuple[int, int],
         floor: float | None,
         ceiling: float | None,
         ceiling_guess: float | None,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-        """The structure column by column, in a level picture."""
-        config = self.config
-        (rows, columns, range_m), (height, width) = hits, size
-        measured = np.zeros(size, np.float32)
-        measured[rows, columns] = range_m
+    ) -> None:
+        self.config, self.size, self.floor = config, size, floor
+        height = size[0]
         elevation = (np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)).astype(np.float32)[:, None]
-        cos, sin = np.cos(elevation), np.sin(elevation)
-        tan = sin / cos
-        hit = np.zeros((height, width), np.float32)  # horizontal range; inf on floor and ceiling
-        flat = np.zeros((height, width), bool)
-        z = range_m * sin[rows, 0]
-        # A row's own height is half a pixel wide, which far away is more than the tolerance.
+        self.cos, self.sin, self.tan = np.cos(elevation), np.sin(elevation), np.tan(elevation)
+        z = range_m * self.sin[rows, 0]
+        # A row is half a pixel uncertain, which far away is more than the tolerance.
         slack = config.floor_tolerance_m + range_m * (np.pi / height)
-        level_point = np.zeros(len(z), bool)
+        of_plane = np.zeros(len(z), bool)
         if floor is not None:
-            level_point |= z < -floor + slack
+            of_plane |= z < -floor + slack
         if ceiling is not None:
-            level_point |= z > ceiling - slack
-        hit[rows, columns] = range_m * cos[rows, 0]
-        flat[rows, columns] = level_point
+            of_plane |= z > ceiling - slack
+        self.measured, self.hit = np.zeros(size, np.float32), np.zeros(size, np.float32)
+        self.measured[rows, columns], self.hit[rows, columns] = range_m, range_m * self.cos[rows, 0]
+        self.flat = np.zeros(size, bool)
+        self.flat[rows, columns] = of_plane
+        self.some = self.hit > 0
+        self.top, self.top_origin = (
+            (ceiling, Origin.CEILING) if ceiling is not None else (ceiling_guess, Origin.ASSUMED)
+        )
+        if self.top is None and floor is not None:
+            self.top = max(config.ceiling_height_m - floor, _highest(z[~of_plane]))
 
-        some = hit > 0
-        columns_used = _bridge(np.any(some, axis=0), round(config.max_gap_deg / 360 * width))
-        index = np.arange(height, dtype=np.int32)[:, None]
-        above = np.maximum.accumulate(np.where(some, index, -1), axis=0)
-        below = np.minimum.accumulate(np.where(some, index, _NONE)[::-1], axis=0)[::-1]
-        has_above, has_below = above >= 0, below < _NONE
-        column = np.broadcast_to(np.arange(width), (height, width))
-        r_above = np.where(has_above, hit[np.maximum(above, 0), column], 0)
-        r_below = np.where(has_below, hit[np.minimum(below, height - 1), column], 0)
-        f_above = has_above & flat[np.maximum(above, 0), column]
-        f_below = has_below & flat[np.minimum(below, height - 1), column]
-        w_above, w_below = has_above & ~f_above, has_below & ~f_below
-        to_above = np.where(has_above, index - above, _NONE)
-        to_below = np.where(has_below, below - index, _NONE)
-        gap = np.minimum(to_above, to_below)
-        share = to_above / np.maximum(to_above + to_below, 1)
-
-        both = w_above & w_below
-        same = both & (np.abs(r_above - r_below) < config.same_surface * np.minimum(r_above, r_below))
-        nearer_above = to_above <= to_below
-        wall = np.zeros((height, width), np.float32)  # horizontal range of the upright surface, 0: none
-        origin = np.zeros((height, width), np.uint8)
-
-        def put(where: NDArray[np.bool_], value: Floats, how: Origin) -> None:
-            wall[where] = value[where]
-            origin[where] = how
-
-        # Up to its top a column is known where the LiDAR's uppermost ring came back; else what is above is taken from
-        # the nearest column where it did.
-        whole = _reaches_top(np.where(some, hit, 0) * ~flat, sin / cos)
-        donor = _bridge(whole, round(config.max_gap_deg / 360 * width))
-        first = np.where(some.any(axis=0), some.argmax(axis=0), 0)
-        crown = np.where(donor >= 0, hit[first[donor], donor], 0)
-        wall_top = np.where(whole, r_below, crown)
-        put(same, r_above * (1 - share) + r_below * share, Origin.BETWEEN)
-        put(both & ~same, np.where(nearer_above, r_above, r_below), Origin.EDGE)
-        put(w_above & f_below, r_above, Origin.DOWN)
-        put(w_below & f_above & (elevation > 0), r_below, Origin.UP)
-        # Something low with floor seen over it: its top is somewhere between.
-        put(w_below & f_above & (elevation <= 0) & ~nearer_above, r_below, Origin.EDGE)
-        put(w_below & ~has_above & (wall_top > 0), wall_top, Origin.UP)
-        put(w_above & ~has_below, r_above, Origin.DOWN)
-
+    def fill(self) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
+        """Depth, origin and angle to the next point, each (H, W)."""
+        height, width = self.size
+        column = np.arange(width)
+        index = np.arange(height)[:, None]
+        above = np.maximum.accumulate(np.where(self.some, index, -1), axis=0)
+        below = np.minimum.accumulate(np.where(self.some, index, height)[::-1], axis=0)[::-1]
+        up, down = np.maximum(above, 0), np.minimum(below, height - 1)
+        gap = np.minimum(np.where(above < 0, height, index - above), np.where(below == height, height, below - index))
+        wall, origin = self._walls(above, below, up, down, column)
         with np.errstate(divide="ignore", invalid="ignore"):
-            depth = np.where(wall > 0, wall / cos, np.inf)
-            # A level surface between two points of one height: a table, a bench.
-            h_above, h_below = r_above * tan[np.maximum(above, 0), 0], r_below * tan[np.minimum(below, height - 1), 0]
-            plate = both & ~same & (h_above < -0.15) & (np.abs(h_above - h_below) < 0.05)
-            depth = np.where(plate, 0.5 * (h_above + h_below) / sin, depth)
-            origin[plate] = Origin.BETWEEN
-            if floor is not None:
-                to_floor = np.where(sin < 0, floor / -sin, np.inf)
-                origin[to_floor < depth] = Origin.FLOOR
-                depth = np.minimum(depth, to_floor)
-            top, how = (ceiling, Origin.CEILING) if ceiling is not None else (ceiling_guess, Origin.ASSUMED)
-            if top is None and floor is not None:
-                top = max(config.ceiling_height_m - floor, _upper(z[~level_point]))
-            if top is not None:
-                # Never lower than what was seen upright in this column: there the ceiling is higher.
-                seen = _middle(np.where(some & ~flat, hit * (sin / cos), 0).max(axis=0))
-                to_top = np.where(
-                    (sin > 0) & ((wall > 0) | (flat & (hit * sin > 0)).any(axis=0)),
-                    np.maximum(top, seen + 0.05) / sin,
-                    np.inf,
-                )
-                origin[to_top < depth] = how
-                depth = np.minimum(depth, to_top)
-        beam = some
-        depth[beam] = measured[beam]
-        origin[beam] = Origin.BEAM
-        unknown = ~np.isfinite(depth) | (depth > config.max_range_m)
+            depth = np.where(wall > 0, wall / self.cos, np.inf)
+            self._plates(depth, origin, above, below, up, down, column)
+            self._planes(depth, origin, wall)
+        depth[self.some], origin[self.some] = self.measured[self.some], Origin.BEAM
+        unknown = ~np.isfinite(depth) | (depth > self.config.max_range_m)
         depth[unknown], origin[unknown] = 0, Origin.UNKNOWN
-        depth, origin, gap = depth[:, columns_used], origin[:, columns_used], gap[:, columns_used]
-        open_ = columns_used != np.arange(width)
-        origin[:, open_] = np.where(origin[:, open_] == Origin.BEAM, Origin.EDGE, origin[:, open_])
-        never = columns_used < 0
-        if never.any():
-            ground = to_floor[:, 0] if floor is not None else np.full(height, np.inf)
-            # Nothing came back: open, or too near to be measured. Only what the robot stands on is sure.
-            ground = np.where(ground * cos[:, 0] <= config.min_range_m, ground, 0)[:, None]
-            depth[:, never] = ground
-            origin[:, never] = np.where(ground > 0, Origin.FLOOR, Origin.UNKNOWN)
-        gap_rad = np.minimum(gap, height) * (np.pi / height)
-        return depth.astype(np.float32), structure_sigma(origin, gap_rad), origin
+
+        used = self._bridged(np.any(self.some, axis=0))
+        bridged = (used >= 0) & (used != column)
+        depth, origin, gap = depth[:, used], origin[:, used], gap[:, used]
+        origin[:, bridged] = np.where(origin[:, bridged] == Origin.BEAM, Origin.EDGE, origin[:, bridged])
+        # Nothing came back: open, or too near to be measured. Only what the robot stands on is sure.
+        ground = np.zeros((height, 1), np.float32)
+        if self.floor is not None:
+            near = -self.floor / self.tan < self.config.min_range_m
+            ground = np.where((self.sin < 0) & near, -self.floor / self.sin, 0)
+        depth[:, used < 0] = ground
+        origin[:, used < 0] = np.where(ground > 0, Origin.FLOOR, Origin.UNKNOWN)
+        return depth.astype(np.float32), origin, (gap * (np.pi / height)).astype(np.float32)
+
+    def _walls(
+        self, above: Indices, below: Indices, up: Indices, down: Indices, column: Indices
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Horizontal range (0: none) of the upright surface that each pixel shows, and its origin.
+
+        ``above`` and ``below`` are the rows of the next points, ``up`` and ``down`` the same within the picture.
+        """
+        index = np.arange(self.size[0])[:, None]
+        wall_above = (above >= 0) & ~self.flat[up, column]
+        wall_below = (below < len(index)) & ~self.flat[down, column]
+        flat_above = (above >= 0) & ~wall_above
+        flat_below = (below < len(index)) & ~wall_below
+        r_above, r_below = self.hit[up, column], self.hit[down, column]
+        both = wall_above & wall_below
+        same = both & (np.abs(r_above - r_below) < self.config.same_surface * np.minimum(r_above, r_below))
+        share = ((index - up) / np.maximum(down - up, 1)).astype(np.float32)
+        nearer_above = index - above <= below - index
+        crown = self._crown()
+        wall, origin = np.zeros(self.size, np.float32), np.zeros(self.size, np.uint8)
+        for where, value, how in (
+            (same, r_above * (1 - share) + r_below * share, Origin.BETWEEN),
+            (both & ~same, np.where(nearer_above, r_above, r_below), Origin.EDGE),
+            (wall_above & (flat_below | (below == len(index))), r_above, Origin.DOWN),
+            (wall_below & flat_above & (self.sin > 0), r_below, Origin.UP),
+            # Something low with floor seen over it: its top is somewhere between.
+            (wall_below & flat_above & (self.sin <= 0) & ~nearer_above, r_below, Origin.EDGE),
+            (wall_below & (above < 0) & (crown > 0), np.broadcast_to(crown, self.size), Origin.UP),
+        ):
+            wall[where], origin[where] = value[where], how
+        return wall, origin
+
+    def _crown(self) -> NDArray[np.float32]:
+        """Horizontal range (W,) at which each column goes on above its uppermost point, 0 where nobody knows.
+
+        A column is known up to its top where the LiDAR's uppermost ring came back. Where it did not, that ring went
+        over what lies below it, and the nearest column with a top tells what is behind.
+        """
+        upright = np.where(self.flat, 0, self.hit)
+        row = (upright > 0).argmax(axis=0)
+        across = upright[row, np.arange(self.size[1])]
+        donor = self._bridged(_reaches_top(across, across * self.tan[row, 0]))
+        return np.where(donor >= 0, across[donor], 0).astype(np.float32)
+
+    def _plates(
+        self, depth: Floats, origin: NDArray[np.uint8], above: Indices, below: Indices, up: Indices, down: Indices,
+        column: Indices,
+    ) -> None:  # fmt: skip
+        """Between two points of one height lies a level surface: a table, a bench."""
+        high, low = self.hit[up, column] * self.tan[up, 0], self.hit[down, column] * self.tan[down, 0]
+        edge = (origin == Origin.EDGE) & (above >= 0) & (below < self.size[0])
+        plate = edge & ~self.flat[up, column] & (high < -0.15) & (np.abs(high - low) < 0.05)
+        depth[plate] = (0.5 * (high + low) / self.sin)[plate]
+        origin[plate] = Origin.BETWEEN
+
+    def _planes(self, depth: Floats, origin: NDArray[np.uint8], wall: Floats) -> None:
+        """Floor and ceiling hide what lies behind them."""
+        if self.floor is not None:
+            to_floor = np.where(self.sin < 0, -self.floor / self.sin, np.inf)
+            origin[to_floor < depth] = Origin.FLOOR
+            np.minimum(depth, to_floor, out=depth)
+        if self.top is None:
+            return
+        # Never lower than what was seen upright in this column: there the ceiling is higher.
+        seen = _middle(np.where(self.some & ~self.flat, self.hit * self.tan, 0).max(axis=0)) + 0.05
+        roofed = (wall > 0) | np.any(self.flat & (self.hit * self.tan > 0), axis=0)
+        to_top = np.where((self.sin > 0) & roofed, np.maximum(self.top, seen) / self.sin, np.inf)
+        origin[to_top < depth] = self.top_origin
+        np.minimum(depth, to_top, out=depth)
+
+    def _bridged(self, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
+        return _bridge(seen, round(self.config.max_gap_deg / 360 * self.size[1]))
 
 
-#: Relative standard deviation at the points and its growth with the angle (rad) to the next one, for each ``Origin``.
+#: Relative standard deviation at a point and its growth with the angle (1/rad) to it, for each ``Origin``.
 _SIGMA = np.array(
     [
         [np.inf, 0.0], [0.02, 0.0], [0.03, 0.2], [0.25, 0.5], [0.1, 0.3], [0.1, 0.3], [0.05, 0.05], [0.05, 0.05],
@@ -383,24 +439,19 @@ def structure_sigma(origin: NDArray[np.uint8], gap_rad: Floats) -> NDArray[np.fl
     return np.hypot(_SIGMA[origin, 0], _SIGMA[origin, 1] * gap_rad.astype(np.float32))
 
 
-def _upper(z: Floats) -> float:
-    """Height under which nearly all of the points' heights (N,) lie, at least 0.1 m."""
+def _highest(z: Floats) -> float:
+    """Height under which nearly all of the heights (N,) lie, at least 0.1 m."""
     return max(0.1, float(np.quantile(z, 0.995))) if len(z) else 0.1
 
 
-def _reaches_top(hit: Floats, tan: Floats) -> NDArray[np.bool_]:
+def _reaches_top(across: Floats, z: Floats) -> NDArray[np.bool_]:
     """Columns (W,) whose uppermost upright point lies where the LiDAR's uppermost ring runs.
 
     Args:
-        hit: (H, W) horizontal ranges of upright points, 0 where none is.
-        tan: (H, 1) tangent of each row's elevation.
+        across: horizontal range of that point, 0 where there is none.
+        z: its height.
     """
-    some = hit > 0
-    there = some.any(axis=0)
-    row = some.argmax(axis=0)
-    across = hit[row, np.arange(hit.shape[1])]
-    z = across * tan[row, 0]
-    use = there.copy()
+    there = across > 0
     line = np.zeros(2)
     # The ring is a line in range and height; what ends below it is left out by and by.
     for slack in (np.inf, 0.3, 0.15):

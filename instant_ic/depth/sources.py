@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ranges import check_ranges
-from .fusion import FusionConfig, ceiling_height, correct, fuse
-from .lidar_depth import LidarDepthConfig, LidarStructure, _rays
+from .fusion import Corrected, FusionConfig, ceiling_height, correct, fuse, fused_sigma
+from .lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, rays
 from .scaler import DepthScaler, ScaleFit, ScalerConfig
 from .visibility import nearest_points
 
@@ -48,7 +48,8 @@ class DepthResult:
         sigma: (H, W) float32 relative standard deviation, inf where unknown.
         ok: false: do not trust ``depth_m``; ``message`` says why.
         scale, shift: of the network's depth, see ``scaler.ScaleFit``; 1 and 0 for ``lidar``.
-        quality: share of points whose range agrees with ``depth_m``, 0..1.
+        quality: share of points, 0..1, whose range agrees with the scaled network, before it is fused: how well
+            picture and LiDAR fit together; for ``lidar``, with ``depth_m``, which has no lonely points in it.
         relative_sigma: one robust number for the picture: median of ``sigma`` over its known pixels.
         points: number of points compared.
         message: for people.
@@ -114,32 +115,55 @@ class DepthSource:
         fit = self.scaler.fit(raw, points)
         if config.source == "network" or config.scaler.method == "as_estimated":
             return _of_fit(fit)
-        if not fit.ok:
-            return _of_fit(fit)
-        measured = self.structure.ranges(points, raw.shape)
-        network = correct(fit.depth_m, measured, config.fusion)
-        rise = _rays(*raw.shape) @ (np.asarray(up, np.float32) / np.float32(np.linalg.norm(up)))
-        top = ceiling_height(network.depth_m, rise)
-        built = self.structure.estimate(points, up, camera_height_m, raw.shape, None if top is None else top[0])
-        if built.message:
-            return _of_fit(fit)
-        fused = fuse(network.depth_m, network.wrong, network.sigma, built.depth_m, built.origin)
+        network, built = self.parts(fit, points, up, camera_height_m)
+        result = _of_fit(fit)
+        if not fit.ok or built.message:
+            # What the LiDAR alone tells is the better guess, but somebody is wrong: not fit.
+            reasons = [] if fit.ok else [fit.message]
+            reasons += [built.message] if built.message else []
+            known = built.depth_m > 0
+            return replace(
+                result,
+                depth_m=np.where(known, built.depth_m, fit.depth_m),
+                sigma=np.where(known, built.sigma, result.sigma),
+                ok=False,
+                message="; ".join(reasons),
+                source="fused",
+            )
+        depth, off = fuse(network, built)
+        sigma = np.where(depth > 0, fused_sigma(built.origin, built.gap_rad, off, network.wrong), np.float32(np.inf))
+        message = f"{fit.message}; floor {_metres(built.camera_height_m)}, ceiling {_metres(built.ceiling_height_m)}"
         return replace(
-            _of_fit(fit),
-            depth_m=fused.depth_m,
-            sigma=fused.sigma,
-            relative_sigma=_median(fused.sigma),
-            source="fused",
+            result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source="fused"
         )
+
+    def parts(
+        self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
+    ) -> tuple[Corrected, LidarDepth]:
+        """What is fused: the scaled network corrected by the points, and the LiDAR's structure. As ``estimate``."""
+        size = fit.depth_m.shape
+        network = correct(fit.depth_m, self.structure.ranges(points, size), self.config.fusion)
+        rise = rays(*size) @ np.asarray(up, np.float32)
+        top = ceiling_height(network.depth_m, rise)
+        return network, self.structure.estimate(points, up, camera_height_m, size, top)
 
     def _lidar(self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int]) -> DepthResult:
         built = self.structure.estimate(points, up, camera_height_m, size)
-        ok = not built.message
-        quality = agreement(built.depth_m, points, self.config.scaler) if ok else 0.0
+        known = f"floor {_metres(built.camera_height_m)}, ceiling {_metres(built.ceiling_height_m)}"
+        quality = agreement(built.depth_m, points, self.config.scaler)
+        message = f"LiDAR alone: {quality:.0%} of {built.points} points on its surfaces; {known}"
         return DepthResult(
-            built.depth_m, built.sigma, ok, 1.0, 0.0, quality,
-            _median(built.sigma), built.points, built.message or f"{built.points} points, LiDAR alone", "lidar",
-        )  # fmt: skip
+            depth_m=built.depth_m,
+            sigma=built.sigma,
+            ok=not built.message,
+            scale=1.0,
+            shift=0.0,
+            quality=quality,
+            relative_sigma=_median(built.sigma),
+            points=built.points,
+            message=built.message or message,
+            source="lidar",
+        )
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
@@ -151,6 +175,10 @@ def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:
     if len(rows) == 0:
         return 0.0
     return float((np.abs(depth_m[rows, columns] - range_m) <= config.agreement * range_m).mean())
+
+
+def _metres(height: float | None) -> str:
+    return "not seen" if height is None else f"{height:.2f} m"
 
 
 def _median(sigma: Floats) -> float:

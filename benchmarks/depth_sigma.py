@@ -1,0 +1,148 @@
+"""Fits how the uncertainty of LiDAR and fused depth grows, and checks it: |error| / sigma is under 1 in 68 % of pixels.
+
+    python benchmarks/depth_sigma.py --mesh ../shared/data/worlds/small_house.glb
+
+The worlds are neither those of the training nor those of the evaluations. The two tables that it prints stand as
+``_SIGMA`` in instant_ic/depth/lidar_depth.py and instant_ic/depth/fusion.py; run it again when the model has changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+
+from instant_ic.depth.fusion import fuse, fused_sigma
+from instant_ic.depth.lidar_depth import Origin, structure_sigma
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.depth.sources import DepthSource
+from instant_ic.evaluation.depth_lidar import Errors, measure_world
+from instant_ic.evaluation.depth_worlds import LIDAR_HEIGHT_M
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.paths import shipped_file
+from instant_ic.sim.render import EquirectRenderer
+from instant_ic.sim.world import World
+from instant_ic.sim.worlds import corridor_world, load_world, random_world
+
+FIRST_SEED = 990_000
+UP = np.array([0.0, 0.0, 1.0])
+SHARE = 0.683
+MOST_M = 16.0
+
+
+def worlds(count: int, mesh: Path | None) -> Iterator[tuple[str, World, int]]:
+    """Kind, world and number of places."""
+    for seed in range(FIRST_SEED, FIRST_SEED + count):
+        yield "random", random_world(seed), 1
+    yield "corridor", corridor_world(5), count // 2
+    if mesh is not None:
+        yield "mesh", load_world(mesh), count // 2
+
+
+def samples(model: DepthModel, count: int, mesh: Path | None) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """Kind, and of some pixels of a panorama: origin, features and relative errors, each (N,)."""
+    rng = np.random.default_rng(99)
+    source = DepthSource()
+    for kind, world, places in worlds(count, mesh):
+        renderer = EquirectRenderer(world)
+        try:
+            poses = world.sample_free_poses(rng, places)
+        except ValueError:  # too full to stand in
+            continue
+        for number, (x, y, yaw) in enumerate(poses):
+            height = float(rng.uniform(0.9, 1.4))
+            pose = pose_matrix(x, y, height, yaw=yaw)
+            frame = renderer.render(pose, model.manifest.input_width, model.manifest.input_height)
+            errors = Errors(outliers=0.05 * (number % 2), seed=number)
+            points = measure_world(renderer, pose, LIDAR_HEIGHT_M, height, errors)
+            fit = source.scaler.fit(model.estimate(frame.rgb), points)
+            if not fit.ok:
+                continue
+            network, built = source.parts(fit, points, UP, height)
+            fused, off = fuse(network, built)
+            alone = source.structure.estimate(points, UP, height, frame.depth_m.shape)
+            truth = frame.depth_m
+            valid = np.flatnonzero((truth > 0) & (truth < MOST_M) & (fused > 0))
+            chosen = rng.choice(valid, 6000)
+            columns = {
+                "origin": built.origin, "gap": built.gap_rad, "off": off, "wrong": network.wrong, "fused": fused,
+                "alone_origin": alone.origin, "alone_gap": alone.gap_rad, "alone": alone.depth_m,
+            }  # fmt: skip
+            picked = {name: column.ravel()[chosen] for name, column in columns.items()}
+            t = truth.ravel()[chosen]
+            yield kind, picked | {name: np.abs(picked[name] - t) / t for name in ("fused", "alone")}
+
+
+def fit_sigma(features: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Coefficients (K,) >= 0 of sigma = root of sum (k features)², features (N, K), with SHARE of the errors under it.
+
+    Quantile regression of log error: the pinball loss is least where the share is met everywhere.
+    """
+    target = np.log(np.maximum(error, 1e-4))
+
+    def loss(logs: np.ndarray) -> float:
+        sigma = np.sqrt(((features * np.exp(logs)) ** 2).sum(axis=1))
+        left = target - np.log(np.maximum(sigma, 1e-4))
+        return float((weight * np.maximum(SHARE * left, (SHARE - 1) * left)).sum() / weight.sum())
+
+    start = np.log(np.full(features.shape[1], max(float(np.quantile(error, SHARE)), 1e-3)))
+    found = minimize(loss, start, method="Nelder-Mead", options={"maxfev": 800, "xatol": 0.02, "fatol": 1e-6})
+    return np.exp(np.clip(found.x, np.log(1e-4), np.log(9.0)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=30, help="random worlds; half as many places in the others")
+    parser.add_argument("--mesh", type=Path, help="a mesh world besides")
+    parser.add_argument("--model", type=Path, help="ONNX file (default: the shipped one)")
+    args = parser.parse_args()
+    model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=1)
+    taken: dict[str, list[dict[str, np.ndarray]]] = {}
+    for kind, one in samples(model, args.count, args.mesh):
+        taken.setdefault(kind, []).append(one)
+    weight = np.concatenate([np.full(len(one["fused"]), 1 / len(ones)) for ones in taken.values() for one in ones])
+    every = {name: np.concatenate([one[name] for ones in taken.values() for one in ones]) for name in ones_keys(taken)}
+    one = np.ones(len(weight))
+    tables = {
+        "lidar_depth": ("alone", every["alone_origin"], np.stack([one, every["alone_gap"]], axis=1)),
+        "fusion": (
+            "fused",
+            every["origin"],
+            np.stack([one, np.abs(every["off"]), every["gap"], every["wrong"]], axis=1),
+        ),
+    }
+    for module, (name, origin, features) in tables.items():
+        print(f"instant_ic/depth/{module}.py")
+        for each in Origin:
+            of = origin == each
+            if each == Origin.UNKNOWN and name == "alone":
+                row = np.array([np.inf, 0.0])
+            elif of.sum() < 200:
+                print(f"  # {each.name}: only {of.sum()} pixels, left as it is")
+                continue
+            else:
+                row = fit_sigma(features[of], every[name][of], weight[of])
+            print(f"  ({', '.join(f'{value:.4f}' for value in row)}),  # {each.name}")
+    print("share of errors under sigma with the tables as they are in the code:")
+    start = 0
+    for kind, ones in taken.items():
+        part = slice(start, start := start + sum(len(each["fused"]) for each in ones))
+        fused = fused_sigma(every["origin"][part], every["gap"][part], every["off"][part], every["wrong"][part])
+        alone = structure_sigma(every["alone_origin"][part], every["alone_gap"][part])
+        known = every["alone_origin"][part] > 0
+        print(
+            f"  {kind:9} fused {(every['fused'][part] < fused).mean():.3f}, "
+            f"lidar {(every['alone'][part] < alone)[known].mean():.3f}"
+        )
+
+
+def ones_keys(taken: dict[str, list[dict[str, np.ndarray]]]) -> list[str]:
+    """Names of the columns."""
+    return list(next(iter(taken.values()))[0])
+
+
+if __name__ == "__main__":
+    main()
