@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from ..depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from ..depth.scaler import ScalerConfig
 from ..depth.sources import DepthSource, SourceConfig
-from ..geometry.projections import equirect_directions, equirect_pixels, sample_equirect
+from ..geometry.projections import equirect_directions, sample_equirect
 from .depth_lidar import measure
 
 if TYPE_CHECKING:
     from ..depth.model import DepthModel
 
 Floats = NDArray[np.floating]
-_EDGE = 0.1
-"""Interpolated depth that differs more from the nearest pixel's would lie between two surfaces."""
+_EDGE = 0.2
+"""Where neighbours differ by more than this share, interpolated depth would lie between two surfaces."""
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -215,19 +215,22 @@ def look_up(depth: Floats, size: tuple[int, ...]) -> NDArray[np.float32]:
     """Equirect depth (H, W) at the pixels of another size: a plane stays a plane, an edge stays an edge."""
     if depth.shape == size:
         return depth.astype(np.float32)
-    closest = nearest(depth, size)
     inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0)
+    around = np.pad(inverse, 1, mode="edge")
+    around[1:-1, 0], around[1:-1, -1] = inverse[:, -1], inverse[:, 0]
+    views = np.lib.stride_tricks.sliding_window_view(around, (3, 3))
+    smooth = views.min(axis=(2, 3)) > (1 - _EDGE) * views.max(axis=(2, 3))
     between = sample_equirect(inverse, equirect_directions(size[1], size[0]))
-    with np.errstate(divide="ignore"):
-        smooth = 1.0 / between
-    return np.where(np.abs(smooth - closest) < _EDGE * closest, smooth, closest).astype(np.float32)
+    use = nearest(smooth, size)
+    return np.where(use, 1.0 / np.where(use, between, 1.0), nearest(depth, size)).astype(np.float32)
 
 
-def nearest(depth: Floats, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Equirect depth (H, W) at the nearest pixel of each pixel of another size."""
-    u, v = equirect_pixels(equirect_directions(size[1], size[0]), depth.shape[1], depth.shape[0])
-    rows = np.clip(np.rint(v).astype(np.intp), 0, depth.shape[0] - 1)
-    return np.asarray(depth[rows, np.rint(u).astype(np.intp) % depth.shape[1]], np.float32)
+def nearest(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
+    """An equirect array (H, W) at the nearest pixel of each pixel of another size."""
+    rows, columns = (
+        ((np.arange(n) + 0.5) * old / n).astype(np.intp) for n, old in zip(size, values.shape, strict=True)
+    )
+    return values[np.ix_(rows, columns)]
 
 
 def _within_sigma(depth: Floats, sigma: Floats, truth: Floats, max_depth_m: float | None) -> float | None:

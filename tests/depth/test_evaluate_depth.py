@@ -1,0 +1,340 @@
+"""Evaluation of depth: the LiDAR's measurement of a truth, pairing of files, scores, and the command."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from instant_ic.cli.main import main
+from instant_ic.depth.metrics import depth_metrics
+from instant_ic.evaluation import depth_pictures
+from instant_ic.evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, look_up, report
+from instant_ic.evaluation.depth_files import PairError, find_pictures, pair, unit_warning
+from instant_ic.evaluation.depth_lidar import Errors, measure, measure_world
+from instant_ic.evaluation.depth_pictures import Sheets
+from instant_ic.evaluation.depth_worlds import FIRST_SEED, held_out, scenes
+from instant_ic.geometry.projections import equirect_directions
+
+CAMERA_M, LIDAR_M = 1.2, 0.6
+SIZE = 64, 128
+
+
+def box_room(size=SIZE, half_x=3.0, half_y=2.0, ceiling_m=2.7, camera_m=CAMERA_M):
+    """True radial depth of an empty room, camera in its middle: the nearest of six planes in each direction."""
+    x, y, z = np.moveaxis(equirect_directions(size[1], size[0]).astype(np.float64), -1, 0)
+    up = np.where(z > 0, (ceiling_m - camera_m) / np.maximum(z, 1e-9), camera_m / np.maximum(-z, 1e-9))
+    ahead, aside = half_x / np.maximum(np.abs(x), 1e-9), half_y / np.maximum(np.abs(y), 1e-9)
+    return np.minimum(np.minimum(ahead, aside), up).astype(np.float32)
+
+
+def test_measured_box_room_lies_on_its_planes():
+    points = measure(box_room((256, 512)), LIDAR_M, CAMERA_M, noise_m=0).astype(np.float64)
+    assert len(points) == 16 * 900  # a closed room answers every beam
+    x, y, z = points.T
+    # Relative to the camera: walls at 3 and 2 m, floor at -1.2 m; the rings up to 15 deg from 0.6 m do not reach 2.7 m.
+    off = np.min([np.abs(np.abs(x) - 3), np.abs(np.abs(y) - 2), np.abs(z + 1.2)], axis=0)
+    assert np.quantile(off, 0.98) < 3e-3  # interpolated between pixels; only corners are cut off
+    assert off.max() < 0.05
+    # Ring elevations as seen from the LiDAR, and its lowest ring on the floor: 0.6 / tan(15 deg) = 2.239 m away.
+    from_lidar = points - [0, 0, LIDAR_M - CAMERA_M]
+    elevation = np.degrees(np.arcsin(from_lidar[:, 2] / np.linalg.norm(from_lidar, axis=1)))
+    assert np.allclose(np.sort(np.unique(np.round(elevation))), np.arange(-15, 16, 2))
+    lowest = points[np.isclose(elevation, -15, atol=0.01) & (np.abs(y) < 0.1) & (x > 0)]
+    assert np.allclose(np.hypot(lowest[:, 0], lowest[:, 1]), 2.239, atol=0.01)
+
+
+def test_nothing_is_measured_behind_what_the_camera_sees_or_through_the_unknown():
+    depth = np.full((128, 256), 6.0, np.float32)
+    # A board at 2 m, 8 to 20 deg under the horizon, right ahead: it hides from the camera what a LiDAR under it sees.
+    elevation = 90 - (np.arange(128) + 0.5) * 180 / 128
+    rows = (elevation < -8) & (elevation > -20)
+    depth[np.ix_(rows, np.arange(118, 138))] = 2.0
+    depth[:, :20] = 0  # an open window behind
+    points = measure(depth, 0.2, 1.2, noise_m=0)
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    distance = np.linalg.norm(points, axis=1)
+    ahead = np.abs(azimuth) < 12
+    # Between the board's lower edge (2 sin 20 deg = 0.68 m under the camera) and the sphere of 6 m nothing is known.
+    assert set(np.unique(np.round(distance[ahead]))) <= {2.0, 6.0}
+    under = ahead & (points[:, 2] < -0.75) & (distance > 5)
+    assert not np.any(under & (points[:, 2] > -1.9))  # beams that leave 1 m under the camera and pass behind the board
+    assert not np.any((azimuth > 153) & (azimuth < 179))
+    assert len(measure(np.zeros((16, 32)), 0.6, 1.2)) == 0
+
+
+def test_noise_and_outliers_are_as_told():
+    clean = np.full(20000, 5.0)
+    noisy = Errors(noise_m=0.02, seed=1).apply(clean)
+    assert abs(noisy.std() - 0.02) < 0.001
+    assert abs(noisy.mean() - 5) < 0.001
+    wrong = Errors(noise_m=0.0, outliers=0.05, seed=1).apply(clean)
+    assert (wrong != 5).sum() == 1000
+    assert 0.4 < (wrong[wrong != 5] < 5).mean() < 0.6
+    assert wrong.min() >= 0.4
+    assert wrong.max() <= 15
+    assert np.array_equal(wrong, Errors(noise_m=0.0, outliers=0.05, seed=1).apply(clean))
+    for bad in ({"noise_m": -1}, {"outliers": 1.5}, {"noise_m": np.nan}):
+        with pytest.raises(ValueError, match="must"):
+            Errors(**bad)
+
+
+@pytest.mark.parametrize(("change", "words"), [({"rings": 0}, "rings"), ({"lidar_height_m": np.nan}, "heights")])
+def test_measure_refuses_nonsense(change, words):
+    with pytest.raises(ValueError, match=words):
+        measure(**({"depth_m": box_room(), "lidar_height_m": 0.6, "camera_height_m": 1.2} | change))
+    with pytest.raises(ValueError, match=r"\(H, W\)"):
+        measure(np.ones((4, 8, 3)), 0.6, 1.2)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return next(iter(scenes("random", 1, height=128)))
+
+
+def test_held_out_scenes_are_always_the_same_and_no_training_world(scene):
+    assert int(scene.name.removeprefix("random:")) >= FIRST_SEED
+    assert scene.rgb.shape == (128, 256, 3)
+    assert abs(float(scene.depth_m[-1].mean()) - scene.camera_height_m) < 0.01  # straight down is the floor
+    name, rgb, truth, height = next(iter(held_out("random", 1, height=128)))
+    assert (name, height) == (scene.name, scene.camera_height_m)
+    assert np.array_equal(rgb, scene.rgb)
+    assert np.array_equal(truth, scene.depth_m)
+    for wrong in (("attic", 1, None), ("random", 0, None), ("mesh", 1, None), ("corridor", 1, "house.glb")):
+        with pytest.raises(ValueError, match=r"must be|needs"):
+            scenes(*wrong)
+
+
+def test_a_measured_picture_agrees_with_rays_in_the_world(scene):
+    points = measure(scene.depth_m, LIDAR_M, CAMERA_M, noise_m=0)
+    mount = np.array([0, 0, LIDAR_M - CAMERA_M])
+    range_m = np.linalg.norm(points - mount, axis=1)
+    rays = np.ascontiguousarray(((points - mount) / range_m[:, None]) @ scene.map_from_camera[:3, :3].T, np.float32)
+    origin = scene.map_from_camera[:3, :3] @ mount + scene.map_from_camera[:3, 3]
+    true, _ = scene.renderer.cast(np.ascontiguousarray(np.broadcast_to(origin, rays.shape), np.float32), rays)
+    assert np.quantile(np.abs(range_m - true) / true, 0.95) < 0.02
+    everything = measure_world(scene.renderer, scene.map_from_camera, LIDAR_M, CAMERA_M, Errors(noise_m=0))
+    assert 0.9 * len(everything) < len(points) <= len(everything)
+
+
+def test_looked_up_depth_keeps_planes_and_edges():
+    small, large = box_room(), box_room((256, 512))
+    up = look_up(small, large.shape)
+    assert np.quantile(np.abs(up - large) / large, 0.95) < 0.01
+    step = np.where(np.arange(128) < 64, 1.0, 3.0)[None].repeat(64, axis=0)
+    assert set(np.unique(look_up(step, (256, 512)))) == {1.0, 3.0}
+    assert np.array_equal(look_up(small, SIZE), small)
+
+
+class KnownModel:
+    """Stands in for a network: gives the depth it was told, whatever the picture."""
+
+    def __init__(self, depth, kind="metric"):
+        self.depth, self.provider = depth, "none"
+        self.manifest = SimpleNamespace(output_kind=kind, name="known")
+
+    def estimate(self, rgb):
+        return self.depth.copy()
+
+
+RGB = np.full((*SIZE, 3), 128, np.uint8)
+
+
+def test_scores_before_and_after_scaling():
+    truth = box_room((128, 256))
+    model = KnownModel(0.5 * box_room((128, 256)))
+    evaluator = Evaluator(Settings("network", LidarSettings()), model)
+    scored = evaluator.score("room", RGB, truth)
+    # Half the depth everywhere: relative error and error of the scale 0.5, no pixel within 1.25; then mended.
+    assert scored.before.mre == pytest.approx(0.5, abs=1e-6)
+    assert scored.before.scale_error_median == pytest.approx(0.5, abs=1e-6)
+    assert scored.before.delta1 == 0
+    assert scored.fit["ok"]
+    assert scored.fit["scale"] == pytest.approx(2, rel=0.01)
+    assert scored.after.mre < 0.01
+    assert scored.after.delta1 == pytest.approx(1)
+    assert scored.shape.mre < 0.001
+    figures = report([scored.as_dict()] * 2, evaluator.settings, model)
+    assert figures["mean"]["mre"] == pytest.approx(scored.after.mre, abs=1e-5)
+    assert figures["before"]["mre"] == pytest.approx(0.5, abs=1e-4)
+    for key in ("mre", "mae_m", "rmse_m", "delta1", "delta2", "delta3", "scale_error_median", "seconds"):
+        assert key in figures["mean"]
+        assert key in figures["images"][0]
+    assert figures["fits_ok"] == 2
+    json.dumps(figures, allow_nan=False)
+
+
+def test_without_lidar_the_network_s_metres_count():
+    truth, raw = box_room(), 1.1 * box_room()
+    truth[:8] = 0
+    scored = Evaluator(Settings("network"), KnownModel(raw)).score("room", RGB, truth)
+    assert scored.after == scored.before == depth_metrics(raw, truth)
+    assert scored.after.pixels == 56 * 128
+    assert scored.fit is None
+    assert scored.weighted.mre == pytest.approx(0.1, abs=1e-6)
+    near = Evaluator(Settings("network", max_depth_m=2.0), KnownModel(raw)).score("room", RGB, truth)
+    assert near.after.pixels == int(((truth > 0) & (truth <= 2)).sum())
+
+
+def test_lidar_alone_needs_no_network():
+    scored = Evaluator(Settings("lidar", LidarSettings(outliers=0.05)), None).score("room", RGB, box_room((128, 256)))
+    assert scored.before is None
+    assert scored.after.delta1 > 0.9
+    assert 0 < scored.sigma_share <= 1
+
+
+def test_what_cannot_be_scored_says_why():
+    model = KnownModel(box_room())
+    with pytest.raises(DepthEvaluationError, match="--lidar"):
+        Settings("fused")
+    with pytest.raises(DepthEvaluationError, match="method"):
+        Settings("network", method="ransac")
+    with pytest.raises(DepthEvaluationError, match="above 0"):
+        Settings("network", camera_height_m=0)
+    with pytest.raises(DepthEvaluationError, match="needs a model"):
+        Evaluator(Settings("network"), None)
+    with pytest.raises(DepthEvaluationError, match="relative"):
+        Evaluator(Settings("network"), KnownModel(box_room(), "relative"))
+    evaluator = Evaluator(Settings("network", LidarSettings()), model)
+    with pytest.raises(DepthEvaluationError, match=r"room: the picture is 100 x 100"):
+        evaluator.score("room", np.zeros((100, 100, 3), np.uint8), box_room())
+    with pytest.raises(DepthEvaluationError, match=r"room: the true depth is 64 x 64"):
+        evaluator.score("room", RGB, np.ones((64, 64)))
+    with pytest.raises(DepthEvaluationError, match="room: no valid pixel"):
+        evaluator.score("room", RGB, np.full(SIZE, np.nan))
+    with pytest.raises(DepthEvaluationError, match="room: there is no true depth"):
+        evaluator.score("room", RGB, None)
+
+
+def test_a_network_that_fits_nothing_is_not_ok_and_says_so():
+    noise = np.random.default_rng(0).uniform(0.5, 12, (128, 256)).astype(np.float32)
+    scored = Evaluator(Settings("network", LidarSettings()), KnownModel(noise)).score("room", RGB, box_room((128, 256)))
+    assert not scored.fit["ok"]
+    assert scored.fit["message"]
+
+
+def test_pictures_and_depth_are_paired_by_stem(tmp_path):
+    rgb, gt = tmp_path / "rgb", tmp_path / "gt"
+    rgb.mkdir()
+    gt.mkdir()
+    for name in ("a.jpg", "b_rgb.png", "c.jpg"):
+        (rgb / name).touch()
+    for name in ("a.npy", "b_depth.png"):
+        (gt / name).touch()
+    pictures = find_pictures([rgb])
+    assert [path.name for path in pictures] == ["a.jpg", "b_rgb.png", "c.jpg"]
+    assert [truth and truth.name for _, truth in pair(pictures, [gt])] == ["a.npy", "b_depth.png", None]
+    assert pair([rgb / "a.jpg"], [gt / "b_depth.png"]) == [(rgb / "a.jpg", gt / "b_depth.png")]
+    # One folder for both: depth is what is no picture.
+    (rgb / "a_depth.png").touch()
+    assert find_pictures([rgb]) == pictures
+    assert pair(pictures, [rgb])[0][1] == rgb / "a_depth.png"
+    with pytest.raises(PairError, match="no depth file has the stem"):
+        pair([rgb / "c.jpg", rgb / "a.jpg"], [gt / "b_depth.png"])
+    with pytest.raises(PairError, match="no such file"):
+        find_pictures([tmp_path / "none"])
+    with pytest.raises(PairError, match="no picture in this folder"):
+        find_pictures([tmp_path])
+    (gt / "a.npz").touch()
+    with pytest.raises(PairError, match=r"two depth files of one stem"):
+        pair(pictures, [gt])
+
+
+def test_units_that_look_wrong_are_told():
+    room = box_room()
+    assert unit_warning(room) == ""
+    assert "millimetres where metres" in unit_warning(1000 * room)
+    assert "metres where millimetres" in unit_warning(room / 1000)
+
+
+def test_pages_of_pictures(tmp_path, monkeypatch):
+    monkeypatch.setattr(depth_pictures, "ROWS", 2)
+    scored = Evaluator(Settings("lidar", LidarSettings()), None).score("raum-ä", RGB, box_room())
+    for side in (False, True):
+        sheets = Sheets(tmp_path / f"{side}.png", side)
+        for _ in range(3):
+            sheets.add(scored)
+        sheets.close()
+        assert [path.name for path in sheets.written] == [f"{side}.png", f"{side}-2.png"]
+        first, second = (cv2.imread(str(path)) for path in sheets.written)
+        assert first.shape[0] == 2 * second.shape[0]
+        assert np.array_equal(first[: second.shape[0]], second)
+    # Near is red, far is blue, the error of this room is white nearly everywhere.
+    row = cv2.imread(str(tmp_path / "False-2.png"))[24:280]
+    floor, corner = row[250, 520 + 256], row[128, 520 + 256 + 48]
+    assert floor[2] > floor[0]
+    assert corner[0] > floor[0]
+    error = row[:, 3 * 520 : 3 * 520 + 512]
+    assert (error.min(axis=2) > 200).mean() > 0.8
+
+
+@pytest.fixture
+def folder(tmp_path):
+    truth = box_room()
+    for name in ("a", "b"):
+        cv2.imwrite(str(tmp_path / f"{name}.jpg"), RGB)
+    cv2.imwrite(str(tmp_path / "a.png"), np.rint(1000 * truth).astype(np.uint16))
+    np.savez(tmp_path / "b.npz", depth=truth)
+    return tmp_path
+
+
+def run(*words):
+    return main(["evaluate", "depth", *map(str, words)])
+
+
+def test_command_with_lidar_alone(folder, capsys):
+    out = folder / "out"
+    out.mkdir()
+    words = (folder / "a.jpg", folder / "b.jpg", "--depth", folder / "a.png", folder / "b.npz", "--lidar")
+    files = ("--json", out / "o.json", "--plot", out / "o.png", "--side", out / "s.png")
+    assert run(*words, "--source", "lidar", "--outliers", "0.05", *files) == 0
+    figures = json.loads((out / "o.json").read_text())
+    assert figures == json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in figures["images"]] == ["a.jpg", "b.jpg"]
+    assert figures["mean"]["delta1"] > 0.9
+    assert figures["lidar"]["outliers"] == 0.05
+    assert figures["errors"] == figures["warnings"] == []
+    assert all(Path(path).stat().st_size > 1000 for path in figures["pictures"])
+
+
+def test_command_goes_on_after_a_bad_file_and_ends_with_an_error(folder, capsys):
+    (folder / "c.jpg").write_bytes(b"no picture")
+    (folder / "d.jpg").write_bytes((folder / "a.jpg").read_bytes())
+    np.save(folder / "c.npy", box_room())
+    np.savez(folder / "b.npz", depth=1000 * box_room())
+    pictures = [folder / f"{name}.jpg" for name in "abcd"]
+    depth = [folder / name for name in ("a.png", "b.npz", "c.npy")]
+    assert run(*pictures, "--depth", *depth, "--lidar", "--source", "lidar") == 1
+    printed = capsys.readouterr()
+    figures = json.loads(printed.out)
+    assert [row["name"] for row in figures["images"]] == ["a.jpg", "b.jpg"]
+    assert [row["name"] for row in figures["errors"]] == ["c.jpg", "d.jpg"]
+    assert "c.jpg: not a readable picture" in printed.err
+    assert "d.jpg: no depth file of this stem" in printed.err
+    assert "b.npz: median" in printed.err
+
+
+def test_command_without_truth_draws_only(folder):
+    assert run(folder / "a.jpg", "--threads", 1, "--plot", folder / "o.png", "--json", folder / "o.json") == 0
+    figures = json.loads((folder / "o.json").read_text())
+    assert "mre" not in figures["mean"]
+    assert figures["mean"]["seconds"] > 0
+    assert cv2.imread(str(folder / "o.png")).shape[1] < 1100  # image and prediction alone
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--source", "fused"), "--lidar too"),
+        (("--lidar",), "give --depth"),
+        (("--json", "none/o.json"), "no folder none"),
+        (("--model", "none.onnx"), "none"),
+        (("--camera-height", "-1"), "above 0"),
+        (("--depth", "none.npy"), "none.npy: no such file"),
+    ],
+)
+def test_command_says_what_is_wrong_with_its_words(folder, capsys, words, message):
+    assert run(folder / "a.jpg", *words) != 0
+    assert message in capsys.readouterr().err
