@@ -12,9 +12,10 @@ import pytest
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.registry import list_topics
-from instant_ic.evaluation.stack import Stack, free_port, free_ports, observer
+from instant_ic.evaluation.stack import Stack, free_port, free_ports, machine_pace, observer
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import ControlState, Odometry, TwistStamped, pose_matrix, twist_stamped
+from instant_ic.pace import read as read_pace
 
 pytest.importorskip("zenoh")
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]
@@ -56,10 +57,11 @@ def drive_robot2(stack, station, robots):
     stack.wait_for(lambda: spin() and states and states[-1].mode == ControlState.REAL, START_S, "robot2 in real mode")
     start = {name: place(name) for name in ROBOTS}
     out = station.publisher("/operator/cmd_vel", TwistStamped, SENSOR)
+    pace = read_pace(stack.run_dir)
 
     def driven():
         spin()
-        out.publish(twist_stamped(0.3, 0.0, time.time_ns()))
+        out.publish(twist_stamped(0.3, 0.0, pace.now_ns()))
         time.sleep(0.04)
         return np.linalg.norm(place("robot2") - start["robot2"]) > 0.4
 
@@ -76,7 +78,7 @@ def fleet():
     result = Fleet()
     try:
         with contextlib.ExitStack() as stack_of:
-            stack = stack_of.enter_context(Stack("fleet.yaml", run_dir, arguments))
+            stack = stack_of.enter_context(Stack("fleet.yaml", run_dir, arguments, pace=machine_pace()))
             result.station_topics = set()
 
             def seen():
