@@ -137,6 +137,8 @@ class VirtualSpaceConfig:
     """``auto`` (CUDA where torch finds it, else numba on the CPU), ``cpu``, ``cuda``, or ``torch-cpu`` (slow)."""
     panorama_width: int = 2048
     """Wider panoramas are area-averaged to this width."""
+    keyframes: Annotated[int, Range(1, 8)] = 1
+    """The newest so many are kept and shown together; a picture takes that many times as long. 1: the paper's way."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
@@ -144,6 +146,7 @@ class VirtualSpaceConfig:
     picture: PictureConfig = dataclasses.field(default_factory=PictureConfig)
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         devices = ("auto", "cpu", "cuda", "torch-cpu")
         _require(self.device in devices, "device", self.device, "one of " + ", ".join(devices))
         _require(64 <= self.panorama_width <= 8192, "panorama_width", self.panorama_width, "from 64 to 8192")

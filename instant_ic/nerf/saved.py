@@ -39,14 +39,25 @@ class Progress:
 
 
 @dataclass(frozen=True)
+class SavedKeyframe:
+    """One keyframe and the field that has learnt it."""
+
+    prior: PanoramaPrior
+    lattice: Lattice
+    parameters: FieldParameters
+    progress: Progress
+
+
+@dataclass(frozen=True)
 class SavedSpace:
-    """What a file holds. ``priors``: the keyframes, newest first."""
+    """What a file holds. ``keyframes``: newest first."""
 
     config: VirtualSpaceConfig
-    parameters: FieldParameters
-    lattice: Lattice
-    priors: tuple[PanoramaPrior, ...]
-    progress: Progress
+    keyframes: tuple[SavedKeyframe, ...]
+
+
+_GROUPS = {"prior": PanoramaPrior, "lattice": Lattice, "parameters": FieldParameters}
+"""The parts of a keyframe that are arrays."""
 
 
 def space_file(path: str | Path) -> Path:
@@ -66,15 +77,14 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
         "format": FORMAT,
         "version": VERSION,
         "config": dataclasses.asdict(saved.config),
-        "progress": dataclasses.asdict(saved.progress),
-        "keyframes": len(saved.priors),
+        "keyframes": [dataclasses.asdict(keyframe.progress) for keyframe in saved.keyframes],
     }
     arrays = {"head": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-    groups: list[tuple[str, Any]] = [("field", saved.parameters), ("lattice", saved.lattice)]
-    groups += [(f"keyframe{number}", prior) for number, prior in enumerate(saved.priors)]
-    for group, values in groups:
-        for field in dataclasses.fields(values):
-            arrays[f"{group}.{field.name}"] = np.asarray(getattr(values, field.name))
+    for number, keyframe in enumerate(saved.keyframes):
+        for group, kind in _GROUPS.items():
+            for field in dataclasses.fields(kind):
+                value = getattr(getattr(keyframe, group), field.name)
+                arrays[f"{number}.{group}.{field.name}"] = np.asarray(value)
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
@@ -114,13 +124,16 @@ def read(path: str | Path) -> SavedSpace:
             raise SpaceFileError(f"{file}: not a saved virtual space (format {head['format']!r})")
         if head["version"] > VERSION:
             raise SpaceFileError(f"{file}: version {head['version']}, this program reads up to {VERSION}: update it")
-        return SavedSpace(
-            config=_built(VirtualSpaceConfig, head["config"]),
-            parameters=_group(FieldParameters, "field", arrays),
-            lattice=_group(Lattice, "lattice", arrays),
-            priors=tuple(_group(PanoramaPrior, f"keyframe{n}", arrays) for n in range(head["keyframes"])),
-            progress=_built(Progress, head["progress"]),
-        )
+        keyframes = [
+            SavedKeyframe(
+                **{group: _group(kind, f"{number}.{group}", arrays) for group, kind in _GROUPS.items()},
+                progress=_built(Progress, progress),
+            )
+            for number, progress in enumerate(head["keyframes"])
+        ]
+        if not keyframes:
+            raise SpaceFileError(f"{file}: holds no keyframe")
+        return SavedSpace(_built(VirtualSpaceConfig, head["config"]), tuple(keyframes))
     except SpaceFileError:
         raise
     except (KeyError, TypeError, ValueError) as error:

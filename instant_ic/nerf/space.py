@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, sample_equirect
 
+from .compose import Layer, compose, exposure_gain
 from .config import VirtualSpaceConfig
 from .field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
-from .saved import Progress, SavedSpace, read, write
+from .saved import Progress, SavedKeyframe, SavedSpace, read, write
 from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
 
 T = TypeVar("T")
@@ -85,8 +86,8 @@ class DeviceError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class _Shown:
-    """The space of the keyframe before the newest, drawn until that is learnt well enough."""
+class _Learnt:
+    """The space of one keyframe: its scene, a frozen copy of its field (None: the one that is being trained)."""
 
     scene: Scene
     frozen: Any
@@ -112,7 +113,8 @@ class VirtualSpace:
         self._device = make_device(self.config)
         self._warning = ""
         self._scene: Scene | None = None
-        self._shown: _Shown | None = None
+        self._kept: list[_Learnt] = []  # keyframes before the newest that were fit, newest first
+        self._gains: list[Floats] = [np.ones(3, np.float32)]  # of the keyframes that pictures show
         self._rng = np.random.default_rng(self.config.train.seed)
         self._reset_run(refresh=False)
 
@@ -127,9 +129,26 @@ class VirtualSpace:
     @property
     def keyframe(self) -> PanoramaPrior | None:
         """The keyframe that pictures show."""
-        if self._shown is not None:
-            return self._shown.scene.prior
-        return None if self._scene is None else self._scene.prior
+        shown = self._shown
+        return shown[0].scene.prior if shown else None
+
+    @property
+    def _refreshing(self) -> bool:
+        """The newest keyframe is not fit yet, and pictures show those before it."""
+        return bool(self._kept) and not self._ready_iterations
+
+    @property
+    def _shown(self) -> list[_Learnt]:
+        """What pictures show, newest first."""
+        if self._scene is None:
+            return []
+        return self._kept if self._refreshing else [_Learnt(self._scene, None, self._progress), *self._kept]
+
+    def _keep(self, count: int) -> None:
+        """Lets go of all but so many of the keyframes before the newest; the others get the newest's exposure."""
+        del self._kept[count:]
+        newest, *older = (learnt.scene.prior for learnt in self._shown)
+        self._gains = [np.ones(3, np.float32), *(exposure_gain(newest, prior) for prior in older)]
 
     def set_keyframe(
         self,
@@ -138,7 +157,10 @@ class VirtualSpace:
         map_from_camera: NDArray[np.floating],
         relative_sigma: float,
     ) -> None:
-        """Replaces the keyframe (K = 1, the paper's way); the field goes on from its present weights where it can.
+        """Learns a new keyframe; the field goes on from its present weights where it can.
+
+        Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), if they were fit: pictures
+        show them together, in the newest's exposure. A keyframe that was not fit is replaced.
 
         Args: as ``prior.prepare``.
 
@@ -151,7 +173,7 @@ class VirtualSpace:
         lattice = Lattice.for_prior(prior, config.field)
         if self._scene is not None and self._ready_iterations:
             frozen = self._on_device(lambda device: device.freeze())
-            self._shown = _Shown(self._scene, frozen, self._progress)
+            self._kept.insert(0, _Learnt(self._scene, frozen, self._progress))
         refresh = self._scene is not None and self._scene.lattice.suits(lattice)
         if refresh:
             assert self._scene is not None
@@ -163,11 +185,12 @@ class VirtualSpace:
             self._on_device(lambda device: device.set_scene(scene))
         except Exception:
             if not refresh:  # the old parameters are gone
-                self._scene, self._shown = None, None
+                self._scene, self._kept = None, []
                 self._reset_run(refresh=False)
             raise
         self._scene = scene
         self._reset_run(refresh)
+        self._keep(config.keyframes)
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
         """Trains until the time is spent, the iterations are done or the schedule has ended, at least one iteration.
@@ -205,7 +228,7 @@ class VirtualSpace:
         good = self._psnr_db >= rule.psnr_db and self._schedule.iteration >= 5
         if not self._ready_iterations and (good or plateau or self._schedule.finished):
             self._ready_iterations = self._schedule.iteration
-            self._shown = None
+            self._keep(self.config.keyframes - 1)
 
     @property
     def status(self) -> Status:
@@ -214,10 +237,10 @@ class VirtualSpace:
         if self._scene is None:
             state = State.EMPTY
         else:
-            state = State.READY if self._ready_iterations or self._shown is not None else State.TRAINING
+            state = State.READY if self._ready_iterations or self._kept else State.TRAINING
         return Status(
             state=state,
-            refreshing=self._shown is not None,
+            refreshing=self._refreshing,
             psnr_db=self._psnr_db,
             iterations=iterations,
             train_seconds=self._train_seconds,
@@ -282,9 +305,12 @@ class VirtualSpace:
         height, width = rays.shape
 
         def draw(device: Device) -> tuple[Floats, Floats, Floats]:
-            shown = self._shown
-            psnr_db, frozen = (self._psnr_db, None) if shown is None else (shown.progress.psnr_db, shown.frozen)
-            return device.draw(rays, self.config.picture.panorama_share(psnr_db), frozen)
+            share = self.config.picture.panorama_share
+            drawn = [device.draw(rays, share(shown.progress.psnr_db), shown.frozen) for shown in self._shown]
+            if len(drawn) == 1:
+                return drawn[0]
+            parts = zip(self._shown, self._gains, drawn, strict=True)
+            return compose([Layer(shown.scene.prior, gain, *part) for shown, gain, part in parts], rays)
 
         colour, depth, confidence = self._on_device(draw)
         depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
@@ -303,7 +329,8 @@ class VirtualSpace:
         parameters = self._device.parameters()
         self._device = make_device(dataclasses.replace(self.config, device="cpu"))
         self._device.load(parameters)
-        self._shown = None  # its copy lies on the device that is left
+        self._kept = []  # their copies lie on the device that is left
+        self._gains = self._gains[:1]
         if self._scene is not None:
             self._device.set_scene(self._scene)
         return call(self._device)
@@ -330,11 +357,11 @@ class VirtualSpace:
         """
         if self._scene is None:
             raise NotReadyError("no keyframe yet: there is nothing to save")
-        scene, progress, frozen = self._scene, self._progress, None
-        if self._shown is not None:
-            scene, progress, frozen = self._shown.scene, self._shown.progress, self._shown.frozen
-        parameters = self._device.parameters(frozen)
-        return write(path, SavedSpace(self.config, parameters, scene.lattice, (scene.prior,), progress))
+        learnt = [
+            SavedKeyframe(shown.scene.prior, shown.scene.lattice, self._device.parameters(shown.frozen), shown.progress)
+            for shown in self._shown
+        ]
+        return write(path, SavedSpace(self.config, tuple(learnt)))
 
     @classmethod
     def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
@@ -349,16 +376,23 @@ class VirtualSpace:
         """
         saved = read(path)
         space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
-        (prior,) = saved.priors
-        scene = Scene(prior, saved.lattice, build_occupancy(prior, saved.config.geometry))
-        space._device.load(saved.parameters)
-        space._device.set_scene(scene)
-        space._scene = scene
-        progress = saved.progress
+        scenes = [
+            Scene(one.prior, one.lattice, build_occupancy(one.prior, saved.config.geometry)) for one in saved.keyframes
+        ]
+        newest = saved.keyframes[0]
+        kept: list[_Learnt] = []
+        for one, scene in reversed(list(zip(saved.keyframes, scenes, strict=True))):
+            space._device.load(one.parameters)
+            space._device.set_scene(scene)
+            if one is not newest:
+                kept.insert(0, _Learnt(scene, space._device.freeze(), one.progress))
+        progress = newest.progress
         space._schedule = Schedule(saved.config.train, progress.refresh, progress.iteration)
         space._psnr_db, space._train_seconds = progress.psnr_db, progress.train_seconds
         space._colour_error = 10 ** (-progress.psnr_db / 10)
         space._ready_iterations = progress.ready_iterations
+        space._scene, space._kept = scenes[0], kept
+        space._keep(len(kept))
         # Rays that were not drawn before, the same at each loading.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space

@@ -124,16 +124,19 @@ def damaged(name, good, path):
             head["config"]["field"]["colour"] = 3
         elif name == "value":
             head["config"]["field"]["levels"] = 99
+        elif name == "no keyframe":
+            head["keyframes"] = []
         elif name == "array":
-            del arrays["field.w1"]
+            del arrays["0.parameters.w1"]
         arrays["head"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
         sha256 = saved._checksum(arrays)
         if name == "swapped":
-            arrays["lattice.origin"] = arrays["lattice.origin"] + 1
+            arrays["0.lattice.origin"] = arrays["0.lattice.origin"] + 1
         np.savez(path, sha256=np.frombuffer(sha256, np.uint8), **arrays)
 
 
 WRONG = {
+    "no keyframe": "no keyframe",
     "missing": "no such file",
     "cut": "damaged",
     "bit": "damaged",
@@ -144,7 +147,7 @@ WRONG = {
     "newer": "version 2, this program reads up to 1",
     "key": "colour",
     "value": "levels",
-    "array": "field.w1",
+    "array": "parameters.w1",
 }
 
 
