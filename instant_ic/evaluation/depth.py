@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,25 @@ from ..geometry.projections import equirect_directions, sample_equirect
 from .depth_lidar import measure
 
 if TYPE_CHECKING:
-    from ..depth.model import DepthModel
+    from ..depth.manifest import ModelManifest
 
 Floats = NDArray[np.floating]
 _EDGE = 0.2
 """Where neighbours differ by more than this share, interpolated depth would lie between two surfaces."""
 _UP = np.array([0.0, 0.0, 1.0])
+
+
+class Model(Protocol):
+    """What gives depth: ``depth.model.DepthModel``, or something in its place."""
+
+    manifest: ModelManifest
+
+    @property
+    def provider(self) -> str:
+        """What it runs on."""
+
+    def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Depth (h, w) in the model's unit of a panorama (H, W, 3), 0 = unknown."""
 
 
 class DepthEvaluationError(ValueError):
@@ -80,7 +93,8 @@ class Scored:
         after: the result; None without truth. ``weighted`` counts pixels by solid angle, ``shape`` the result
             after division by its median ratio to the truth: what no scale can mend.
         sigma_share: share of pixels whose error is within one sigma; None without LiDAR or truth.
-        seconds_model, seconds_source: wall time of the network, and of scaling and fusion.
+        seconds_model, seconds_source: wall time of the network, and of scaling and fusion; ``cpu_source_s``: what
+            scaling and fusion took of the processor.
         fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma``, ``points``; None without LiDAR.
     """
 
@@ -96,6 +110,7 @@ class Scored:
     sigma_share: float | None
     seconds_model: float
     seconds_source: float
+    cpu_source_s: float
     fit: dict[str, Any] | None
 
     @property
@@ -112,6 +127,7 @@ class Scored:
             "seconds": round(self.seconds, 4),
             "seconds_model": round(self.seconds_model, 4),
             "seconds_source": round(self.seconds_source, 4),
+            "cpu_source_s": round(self.cpu_source_s, 4),
         }
         for key in ("before", "after", "weighted", "shape"):
             metrics: DepthMetrics | None = getattr(self, key)
@@ -131,7 +147,7 @@ class Evaluator:
         DepthEvaluationError: the settings need a model, or another one.
     """
 
-    def __init__(self, settings: Settings, model: DepthModel | None) -> None:
+    def __init__(self, settings: Settings, model: Model | None) -> None:
         self.settings = settings
         self.model = model if settings.source != "lidar" else None
         if self.model is None and settings.source != "lidar":
@@ -182,7 +198,7 @@ class Evaluator:
             self._warm = True
         begin = time.perf_counter()
         raw = self.model.estimate(rgb) if self.model is not None else None
-        between = time.perf_counter()
+        between, cpu_s = time.perf_counter(), time.process_time()
         sigma = fit = None
         if settings.lidar is None:
             assert raw is not None  # __init__ and Settings: only the network goes without LiDAR
@@ -193,7 +209,7 @@ class Evaluator:
             depth, sigma = result.depth_m, result.sigma
             keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
             fit = {key: _rounded(getattr(result, key)) for key in keys}
-        end = time.perf_counter()
+        end, cpu_s = time.perf_counter(), time.process_time() - cpu_s
         before = after = weighted = shape = share = None
         if truth is not None:
             at_truth = look_up(depth, truth.shape)
@@ -207,7 +223,7 @@ class Evaluator:
                 share = _within_sigma(depth, sigma, nearest(truth, depth.shape), settings.max_depth_m)
         return Scored(
             name, rgb, depth, truth, None if points is None else points.astype(np.float32), before, after, weighted,
-            shape, share, between - begin, end - between, fit,
+            shape, share, between - begin, end - between, cpu_s, fit,
         )  # fmt: skip
 
 
@@ -242,7 +258,7 @@ def _within_sigma(depth: Floats, sigma: Floats, truth: Floats, max_depth_m: floa
     return float((np.abs(depth[known] - truth[known]) <= sigma[known] * truth[known]).mean())
 
 
-def report(scored: Sequence[dict[str, Any]], settings: Settings, model: DepthModel | None) -> dict[str, Any]:
+def report(scored: Sequence[dict[str, Any]], settings: Settings, model: Model | None) -> dict[str, Any]:
     """Everything as plain values: ``mean`` (after scaling), ``before`` and ``after`` in the mean, then each image.
 
     Args:
