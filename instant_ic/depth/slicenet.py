@@ -10,7 +10,12 @@ The full-size ResNet-50 model has the published parameter names and shapes, so p
 
 from __future__ import annotations
 
+import re
+import warnings
+import zipfile
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,6 +32,8 @@ BACKBONES: dict[str, tuple[bool, tuple[int, int, int, int]]] = {
 }
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+REPLACED = datetime(2021, 8, 13, tzinfo=UTC)
+"""The day on which the authors replaced the weights that they had published."""
 
 
 class CheckpointError(ValueError):
@@ -322,33 +329,102 @@ def _decoder_stages(config: SliceNetConfig) -> list[ConvStage]:
 def load_checkpoint(path: str | Path) -> SliceNet:
     """Loads a checkpoint of ours (``config``, ``state_dict``) or a published one (``kwargs``, ``state_dict``).
 
-    Only tensors and plain values are unpickled. Published weights from before 2021-08-13 were replaced by their
-    authors; the file's own date cannot prove its age, so check where it came from.
+    Only tensors and plain values are unpickled, so a file cannot run code. The authors replaced their weights on
+    2021-08-13: a published file whose own date is earlier is refused (a later date proves nothing).
 
     Raises:
-        CheckpointError: the file is no such checkpoint, or its tensors do not fit the network it names.
+        CheckpointError: the file is no such checkpoint, or its tensors do not fit the network it names; the text says
+            which are missing, unknown, of another shape or no numbers.
     """
     path = Path(path)
+    payload = _read(path)
+    if not isinstance(payload, dict):
+        raise CheckpointError(f"{path}: holds {type(payload).__name__} instead of a checkpoint with 'state_dict'")
+    if "state_dict" not in payload:
+        what = "a bare state dict: " if payload and all(isinstance(v, Tensor) for v in payload.values()) else ""
+        raise CheckpointError(f"{path}: {what}no 'state_dict' in the file (it has: {_some(payload)})")
+    state = payload["state_dict"]
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(f"{path}: its 'state_dict' does not hold tensors by name")
+    config = _config(path, payload)
+    with torch.device("meta"):  # shapes only, before memory is taken
+        expected = {key: tuple(value.shape) for key, value in SliceNet(config).state_dict().items()}
+    _check_state(f"{path}: does not fit {config.backbone}, {config.height} x {config.width}", state, expected)
+    model = SliceNet(config)
+    model.load_state_dict(state, strict=True)
+    return model.eval()
+
+
+def _read(path: Path) -> Any:
     try:
-        payload = torch.load(path, map_location="cpu", weights_only=True)
+        if zipfile.is_zipfile(path):  # what torch writes; it does not look at the check sums itself
+            with zipfile.ZipFile(path) as archive:
+                if bad := archive.testzip():
+                    raise CheckpointError(f"{path}: damaged: {bad} in it has another check sum")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of TorchScript, which is refused below
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except CheckpointError:
+        raise
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
-    except Exception as error:  # torch.load raises anything from KeyError to UnpicklingError
-        raise CheckpointError(f"{path}: not a torch checkpoint of tensors and plain values ({error})") from error
-    if not isinstance(payload, dict) or "state_dict" not in payload:
-        raise CheckpointError(f"{path}: no 'state_dict' in the file")
-    if "config" in payload:
-        config = SliceNetConfig(**payload["config"])
-    elif "kwargs" in payload:
-        options = payload["kwargs"]
-        config = SliceNetConfig(
-            backbone=options.get("backbone", "resnet50"), height=512 if options.get("full_size", True) else 256
-        )
-    else:
-        raise CheckpointError(f"{path}: neither 'config' nor 'kwargs' in the file; cannot tell the network's shape")
-    model = SliceNet(config)
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # torch.load raises anything from EOFError to RuntimeError
+        # Only the first sentence: torch goes on with how to load such a file all the same.
+        first = re.split(r"\. [A-Z]|\n", str(error))[0] or type(error).__name__
+        if refused := re.search(r"GLOBAL ([\w.]+)", str(error)):
+            raise CheckpointError(f"{path}: holds more than tensors and plain values ({refused[1]}); it is not loaded, "
+                                  "because it could run code") from error  # fmt: skip
+        raise CheckpointError(f"{path}: not a torch checkpoint, or damaged or cut off ({first})") from error
+
+
+def _config(path: Path, payload: dict[str, Any]) -> SliceNetConfig:
+    """The network that a checkpoint names."""
+    key = next((key for key in ("config", "kwargs") if key in payload), None)
+    if key is None:
+        raise CheckpointError(f"{path}: neither 'config' nor 'kwargs' in the file (it has: {_some(payload)}); cannot "
+                              "tell the network's shape. Files from before 2021-08-13 are of no use")  # fmt: skip
+    options = payload[key]
+    if not isinstance(options, dict):
+        raise CheckpointError(f"{path}: {key!r} must be names and values (got {type(options).__name__})")
     try:
-        model.load_state_dict(payload["state_dict"], strict=True)
-    except RuntimeError as error:
-        raise CheckpointError(f"{path}: does not fit {config}: {error}") from error
-    return model.eval()
+        if key == "config":
+            return SliceNetConfig(**options)
+        if unknown := set(options) - {"backbone", "full_size"}:
+            raise TypeError(f"unknown {', '.join(sorted(map(str, unknown)))}")
+        if not isinstance(full_size := options.get("full_size", True), bool):
+            raise TypeError(f"full_size must be true or false (got {full_size!r})")
+        config = SliceNetConfig(backbone=options.get("backbone", "resnet50"), height=512 if full_size else 256)
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: {key!r} is not of a SliceNet: {error}") from error
+    if (written := datetime.fromtimestamp(path.stat().st_mtime, UTC)) < REPLACED:
+        raise CheckpointError(f"{path}: dates from {written:%Y-%m-%d}; the authors replaced their weights on "
+                              f"{REPLACED:%Y-%m-%d}: download them again")  # fmt: skip
+    return config
+
+
+def _check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:
+    """Says in one error all that differs."""
+    faults = []
+    if missing := [key for key in expected if key not in state]:
+        faults.append(f"{len(missing)} missing ({_some(missing)})")
+    if unknown := [key for key in state if key not in expected]:
+        faults.append(f"{len(unknown)} unknown ({_some(unknown)})")
+    shapes = [
+        f"{key} is {tuple(state[key].shape)} instead of {shape}"
+        for key, shape in expected.items()
+        if key in state and tuple(state[key].shape) != shape
+    ]
+    if shapes:
+        faults.append(f"{len(shapes)} of another shape ({_some(shapes, '; ')})")
+    if faults:
+        raise CheckpointError(f"{what}: of {len(expected)} tensors {', '.join(faults)}")
+    if bad := [key for key in expected if not bool(torch.isfinite(state[key]).all())]:
+        raise CheckpointError(f"{what}: {len(bad)} tensors hold values that are no numbers ({_some(bad)})")
+
+
+def _some(names: Iterable[Any], joint: str = ", ", most: int = 4) -> str:
+    """The first few, and how many more."""
+    listed = [str(name) for name in names]
+    return joint.join(listed[:most]) + (f"{joint}... {len(listed) - most} more" if len(listed) > most else "")
