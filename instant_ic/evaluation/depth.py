@@ -14,7 +14,7 @@ from ..depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_ang
 from ..depth.scaler import ScalerConfig
 from ..depth.sources import DepthSource, SourceConfig
 from ..geometry.projections import equirect_directions, sample_equirect
-from .depth_lidar import measure
+from .depth_lidar import Errors, measure
 
 if TYPE_CHECKING:
     from ..depth.manifest import ModelManifest
@@ -51,6 +51,11 @@ class LidarSettings:
     outliers: float = 0.0
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if not self.height_m > 0:
+            raise DepthEvaluationError(f"the LiDAR's height must be above 0 (got {self.height_m})")
+        Errors(self.noise_m, self.outliers, self.seed)
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -75,6 +80,8 @@ class Settings:
             raise DepthEvaluationError(f"source {self.source} needs LiDAR points: add --lidar (and --depth)")
         if self.method and self.lidar is None:
             raise DepthEvaluationError("a method of scaling needs LiDAR points: add --lidar (and --depth)")
+        if self.method and self.source == "lidar":
+            raise DepthEvaluationError("source lidar scales no network: leave the method out")
         if not self.camera_height_m > 0 or (self.max_depth_m is not None and not self.max_depth_m > 0):
             raise DepthEvaluationError("camera height and largest depth must be above 0")
 

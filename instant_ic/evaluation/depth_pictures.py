@@ -46,7 +46,7 @@ class Sheets:
         """Adds a panorama; writes a page when it is full.
 
         Raises:
-            OSError: a page cannot be written.
+            OSError: the page cannot be written.
         """
         self._rows.append(self._draw(scored))
         if len(self._rows) == ROWS:
@@ -60,9 +60,7 @@ class Sheets:
         path = self.path if page == 1 else self.path.with_stem(f"{self.path.stem}-{page}")
         width = max(row.shape[1] for row in self._rows)
         rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=255) for row in self._rows]
-        done, content = cv2.imencode(path.suffix or ".png", np.vstack(rows)[..., ::-1])
-        if not done:
-            raise OSError(f"{path}: cannot be encoded")
+        _, content = cv2.imencode(".png", np.vstack(rows)[..., ::-1])
         path.write_bytes(content.tobytes())
         self.written.append(path)
         self._rows = []

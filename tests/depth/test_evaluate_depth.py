@@ -7,6 +7,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from instant_ic.cli.main import main
 from instant_ic.depth.metrics import depth_metrics
@@ -63,6 +66,18 @@ def test_nothing_is_measured_behind_what_the_camera_sees_or_through_the_unknown(
     assert not np.any(under & (points[:, 2] > -1.9))  # beams that leave 1 m under the camera and pass behind the board
     assert not np.any((azimuth > 153) & (azimuth < 179))
     assert len(measure(np.zeros((16, 32)), 0.6, 1.2)) == 0
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    arrays(np.float32, (8, 16), elements=st.floats(-1, 200, width=32) | st.sampled_from([np.nan, np.inf, 0])),
+    st.floats(-3, 3),
+)
+def test_whatever_the_picture_points_are_finite_and_in_reach(depth, lidar_m):
+    points = measure(depth, lidar_m, 1.0, noise_m=0)
+    range_m = np.linalg.norm(points - np.array([0, 0, lidar_m - 1.0], np.float32), axis=1)
+    assert np.isfinite(points).all()
+    assert ((range_m > 0.399) & (range_m < 100.1)).all()
 
 
 def test_noise_and_outliers_are_as_told():
@@ -332,9 +347,15 @@ def test_command_without_truth_draws_only(folder):
         (("--json", "none/o.json"), "no folder none"),
         (("--model", "none.onnx"), "none"),
         (("--camera-height", "-1"), "above 0"),
+        (("--plot", "o.gif"), "written as .png"),
+        (("--json", "."), ". cannot be written"),
+        (("--depth", "{}/a.png", "--lidar", "--outliers", "2"), "outliers must lie"),
+        (("--depth", "{}/a.png", "--lidar", "--lidar-height", "-1"), "height must be above 0"),
+        (("--depth", "{}/a.png", "--lidar", "--method", "guess"), "method must be one of"),
+        (("--depth", "{}/a.png", "--lidar", "--source", "lidar", "--method", "ransac"), "leave the method out"),
         (("--depth", "none.npy"), "none.npy: no such file"),
     ],
 )
 def test_command_says_what_is_wrong_with_its_words(folder, capsys, words, message):
-    assert run(folder / "a.jpg", *words) != 0
+    assert run(folder / "a.jpg", *(word.format(folder) for word in words)) != 0
     assert message in capsys.readouterr().err

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     """Runs ``ic evaluate depth``; returns the exit status."""
     from ...depth.files import DepthFileError, load_depth, load_picture
     from ...depth.manifest import ManifestError
-    from ...depth.model import DEFAULT_MODEL, DepthModel
+    from ...depth.model import DEFAULT_MODEL, DepthModel, InferenceError
     from ...evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, report
     from ...evaluation.depth_files import PairError, find_pictures, pair, unit_warning
     from ...evaluation.depth_pictures import Sheets
@@ -69,6 +71,9 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     for file in (args.json, args.plot, args.side):
         if file is not None and not file.parent.is_dir():
             raise UserError(f"{file}: there is no folder {file.parent}", 2)
+    for file in (args.plot, args.side):
+        if file is not None and file.suffix.lower() != ".png":
+            raise UserError(f"{file}: sheets are written as .png", 2)
     if args.lidar and not args.depth:
         raise UserError("--lidar measures the true depth: give --depth too", 2)
     if args.source not in (None, "network") and not args.lidar:
@@ -101,23 +106,38 @@ def evaluate_depth(args: argparse.Namespace) -> int:
                 if warning:
                     warnings.append(f"{truth}: {warning}")
                 scored = evaluator.score(image.name, load_picture(image), truth_m)
-            except (PairError, DepthFileError, DepthEvaluationError) as error:
+            except (PairError, DepthFileError, DepthEvaluationError, InferenceError) as error:
                 errors.append({"name": image.name, "error": str(error)})
                 continue
             rows.append(scored.as_dict() | {"image": str(image), "truth": str(truth) if truth else None})
-            for sheet in sheets:
-                sheet.add(scored)
+            with _written():
+                for sheet in sheets:
+                    sheet.add(scored)
         tell(1.0)
-    for sheet in sheets:
-        sheet.close()
+    with _written():
+        for sheet in sheets:
+            sheet.close()
     figures = report(rows, settings, evaluator.model)
+    if unfit := [row["name"] for row in rows if row["fit"] and not row["fit"]["ok"]]:
+        warnings.append(
+            f"{len(unfit)} of {len(rows)} fits are not ok, their depth is not to be trusted: {unfit[0]} ..."
+        )
     figures |= {"errors": errors, "warnings": warnings, "pictures": [str(p) for sheet in sheets for p in sheet.written]}
     text = json.dumps(figures, indent=2)
     if args.json:
-        args.json.write_text(text + "\n")
+        with _written():
+            args.json.write_text(text + "\n")
     sys.stdout.write(text + "\n")
     for line in warnings:
         print(f"ic evaluate depth: warning: {line}", file=sys.stderr)
     for entry in errors:
         print(f"ic evaluate depth: {entry['error']}", file=sys.stderr)
     return 1 if errors else 0
+
+
+@contextmanager
+def _written() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"evaluate depth: {error.filename} cannot be written: {error.strerror}") from None
