@@ -81,7 +81,9 @@ def fit_sigma(features: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np
 
     Quantile regression of log error: the pinball loss is least where the share is met everywhere.
     """
-    target = np.log(np.maximum(error, 1e-4))
+    used = np.ptp(features, axis=0) > 1e-6
+    used[0] = True
+    features, target = features[:, used], np.log(np.maximum(error, 1e-4))
 
     def loss(logs: np.ndarray) -> float:
         sigma = np.sqrt(((features * np.exp(logs)) ** 2).sum(axis=1))
@@ -90,7 +92,9 @@ def fit_sigma(features: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np
 
     start = np.log(np.full(features.shape[1], max(float(np.quantile(error, SHARE)), 1e-3)))
     found = minimize(loss, start, method="Nelder-Mead", options={"maxfev": 800, "xatol": 0.02, "fatol": 1e-6})
-    return np.exp(np.clip(found.x, np.log(1e-4), np.log(9.0)))
+    every = np.zeros(len(used))
+    every[used] = np.exp(np.clip(found.x, np.log(1e-4), np.log(9.0)))
+    return every
 
 
 def main() -> None:
@@ -104,7 +108,7 @@ def main() -> None:
     for kind, one in samples(model, args.count, args.mesh):
         taken.setdefault(kind, []).append(one)
     weight = np.concatenate([np.full(len(one["fused"]), 1 / len(ones)) for ones in taken.values() for one in ones])
-    every = {name: np.concatenate([one[name] for ones in taken.values() for one in ones]) for name in ones_keys(taken)}
+    every = {name: np.concatenate([one[name] for ones in taken.values() for one in ones]) for name in _names(taken)}
     one = np.ones(len(weight))
     tables = {
         "lidar_depth": ("alone", every["alone_origin"], np.stack([one, every["alone_gap"]], axis=1)),
@@ -133,13 +137,16 @@ def main() -> None:
         fused = fused_sigma(every["origin"][part], every["gap"][part], every["off"][part], every["wrong"][part])
         alone = structure_sigma(every["alone_origin"][part], every["alone_gap"][part])
         known = every["alone_origin"][part] > 0
+        floor = every["origin"][part] == Origin.FLOOR
         print(
             f"  {kind:9} fused {(every['fused'][part] < fused).mean():.3f}, "
-            f"lidar {(every['alone'][part] < alone)[known].mean():.3f}"
+            f"without the floor {(every['fused'][part] < fused)[~floor].mean():.3f}, "
+            f"lidar {(every['alone'][part] < alone)[known].mean():.3f}, "
+            f"without the floor {(every['alone'][part] < alone)[known & ~floor].mean():.3f}"
         )
 
 
-def ones_keys(taken: dict[str, list[dict[str, np.ndarray]]]) -> list[str]:
+def _names(taken: dict[str, list[dict[str, np.ndarray]]]) -> list[str]:
     """Names of the columns."""
     return list(next(iter(taken.values()))[0])
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ranges import Positive, check_ranges
-from .lidar_depth import LidarDepth, Origin
+from .lidar_depth import LEAST_SIGMA, LidarDepth
 
 Floats = NDArray[np.floating]
 
@@ -132,13 +132,27 @@ _TRUST = np.array(
 #: Relative standard deviation of fused depth for each ``Origin`` of the structure: at a point, its growth with the log
 #: ratio of network and structure, with the angle (1/rad) to the next point, and with ``Corrected.wrong``.
 #: Fitted so that 68 % of the errors are smaller: benchmarks/depth_sigma.py.
-_SIGMA = np.array([[0.05, 0.3, 0.05, 0.1]] * len(Origin), np.float32)
+_SIGMA = np.array(
+    [
+        (0.5767, 0.0, 0.0, 0.0001),  # UNKNOWN
+        (0.0122, 0.0173, 0.0094, 0.0098),  # BEAM
+        (0.0009, 0.0001, 0.6475, 0.0001),  # BETWEEN
+        (0.1370, 0.0188, 2.4074, 0.6396),  # EDGE
+        (0.0067, 0.4539, 0.0164, 0.0120),  # UP
+        (0.0089, 0.4220, 0.1347, 0.1642),  # DOWN
+        (0.0008, 0.0001, 0.0001, 0.0001),  # FLOOR
+        (0.0040, 0.0895, 0.0006, 0.0359),  # CEILING
+        (0.0278, 0.2179, 0.0008, 0.4871),  # ASSUMED
+    ],
+    np.float32,
+)
 
 
 def fused_sigma(origin: NDArray[np.uint8], gap_rad: Floats, off: Floats, wrong: Floats) -> NDArray[np.float32]:
     """Relative standard deviation (H, W) of fused depth; all of (H, W), see ``_SIGMA``."""
     base, by_off, by_gap, by_wrong = np.moveaxis(_SIGMA[origin], -1, 0)
-    return np.sqrt(base**2 + (by_off * off) ** 2 + (by_gap * gap_rad) ** 2 + (by_wrong * wrong) ** 2)
+    sigma = np.sqrt(base**2 + (by_off * off) ** 2 + (by_gap * gap_rad) ** 2 + (by_wrong * wrong) ** 2)
+    return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
 
 
 def fuse(network: Corrected, structure: LidarDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

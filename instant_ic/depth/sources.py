@@ -15,6 +15,8 @@ from .visibility import nearest_points
 
 Floats = NDArray[np.floating]
 SOURCES = ("network", "lidar", "fused")
+# Of the floor under the robot: a camera's height is known to centimetres.
+_FLOOR_SIGMA = 0.02
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,15 @@ class DepthSource:
             result, depth_m=depth, sigma=sigma, relative_sigma=_median(sigma), message=message, source="fused"
         )
 
+    def refuse(self, raw: Floats | None, message: str, size: tuple[int, int] = (256, 512)) -> DepthResult:
+        """The result that is not ok, of a picture without points: ``raw`` where that is metres, else all unknown."""
+        if raw is not None:
+            return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
+        unknown = np.full(size, np.inf, np.float32)
+        return DepthResult(
+            np.zeros(size, np.float32), unknown, False, 1.0, 0.0, 0.0, float("inf"), 0, message, "lidar"
+        )  # fmt: skip
+
     def parts(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
     ) -> tuple[Corrected, LidarDepth]:
@@ -164,6 +175,25 @@ class DepthSource:
             message=built.message or message,
             source="lidar",
         )
+
+
+def without_body(result: DepthResult, up: Floats, camera_height_m: float | None, elevation_deg: float) -> DepthResult:
+    """The result with floor in place of the robot itself, which fills the picture below an elevation.
+
+    Args:
+        result: depth (H, W).
+        up: (3,) gravity's up in the camera's frame.
+        camera_height_m: of the camera over the floor; None: what is masked is unknown.
+        elevation_deg: below it the picture shows the robot; -90 masks nothing.
+    """
+    rise = rays(*result.depth_m.shape) @ np.asarray(up, np.float32)
+    body = rise < np.sin(np.radians(elevation_deg))
+    if elevation_deg <= -90 or not body.any():
+        return result
+    depth, sigma = result.depth_m.copy(), result.sigma.copy()
+    depth[body] = 0 if camera_height_m is None else -camera_height_m / rise[body]
+    sigma[body] = np.inf if camera_height_m is None else _FLOOR_SIGMA
+    return replace(result, depth_m=depth, sigma=sigma)
 
 
 def agreement(depth_m: Floats, points: Floats, config: ScalerConfig) -> float:

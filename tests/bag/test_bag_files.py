@@ -47,6 +47,8 @@ def keyframe() -> bytes:
         pose=pose_message(np.eye(4)),
         panorama=compressed_image_message(b"\xff\xd8jpeg", "camera", 7),
         depth=depth,
+        sigma=image_message(np.ones((2, 4), np.uint8), "mono8", "camera", 7),
+        source="fused",
         scale=1.5,
         quality=0.9,
         relative_sigma=0.1,

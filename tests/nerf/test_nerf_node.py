@@ -37,6 +37,8 @@ def keyframe_message(number=1, fit=True, depth=None, panorama=None, sigma=0.03):
         pose=pose_message(CAMERA),
         panorama=compressed_image_message(panorama, "camera", 7 * S),
         depth=image_message(picture.depth_m if depth is None else depth, "32FC1", "camera", 7 * S),
+        sigma=image_message(np.empty((0, 0), np.uint8), "mono8", "camera", 7 * S),
+        source="network",
         scale=1.0,
         quality=0.9,
         relative_sigma=sigma,
