@@ -1,0 +1,284 @@
+"""Models of others: the manifests of models/examples with ONNX files of exactly those inputs and outputs."""
+
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import tiny_onnx
+import yaml
+from onnx import helper
+from tiny_onnx import CHANNELS, channel
+
+from instant_ic.depth.manifest import ManifestError, load_manifest
+from instant_ic.depth.model import DepthModel, InferenceError
+from instant_ic.paths import share_dir
+
+EXAMPLES = sorted((share_dir("models") / "examples").glob("*.yaml"))
+
+
+def squeeze(source: str, result: str, axis: int = 1) -> onnx.NodeProto:
+    return helper.make_node("Squeeze", [source, f"axis{axis}"], [result])
+
+
+def add_model(folder: Path, example: str) -> Path:
+    """The example's manifest with a network beside it whose depth is the red channel as it comes in."""
+    manifest = folder / f"{example}.yaml"
+    shutil.copy(share_dir("models") / "examples" / f"{example}.yaml", manifest)
+    path = folder / f"{example}.onnx"
+    red = channel("image", 0, "depth4")
+    match example:
+        case "da2":  # (1, 3, 546, 1092) -> (1, 546, 1092)
+            nodes = [*channel("images", 0, "four"), squeeze("four", "distance")]
+            tiny_onnx.write(path, {"images": (1, 3, 546, 1092)}, {"distance": (1, 546, 1092)}, nodes, CHANNELS)
+        case "dap":  # the mask comes first, as an exporter may order a dictionary: green over 0.5 is sky
+            nodes = [*channel("image", 1, "pred_mask"), *channel("image", 0, "pred_depth")]
+            both = {"pred_mask": (1, 1, 512, 1024), "pred_depth": (1, 1, 512, 1024)}
+            tiny_onnx.write(path, {"image": (1, 3, 512, 1024)}, both, nodes, CHANNELS)
+        case "panda":  # dynamic axes
+            tiny_onnx.write(path, {"image": ("n", 3, "h", "w")}, {"depth4": ("n", 1, "h", "w")}, red, CHANNELS)
+        case "da360":
+            tiny_onnx.write(path, {"image": (1, 3, 518, 1036)}, {"depth4": (1, 1, 518, 1036)}, red, CHANNELS)
+        case "hohonet":
+            tiny_onnx.write(path, {"image": (1, 3, 512, 1024)}, {"depth4": (1, 1, 512, 1024)}, red, CHANNELS)
+        case "slicenet_m3d":
+            nodes = [*red, squeeze("depth4", "depth")]
+            tiny_onnx.write(path, {"image": (1, 3, 512, 1024)}, {"depth": (1, 512, 1024)}, nodes, CHANNELS)
+    return path
+
+
+RED = (0.8 - 0.485) / 0.229  # byte 204 as ImageNet's normalisation leaves it
+
+
+@pytest.mark.parametrize(
+    ("example", "size", "expected"),
+    [
+        ("da2", (546, 1092), 0.8),
+        ("dap", (512, 1024), 80.0),
+        ("panda", (504, 1008), RED),
+        ("da360", (518, 1036), 1 / RED),
+        ("hohonet", (512, 1024), 0.8),
+        ("slicenet_m3d", (512, 1024), 0.8),
+    ],
+)
+def test_examples_work_unchanged(tmp_path: Path, example: str, size: tuple[int, int], expected: float) -> None:
+    model = DepthModel.load(add_model(tmp_path, example), threads=1)
+    picture = np.zeros((480, 960, 3), np.uint8)
+    picture[..., 0] = 204
+    depth = model.estimate(picture)
+    assert depth.shape == size and depth.dtype == np.float32
+    np.testing.assert_allclose(depth, expected, rtol=1e-5)
+
+
+def test_every_example_is_held_by_a_test() -> None:
+    held = {"da2", "dap", "panda", "da360", "hohonet", "slicenet_m3d"}
+    assert {path.stem for path in EXAMPLES} == held
+    for path in EXAMPLES:
+        load_manifest(path)
+
+
+def test_dap_sky_is_unknown(tmp_path: Path) -> None:
+    model = DepthModel.load(add_model(tmp_path, "dap"), threads=1)
+    picture = np.full((512, 1024, 3), 51, np.uint8)  # 0.2: 20 m, mask 0.2
+    picture[:128, :, 1] = 204  # mask 0.8
+    depth = model.estimate(picture)
+    assert not depth[:128].any()
+    np.testing.assert_allclose(depth[128:], 20.0, rtol=1e-5)
+
+
+def test_relative_depth_is_moved_above_zero(tmp_path: Path) -> None:
+    model = DepthModel.load(add_model(tmp_path, "panda"), threads=1)
+    picture = np.zeros((504, 1008, 3), np.uint8)
+    picture[:, 500:] = 255  # (0 - 0.485) / 0.229 = -2.118 and 2.249: below 0 would be unknown, but the shift is free
+    depth = model.estimate(picture)
+    assert depth.min() > 0
+    assert depth[0, 900] - depth[0, 100] == pytest.approx(1 / 0.229, rel=1e-4)
+
+
+def test_disparity_of_nothing_is_unknown_depth(tmp_path: Path) -> None:
+    model = DepthModel.load(add_model(tmp_path, "da360"), threads=1)
+    assert not model.estimate(np.zeros((518, 1036, 3), np.uint8)).any()  # -2.1: behind infinity
+
+
+def manifest_of(path: Path, **changes: object) -> Path:
+    values = {"model": path.name, "name": "m", "licence": "x", "input_height": 64, "input_width": 128, **changes}
+    path.with_suffix(".yaml").write_text(yaml.safe_dump(values))
+    return path
+
+
+def test_channels_last_and_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "m.onnx"
+    cast = helper.make_node("Cast", ["red"], ["depth"], to=tiny_onnx.FLOAT)
+    nodes = [*channel("image", 0, "red", axis=3), cast]
+    tiny_onnx.write(path, {"image": (1, 64, 128, 3)}, {"depth": (1, 64, 128, 1)}, nodes, CHANNELS, kind=tiny_onnx.BYTES)
+    picture = np.zeros((64, 128, 3), np.uint8)
+    picture[..., 0] = 7
+    model = DepthModel.load(manifest_of(path, input_layout="nhwc", input_scale=1.0))
+    np.testing.assert_array_equal(model.estimate(picture), 7.0)
+    with pytest.raises(ManifestError, match="takes bytes: the manifest must say input_scale 1"):
+        DepthModel.load(manifest_of(path, input_layout="nhwc"))
+    with pytest.raises(ManifestError, match="its input_layout is nhwc"):
+        DepthModel.load(manifest_of(path, input_scale=1.0))
+
+
+def test_half_precision_points_and_oblong_pixels(tmp_path: Path) -> None:
+    path = tmp_path / "m.onnx"
+    identity = [helper.make_node("Identity", ["image"], ["points"])]
+    tiny_onnx.write(
+        path, {"image": (1, 3, 64, 112)}, {"points": (1, 3, 64, 112)}, identity, None, tiny_onnx.HALF, tiny_onnx.HALF
+    )
+    model = DepthModel.load(manifest_of(path, input_width=112, output_form="points", output_scale=10.0))
+    picture = np.zeros((64, 128, 3), np.uint8)
+    picture[...] = (51, 102, 102)  # (0.2, 0.4, 0.4): length 0.6
+    depth = model.estimate(picture)
+    assert depth.shape == (64, 128)  # square pixels again
+    np.testing.assert_allclose(depth, 6.0, rtol=2e-3)  # float16
+    with pytest.raises(ManifestError, match=r"output 'points' is \[1, 3, 64, 112\]; one number a pixel"):
+        DepthModel.load(manifest_of(path, input_width=112))
+
+
+def test_output_of_another_size_than_the_input(tmp_path: Path) -> None:
+    path = tmp_path / "m.onnx"
+    pool = helper.make_node("AveragePool", ["red"], ["depth"], kernel_shape=[2, 2], strides=[2, 2])
+    nodes = [*channel("image", 0, "red"), pool]
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 32, 64)}, nodes, CHANNELS)
+    model = DepthModel.load(manifest_of(path, geometry="planar"))
+    assert model.estimate(np.full((64, 128, 3), 204, np.uint8)).shape == (32, 64)
+
+
+def test_models_that_cannot_be_used_say_why(tmp_path: Path) -> None:
+    path = tmp_path / "m.onnx"
+    add = [helper.make_node("Add", ["image", "rays"], ["sum"])]
+    both = {"image": (1, 3, 64, 128), "rays": (1, 3, 64, 128)}
+    tiny_onnx.write(path, both, {"sum": (1, 3, 64, 128)}, add)
+    with pytest.raises(ManifestError, match=r"takes 2 inputs \(image, rays\)"):
+        DepthModel.load(manifest_of(path))
+    mean = [helper.make_node("ReduceMean", ["image"], ["depth"], axes=[1, 2, 3], keepdims=0)]
+    tiny_onnx.write(path, {"image": ("n", 3, "h", "w")}, {"depth": ("n",)}, mean)  # open: only the first run can tell
+    model = DepthModel.load(manifest_of(path))
+    with pytest.raises(ManifestError, match=r"output 'depth' is \[1\]; one number a pixel"):
+        model.estimate(np.zeros((64, 128, 3), np.uint8))
+    with pytest.raises(ManifestError, match="no output 'dep' for the depth"):
+        DepthModel.load(manifest_of(path, depth_output="dep"))
+    shape = [helper.make_node("Shape", ["image"], ["depth"])]
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (4,)}, shape, output_kind=onnx.TensorProto.INT64)
+    with pytest.raises(ManifestError, match=r"output 'depth' is \[4\]"):
+        DepthModel.load(manifest_of(path))
+
+
+def endless(path: Path) -> Path:
+    """A network that multiplies its input again and again, for hours."""
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["on"], ["still"]), helper.make_node("Mul", ["x", "x"], ["y"])],
+        "body",
+        [
+            helper.make_tensor_value_info("step", onnx.TensorProto.INT64, []),
+            helper.make_tensor_value_info("on", onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info("x", tiny_onnx.FLOAT, None),
+        ],
+        [
+            helper.make_tensor_value_info("still", onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info("y", tiny_onnx.FLOAT, None),
+        ],
+    )
+    loop = helper.make_node("Loop", ["many", "", "red"], ["depth"], body=body)
+    nodes = [*channel("image", 0, "red"), loop]
+    many = CHANNELS | {"many": [10**12]}
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, many)
+    return manifest_of(path)
+
+
+def test_an_inference_can_be_ended(tmp_path: Path) -> None:
+    model = DepthModel.load(endless(tmp_path / "m.onnx"), threads=1)
+    failed: list[Exception] = []
+
+    def run() -> None:
+        try:
+            model.estimate(np.zeros((64, 128, 3), np.uint8))
+        except InferenceError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    ended = threading.Event()
+    for _ in range(1000):  # the inference may not have begun yet: ask until it ends
+        model.cancel()
+        thread.join(0.03)
+        if not thread.is_alive():
+            ended.set()
+            break
+    assert ended.is_set()
+    assert "terminate" in str(failed[0])
+
+
+class FakeRuntime:
+    """Stands for an onnxruntime with a GPU: what opens, what fails."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, available: list[str], fails: dict[str, str]) -> None:
+        import onnxruntime
+
+        real = onnxruntime.InferenceSession
+
+        class Session:
+            def __init__(self, path: str, options: object, providers: list[object], **extra: object) -> None:
+                self.first = providers[0][0] if isinstance(providers[0], tuple) else providers[0]
+                if (what := fails.get(self.first)) and what != "missing":
+                    raise RuntimeError(what)
+                self.real = real(path, options, providers=["CPUExecutionProvider"])
+
+            def __getattr__(self, name: str) -> object:
+                return getattr(self.real, name)
+
+            def get_providers(self) -> list[str]:
+                silent = fails.get(self.first) == "missing"
+                return ["CPUExecutionProvider"] if silent else [self.first, "CPUExecutionProvider"]
+
+        monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: [*available, "CPUExecutionProvider"])
+        monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+        monkeypatch.setattr(onnxruntime, "preload_dlls", lambda: None, raising=False)
+
+
+TRT, CUDA = "TensorrtExecutionProvider", "CUDAExecutionProvider"
+
+
+@pytest.mark.parametrize(
+    ("available", "fails", "asked", "got", "notes"),
+    [
+        ([TRT, CUDA], {}, "auto", "tensorrt", []),
+        ([TRT, CUDA], {}, "cuda", "cuda", []),
+        ([TRT, CUDA], {}, "cpu", "cpu", []),
+        ([TRT, CUDA], {TRT: "libnvinfer.so.10: cannot open\nmore"}, "auto", "cuda", ["libnvinfer.so.10: cannot open"]),
+        ([TRT, CUDA], {TRT: "a", CUDA: "out of memory"}, "auto", "cpu", ["tensorrt: a", "cuda: out of memory"]),
+        ([CUDA], {CUDA: "missing"}, "cuda", "cpu", ["cuda: its libraries or its GPU are missing"]),
+        ([], {}, "auto", "cpu", ["tensorrt: not in this onnxruntime", "cuda: not in this onnxruntime"]),
+    ],
+)
+def test_the_fastest_provider_that_works(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    available: list[str],
+    fails: dict[str, str],
+    asked: str,
+    got: str,
+    notes: list[str],
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    path = tmp_path / "m.onnx"
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"d": (1, 1, 64, 128)}, channel("image", 0, "d"), CHANNELS)
+    FakeRuntime(monkeypatch, available, fails)
+    model = DepthModel.load(manifest_of(path), provider=asked)
+    assert model.provider == got
+    assert len(model.notes) == len(notes)
+    assert all(part in note for part, note in zip(notes, model.notes, strict=True))
+    assert model.estimate(np.full((64, 128, 3), 255, np.uint8))[0, 0] == 1.0
+
+
+def test_unknown_provider_and_threads(tmp_path: Path) -> None:
+    path = tmp_path / "m.onnx"
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"d": (1, 1, 64, 128)}, channel("image", 0, "d"), CHANNELS)
+    with pytest.raises(ValueError, match="provider must be one of auto, tensorrt, cuda, cpu"):
+        DepthModel.load(manifest_of(path), provider="gpu")
+    with pytest.raises(ValueError, match="threads must be 1 or more"):
+        DepthModel.load(manifest_of(path), threads=0)
