@@ -1,9 +1,33 @@
-"""Augmentation of a batch of panoramas (torch): what keeps the depth, and what a camera does to the colours."""
+"""Augmentation of a batch of panoramas (torch): what keeps the depth, and what a real camera does to a picture."""
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
+from torch.nn import functional
+
+#: Quantisation of JPEG's luminance at quality 50 (ITU-T T.81, table K.1).
+_QUANTISATION = (
+    (16, 11, 10, 16, 24, 40, 51, 61), (12, 12, 14, 19, 26, 58, 60, 55), (14, 13, 16, 24, 40, 57, 69, 56),
+    (14, 17, 22, 29, 51, 87, 80, 62), (18, 22, 37, 56, 68, 109, 103, 77), (24, 35, 55, 64, 81, 104, 113, 92),
+    (49, 64, 78, 87, 103, 121, 120, 101), (72, 92, 95, 98, 112, 100, 103, 99),
+)  # fmt: skip
+_MAX_GAIN = 2.5
+
+
+def to_brightness(rgb: Tensor, brightness: float) -> Tensor:
+    """Brings each picture's mean byte to ``brightness`` by one factor, as inference does with the manifest's value.
+
+    Args:
+        rgb: (B, 3, H, W) in 0..1.
+        brightness: mean byte; 0 leaves the pictures as they are.
+    """
+    if not brightness:
+        return rgb
+    mean = rgb.mean(dim=(1, 2, 3), keepdim=True).clamp_min(1 / 255)
+    return (rgb * (brightness / 255 / mean).clamp(1 / _MAX_GAIN, _MAX_GAIN)).clamp(0.0, 1.0)
 
 
 def turn_and_mirror(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -27,17 +51,115 @@ def turn_and_mirror(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> t
     return torch.stack(pictures), torch.stack(depths)
 
 
+def photograph(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:
+    """What a real panorama camera on a robot adds to a picture (B, 3, H, W) in 0..1; each effect on some pictures.
+
+    In the order in which they arise: reflections in the floor, the robot or its stand over the bottom, lens
+    (vignetting, blur), sensor (exposure, colours, noise), JPEG. The depth (B, H, W) stays: under the robot it is the
+    floor's, so that the network learns to go on with the floor there.
+    """
+    rgb = _some(rgb, floor_reflection(rgb, depth, generator), 0.2, generator)
+    rgb = _some(rgb, robot_body(rgb, generator), 0.4, generator)
+    rgb = _some(rgb, vignetting(rgb, generator), 0.4, generator)
+    rgb = _some(rgb, blur(rgb, generator), 0.25, generator)
+    rgb = camera_colours(rgb, generator)
+    return _some(rgb, jpeg(rgb, generator), 0.4, generator)
+
+
+def _some(before: Tensor, after: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    chosen = torch.rand(before.shape[0], 1, 1, 1, generator=generator) < share
+    return torch.where(chosen.to(before.device), after, before)
+
+
+def _uniform(like: Tensor, generator: torch.Generator, low: float, high: float, channels: int = 1) -> Tensor:
+    values = torch.rand(like.shape[0], channels, 1, 1, generator=generator)
+    return (low + (high - low) * values).to(like.device)
+
+
 def camera_colours(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Exposure, contrast, white balance, saturation and sensor noise, a picture at a time; (B, 3, H, W) in 0..1."""
-    count = rgb.shape[0]
-
-    def uniform(low: float, high: float, channels: int = 1) -> Tensor:
-        return low + (high - low) * torch.rand(count, channels, 1, 1, generator=generator)
-
-    gamma = torch.exp(uniform(-0.35, 0.35))
-    rgb = rgb.clamp_min(1e-4).pow(gamma) * torch.exp(uniform(-0.45, 0.3))
-    rgb = rgb * torch.exp(uniform(-0.12, 0.12, 3))
+    """Exposure (over- and under-), contrast, white balance, saturation and sensor noise; (B, 3, H, W) in 0..1."""
+    gamma = torch.exp(_uniform(rgb, generator, -0.4, 0.5))
+    rgb = rgb.clamp_min(1e-4).pow(gamma) * torch.exp(_uniform(rgb, generator, -0.6, 0.45))
+    rgb = rgb * torch.exp(_uniform(rgb, generator, -0.15, 0.15, 3))
     grey = rgb.mean(dim=1, keepdim=True)
-    rgb = grey + (rgb - grey) * uniform(0.3, 1.4)
-    rgb = rgb + torch.randn(rgb.shape, generator=generator) * uniform(0.0, 0.03)
-    return rgb.clamp(0.0, 1.0)
+    rgb = grey + (rgb - grey) * _uniform(rgb, generator, 0.2, 1.4)
+    noise = torch.randn(rgb.shape, generator=generator).to(rgb.device)
+    return (rgb + noise * _uniform(rgb, generator, 0.0, 0.035)).clamp(0.0, 1.0)
+
+
+def vignetting(rgb: Tensor, generator: torch.Generator) -> Tensor:
+    """Darkening towards the seam of the two lenses, which look along some yaw and its opposite."""
+    height, width = rgb.shape[-2:]
+    yaw = torch.linspace(-math.pi, math.pi, width + 1)[:-1] + math.pi / width
+    elevation = math.pi / 2 - (torch.arange(height) + 0.5) * math.pi / height
+    turn = 2 * math.pi * torch.rand(rgb.shape[0], 1, 1, generator=generator)
+    across = (torch.cos(elevation)[None, :, None] * torch.cos(yaw[None, None, :] + turn)).abs()  # 1 in a lens's middle
+    return rgb * (1 - _uniform(rgb, generator, 0.1, 0.45) * ((1 - across) ** 2)[:, None].to(rgb.device))
+
+
+def robot_body(rgb: Tensor, generator: torch.Generator) -> Tensor:
+    """A dark body with an uneven rim, up to some elevation below the horizon (the foot of a stand, a robot's deck)."""
+    count, _, height, width = rgb.shape
+    yaw = torch.arange(width)[None] * (2 * math.pi / width)
+    rim = 4 + 26 * torch.rand(count, 1, generator=generator)  # degrees above the nadir
+    for wave in (1, 2, 3, 5):
+        phase = 2 * math.pi * torch.rand(count, 1, generator=generator)
+        rim = rim + 8 / wave * torch.rand(count, 1, generator=generator) * torch.cos(wave * yaw + phase)
+    bump = torch.rand(count, 1, generator=generator) * 2 * math.pi
+    away = torch.remainder(yaw - bump + math.pi, 2 * math.pi) - math.pi
+    rim = rim + (25 * torch.rand(count, 1, generator=generator) - 5).clamp_min(0) * torch.exp(-((away / 0.15) ** 2))
+    from_nadir = 180 - (torch.arange(height) + 0.5) * (180 / height)
+    inside = from_nadir[None, :, None] < rim[:, None, :]  # (B, H, W)
+    shade = _uniform(rgb, generator, 0.0, 0.2) + _uniform(rgb, generator, 0.0, 0.05, 3)
+    relief = 1 + 0.3 * torch.randn(count, 1, height // 16, width // 16, generator=generator).to(rgb.device)
+    body = shade * functional.interpolate(relief, size=(height, width), mode="bilinear").clamp_min(0)
+    return torch.where(inside[:, None].to(rgb.device), body, rgb)
+
+
+def floor_reflection(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:
+    """A polished floor: what stands above the horizon shows in it, more at grazing angles.
+
+    The floor is taken for what lies as deep as the deepest known pixel. A mirror image is taken from the same
+    elevation above the horizon, which is right for what is far.
+    """
+    height = rgb.shape[-2]
+    elevation = math.pi / 2 - (torch.arange(height, device=rgb.device) + 0.5) * math.pi / height
+    drop = -depth * torch.sin(elevation)[None, :, None]  # metres below the camera
+    lowest = torch.quantile(drop[:, height // 2 :].flatten(1)[:, ::7], 0.9, dim=1)
+    floor = (drop > 0.9 * lowest[:, None, None]) & (depth > 0) & (lowest[:, None, None] > 0.2)
+    mirrored = functional.avg_pool2d(rgb.flip(-2), (5, 3), stride=1, padding=(2, 1))
+    grazing = torch.cos(elevation).clamp(0, 1) ** 3
+    share = _uniform(rgb, generator, 0.1, 0.6) * grazing[None, None, :, None]
+    return torch.where(floor[:, None], rgb + share * (mirrored - rgb), rgb)
+
+
+def blur(rgb: Tensor, generator: torch.Generator) -> Tensor:
+    """Soft lens or a little motion: 3 × 3 mean, mixed in by some share; circular in width."""
+    padded = functional.pad(functional.pad(rgb, (1, 1, 0, 0), mode="circular"), (0, 0, 1, 1), mode="replicate")
+    return rgb + _uniform(rgb, generator, 0.3, 1.0) * (functional.avg_pool2d(padded, 3, stride=1) - rgb)
+
+
+def jpeg(rgb: Tensor, generator: torch.Generator, quality: tuple[float, float] = (20.0, 85.0)) -> Tensor:
+    """Rounds the cosine coefficients of 8 × 8 blocks as JPEG of a random quality does; colour twice as coarsely.
+
+    Height and width are multiples of 8.
+    """
+    count, _, height, width = rgb.shape
+    k = torch.arange(8, dtype=rgb.dtype, device=rgb.device)
+    basis = torch.cos((2 * k[None] + 1) * k[:, None] * math.pi / 16) * 0.5
+    basis[0] /= math.sqrt(2)
+    red, green, blue = rgb.unbind(1)
+    luma = 0.299 * red + 0.587 * green + 0.114 * blue
+    planes = torch.stack((luma - 128 / 255, (blue - luma) * 0.564, (red - luma) * 0.713), dim=1) * 255
+    blocks = planes.view(count, 3, height // 8, 8, width // 8, 8).transpose(3, 4)
+    coefficients = basis @ blocks @ basis.T
+    q = _uniform(rgb, generator, *quality)
+    factor = torch.where(q < 50, 50 / q, 2 - q / 50)
+    steps = (torch.tensor(_QUANTISATION, dtype=rgb.dtype, device=rgb.device) * factor[..., None, None]).clamp_min(1)
+    steps = steps * torch.tensor([1.0, 2.0, 2.0], device=rgb.device).view(1, 3, 1, 1, 1, 1)
+    blocks = basis.T @ (torch.round(coefficients / steps) * steps) @ basis
+    luma, cb, cr = (blocks.transpose(3, 4).reshape(count, 3, height, width) / 255).unbind(1)
+    luma = luma + 128 / 255
+    red, blue = luma + cr / 0.713, luma + cb / 0.564
+    green = (luma - 0.299 * red - 0.114 * blue) / 0.587
+    return torch.stack((red, green, blue), dim=1).clamp(0.0, 1.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,35 @@ class Sample:
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.floating]
     world: int
+
+
+class Subset:
+    """Some panoramas of a collection."""
+
+    def __init__(self, samples: Any, indices: Sequence[int] | NDArray[np.intp]) -> None:
+        self.samples, self.indices = samples, indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, index: int) -> Sample:
+        sample: Sample = self.samples[int(self.indices[index])]
+        return sample
+
+    @classmethod
+    def joined(cls, parts: Sequence[Subset]) -> Subset:
+        """All panoramas of several, one collection after the other."""
+        places = [(part, index) for part in parts for index in range(len(part))]
+        return cls(_Joined(places), range(len(places)))
+
+
+@dataclass(frozen=True)
+class _Joined:
+    places: list[tuple[Subset, int]]
+
+    def __getitem__(self, index: int) -> Sample:
+        part, within = self.places[index]
+        return part[within]
 
 
 class PanoramaDataset:

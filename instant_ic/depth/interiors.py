@@ -1,7 +1,8 @@
-"""Made-up interiors of many kinds for the training: what a depth network must have seen that is to work in real ones.
+"""Made-up interiors of many kinds for the training of depth.
 
-``instant_ic.sim.worlds.random_world`` makes rooms and corridors with some furniture. Here are the places where a network
-of such rooms alone fails: halls with pillars, glass fronts, show-cases and rows of shelves, offices, stores, plain homes.
+``instant_ic.sim.worlds.random_world`` makes rooms and corridors with some furniture. Here are the places where a
+network of such rooms alone fails: halls with pillars, glass fronts, show-cases, rows of shelves, offices, stores, and
+homes with plain walls.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,7 +26,7 @@ KINDS: dict[str, float] = {
 _HALLS = ("library", "exhibition", "canteen", "office", "store")
 
 
-def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.35, rays: int = 14) -> World:
+def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.45, rays: int = 12) -> World:
     """Interior of one of :data:`KINDS`; the same seed gives the same world.
 
     Args:
@@ -182,7 +184,7 @@ def _pillars(rng: np.random.Generator, build: WorldBuilder, zone: Zone) -> None:
                 continue
             angle = np.linspace(0, 2 * math.pi, 13)
             ring = [(float(x + radius * math.cos(a)), float(y + radius * math.sin(a))) for a in angle]
-            for a, b in zip(ring, ring[1:], strict=False):
+            for a, b in pairwise(ring):
                 build.wall(a, b, 0.0, zone.height, material)
 
 
@@ -197,7 +199,7 @@ def _glass_front(rng: np.random.Generator, building: Building, zone: Zone) -> No
         for low, high in building.free_runs(zone, str(side), 0.1):
             count = max(1, round((high - low) / pane))
             edges = np.linspace(low, high, count + 1)
-            for index, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            for index, (a, b) in enumerate(pairwise(edges.tolist())):
                 glass = Material(f"window:{(variant + index) % 24}", 0, emission=shine)
                 building.relief(start, end, (a + 0.03, b - 0.03), (bottom, top), 0.01, glass, frame)
                 building.relief(start, end, (a - 0.03, a + 0.03), (bottom, top), 0.06, frame)
@@ -256,8 +258,9 @@ def _show_case(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, f
     for _ in range(int(rng.integers(1, 5))):
         tall = float(rng.uniform(0.05, 0.8 * (top - base)))
         a = placed(*(rng.uniform(-0.35, 0.35, 2) * size))
-        build.box(a, (float(rng.uniform(0.05, 0.25)), float(rng.uniform(0.05, 0.25)), tall), base + 0.002,
-                  float(rng.uniform(0, 3)), side=_tinted(rng, ("wood", "metal", "fabric", "white"), 0.1, 0.4))  # fmt: skip
+        thing = (float(rng.uniform(0.05, 0.25)), float(rng.uniform(0.05, 0.25)), tall)
+        material = _tinted(rng, ("wood", "metal", "fabric", "white"), 0.1, 0.4)
+        build.box(a, thing, base + 0.002, float(rng.uniform(0, 3)), side=material)
 
 
 def _desk(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, float], yaw: float) -> None:
@@ -358,7 +361,11 @@ def _store(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None
             build.box((x, y), (2.4, 0.8, 0.04), float(low), side=metal)
             for s in np.arange(-0.95, 1.0, 0.48):
                 if rng.random() < 0.6:
-                    size = (float(rng.uniform(0.25, 0.44)), float(rng.uniform(0.3, 0.6)), float(rng.uniform(0.15, 0.42)))
+                    size = (
+                        float(rng.uniform(0.25, 0.44)),
+                        float(rng.uniform(0.3, 0.6)),
+                        float(rng.uniform(0.15, 0.42)),
+                    )
                     box = Material("cardboard", 0) if rng.random() < 0.7 else _tinted(rng, ("white", "metal", "wood"))
                     build.box((x + float(s), y), size, float(low) + 0.041, side=box)
 
@@ -386,7 +393,9 @@ def _room(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
         elif name == "kitchen" and (place := floor.wall_place(rng, (0.62, 2.4))):
             (x, y), yaw = place
             c, s = math.cos(yaw), math.sin(yaw)
-            build.box((x, y), (0.6, 2.4, 0.9), 0.0, yaw, side=wood, top=_tinted(rng, ("concrete", "white", "wood"), 0.2))
+            build.box(
+                (x, y), (0.6, 2.4, 0.9), 0.0, yaw, side=wood, top=_tinted(rng, ("concrete", "white", "wood"), 0.2)
+            )
             build.box((x - 0.14 * c, y - 0.14 * s), (0.33, 2.4, 0.65), 1.45, yaw, side=wood)
         elif name == "screen" and (place := floor.wall_place(rng, (0.45, 1.6))):
             (x, y), yaw = place
@@ -417,8 +426,8 @@ def _corridor(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> N
                   side=_tinted(rng, ("wood", "metal", "white", "fabric"), 0.15))  # fmt: skip
     if rng.random() < 0.3:
         w, d = zone.x1 - zone.x0, zone.y1 - zone.y0
-        size = (w - 0.02, 0.2, 0.12) if w > d else (0.2, d - 0.02, 0.12)
-        build.box((zone.centre[0] + 0.3 * (w < d), zone.centre[1] + 0.3 * (w > d)), size, zone.height - 0.3,
+        duct = (w - 0.02, 0.2, 0.12) if w > d else (0.2, d - 0.02, 0.12)
+        build.box((zone.centre[0] + 0.3 * (w < d), zone.centre[1] + 0.3 * (w > d)), duct, zone.height - 0.3,
                   side=_tinted(rng, ("metal", "white"), 0.3))  # fmt: skip
 
 
@@ -444,7 +453,9 @@ def _clutter(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> No
             build.box(at, (0.2, 0.16, 0.25), 1.48, yaw, side=Material("white", 0.4, (0.8, 0.6, 0.5)))
         else:
             size = (float(rng.uniform(0.15, 0.5)), float(rng.uniform(0.15, 0.5)), float(rng.uniform(0.2, 1.3)))
-            build.box(at, size, 0.0, yaw, side=_tinted(rng, ("metal", "white", "wood", "fabric", "cardboard"), 0.1, 0.5))
+            build.box(
+                at, size, 0.0, yaw, side=_tinted(rng, ("metal", "white", "wood", "fabric", "cardboard"), 0.1, 0.5)
+            )
 
 
 _THEMES: dict[str, Callable[[np.random.Generator, WorldBuilder, _Floor], None]] = {

@@ -1,9 +1,9 @@
-"""Training panoramas: random worlds of the simulator, seen from where a robot's camera could be."""
+"""Training panoramas: generated interiors, seen from where a robot's camera could be."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -13,16 +13,21 @@ from instant_ic.geometry.poses import pose_matrix
 
 from .dataset import Sample
 
+FIRST_HELD_OUT = 900_000
+"""Worlds from this seed on belong to the evaluations (``instant_ic.evaluation.depth_worlds``)."""
+INTERIORS = ("wide", "random")
+
 
 @dataclass(frozen=True)
 class RoomsConfig:
-    """Recipe of a data folder.
+    """Recipe of generated panoramas.
 
     Attributes:
-        worlds: number of random worlds.
+        worlds: number of worlds.
         poses: panoramas in each.
         first_world: seed of the first world; the others follow. Held-out worlds are the last ones.
         height: rows of a panorama.
+        interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
         camera_height_m: lowest and highest camera above the floor.
         tilt_deg: standard deviation of roll and pitch.
         clearance_m: distance from things, lowest and highest.
@@ -32,13 +37,19 @@ class RoomsConfig:
     poses: int = 6
     first_world: int = 1000
     height: int = 256
-    camera_height_m: tuple[float, float] = (0.8, 1.4)
-    tilt_deg: float = 1.0
-    clearance_m: tuple[float, float] = (0.3, 0.6)
+    interiors: str = "wide"
+    camera_height_m: tuple[float, float] = (0.5, 1.7)
+    tilt_deg: float = 1.5
+    clearance_m: tuple[float, float] = (0.3, 0.7)
 
     def __post_init__(self) -> None:
         if self.worlds < 2 or self.poses < 1:
             raise ValueError(f"at least 2 worlds and 1 pose are needed (got {self.worlds}, {self.poses})")
+        if self.interiors not in INTERIORS:
+            raise ValueError(f"interiors must be one of {', '.join(INTERIORS)} (got {self.interiors!r})")
+        if self.first_world < 0 or self.first_world + self.worlds > FIRST_HELD_OUT:
+            raise ValueError(f"world seeds must lie in 0..{FIRST_HELD_OUT - 1}: the others are for evaluation "
+                             f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip
 
     @property
     def count(self) -> int:
@@ -47,7 +58,8 @@ class RoomsConfig:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, for the folder's ``dataset.json``."""
-        return {"kind": "instant_ic.sim.worlds.random_world", **asdict(self)}
+        module = "depth.interiors.interior_world" if self.interiors == "wide" else "sim.worlds.random_world"
+        return {"kind": f"instant_ic.{module}", **asdict(self)}
 
 
 def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> Iterator[Sample]:
@@ -56,12 +68,15 @@ def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> It
     Worlds without a free place are left out, so that fewer samples than ``config.count`` may come.
     """
     from instant_ic.sim.render import EquirectRenderer
-    from instant_ic.sim.worlds import random_world
+    from instant_ic.sim.worlds import World, random_world
 
+    from .interiors import interior_world
+
+    make: Callable[[int], World] = interior_world if config.interiors == "wide" else random_world
     seeds = range(config.first_world, config.first_world + config.worlds) if worlds is None else worlds
     for seed in seeds:
         rng = np.random.default_rng((7, seed))
-        world = random_world(seed)
+        world = make(seed)
         renderer = EquirectRenderer(world)
         try:
             poses = world.sample_free_poses(rng, config.poses, clearance_m=rng.uniform(*config.clearance_m))

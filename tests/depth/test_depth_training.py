@@ -1,81 +1,134 @@
-"""Data folder, augmentation and a very short training."""
+"""Training on a few striped pictures: it learns, repeats, is taken up again, and records what it did."""
 
+import csv
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from instant_ic.depth.augment import camera_colours, turn_and_mirror
-from instant_ic.depth.dataset import DatasetError, PanoramaDataset, Sample, write_dataset
-from instant_ic.depth.slicenet import CheckpointError, SliceNetConfig, load_checkpoint
-from instant_ic.depth.training import Trainer, TrainingConfig, schedule
+from instant_ic.depth.dataset import Sample, Subset
+from instant_ic.depth.feeds import FileFeed
+from instant_ic.depth.slicenet import CheckpointError, SliceNet, SliceNetConfig, load_checkpoint
+from instant_ic.depth.training import Team, Trainer, TrainingConfig, evaluate, schedule, to_tensors, update_average
+from instant_ic.depth.training_log import TrainingLog
 
 TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
 
 
-def stripes(count: int, worlds: int, height: int = 64) -> list[Sample]:
+def stripes(count: int, height: int = 64) -> list[Sample]:
     """Pictures whose brightness tells their depth."""
     samples = []
     for index in range(count):
         depth = np.full((height, 2 * height), 1.0 + index % 4, np.float32)
         depth[:2] = 0.0
         rgb = np.repeat((depth * 50).astype(np.uint8)[..., None], 3, axis=-1)
-        samples.append(Sample(rgb, depth, 100 + index * worlds // count))
+        samples.append(Sample(rgb, depth, index))
     return samples
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    assert list(write_dataset(tmp_path / "data", stripes(12, 4), 12, (64, 128), {"kind": "stripes"}))[-1] == 12
-    return tmp_path / "data"
+def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **options) -> Trainer:
+    samples = samples or stripes(12)
+    config = TrainingConfig(
+        minutes=60, epochs=epochs, batch_size=3, threads=1, mixed_precision=False, average=0.8, learning_rate=1e-2,
+        photograph=False, brightness=0.0,
+    )  # fmt: skip
+    feed = FileFeed(samples, np.arange(9), 3, info={"kind": "stripes"})
+    return Trainer(feed, Subset(samples, range(9, 12)), TINY, config, output, report=lambda line: None, **options)
 
 
-def test_folder_gives_back_what_was_written(folder: Path) -> None:
-    data = PanoramaDataset(folder)
-    assert (len(data), data.size, data.info["kind"]) == (12, (64, 128), "stripes")
-    for index, sample in enumerate(stripes(12, 4)):
-        np.testing.assert_array_equal(data[index].rgb, sample.rgb)
-        np.testing.assert_array_equal(data[index].depth_m, sample.depth_m)
-        assert data[index].world == sample.world
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """A run of 12 epochs."""
+    path, lines, shares = tmp_path_factory.mktemp("r") / "a.pt", [], []
+    run = trainer(path, 12, command="ic depth train")
+    run.report, run.bar = lines.append, shares.append
+    first_loss = run.train_step()
+    metrics = run.run()
+    run.close()
+    return SimpleNamespace(path=path, run=run, metrics=metrics, lines=lines, shares=shares, first_loss=first_loss)
 
 
-def test_whole_worlds_are_held_out(folder: Path) -> None:
-    data = PanoramaDataset(folder)
-    train, held_out = data.split(0.25)
-    assert set(data.world[held_out]) == {103}
-    assert set(data.world[train]) == {100, 101, 102}
-    with pytest.raises(ValueError, match="nothing to train on"):
-        data.split(0.99)
+def test_training_learns(trained: SimpleNamespace) -> None:
+    assert trained.run.step == 36
+    assert trained.metrics.mre < 0.5 < trained.first_loss
+    assert trained.shares == sorted(trained.shares) and trained.shares[-1] == 1.0
 
 
-def test_unfinished_folder_opens_and_foreign_ones_do_not(tmp_path: Path) -> None:
-    writer = write_dataset(tmp_path / "cut", stripes(4, 2), 4, (64, 128), {})
-    next(writer), next(writer)
-    assert len(PanoramaDataset(tmp_path / "cut")) == 2
-    with pytest.raises(DatasetError, match="not a panorama data folder"):
-        PanoramaDataset(tmp_path)
-    with pytest.raises(DatasetError, match="wanted"):
-        list(write_dataset(tmp_path / "bad", stripes(1, 1, height=32), 1, (64, 128), {}))
+def test_record_tells_what_made_the_weights(trained: SimpleNamespace) -> None:
+    record = torch.load(trained.path, weights_only=True)["record"]
+    assert record["data"] == {"kind": "stripes", "panoramas": 9} and record["held_out"] == 3
+    assert (record["steps"], record["epochs"], record["command"]) == (36, 12.0, "ic depth train")
+    assert record["device"].startswith("1 x CPU") and record["start"] is None
+    assert record["history"][-1]["mre"] == round(trained.metrics.mre, 5)
+    json.dumps(record)
 
 
-def test_turn_and_mirror_keep_picture_and_depth_together() -> None:
-    depth = torch.arange(32.0).repeat(6, 4, 1)
-    rgb = depth[:, None].repeat(1, 3, 1, 1)
-    turned, distance = turn_and_mirror(rgb, depth, torch.Generator().manual_seed(0))
-    assert torch.equal(turned[:, 0], distance)
-    steps = torch.remainder(distance.diff(dim=-1), 32)
-    assert set(steps.unique().tolist()) == {1.0, 31.0}  # some turned, some mirrored too
-    assert all(sorted(row.tolist()) == list(range(32)) for row in distance[:, 0])
+def test_csv_has_losses_and_metrics(trained: SimpleNamespace) -> None:
+    with trained.path.with_suffix(".csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["step"] for row in rows if row["loss"]][-1] == "36"
+    assert float(rows[0]["loss"]) > 0 and float(rows[0]["panoramas_per_s"]) > 0 and rows[0]["mre"] == ""
+    assert float(rows[-1]["mre"]) == round(trained.metrics.mre, 5)
+    assert any("held-out" in line for line in trained.lines)
 
 
-def test_camera_colours_stay_in_range_and_change() -> None:
-    rgb = torch.full((4, 3, 8, 8), 0.5)
-    changed = camera_colours(rgb, torch.Generator().manual_seed(0))
-    assert changed.min() >= 0 and changed.max() <= 1
-    means = changed.mean(dim=(1, 2, 3))
-    assert means.std() > 0.02
+def test_same_seed_gives_the_same_weights_also_when_taken_up_again(tmp_path: Path) -> None:
+    whole, part = trainer(tmp_path / "whole.pt", 3), trainer(tmp_path / "part.pt", 3)
+    whole.run()
+    for _ in range(4):
+        part.train_step()
+    part.stop = True
+    part.run()
+    again = trainer(tmp_path / "part.pt", 3)
+    again.resume(tmp_path / "part.pt")
+    assert again.step == 4
+    again.run()
+    for one in (whole, part, again):
+        one.close()
+    for mine, other in ((whole.model, again.model), (whole.average, again.average)):
+        assert all(
+            torch.equal(a, b) for a, b in zip(mine.state_dict().values(), other.state_dict().values(), strict=True)
+        )
+    loaded = load_checkpoint(tmp_path / "part.pt")
+    assert all(torch.equal(a, b) for a, b in zip(loaded.parameters(), again.average.parameters(), strict=True))
+
+
+def test_only_a_run_of_this_network_is_taken_up(tmp_path: Path) -> None:
+    run = trainer(tmp_path / "x.pt", 1)
+    torch.save({"config": SliceNetConfig().as_dict(), "state_dict": {}, "resume": {}}, tmp_path / "other.pt")
+    (tmp_path / "broken.pt").write_bytes(b"no checkpoint")
+    for name, words in (("other", "not a checkpoint of a run"), ("broken", "not a checkpoint of tensors"),
+                        ("absent", "no such checkpoint")):  # fmt: skip
+        with pytest.raises(CheckpointError, match=words):
+            run.resume(tmp_path / f"{name}.pt")
+    run.close()
+
+
+def test_pictures_of_another_size_and_no_depth_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="32 x 64, the network takes 64 x 128"):
+        trainer(tmp_path / "x.pt", 1, stripes(12, height=32))
+    far = [Sample(s.rgb, s.depth_m + 20, s.world) for s in stripes(12)]
+    with pytest.raises(ValueError, match="no depth within max_range_m"):
+        trainer(tmp_path / "x.pt", 1, far)
+
+
+def test_truth_that_is_unknown_or_too_far_is_zero() -> None:
+    depth = np.array([[[1.0, 17.0, np.nan, np.inf]]], np.float32)
+    rgb, truth = to_tensors(np.full((1, 1, 4, 3), 51, np.uint8), depth, 16.0, torch.device("cpu"))
+    assert truth.tolist() == [[[1.0, 0.0, 0.0, 0.0]]]
+    assert rgb.shape == (1, 3, 1, 4) and torch.allclose(rgb, torch.tensor(0.2))
+
+
+def test_evaluation_weighs_by_solid_angle(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = SliceNet(TINY)
+    monkeypatch.setattr(SliceNet, "forward", lambda self, x: torch.full((1, 64, 128), 2.0))
+    depth = np.full((64, 128), 2.0, np.float32)
+    depth[:16] = 1.0  # the upper 45° to 90°: (1 - sin 45°) / 2 of the sphere, a quarter of the rows; relative error 1
+    got = evaluate(model, [Sample(np.zeros((64, 128, 3), np.uint8), depth, 0)], 16.0)
+    assert got.mre == pytest.approx((1 - np.sqrt(0.5)) / 2, abs=1e-5)
 
 
 def test_schedule_by_hand() -> None:
@@ -86,69 +139,54 @@ def test_schedule_by_hand() -> None:
     assert schedule(0.0, 0.1) == 0.02
 
 
-def quick(epochs: int) -> TrainingConfig:
-    return TrainingConfig(
-        minutes=60, epochs=epochs, batch_size=3, held_out_share=0.25, threads=1, mixed_precision=False, average=0.8,
-        learning_rate=1e-2,
-    )  # fmt: skip
+def test_average_by_hand() -> None:
+    kept, new = torch.nn.BatchNorm1d(1), torch.nn.BatchNorm1d(1)
+    torch.nn.init.constant_(kept.weight, 1.0), torch.nn.init.constant_(new.weight, 2.0)
+    new.num_batches_tracked.fill_(7)
+    update_average(kept, new, 0.75)
+    assert kept.weight.item() == 1.25 and kept.num_batches_tracked.item() == 7
 
 
-def test_training_learns_records_and_repeats(folder: Path, tmp_path: Path) -> None:
-    data = PanoramaDataset(folder)
-    lines: list[str] = []
-    first = Trainer(data, TINY, quick(20), tmp_path / "a.pt", report=lines.append)
-    begin = first.train_step()
-    metrics = first.run()
-    assert first.step == 60
-    assert metrics.mre < 0.5 < begin
-    assert any("held-out worlds" in line for line in lines)
-    record = torch.load(tmp_path / "a.pt", weights_only=True)["record"]
-    assert record["panoramas"] == {"train": 9, "held_out": 3}
-    assert record["history"][-1]["mre"] == round(metrics.mre, 5)
-    json.dumps(record)
-
-    second = Trainer(data, TINY, quick(20), tmp_path / "b.pt", report=lines.append)
-    assert second.run() == metrics  # one thread, same seed: the same weights
-    same = zip(load_checkpoint(tmp_path / "a.pt").parameters(), second.average.parameters(), strict=True)
-    assert all(torch.equal(a, b) for a, b in same)
+def test_devices_that_are_not_there() -> None:
+    assert Team.join("cpu").device.type == "cpu" and Team.join("cpu").ranks == 1
+    with pytest.raises(ValueError, match="device 'gpu'"):
+        Team.join("gpu")
+    if not torch.cuda.is_available():
+        assert Team.join("auto").device.type == "cpu"
+        with pytest.raises(ValueError, match="sees no CUDA GPU"):
+            Team.join("cuda")
 
 
-def test_training_is_taken_up_again(folder: Path, tmp_path: Path) -> None:
-    data = PanoramaDataset(folder)
-    whole = Trainer(data, TINY, quick(4), tmp_path / "whole.pt", report=lambda _: None)
-    whole.run()
-    part = Trainer(data, TINY, quick(4), tmp_path / "part.pt", report=lambda _: None)
-    for _ in range(5):
-        part.train_step()
-    part.stop = True
-    part.run()
-    again = Trainer(data, TINY, quick(4), tmp_path / "part.pt", report=lambda _: None)
-    again.resume(tmp_path / "part.pt")
-    assert again.step == 5
-    again.run()
-    assert all(torch.equal(a, b) for a, b in zip(whole.model.parameters(), again.model.parameters(), strict=True))
-    with pytest.raises(CheckpointError, match="not a checkpoint of a run"):
-        Trainer(data, TINY, quick(4), tmp_path / "x.pt").resume(_other_checkpoint(tmp_path))
+@pytest.mark.parametrize("key", ["minutes", "batch_size", "learning_rate", "warmup", "brightness"])
+def test_wrong_settings_are_named(key: str) -> None:
+    with pytest.raises(ValueError, match=key):
+        TrainingConfig(**{key: -1})
 
 
-def _other_checkpoint(folder: Path) -> Path:
-    path = folder / "other.pt"
-    torch.save({"config": SliceNetConfig().as_dict(), "state_dict": {}, "resume": {}}, path)
-    return path
+def test_tensorboard_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
 
+    written = []
 
-def test_data_of_another_size_is_refused(folder: Path, tmp_path: Path) -> None:
-    other = SliceNetConfig(backbone="resnet18", height=128, width_multiplier=0.125, lstm_hidden=8)
-    with pytest.raises(DatasetError, match="the network takes"):
-        Trainer(PanoramaDataset(folder), other, quick(1), tmp_path / "x.pt")
+    class SummaryWriter:
+        def __init__(self, folder: str, purge_step: int | None) -> None:
+            written.append((Path(folder).name, purge_step))
 
+        def add_scalar(self, name: str, value: float, step: int) -> None:
+            written.append((name, value, step))
 
-def test_rooms_are_reproducible() -> None:
-    from instant_ic.depth.rooms import RoomsConfig, render_rooms
+        def flush(self) -> None:
+            pass
 
-    recipe = RoomsConfig(worlds=2, poses=2, height=64)
-    first, again = list(render_rooms(recipe)), list(render_rooms(recipe, worlds=[1001]))
-    assert [s.world for s in first] == [1000, 1000, 1001, 1001]
-    np.testing.assert_array_equal(first[2].rgb, again[0].rgb)
-    np.testing.assert_array_equal(first[3].depth_m, again[1].depth_m)
-    assert all((s.depth_m > 0).mean() > 0.99 for s in first)
+        close = flush
+
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=SummaryWriter))
+    log = TrainingLog(tmp_path / "a.pt", 0, lambda line: None)
+    for step in (50, 100):
+        log.row({"step": step, "loss": step / 100}, "line")
+    log.close()
+    assert written == [("a.tensorboard", None), ("loss", 0.5, 50), ("loss", 1.0, 100)]
+    again = TrainingLog(tmp_path / "a.pt", 60, lambda line: None)  # cut off after step 60's checkpoint
+    again.close()
+    assert written[-1] == ("a.tensorboard", 60)
+    assert [line.split(",")[0] for line in (tmp_path / "a.csv").read_text().split()] == ["step", "50"]

@@ -1,0 +1,277 @@
+"""``ic depth train``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import shlex
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from instant_ic.cli.arguments import not_negative, positive, positive_int
+from instant_ic.cli.errors import UserError
+
+if TYPE_CHECKING:
+    from instant_ic.depth.dataset import PanoramaDataset
+    from instant_ic.depth.feeds import Feed, Samples
+    from instant_ic.depth.rooms import RoomsConfig
+    from instant_ic.depth.slicenet import SliceNetConfig
+    from instant_ic.depth.training import Team, Trainer
+
+LICENCE = "Apache-2.0"
+_EPILOG = """examples:
+  ic depth train --minutes 60 --export models/mine.onnx
+  ic depth train --init models/slicenet_small.onnx --learning-rate 5e-4 --minutes 60 --export models/mine.onnx
+  ic depth train --data s3d:/data/Structured3D --data m3d:/data/m3d --network resnet50:512 --minutes 1440
+  torchrun --nproc-per-node 4 -m instant_ic.cli.main depth train --batch-size 32 --minutes 600
+"""
+
+
+def add_parser(commands: Any) -> None:
+    """Adds ``train`` to the subcommands of ``ic depth``."""
+    parser = commands.add_parser(
+        "train",
+        help="train SliceNet on generated worlds and on folders of panoramas",
+        description="Trains SliceNet on worlds that are rendered while it goes on, on folders of panoramas with depth, "
+        "or on both, and exports it. Ctrl-C ends early: the last weights are evaluated, saved and exported. Beside "
+        "the checkpoint stand a CSV of the progress and, where the package is installed, a TensorBoard folder.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    data = parser.add_argument_group("data")
+    data.add_argument("--data", action="append", default=[], metavar="LAYOUT:FOLDER",
+                      help="panoramas with depth: m3d, s2d3d, s3d or plain (docs/depth.md); may be given several times"
+                      )  # fmt: skip
+    data.add_argument("--generated", choices=("wide", "random", "none"), help="generated interiors: of all kinds, only "
+                      "plain random rooms, or none (wide, and none with --data)")  # fmt: skip
+    data.add_argument("--generated-share", type=float, default=0.5, metavar="SHARE",
+                      help="of a batch, beside --data (%(default)s)")  # fmt: skip
+    data.add_argument("--worlds", type=positive_int, default=100_000, help="generated worlds (%(default)s)")
+    data.add_argument("--poses", type=positive_int, default=6, help="panoramas in each (%(default)s)")
+    data.add_argument("--first-world", type=not_negative, default=100_000, metavar="SEED",
+                      help="seed of the first (%(default)s)")  # fmt: skip
+    data.add_argument("--workers", type=not_negative, default=max(1, (os.cpu_count() or 2) - 1), metavar="N",
+                      help="processes that render in the background (%(default)s)")  # fmt: skip
+    data.add_argument("--pool", type=positive_int, default=192, metavar="N",
+                      help="generated panoramas to draw from at a time (%(default)s)")  # fmt: skip
+    data.add_argument("--reuse", type=positive, default=3.0, metavar="N",
+                      help="how often each is used, on average (%(default)s)")  # fmt: skip
+    data.add_argument("--cache", type=Path, metavar="FOLDER", help="render all worlds into this folder first (once) "
+                      "and train on it, instead of rendering on the way")  # fmt: skip
+    training = parser.add_argument_group("training")
+    training.add_argument("--network", default="small", metavar="NAME",
+                          help="small, or BACKBONE:HEIGHT such as resnet50:512 (%(default)s)")  # fmt: skip
+    training.add_argument("--init", type=Path, metavar="FILE", help="begin with the weights of this checkpoint or ONNX")
+    training.add_argument("--minutes", type=positive, default=60.0, help="wall time (%(default)s)")
+    training.add_argument("--epochs", type=positive_int, default=1000, help="most passes over the data (%(default)s)")
+    training.add_argument("--batch-size", type=positive_int, default=8, help="panoramas a step and GPU (%(default)s)")
+    training.add_argument("--learning-rate", type=positive, default=2e-3, metavar="RATE", help="highest (%(default)s)")
+    training.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 (%(default)s)")
+    training.add_argument("--threads", type=positive_int, default=1, help="CPU threads; more only on idle cores "
+                          "(%(default)s)")  # fmt: skip
+    training.add_argument("--seed", type=not_negative, default=0, help="weights, order, augmentation (%(default)s)")
+    training.add_argument("--held-out", type=positive_int, default=48, metavar="N",
+                          help="generated panoramas for evaluation, of worlds of their own (%(default)s)")  # fmt: skip
+    training.add_argument("--checkpoint-s", type=positive, default=300.0, metavar="S",
+                          help="seconds between checkpoints with evaluation (%(default)s)")  # fmt: skip
+    output = parser.add_argument_group("output")
+    output.add_argument("--checkpoint", type=Path, default=Path("runs/depth/slicenet_small.pt"),
+                        help="file of the weights (%(default)s)")  # fmt: skip
+    output.add_argument("--resume", action="store_true", help="go on from the checkpoint")
+    output.add_argument(
+        "--export", type=Path, metavar="ONNX", help="file to write at the end, with manifest and record"
+    )
+    parser.set_defaults(func=train)
+
+
+def train(args: argparse.Namespace) -> int:
+    """``ic depth train``."""
+    from instant_ic.cli.progress import progress
+    from instant_ic.depth.training import Team
+
+    for path in (args.checkpoint, args.export):
+        if path is not None and path.is_dir():
+            raise UserError(f"{path} is a folder; name a file in it", 2)
+    try:
+        network = _network(args.network)
+        team = Team.join(args.device)
+    except ValueError as error:
+        raise UserError(f"ic depth train: {error}", 2) from error
+
+    def report(line: str) -> None:
+        if team.rank == 0:
+            print(line, flush=True)
+
+    try:
+        with contextlib.ExitStack() as stack:
+            trainer = _trainer(args, network, team, report)
+            stack.callback(trainer.close)
+            stack.enter_context(_ends_early(trainer))
+            if team.rank == 0:
+                trainer.bar = stack.enter_context(progress("training"))
+            metrics = trainer.run()
+    except ValueError as error:
+        if type(error) is not ValueError:  # those of our own modules say all
+            raise
+        raise UserError(f"ic depth train: {error}", 2) from error
+    finally:
+        team.leave()
+    if metrics is None:
+        return 0
+    print(json.dumps(metrics.as_dict()), flush=True)
+    if args.export:
+        from instant_ic.depth.export import export_model
+        from instant_ic.depth.slicenet import load_checkpoint
+
+        manifest = export_model(
+            load_checkpoint(args.checkpoint), args.export, args.export.stem, LICENCE, trainer.config.max_range_m,
+            record=trainer.record(), half_weights=True, brightness=trainer.config.brightness,
+        )  # fmt: skip
+        print(f"wrote {args.export} ({args.export.stat().st_size / 1e6:.1f} MB, {manifest.sha256[:12]})", flush=True)
+    return 0
+
+
+def _network(name: str) -> SliceNetConfig:
+    from instant_ic.depth.slicenet import SMALL, SliceNetConfig
+
+    if name == "small":
+        return SMALL
+    backbone, _, height = name.partition(":")
+    if not height.isdigit():
+        raise ValueError(f"--network is small or BACKBONE:HEIGHT, such as resnet50:512 (got {name!r})")
+    return SliceNetConfig(backbone=backbone, height=int(height))
+
+
+def _trainer(args: argparse.Namespace, network: SliceNetConfig, team: Team, report: Any) -> Trainer:
+    from instant_ic.depth.training import Trainer, TrainingConfig
+    from instant_ic.depth.weights import load_start
+
+    config = TrainingConfig(
+        minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, learning_rate=args.learning_rate,
+        threads=args.threads, seed=args.seed, checkpoint_s=args.checkpoint_s,
+    )  # fmt: skip
+    start = load_start(args.init, network) if args.init else None
+    report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas a step")
+    feed, held_out = _data(args, network, team, report)
+    command = (
+        shlex.join(["ic", *sys.argv[1:]]) if team.ranks == 1 else f"torchrun ({team.ranks}): {shlex.join(sys.argv)}"
+    )
+    trainer = Trainer(feed, held_out, network, config, args.checkpoint, team, start, command, report)
+    if args.resume:
+        trainer.resume(args.checkpoint)
+    return trainer
+
+
+def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
+    """Training batches and panoramas for evaluation, as the command line asks for."""
+    from instant_ic.depth.dataset import Subset
+    from instant_ic.depth.feeds import FileFeed, MixedFeed, RenderedFeed
+    from instant_ic.depth.rooms import FIRST_HELD_OUT, RoomsConfig
+
+    generated = args.generated or ("none" if args.data else "wide")
+    if generated == "none" and not args.data:
+        raise ValueError("nothing to train on: give --data LAYOUT:FOLDER, or --generated wide")
+    if args.data:
+        from instant_ic.depth.folders import open_folder
+    folders = [open_folder(name, (network.height, network.width)) for name in args.data]
+    size = args.batch_size
+    own = (
+        0 if generated == "none" else size if not folders else min(size - 1, max(1, round(size * args.generated_share)))
+    )
+    if folders and size - own < len(folders):
+        raise ValueError(f"a batch of {size} leaves no place for each of {len(folders)} folders; raise --batch-size")
+    feeds: list[Feed] = []
+    held_out: list[Subset] = []
+    for number, folder in enumerate(folders):
+        part = (size - own + number) // len(folders)
+        training, kept = folder.split()
+        report(f"{folder.folder}: {len(training)} panoramas to train on, {len(kept)} for evaluation")
+        feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers or 1))
+        held_out.append(Subset(folder, kept))
+    if own:
+        recipe = RoomsConfig(worlds=args.worlds, poses=args.poses, first_world=args.first_world, height=network.height,
+                             interiors=generated)  # fmt: skip
+        if args.cache:
+            data = open_cache(args.cache, recipe, args.workers, team, report)
+            training, kept = data.split(0.08)
+            feeds.append(FileFeed(data, training, own, args.seed, team.rank, team.ranks, data.info))
+            held_out.append(Subset(data, kept))
+        else:
+            worlds = max(2, args.held_out // 2)
+            held = RoomsConfig(worlds=worlds, poses=2, first_world=FIRST_HELD_OUT - worlds, height=network.height,
+                               interiors=generated)  # fmt: skip
+            if args.first_world + args.worlds > held.first_world:
+                raise ValueError(f"worlds from seed {held.first_world} on are for evaluation; lower --worlds")
+            feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
+                                      team.rank, team.ranks))  # fmt: skip
+            if team.rank == 0:
+                report(f"rendering {held.count} panoramas for evaluation")
+                samples = _rendered(held, args.workers)
+                held_out.append(Subset(samples, range(len(samples))))
+    return feeds[0] if len(feeds) == 1 else MixedFeed(feeds), Subset.joined(held_out)
+
+
+def _rendered(recipe: RoomsConfig, workers: int) -> list[Any]:
+    from instant_ic.depth.feeds import Renderers
+
+    with Renderers(recipe, workers, lambda place: recipe.first_world + place % recipe.worlds) as renderers:
+        return [sample for _ in range(recipe.worlds) for sample in renderers.world()]
+
+
+def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, report: Any) -> PanoramaDataset:
+    """The data folder, rendered first (by process 0) where it is absent or not complete.
+
+    Raises:
+        UserError: it was rendered by another recipe.
+    """
+    from instant_ic.depth.dataset import PanoramaDataset, write_dataset
+    from instant_ic.depth.feeds import WORLD_TIMEOUT_S, Renderers
+
+    done = folder / "complete"
+    if not done.exists() and team.rank == 0:
+        begin = time.monotonic()
+        size = (recipe.height, 2 * recipe.height)
+        with Renderers(recipe, workers, lambda place: recipe.first_world + place % recipe.worlds) as renderers:
+            samples = (sample for _ in range(recipe.worlds) for sample in renderers.world())
+            for count in write_dataset(folder, samples, recipe.count, size, recipe.as_dict()):
+                if count % 100 == 0 or count == recipe.count:
+                    rate = count / (time.monotonic() - begin)
+                    report(f"rendered {count} of {recipe.count} panoramas, {rate:.1f} a second")
+        done.touch()
+    end = time.monotonic() + WORLD_TIMEOUT_S + recipe.count
+    while not done.exists():
+        if time.monotonic() > end:
+            raise UserError(f"{folder}: process 0 did not finish rendering")
+        time.sleep(1.0)
+    data = PanoramaDataset(folder)
+    wanted = json.loads(json.dumps(recipe.as_dict()))
+    differs = [key for key, value in wanted.items() if data.info.get(key) != value]
+    if differs:
+        raise UserError(f"{folder} was rendered with another {', '.join(differs)}; name another folder or delete it")
+    return data
+
+
+@contextlib.contextmanager
+def _ends_early(trainer: Trainer) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the training as its schedule would."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, frame: FrameType | None) -> None:
+        trainer.stop = True
+
+    before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
