@@ -111,14 +111,14 @@ class ReadinessConfig:
 
 @dataclass(frozen=True)
 class PictureConfig:
-    """Where a drawn surface's colour comes from: the keyframe's panorama, then the field as it becomes better.
+    """What a picture shows: the keyframe's panorama, warped by its depth, then the field as it becomes better.
 
     The share of the panorama falls linearly in the PSNR of the training rays.
     """
 
-    panorama_until_db: float = 30.0
-    """The panorama alone up to this PSNR."""
-    field_from_db: float = 36.0
+    panorama_until_db: float = 36.0
+    """The panorama alone up to this PSNR. Views of a field are below their warp until about here (docs/nerf.md)."""
+    field_from_db: float = 40.0
     """The field alone from this PSNR on; at or under ``panorama_until_db`` the panorama is never used."""
 
     def panorama_share(self, psnr_db: float) -> float:
@@ -133,6 +133,9 @@ class PictureConfig:
 class VirtualSpaceConfig:
     """Everything about the virtual space but the bus."""
 
+    source: str = "field"
+    """What pictures show: ``field`` (the panorama warped by its depth until the field is better), or ``warp``: the
+    warped panorama alone; nothing is trained."""
     device: str = "auto"
     """``auto`` (CUDA where torch finds it, else numba on the CPU), ``cpu``, ``cuda``, or ``torch-cpu`` (slow)."""
     panorama_width: int = 2048
@@ -149,4 +152,5 @@ class VirtualSpaceConfig:
         check_ranges(self)
         devices = ("auto", "cpu", "cuda", "torch-cpu")
         _require(self.device in devices, "device", self.device, "one of " + ", ".join(devices))
+        _require(self.source in ("field", "warp"), "source", self.source, "field or warp")
         _require(64 <= self.panorama_width <= 8192, "panorama_width", self.panorama_width, "from 64 to 8192")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import functools
+import importlib.util
 import math
 import time
 from collections import deque
@@ -25,6 +26,7 @@ from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
 from .saved import Progress, SavedKeyframe, SavedSpace, read, write
 from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
+from .warp import PanoramaWarp, dissolve
 
 T = TypeVar("T")
 
@@ -114,6 +116,8 @@ class VirtualSpace:
         self._warning = ""
         self._scene: Scene | None = None
         self._kept: list[_Learnt] = []  # keyframes before the newest that were fit, newest first
+        self._warps: list[PanoramaWarp] = []
+        self._can_warp = importlib.util.find_spec("numba") is not None
         self._gains: list[Floats] = [np.ones(3, np.float32)]  # of the keyframes that pictures show
         self._rng = np.random.default_rng(self.config.train.seed)
         self._reset_run(refresh=False)
@@ -131,6 +135,11 @@ class VirtualSpace:
         """The keyframe that pictures show."""
         shown = self._shown
         return shown[0].scene.prior if shown else None
+
+    @property
+    def _done(self) -> bool:
+        """Nothing is left to train."""
+        return self._schedule.finished or self.config.source == "warp"
 
     @property
     def _refreshing(self) -> bool:
@@ -155,7 +164,7 @@ class VirtualSpace:
         rgb: NDArray[np.uint8],
         depth_m: NDArray[np.floating],
         map_from_camera: NDArray[np.floating],
-        relative_sigma: float,
+        relative_sigma: float | NDArray[np.floating],
     ) -> None:
         """Learns a new keyframe; the field goes on from its present weights where it can.
 
@@ -190,7 +199,9 @@ class VirtualSpace:
             raise
         self._scene = scene
         self._reset_run(refresh)
-        self._keep(config.keyframes)
+        if config.source == "warp":
+            self._ready_iterations = 1  # a warp is ready at once
+        self._keep(config.keyframes - 1 if self._ready_iterations else config.keyframes)
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
         """Trains until the time is spent, the iterations are done or the schedule has ended, at least one iteration.
@@ -204,7 +215,7 @@ class VirtualSpace:
         done, distance_error = 0, math.nan
         limit = self.config.train.iterations if iterations is None else iterations
         shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
-        while not self._schedule.finished and done < limit:
+        while not self._done and done < limit:
             uniform = self._rng.random(shape, np.float32)
             colour, distance = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
             self._schedule.iteration += 1
@@ -215,7 +226,7 @@ class VirtualSpace:
                 break
         elapsed = time.perf_counter() - start
         self._train_seconds += elapsed
-        return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._schedule.finished)
+        return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._done)
 
     def _note(self, colour_error: float) -> None:
         first = math.isnan(self._colour_error)
@@ -244,10 +255,10 @@ class VirtualSpace:
             psnr_db=self._psnr_db,
             iterations=iterations,
             train_seconds=self._train_seconds,
-            ready_iterations=self._ready_iterations,
+            ready_iterations=self._ready_iterations if self.config.source == "field" else 0,
             ms_per_iteration=self._train_seconds * 1e3 / iterations if iterations else 0.0,
             ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
-            converged=self._scene is not None and self._schedule.finished,
+            converged=self._scene is not None and self._done,
             device=self._device.name,
             warning=self._warning,
         )
@@ -305,8 +316,7 @@ class VirtualSpace:
         height, width = rays.shape
 
         def draw(device: Device) -> tuple[Floats, Floats, Floats]:
-            share = self.config.picture.panorama_share
-            drawn = [device.draw(rays, share(shown.progress.psnr_db), shown.frozen) for shown in self._shown]
+            drawn = [self._draw(device, rays, shown, warps=projection != "equirect") for shown in self._shown]
             if len(drawn) == 1:
                 return drawn[0]
             parts = zip(self._shown, self._gains, drawn, strict=True)
@@ -317,6 +327,30 @@ class VirtualSpace:
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
         return View(rgb, depth, confidence, projection)
+
+    def _draw(self, device: Device, rays: Rays, shown: _Learnt, warps: bool) -> tuple[Floats, Floats, Floats]:
+        """A keyframe's part of a view: its panorama warped, then the field as it becomes better."""
+        share = self._panorama_share(shown)
+        if share == 0 or not (warps and self._can_warp):
+            return device.draw(rays, share, shown.frozen)
+        warped = self._warp(shown.scene.prior).draw(rays)
+        if share == 1:
+            return warped
+        colour, depth, confidence = device.draw(rays, 0.0, shown.frozen)
+        return dissolve(warped, (colour, depth, confidence), share)
+
+    def _panorama_share(self, shown: _Learnt) -> float:
+        return 1.0 if self.config.source == "warp" else self.config.picture.panorama_share(shown.progress.psnr_db)
+
+    def _warp(self, prior: PanoramaPrior) -> PanoramaWarp:
+        """The keyframe as a warp; made at its first picture, kept as long as pictures show it."""
+        shown = [learnt.scene.prior for learnt in self._shown]
+        self._warps = [warp for warp in self._warps if any(warp.prior is one for one in shown)]
+        for warp in self._warps:
+            if warp.prior is prior:
+                return warp
+        self._warps.append(PanoramaWarp.of_prior(prior))
+        return self._warps[-1]
 
     def _on_device(self, call: Callable[[Device], T]) -> T:
         """Calls; a GPU without memory is left for the CPU where ``device`` is ``auto``, with what is learnt."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .config import GeometryConfig
 from .field import Floats, Rays
-from .prior import PanoramaPrior, area_average, prepare
+from .prior import PanoramaPrior, area_average, prepare, torn_quads
 from .view import View, check_size, checked_pose, continue_unseen, perspective_rays
 
 TORN_RATIO = 0.05
@@ -99,8 +99,7 @@ class PanoramaWarp:
         Raises:
             KeyframeError: the keyframe is no good.
         """
-        config = GeometryConfig(torn_ratio=TORN_RATIO)
-        self._take(prepare(rgb, depth_m, map_from_camera, 0.0, config, panorama_width))
+        self._take(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), panorama_width))
 
     @classmethod
     def of_prior(cls, prior: PanoramaPrior) -> PanoramaWarp:
@@ -120,7 +119,8 @@ class PanoramaWarp:
         )
         none = np.zeros((1, width), np.uint8)
         # The last row's own quads reach down to the pole, where nothing is torn.
-        self._torn = np.concatenate([none, prior.torn[:-1], none, none])
+        torn = torn_quads(prior.inverse_depth, TORN_RATIO)
+        self._torn = np.concatenate([none, torn[:-1], none, none])
         self._halves = _half_step_directions(width, height)
         self._directions = np.ascontiguousarray(self._halves[::2, ::2])
         self._vertices = np.empty((height + 2, width, 3), np.float32)
@@ -134,31 +134,66 @@ class PanoramaWarp:
         Raises:
             ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
         """
+        check_size(width, height)
+        rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
+        colour, depth, confidence = self.draw(rays)
+        depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
+        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence)
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        return View(rgb, depth, confidence)
+
+    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+        """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,) of a perspective view's rays, as
+        ``field.Device.draw``; what has no confidence has no colour.
+        """
         from . import warp_kernels
 
-        check_size(width, height)
-        pose = checked_pose(map_from_camera)
-        rays = perspective_rays(pose, width, height, fov_rad)
-        half = np.float32(math.tan(fov_rad / 2))
-        view_from_camera = (np.linalg.inv(pose) @ self.prior.map_from_camera).astype(np.float32)
-        nearness = np.zeros((height, width), np.float32)
-        marks = np.zeros((height, width), np.uint8)
+        map_from_view, half = _pinhole(rays)
+        view_from_camera = (np.linalg.inv(map_from_view) @ self.prior.map_from_camera).astype(np.float32)
+        nearness = np.zeros(rays.shape, np.float32)
+        marks = np.zeros(rays.shape, np.uint8)
+        aspect = np.float32(rays.shape[0] / rays.shape[1])
         warp_kernels.place_vertices(
-            self._inverse, self._directions, view_from_camera, half, np.float32(height / width),
-            self._vertices, self._outside,
-        )  # fmt: skip
+            self._inverse, self._directions, view_from_camera, half, aspect, self._vertices, self._outside
+        )
         warp_kernels.draw_mesh(
             self._vertices, self._outside, self._inverse, self._torn, self._known, self._halves,
             view_from_camera, half, nearness, marks,
         )  # fmt: skip
-        depth = np.zeros((height, width), np.float32)
-        np.divide(1 / rays.axial.reshape(height, width), nearness, out=depth, where=nearness > 0)
-        confidence = np.array([0, 0.5, 1, 0], np.float32)[marks]
-        colour = np.zeros((height * width, 3), np.float32)
-        self.pyramid.look_up(self._camera_from_map, rays, depth.reshape(-1), confidence.reshape(-1), 1.0, colour)
-        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence)
-        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence)
+        depth = np.zeros(len(rays.axial), np.float32)
+        np.divide(1 / rays.axial, nearness.reshape(-1), out=depth, where=nearness.reshape(-1) > 0)
+        confidence = np.array([0, 0.5, 1, 0], np.float32)[marks.reshape(-1)]
+        colour = np.zeros((len(depth), 3), np.float32)
+        self.pyramid.look_up(self._camera_from_map, rays, depth, confidence, 1.0, colour)
+        return colour, depth, confidence
+
+
+def dissolve(
+    warped: tuple[Floats, Floats, Floats], field: tuple[Floats, Floats, Floats], share: float
+) -> tuple[Floats, Floats, Floats]:
+    """Two pictures of one view, each as ``draw`` gives it: ``share`` of the first; where one has nothing, the other.
+
+    Depth and confidence are those of the larger share.
+    """
+    weights = [share * (warped[2] > 0), (1 - share) * (field[2] > 0)]
+    total = np.maximum(weights[0] + weights[1], np.float32(1e-9))
+    colour = (warped[0] * (weights[0] / total)[:, None] + field[0] * (weights[1] / total)[:, None]).astype(np.float32)
+    first = weights[0] >= weights[1]
+    return colour, np.where(first, warped[1], field[1]), np.where(first, warped[2], field[2])
+
+
+def _pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
+    """Pose (4, 4) of a perspective view, and the tangent of half its horizontal field of view, from its rays."""
+    height, width = rays.shape
+    flat = (rays.directions / rays.axial[:, None]).reshape(height, width, 3)[:: height - 1, :: width - 1]
+    corners = flat.astype(np.float64)
+    ahead = corners.mean(axis=(0, 1))
+    left, up = (corners[:, 0] - corners[:, 1]).mean(axis=0), (corners[0] - corners[1]).mean(axis=0)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in (ahead, left, up)], axis=1)
+    pose[:3, 3] = rays.origin
+    # The outermost pixels' centres lie half a pixel inside the picture's edge.
+    return pose, np.float32(0.5 * np.linalg.norm(left) * width / (width - 1))
 
 
 def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:

@@ -281,7 +281,8 @@ def no_memory(*args):
 @pytest.mark.parametrize("call", ["step", "draw", "set_scene", "freeze"])
 def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monkeypatch):
     monkeypatch.setattr("instant_ic.nerf.space._may_have_cuda", lambda: False)
-    ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1))  # so that the old one is frozen
+    # Ready at once, so that the old one is frozen; pictures by the field.
+    ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), picture=FIELD_ONLY.picture)
     space, whole = trained(6, ready), trained(6, ready)
     monkeypatch.setattr(space._device, call, no_memory)
     assert not space.status.warning

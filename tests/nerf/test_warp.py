@@ -7,8 +7,18 @@ import pytest
 
 from instant_ic.evaluation.pictures import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import KeyframeError, box_room
-from instant_ic.nerf.warp import PanoramaWarp, Pyramid
+from instant_ic.nerf import (
+    FieldConfig,
+    KeyframeError,
+    PictureConfig,
+    State,
+    TrainConfig,
+    VirtualSpace,
+    VirtualSpaceConfig,
+    box_room,
+)
+from instant_ic.nerf.view import perspective_rays
+from instant_ic.nerf.warp import PanoramaWarp, Pyramid, dissolve
 
 FOV = math.pi / 2
 
@@ -132,3 +142,78 @@ def test_what_is_no_keyframe_or_view_is_refused(room, warp):
         warp.render(camera, 8, 8, FOV)
     with pytest.raises(ValueError, match="finite"):
         warp.render(np.full((4, 4), np.nan), 64, 36, FOV)
+
+
+SMALL = VirtualSpaceConfig(
+    device="cpu", field=FieldConfig(log2_table=10), train=TrainConfig(ray_columns=32, ray_rows=16, iterations=50)
+)
+
+
+def test_a_space_shows_the_warp_from_the_first_moment(room, warp):
+    camera, picture = room
+    pose = camera @ pose_matrix(0.5, 0.2)
+    space = VirtualSpace(SMALL)
+    space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.02)
+    first, truth = space.render(pose, 96, 54, FOV), box_room.perspective(pose, 96, 54, FOV)
+    assert np.array_equal(first.rgb, warp.render(pose, 96, 54, FOV).rgb)
+    assert psnr_db(first.rgb, truth.rgb) > 24
+    assert space.status.state == State.TRAINING
+    space.train(iterations=1)
+    assert np.array_equal(space.render(pose, 96, 54, FOV).rgb, first.rgb)  # no jump while the field is worse
+
+
+def test_the_warp_as_the_source_is_ready_at_once_and_trains_nothing(room):
+    camera, picture = room
+    space = VirtualSpace(VirtualSpaceConfig(device="cpu", source="warp"))
+    space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.02)
+    before = space.parameters().table
+    assert space.train(iterations=10).iterations == 0
+    assert np.array_equal(space.parameters().table, before)
+    status = space.status
+    assert (status.state, status.converged, status.iterations) == (State.READY, True, 0)
+    other = camera @ pose_matrix(0.3)
+    moved = box_room.panorama(other, 128)
+    space.set_keyframe(moved.rgb, moved.depth_m, other, 0.02)  # the next one takes over at once
+    assert np.array_equal(space.keyframe.map_from_camera, other)
+    assert not space.status.refreshing
+    with pytest.raises(ValueError, match="source"):
+        VirtualSpaceConfig(source="mesh")
+
+
+def test_warp_and_field_are_dissolved_into_each_other(room):
+    camera, picture = room
+    pose = camera @ pose_matrix(0.4)
+    pictures = []
+    for until, end in ((50.0, 60.0), (-20.0, 60.0), (-20.0, -20.0)):  # warp alone, both, field alone
+        config = VirtualSpaceConfig(
+            device="cpu", field=SMALL.field, train=SMALL.train, picture=PictureConfig(until, end)
+        )
+        space = VirtualSpace(config)
+        space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.02)
+        space.train(iterations=20)
+        pictures.append(space.render(pose, 96, 54, FOV))
+    warped, both, field = (p.rgb.astype(int) for p in pictures)
+    seen = (pictures[0].confidence > 0) & (pictures[2].confidence > 0)
+    low, high = np.minimum(warped, field)[seen] - 1, np.maximum(warped, field)[seen] + 1
+    assert np.all((both[seen] >= low) & (both[seen] <= high))
+    assert psnr_db(pictures[1].rgb, pictures[0].rgb) > psnr_db(pictures[2].rgb, pictures[0].rgb) + 1
+
+
+def test_a_dissolve_by_hand():
+    """0.75 of the first where both have a surface; where one has none, the other alone."""
+    one = np.ones((3, 3), np.float32)
+    first = one * 0.8, np.array([2, 2, 0], np.float32), np.array([1, 1, 0], np.float32)
+    second = one * 0.4, np.array([3, 0, 3], np.float32), np.array([1, 0, 1], np.float32)
+    colour, depth, confidence = dissolve(first, second, 0.75)
+    assert colour[:, 0] == pytest.approx([0.7, 0.8, 0.4])
+    assert depth.tolist() == [2, 2, 3]
+    assert confidence.tolist() == [1, 1, 1]
+
+
+def test_a_views_pose_follows_from_its_rays(warp):
+    from instant_ic.nerf.warp import _pinhole
+
+    pose = pose_matrix(1.0, 2.0, 0.3, 0.1, -0.2, 0.7)
+    found, half = _pinhole(perspective_rays(pose, 96, 54, 1.2))
+    assert found == pytest.approx(pose, abs=1e-5)
+    assert half == pytest.approx(math.tan(0.6), rel=1e-5)
