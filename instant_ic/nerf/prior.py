@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from .config import GeometryConfig
 
+MOST_SIGMA = 0.5
+"""Depth that is more uncertain than this, relative to it, is as good as filled in: views of it are less confident."""
+
 
 class KeyframeError(ValueError):
     """The keyframe cannot be trained from; the message says what is wrong with it."""
@@ -21,10 +24,10 @@ class PanoramaPrior:
     Attributes:
         rgb: panorama, (H, W, 3) uint8.
         inverse_depth: 1/m along the ray, (h, w) float32, h = w/2, holes filled.
-        known: 1 where the depth was measured or estimated, (h, w) uint8.
+        known: 1 where the depth was measured or estimated and is less uncertain than ``MOST_SIGMA``, (h, w) uint8.
         torn: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
         map_from_camera: pose, (4, 4).
-        relative_sigma: standard deviation of the depth, relative to it.
+        relative_sigma: standard deviation of the depth, relative to it: median over the picture.
         band: half width, relative to the depth, of the band in which the signed distance is learnt.
     """
 
@@ -47,7 +50,7 @@ def prepare(
     rgb: NDArray[np.uint8],
     depth_m: NDArray[np.floating],
     map_from_camera: NDArray[np.floating],
-    relative_sigma: float,
+    relative_sigma: float | NDArray[np.floating],
     config: GeometryConfig,
     panorama_width: int,
 ) -> PanoramaPrior:
@@ -57,7 +60,8 @@ def prepare(
         rgb: equirect panorama (H, W, 3) uint8, W = 2 H.
         depth_m: radial depth (h, w) in metres, w = 2 h, 0 = unknown; need not have the panorama's size.
         map_from_camera: camera pose in the map, (4, 4).
-        relative_sigma: one standard deviation of the depth, relative to it.
+        relative_sigma: one standard deviation of the depth, relative to it: one number, or (h, w) for each pixel of
+            the depth, not finite where it is unknown.
         config: geometry parameters.
         panorama_width: a wider panorama is area-averaged to this width.
 
@@ -67,22 +71,21 @@ def prepare(
     _check_panorama(rgb)
     _check_pose(map_from_camera)
     depth = _checked_depth(depth_m, config)
-    if not np.isfinite(relative_sigma) or relative_sigma < 0:
-        raise KeyframeError(f"relative_sigma must be finite and not negative (got {relative_sigma})")
+    sigma, sure = _checked_sigma(relative_sigma, depth_m, depth)
     if rgb.shape[1] > panorama_width:
         rgb = area_average(rgb, panorama_width // 2, panorama_width)
     known = depth > 0
     with np.errstate(divide="ignore"):
         inverse = np.where(known, 1.0 / np.clip(depth, config.min_depth_m, config.max_depth_m), 0.0)
     inverse = fill_holes(inverse.astype(np.float32), known)
-    band = float(np.clip(config.band_sigmas * relative_sigma, config.band_min, config.band_max))
+    band = float(np.clip(config.band_sigmas * sigma, config.band_min, config.band_max))
     return PanoramaPrior(
         rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile anew
         inverse_depth=np.ascontiguousarray(inverse),
-        known=known.astype(np.uint8),
+        known=(known & sure).astype(np.uint8),
         torn=torn_quads(inverse, config.torn_ratio),
         map_from_camera=np.array(map_from_camera, np.float64),
-        relative_sigma=float(relative_sigma),
+        relative_sigma=sigma,
         band=band,
     )
 
@@ -123,6 +126,25 @@ def _checked_depth(depth_m: NDArray[np.floating], config: GeometryConfig) -> NDA
     if share < config.min_known_share:
         raise KeyframeError(f"depth is known in {share:.0%} of the picture, {config.min_known_share:.0%} are needed")
     return depth
+
+
+def _checked_sigma(
+    relative_sigma: float | NDArray[np.floating], depth_m: NDArray[np.floating], depth: NDArray[np.float32]
+) -> tuple[float, NDArray[np.bool_]]:
+    """One number for the picture, and where the depth (after ``_checked_depth``) is sure enough, (h, w)."""
+    sigma = np.asarray(relative_sigma, np.float32)
+    if sigma.ndim == 0:
+        if not np.isfinite(sigma) or sigma < 0:
+            raise KeyframeError(f"relative_sigma must be finite and not negative (got {relative_sigma})")
+        return float(relative_sigma), np.ones(depth.shape, bool)
+    if sigma.shape != depth_m.shape:
+        raise KeyframeError(f"relative_sigma must be one number or as the depth {depth_m.shape} (got {sigma.shape})")
+    step = max(1, depth_m.shape[1] // 1024)
+    sigma = sigma[::step, ::step][: depth.shape[0], : depth.shape[1]]
+    known = (depth > 0) & np.isfinite(sigma)
+    if not known.any() or float(sigma[known].min()) < 0:
+        raise KeyframeError("relative_sigma must be finite somewhere and nowhere negative")
+    return float(np.median(sigma[known])), known & (sigma <= MOST_SIGMA)
 
 
 def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

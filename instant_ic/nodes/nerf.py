@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.depth.keyframes import decode_sigma
 from instant_ic.msg import (
     CompressedImage,
     Keyframe,
@@ -235,7 +236,9 @@ class NerfNode(Node[NerfConfig]):
         rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
         if keyframe.depth.encoding != "32FC1":
             raise KeyframeError(f"depth must be 32FC1 (got {keyframe.depth.encoding!r})")
-        space.set_keyframe(rgb, image_array(keyframe.depth), pose_matrix(keyframe.pose), keyframe.relative_sigma)
+        each = keyframe.sigma.data.size > 0
+        sigma = decode_sigma(image_array(keyframe.sigma)) if each else keyframe.relative_sigma
+        space.set_keyframe(rgb, image_array(keyframe.depth), pose_matrix(keyframe.pose), sigma)
 
     # -- back on the node's thread -------------------------------------------------------------------
 

@@ -1,0 +1,47 @@
+"""The uncertainty of a keyframe's depth, pixel by pixel."""
+
+import numpy as np
+import pytest
+
+from instant_ic.nerf import KeyframeError, box_room
+from instant_ic.nerf.config import GeometryConfig
+from instant_ic.nerf.prior import prepare
+
+CAMERA = np.eye(4)
+PICTURE = box_room.panorama(CAMERA, 64)
+
+
+def prior(sigma, depth=PICTURE.depth_m):
+    return prepare(PICTURE.rgb, depth, CAMERA, sigma, GeometryConfig(band_min=0.01, band_max=0.5), 2048)
+
+
+def test_one_number_and_a_picture_of_it_are_the_same() -> None:
+    one, each = prior(0.1), prior(np.full(PICTURE.depth_m.shape, 0.1, np.float32))
+    assert each.relative_sigma == pytest.approx(one.relative_sigma) and each.band == pytest.approx(one.band)
+    assert (each.known == 1).all() and (each.inverse_depth == one.inverse_depth).all()
+
+
+def test_the_median_of_what_is_known_counts_and_guesses_are_not_known() -> None:
+    sigma = np.full(PICTURE.depth_m.shape, 0.02, np.float32)
+    depth = PICTURE.depth_m.copy()
+    sigma[:4], sigma[4:8], depth[4:8] = 0.7, np.inf, 0
+    found = prior(sigma, depth)
+    assert found.relative_sigma == pytest.approx(0.02) and found.band == pytest.approx(0.04)
+    assert (found.known[:8] == 0).all() and (found.known[8:] == 1).all()
+    # A guess is kept as it is, what is unknown is filled from around.
+    np.testing.assert_allclose(1 / found.inverse_depth[:4], depth[:4], rtol=1e-5)
+    assert (found.inverse_depth[4:8] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("sigma", "words"),
+    [
+        (np.full((8, 16), 0.1), "one number or as the depth"),
+        (np.full(PICTURE.depth_m.shape, np.inf), "finite somewhere"),
+        (np.full(PICTURE.depth_m.shape, -0.1), "nowhere negative"),
+        (float("nan"), "relative_sigma must be finite"),
+    ],
+)
+def test_a_sigma_that_is_none_is_refused(sigma, words) -> None:
+    with pytest.raises(KeyframeError, match=words):
+        prior(sigma)
