@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES
+from ..depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES, DepthFileError, load_depth
 
+_PNG_UNKNOWN_M = 65.5345
 _NEAREST_MEDIAN_M, _FARTHEST_MEDIAN_M = 0.05, 150.0
 
 
@@ -45,6 +46,25 @@ def pair(pictures: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, P
         names = ", ".join(sorted(path.name for path in found)[:5]) or "nothing"
         raise PairError(f"no depth file has the stem of a picture ({pictures[0].name}, ... against {names}, ...)")
     return pairs
+
+
+def load_truth(path: Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
+    """True radial depth (H, W) in metres, 0 = unknown; see ``depth.files.load_depth``.
+
+    Args:
+        path: of the file.
+        png_unit_m: metres of one step of a PNG (Stanford2D3D: 1/512, Matterport3D: 1/4000). Its largest value, 65535,
+            is unknown.
+
+    Raises:
+        DepthFileError: as ``load_depth``; also when everything is unknown.
+    """
+    depth = load_depth(path)
+    if path.suffix.lower() == ".png":
+        depth = np.where(depth < _PNG_UNKNOWN_M, depth * np.float32(png_unit_m / 1e-3), np.float32(0))
+        if not depth.any():
+            raise DepthFileError(f"{path}: no known depth in it: all values are 0 or 65535")
+    return depth
 
 
 def unit_warning(depth_m: NDArray[np.floating]) -> str:

@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from instant_ic.cli.main import main
+from instant_ic.depth.files import DepthFileError
 from instant_ic.depth.metrics import depth_metrics
 from instant_ic.evaluation import depth_pictures
 from instant_ic.evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, look_up, report
-from instant_ic.evaluation.depth_files import PairError, find_pictures, pair, unit_warning
+from instant_ic.evaluation.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
 from instant_ic.evaluation.depth_lidar import Errors, measure, measure_world
 from instant_ic.evaluation.depth_pictures import Sheets
 from instant_ic.evaluation.depth_worlds import FIRST_SEED, held_out, scenes
@@ -264,6 +265,18 @@ def test_units_that_look_wrong_are_told():
     assert "metres where millimetres" in unit_warning(room / 1000)
 
 
+def test_a_png_has_its_own_unit_and_unknown_values(tmp_path):
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.array([[512, 1024], [0, 65535]], np.uint16))
+    assert np.allclose(load_truth(path, 1 / 512), [[1, 2], [0, 0]])
+    assert np.allclose(load_truth(path), [[0.512, 1.024], [0, 0]])
+    cv2.imwrite(str(path), np.full((4, 8), 65535, np.uint16))
+    with pytest.raises(DepthFileError, match=r"a.png: no known depth"):
+        load_truth(path)
+    np.save(tmp_path / "b.npy", np.full((4, 8), 70.0))
+    assert np.all(load_truth(tmp_path / "b.npy", 1 / 512) == 70)
+
+
 def test_pages_of_pictures(tmp_path, monkeypatch):
     monkeypatch.setattr(depth_pictures, "ROWS", 2)
     scored = Evaluator(Settings("lidar", LidarSettings()), None).score("raum-ä", RGB, box_room())
@@ -347,6 +360,7 @@ def test_command_without_truth_draws_only(folder):
         (("--json", "none/o.json"), "no folder none"),
         (("--model", "none.onnx"), "none"),
         (("--camera-height", "-1"), "above 0"),
+        (("--png-unit", "0"), "above 0"),
         (("--plot", "o.gif"), "written as .png"),
         (("--json", "."), ". cannot be written"),
         (("--depth", "{}/a.png", "--lidar", "--outliers", "2"), "outliers must lie"),

@@ -47,6 +47,8 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of noise and outliers (default: %(default)s)")
     parser.add_argument("--method", default="", metavar="RULE",
                         help="of scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)")  # fmt: skip
+    parser.add_argument("--png-unit", type=float, default=1e-3, metavar="M",
+                        help="metres of one step of a depth PNG (default: %(default)g)")  # fmt: skip
     parser.add_argument("--max-depth", type=float, metavar="M", help="leave out truth farther than this")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads of the model (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
@@ -59,11 +61,11 @@ def add_kind(kinds: Any) -> None:
 
 def evaluate_depth(args: argparse.Namespace) -> int:
     """Runs ``ic evaluate depth``; returns the exit status."""
-    from ...depth.files import DepthFileError, load_depth, load_picture
+    from ...depth.files import DepthFileError, load_picture
     from ...depth.manifest import ManifestError
     from ...depth.model import DEFAULT_MODEL, DepthModel, InferenceError
     from ...evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, report
-    from ...evaluation.depth_files import PairError, find_pictures, pair, unit_warning
+    from ...evaluation.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
     from ...evaluation.depth_pictures import Sheets
     from ...paths import shipped_file
     from ..progress import progress
@@ -74,6 +76,8 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     for file in (args.plot, args.side):
         if file is not None and file.suffix.lower() != ".png":
             raise UserError(f"{file}: sheets are written as .png", 2)
+    if not args.png_unit > 0:
+        raise UserError(f"--png-unit must be above 0 (got {args.png_unit:g})", 2)
     if args.lidar and not args.depth:
         raise UserError("--lidar measures the true depth: give --depth too", 2)
     if args.source not in (None, "network") and not args.lidar:
@@ -101,7 +105,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
             try:
                 if args.depth and truth is None:
                     raise PairError(f"{image}: no depth file of this stem")
-                truth_m = load_depth(truth) if truth is not None else None
+                truth_m = load_truth(truth, args.png_unit) if truth is not None else None
                 warning = unit_warning(truth_m) if truth_m is not None else ""
                 if warning:
                     warnings.append(f"{truth}: {warning}")
