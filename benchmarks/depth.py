@@ -80,7 +80,7 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def score(scene: Scene, number: int, made: dict[str, Evaluator], share: float, sheets: dict[str, Sheets]) -> Any:
+def score(scene: Scene, number: int, made: dict[str, Evaluator], share: float, sheets: list[Sheets]) -> Any:
     """Rows of one panorama by source."""
     points = measure_world(
         scene.renderer, scene.map_from_camera, LIDAR_HEIGHT_M, scene.camera_height_m,
@@ -88,8 +88,8 @@ def score(scene: Scene, number: int, made: dict[str, Evaluator], share: float, s
     )  # fmt: skip
     for name, evaluator in made.items():
         scored = evaluator.score(scene.name, scene.rgb, scene.depth_m, points if evaluator.settings.lidar else None)
-        if name in sheets and not share:
-            sheets[name].add(scored)
+        for sheet in sheets if name == "fused" and share else []:
+            sheet.add(scored)
         yield name, scored.as_dict()
 
 
@@ -111,7 +111,7 @@ def table(results: dict[str, Any]) -> str:
 
 
 def targets(results: dict[str, Any]) -> dict[str, dict[str, bool]]:
-    """For each set with 5 % outliers: what issue's target the fused source meets."""
+    """For each set with 5 % outliers: which targets the fused source meets."""
     met = {}
     for kind, shares in results.items():
         sources = shares["5 %"]
@@ -138,7 +138,9 @@ def main() -> int:
     parser.add_argument("--method", default="", help="of scaling (default: the scaler's)")
     parser.add_argument("--threads", type=int, default=2, help="of the model (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
-    parser.add_argument("--sheets", type=Path, metavar="DIR", help="sheets of pictures of the fused source")
+    parser.add_argument(
+        "--sheets", type=Path, metavar="DIR", help="sheets of pictures of the fused source, 5 %% outliers"
+    )
     args = parser.parse_args()
     model = Remembered(DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads))
     results: dict[str, Any] = {}
@@ -147,14 +149,14 @@ def main() -> int:
             print("mesh: not measured, no --mesh given", file=sys.stderr)
             continue
         rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
-        sheets = {"fused": Sheets(args.sheets / f"{kind}.png")} if args.sheets else {}
+        sheets = [Sheets(args.sheets / f"{kind}{end}.png", bool(end)) for end in ("", "-side")] if args.sheets else []
         made = {share: evaluators(model, share, args.method) for share in (0.0, 0.05)}
         for number, scene in enumerate(scenes(kind, args.count, args.mesh if kind == "mesh" else None)):
             for share, each in made.items():
                 for name, row in score(scene, number, each, share, sheets):
                     rows.setdefault(f"{share:.0%}".replace("%", " %"), {}).setdefault(name, []).append(row)
             print(f"{kind}: {scene.name}", file=sys.stderr, flush=True)
-        for sheet in sheets.values():
+        for sheet in sheets:
             sheet.close()
         results[kind] = {share: {name: summary(each) for name, each in of.items()} for share, of in rows.items()}
     figures = {
