@@ -83,6 +83,15 @@ def test_depth_is_taken_unchecked_only_where_it_is_asked_for() -> None:
     assert all("trust_depth" not in {a.name for a in read_arguments(find_launch_file(n))} for n in ("robot", "full"))
 
 
+def test_lidar_alone_starts_no_network() -> None:
+    for name in ("station", "full", "sim", "replay"):
+        with_network, without = nodes(name), nodes(name, depth_source="lidar")
+        assert set(with_network) - set(without) == {"depth_estimator"}
+        assert " source:=" not in with_network["depth_scaler"] and " source:=lidar" in without["depth_scaler"]
+        assert " source:=network" in nodes(name, depth_source="network")["depth_scaler"]
+    assert "depth_estimator" not in nodes("replay", depth_source="lidar")["bag_player"]
+
+
 def test_robot_leaves_to_the_configuration_what_is_not_given() -> None:
     found = nodes("robot")
     assert "url:=" not in found["theta_camera"] and "roboclaw.port" not in found["crawler_base"]
