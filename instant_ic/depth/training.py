@@ -159,8 +159,8 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
 
 def to_tensors(rgb: np.ndarray, depth: np.ndarray, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor]:
     """A batch (B, 3, H, W) in 0..1 and its truth (B, H, W), 0 where it is unknown or too far."""
-    pictures = torch.from_numpy(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
-    truth = torch.from_numpy(depth).to(device)
+    pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
+    truth = torch.tensor(depth).to(device)
     return pictures, torch.where(torch.isfinite(truth) & (truth <= max_range_m), truth, 0.0)
 
 
