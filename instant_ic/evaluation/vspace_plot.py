@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from .pictures import new_figure, save_figure
 from .vspace import Report
 
+_TILE = 320
+"""Width of a strip's pictures, pixels."""
 _LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 
 
@@ -35,16 +39,31 @@ def save_plot(path: Path, report: Report) -> None:
 
 
 def save_strip(path: Path, report: Report) -> None:
-    """Pictures: a row each distance and path, the truth first, then the sources."""
-    rows = [(name, distance) for name, strip in report.strips.items() for distance in sorted(strip)]
-    if not rows:
-        raise ValueError("the paths end before the first picture of the strip")
+    """Pictures: a row each path and distance, the truth first, then the sources.
+
+    Raises:
+        ValueError: there is no picture, or the file cannot be written.
+    """
+    import cv2
+
     names = ["truth", *report.settings.sources]
+    lines = []
+    for route, strip in report.strips.items():
+        for distance in sorted(strip):
+            tiles = []
+            for name in names:
+                tile = cv2.resize(strip[distance][name], (_TILE, _tile_height(report)), interpolation=cv2.INTER_AREA)
+                tile = cv2.copyMakeBorder(tile, 18, 2, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+                words = f"{name}, {route} {distance:g} m"
+                cv2.putText(tile, words, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (0, 0, 0), 1, cv2.LINE_AA)
+                tiles.append(tile)
+            lines.append(np.hstack(tiles))
+    if not lines:
+        raise ValueError("the paths end before the first picture of the strip")
+    if not cv2.imwrite(str(path), np.vstack(lines)[..., ::-1]):
+        raise ValueError(f"{path}: cannot be written as a picture")
+
+
+def _tile_height(report: Report) -> int:
     width, height = report.settings.size
-    drawn, axes = new_figure(len(rows), len(names), (2.1 * len(names), (2.1 * height / width + 0.25) * len(rows)))
-    for (name, distance), line in zip(rows, axes, strict=True):
-        for source, axis in zip(names, line, strict=True):
-            axis.imshow(report.strips[name][distance][source])
-            axis.set_title(f"{source}, {name} {distance:g} m", fontsize=7)
-            axis.set_axis_off()
-    save_figure(drawn, path)
+    return max(round(_TILE * height / width), 1)

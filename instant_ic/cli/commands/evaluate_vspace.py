@@ -91,15 +91,18 @@ def run(args: argparse.Namespace) -> int:
     except ValueError as error:
         raise UserError(f"ic evaluate vspace: {error}", 2) from error
     figures = report.figures()
-    if args.json:
-        args.json.write_text(json.dumps(figures, indent=2) + "\n")
-    if args.plot or args.strip:
-        from ...evaluation.vspace_plot import save_plot, save_strip
+    try:
+        if args.json:
+            args.json.write_text(json.dumps(figures, indent=2) + "\n")
+        if args.plot or args.strip:
+            from ...evaluation.vspace_plot import save_plot, save_strip
 
-        if args.plot:
-            save_plot(args.plot, report)
-        if args.strip:
-            save_strip(args.strip, report)
+            if args.plot:
+                save_plot(args.plot, report)
+            if args.strip:
+                save_strip(args.strip, report)
+    except (OSError, ValueError) as error:
+        raise UserError(f"ic evaluate vspace: {error}") from error
     for key, label in (("psnr_db", "PSNR, dB"), ("ssim", "SSIM")):
         for path, sources in report.table(key).items():
             distances = sorted({distance for values in sources.values() for distance in values if distance % 0.5 == 0})
