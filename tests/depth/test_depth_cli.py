@@ -21,11 +21,12 @@ def ic(*words: str) -> int:
 
 def test_train_export_estimate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cache, weights = str(tmp_path / "rooms"), str(tmp_path / "small.pt")
-    words = ("train", "--cache", cache, "--worlds", "2", "--poses", "1", "--batch-size", "1", "--checkpoint", weights)
+    words = ("train", "--cache", cache, "--worlds", "2", "--poses", "1", "--batch-size", "1", "--workers", "0",
+             "--checkpoint", weights)  # fmt: skip
     assert ic(*words, "--epochs", "1", "--export", str(tmp_path / "first.onnx")) == 0
     assert (tmp_path / "rooms" / "complete").exists()
     record = json.loads((tmp_path / "first.json").read_text())
-    assert record["steps"] == 1 and record["data"]["first_world"] == 1000
+    assert record["steps"] == 1 and record["data"]["first_world"] == 100_000
     assert load_manifest(tmp_path / "first.yaml").input_height == 256
 
     assert ic(*words, "--epochs", "2", "--resume") == 0  # the cache is not rendered again
