@@ -103,11 +103,10 @@ def _scenes(kind: str, count: int, mesh: Path | None, height: int) -> Iterator[S
 
 
 def _places(world: World, count: int, stem: str) -> NDArray[np.float64]:
-    """(count, 3) x, y, yaw: known places first, looking along x."""
-    known = np.array([(x, y, 0.0) for x, y in _MESH_POSITIONS.get(stem, ())]).reshape(-1, 3)[:count]
-    if len(known) == count:
-        return known
-    return np.vstack([known, world.sample_free_poses(np.random.default_rng([5, FIRST_SEED]), count - len(known))])
+    """(count, 3) x, y, yaw: known places first, looking along x; the first ones are the same whatever the count."""
+    known = [np.array([x, y, 0.0]) for x, y in _MESH_POSITIONS.get(stem, ())][:count]
+    rngs = (np.random.default_rng([5, FIRST_SEED, k]) for k in range(count - len(known)))
+    return np.array(known + [world.sample_free_poses(rng, 1)[0] for rng in rngs])
 
 
 def _scene(name: str, renderer: EquirectRenderer, x: float, y: float, yaw: float, height: int) -> Scene:

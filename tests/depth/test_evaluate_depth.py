@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import arrays
 from instant_ic.cli.main import main
 from instant_ic.depth.files import DepthFileError
 from instant_ic.depth.metrics import depth_metrics
-from instant_ic.evaluation import depth_pictures
+from instant_ic.evaluation import depth_pictures, depth_worlds
 from instant_ic.evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, look_up, report
 from instant_ic.evaluation.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
 from instant_ic.evaluation.depth_lidar import Errors, measure, measure_world
@@ -118,6 +118,9 @@ def test_held_out_scenes_are_always_the_same_and_no_training_world(scene):
     assert (name, height) == (scene.name, scene.camera_height_m)
     assert np.array_equal(rgb, scene.rgb)
     assert np.array_equal(truth, scene.depth_m)
+    one, two = (list(depth_worlds._places(scene.renderer.world, count, "small_house")) for count in (6, 7))
+    assert np.array_equal(one, two[:6])
+    assert two[0].tolist() == [3.2, -2.2, 0]
     for wrong in (("attic", 1, None), ("random", 0, None), ("mesh", 1, None), ("corridor", 1, "house.glb")):
         with pytest.raises(ValueError, match=r"must be|needs"):
             scenes(*wrong)
