@@ -121,6 +121,16 @@ class PictureConfig:
     field_from_db: float = 40.0
     """The field alone from this PSNR on; at or under ``panorama_until_db`` the panorama is never used."""
 
+    least_depth_share: Share = 0.5
+    """Of the keyframe's depth in where surfaces lie, at least; otherwise the panorama's share counts here too."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+    def depth_share(self, psnr_db: float) -> float:
+        """Share of the keyframe's depth in the signed distance, 0..1."""
+        return max(self.panorama_share(psnr_db), self.least_depth_share)
+
     def panorama_share(self, psnr_db: float) -> float:
         """Share of the panorama's colour, 0..1; 1 where nothing is known yet (NaN)."""
         span = self.field_from_db - self.panorama_until_db

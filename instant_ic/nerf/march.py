@@ -117,6 +117,17 @@ def prior_agrees(x, y, z, inverse, torn, known, tolerance):  # type: ignore[no-u
 
 
 @njit(**_OPTIONS)
+def prior_distance(x, y, z, inverse, torn, band):  # type: ignore[no-untyped-def]
+    """Signed distance of a point of the camera frame to the prior's surface in its direction, in units of the band."""
+    height, width = inverse.shape
+    flat = math.sqrt(x * x + y * y)
+    u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
+    v = np.float32((math.pi / 2 - math.atan2(z, flat)) * (height / math.pi) - 0.5)
+    away = math.sqrt(flat * flat + z * z)
+    return (np.float32(1) - away * prior_inverse_depth(inverse, torn, u, v)) / band
+
+
+@njit(**_OPTIONS)
 def grid_span(origin, direction, low, cell, shape):  # type: ignore[no-untyped-def]
     """Where a ray enters and leaves the grid; entry > exit when it misses it."""
     enter, leave = 0.0, 1e9
@@ -165,13 +176,16 @@ def along(target_from_source, origin, direction, t):  # type: ignore[no-untyped-
 @njit(**_OPTIONS)
 def trace(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, grid, low, cell,
-    inverse, torn, known, camera_from_map, band, origin, directions, pixels, depth, confidence
+    inverse, torn, known, camera_from_map, band, share, origin, directions, pixels, depth, confidence
 ):  # fmt: skip
     """Marches rays to the first zero of the signed distance that agrees with the keyframe's depth.
+
+    The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
 
     Args:
         grid, low, cell: of the ``Occupancy``.
         inverse, torn, known, band: of the ``PanoramaPrior``; camera_from_map: (4, 4) float32.
+        share: of the prior in the distance, 0..1; with 1 the field is not asked at all.
         origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
         pixels: (N,) which of them to march.
         depth: out, (P,): metres along the ray, 0 where it meets nothing.
@@ -215,18 +229,22 @@ def trace(  # type: ignore[no-untyped-def]
         size = 0
         for start in range(0, queries, BLOCK):
             block = min(BLOCK, queries - start)
-            for i in range(block):
-                n = active[start + i]
-                for c in range(3):
-                    points[i, c] = origin[c] + t[n] * directions[pixels[n], c]
-            encode_block(table, cells_per_m, lattice_origin, focus, points, 0, block, x)
-            layer_block(w1, b1, x, h)
-            relu_block(h)
-            layer_block(head, bias, h, s)
+            if share < 1:
+                for i in range(block):
+                    n = active[start + i]
+                    for c in range(3):
+                        points[i, c] = origin[c] + t[n] * directions[pixels[n], c]
+                encode_block(table, cells_per_m, lattice_origin, focus, points, 0, block, x)
+                layer_block(w1, b1, x, h)
+                relu_block(h)
+                layer_block(head, bias, h, s)
             for i in range(block):
                 n = active[start + i]
                 pixel = pixels[n]
                 value, before = s[0, i], last_s[n]
+                if share > 0:
+                    px, py, pz = along(camera_from_map, origin, directions[pixel], t[n])
+                    value += share * (prior_distance(px, py, pz, inverse, torn, band) - value)
                 if t[n] - last_t[n] > 3 * cell:
                     before = NOT_SEEN
                 hit = t[n]

@@ -101,11 +101,11 @@ class NumbaDevice:
         return replace(self._drawn, parameters=self.parameters())
 
     def draw(
-        self, rays: Rays, panorama_share: float, frozen: DrawnField | None = None
+        self, rays: Rays, panorama_share: float, depth_share: float, frozen: DrawnField | None = None
     ) -> tuple[Floats, Floats, Floats]:
         height, width = rays.shape
         drawn = frozen or self._drawn
-        axial_depth, confidence = self._trace(drawn, rays)
+        axial_depth, confidence = self._trace(drawn, rays, depth_share)
         depth = axial_depth / rays.axial
         colour = np.zeros((height * width, 3), np.float32)
         if panorama_share < 1:
@@ -127,14 +127,14 @@ class NumbaDevice:
         kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, points, out)
         colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
 
-    def _trace(self, drawn: DrawnField, rays: Rays) -> tuple[Floats, Floats]:
+    def _trace(self, drawn: DrawnField, rays: Rays, depth_share: float) -> tuple[Floats, Floats]:
         """Depth along the view's axis and confidence: every 4th pixel first, then what cannot be interpolated."""
         height, width = rays.shape
         depth = np.zeros(height * width, np.float32)
         confidence = np.zeros(height * width, np.float32)
         index = np.arange(height * width, dtype=np.int32).reshape(height, width)
         stride = min(self.first_stride, rays.stride)
-        self._march(drawn, rays, index[::stride, ::stride].reshape(-1).copy(), depth, confidence)
+        self._march(drawn, rays, depth_share, index[::stride, ::stride].reshape(-1).copy(), depth, confidence)
         listed = np.empty(height * width, np.int32)
         stride //= 2
         while stride >= 1:
@@ -145,18 +145,20 @@ class NumbaDevice:
                 np.float32(DEPTH_TOLERANCE),
                 listed,
             )
-            self._march(drawn, rays, listed[:count], depth, confidence)
+            self._march(drawn, rays, depth_share, listed[:count], depth, confidence)
             stride //= 2
         return depth, confidence
 
-    def _march(self, drawn: DrawnField, rays: Rays, pixels: np.ndarray, depth: Floats, confidence: Floats) -> None:
+    def _march(
+        self, drawn: DrawnField, rays: Rays, depth_share: float, pixels: np.ndarray, depth: Floats, confidence: Floats
+    ) -> None:
         scene, p = drawn.scene, drawn.parameters
         prior, grid = scene.prior, scene.occupancy
         march.trace(
             p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, drawn.focus,
             grid.distance, grid.origin, np.float32(grid.cell_m),
             prior.inverse_depth, prior.torn, prior.known, drawn.camera_from_map, np.float32(prior.band),
-            rays.origin, rays.directions, pixels, depth, confidence,
+            np.float32(depth_share), rays.origin, rays.directions, pixels, depth, confidence,
         )  # fmt: skip
         depth[pixels] *= rays.axial[pixels]
 

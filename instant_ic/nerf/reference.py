@@ -195,6 +195,15 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
     return torch.where(torch.where(prior.torn[top, left], any_near, between), seen, torch.zeros_like(seen))
 
 
+def prior_distance(prior: TorchPrior, points: Tensor) -> Tensor:
+    """Signed distance of points (N, 3) of the camera frame to the prior's surface, in bands; as in ``march``."""
+    height, width = prior.inverse_depth.shape
+    x, y, z = points.unbind(1)
+    u = (math.pi - torch.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
+    v = (math.pi / 2 - torch.atan2(z, torch.hypot(x, y))) * (height / math.pi) - 0.5
+    return (1 - points.norm(dim=1) * prior_inverse_depth(prior, u, v)) / prior.band
+
+
 @torch.no_grad()
 def mix_panorama(
     prior: TorchPrior,
@@ -217,7 +226,7 @@ def mix_panorama(
 
 @torch.no_grad()
 def trace(
-    field: TorchField, grid: TorchGrid, prior: TorchPrior, origin: Tensor, directions: Tensor
+    field: TorchField, grid: TorchGrid, prior: TorchPrior, share: float, origin: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Depth along each ray, 0 where it meets nothing, and confidence, both (N,); see ``march.trace``."""
     count = directions.shape[0]
@@ -235,7 +244,10 @@ def trace(
         active = active[t[active] >= 0]
         here = t[active]
         points = origin + here[:, None] * directions[active]
-        value = query(field, points)[:, 3]
+        local = points @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]
+        value = share * prior_distance(prior, local)
+        if share < 1:
+            value = value + (1 - share) * query(field, points)[:, 3]
         gap = here - last_t[active] > 3 * grid.cell_m
         before = torch.where(gap, torch.full_like(value, NOT_SEEN), last_s[active])
         crossing = last_t[active] + (here - last_t[active]) * before / (before - value)

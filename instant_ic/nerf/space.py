@@ -330,13 +330,13 @@ class VirtualSpace:
 
     def _draw(self, device: Device, rays: Rays, shown: _Learnt, warps: bool) -> tuple[Floats, Floats, Floats]:
         """A keyframe's part of a view: its panorama warped, then the field as it becomes better."""
-        share = self._panorama_share(shown)
+        share, depth_share = self._panorama_share(shown), self.config.picture.depth_share(shown.progress.psnr_db)
         if share == 0 or not (warps and self._can_warp):
-            return device.draw(rays, share, shown.frozen)
+            return device.draw(rays, share, depth_share, shown.frozen)
         warped = self._warp(shown.scene.prior).draw(rays)
         if share == 1:
             return warped
-        colour, depth, confidence = device.draw(rays, 0.0, shown.frozen)
+        colour, depth, confidence = device.draw(rays, 0.0, depth_share, shown.frozen)
         return dissolve(warped, (colour, depth, confidence), share)
 
     def _panorama_share(self, shown: _Learnt) -> float:

@@ -103,25 +103,35 @@ class TorchDevice:
 
     @torch.no_grad()
     def draw(
-        self, rays: Rays, panorama_share: float, frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None
+        self,
+        rays: Rays,
+        panorama_share: float,
+        depth_share: float,
+        frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None,
     ) -> tuple[Floats, Floats, Floats]:
         drawn = frozen or (self._field, self._prior, self._grid)
         origin = torch.from_numpy(rays.origin).to(self._device)
         directions = torch.from_numpy(rays.directions).to(self._device)
-        parts = [self._draw(*drawn, origin, part, panorama_share) for part in directions.split(RAYS_AT_ONCE)]
+        shares = panorama_share, depth_share
+        parts = [self._draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
     @staticmethod
     def _draw(
-        field: TorchField, prior: TorchPrior, grid: TorchGrid, origin: Tensor, directions: Tensor, share: float
+        field: TorchField,
+        prior: TorchPrior,
+        grid: TorchGrid,
+        origin: Tensor,
+        directions: Tensor,
+        shares: tuple[float, float],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        depth, confidence = reference.trace(field, grid, prior, origin, directions)
+        depth, confidence = reference.trace(field, grid, prior, shares[1], origin, directions)
         met = torch.nonzero(depth)[:, 0]
         colour = torch.zeros_like(directions)
         points = origin + depth[met, None] * directions[met]
         colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
-        reference.mix_panorama(prior, origin, directions, depth, confidence, share, colour)
+        reference.mix_panorama(prior, origin, directions, depth, confidence, shares[0], colour)
         return colour, depth, confidence
 
     def parameters(self, frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None) -> FieldParameters:
