@@ -20,6 +20,8 @@ def warm_up(config: VirtualSpaceConfig) -> None:
         config,
         field=dataclasses.replace(config.field, log2_table=10),
         train=dataclasses.replace(config.train, ray_columns=8, ray_rows=8),
+        # Pictures of both the warp and the field.
+        picture=dataclasses.replace(config.picture, panorama_until_db=-1e3, field_from_db=1e3),
     )
     space = VirtualSpace(small)
     rgb = np.zeros((32, 64, 3), np.uint8)
@@ -27,3 +29,4 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     space.set_keyframe(rgb, np.full((32, 64), 2.0, np.float32), np.eye(4), 0.05)
     space.train(iterations=1)
     space.render(np.eye(4), 32, 16, math.pi / 2)
+    space.render_equirect(np.eye(4), 64)

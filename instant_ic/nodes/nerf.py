@@ -328,10 +328,17 @@ class NerfNode(Node[NerfConfig]):
             return "warming up: kernels are being compiled"
         if self.keyframe is None:
             return "waiting for the first keyframe"
+        space = self.config.space
+        if space.source == "warp":
+            return "the panorama warped by its depth; nothing is trained (source: warp)"
         if self.status.converged:
-            return f"trained, {self.status.psnr_db:.1f} dB; idle"
-        words = f"training, {self.status.psnr_db:.1f} dB" if self.status.iterations else "training"
-        return f"{words}; keyframe {self.keyframe.id} takes over soon" if self.status.refreshing else words
+            words = f"trained, {self.status.psnr_db:.1f} dB; idle"
+        else:
+            words = f"training, {self.status.psnr_db:.1f} dB" if self.status.iterations else "training"
+        if self.status.refreshing:
+            return f"{words}; keyframe {self.keyframe.id} takes over soon"
+        share = space.picture.panorama_share(self.status.psnr_db)
+        return f"{words}; shown: {share:.0%} warped panorama" if share > 0 else words
 
     def frames_per_second(self, now_ns: int) -> float:
         """Over the last 20 pictures; 0 when none was drawn for 2 s."""

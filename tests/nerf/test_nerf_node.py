@@ -1,5 +1,7 @@
 """The node in lockstep: keyframe in, status and views out, bad keyframes refused."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
@@ -102,6 +104,30 @@ def test_trains_draws_and_comes_to_rest(bus):
     psnr = 10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2))
     assert psnr > 20  # a flat grey of the right mean scores about 15
     assert len(bus.messages("/vspace/image/compressed")) == 2
+
+
+def test_the_first_view_comes_before_any_training(bus):
+    bus.publish("/keyframe", keyframe_message(number=4), latched=True)
+    bus.publish("/view/request", request_message(1))
+    (view,) = bus.messages("/vspace/view")
+    picture = cv2.imdecode(view.image.data, cv2.IMREAD_COLOR)[..., ::-1]
+    truth = box_room.perspective(CAMERA, 160, 90, 1.57).rgb
+    assert 10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2)) > 20
+    status = bus.last("/vspace/status")
+    assert (status.state, status.iterations) == (TRAINING, 0)
+    assert "100% warped panorama" in status.message
+
+
+def test_the_warp_as_the_source_is_ready_with_the_keyframe():
+    with LockstepBus(start_ns=10 * S) as bus:
+        bus.add(NerfNode, NerfConfig(space=dataclasses.replace(SPACE, source="warp")))
+        bus.publish("/keyframe", keyframe_message(number=4), latched=True)
+        bus.advance(1.0)
+        status = bus.last("/vspace/status")
+        assert (status.state, status.keyframe_id, status.iterations) == (READY, 4, 0)
+        assert "source: warp" in status.message
+        bus.publish("/view/request", request_message(1))
+        assert bus.last("/vspace/view").confidence > 0.9
 
 
 def test_the_same_input_gives_the_same_bytes():
