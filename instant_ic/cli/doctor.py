@@ -183,7 +183,7 @@ def check_models() -> Iterator[Finding]:
     except FileNotFoundError:
         models = []
     if not models:
-        yield Finding(FAIL, "models", "there is no model file", "install the package again, or ic depth export")
+        yield Finding(FAIL, "models", "there is no model file", "install the package again, or ic depth train")
         return
     import onnxruntime
 

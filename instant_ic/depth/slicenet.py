@@ -292,8 +292,14 @@ class SliceNet(nn.Module):
         self.bi_rnn = nn.LSTM(features, config.lstm_hidden, num_layers=2, bidirectional=True)
         self.decoder = nn.ModuleList(_decoder_stages(config))
         # Not persistent: the published state has no such keys.
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("mean", torch.zeros(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.ones(1, 3, 1, 1), persistent=False)
+        self.set_normalisation()
+
+    def set_normalisation(self) -> None:
+        """Mean and spread of ImageNet's colours, which no checkpoint holds."""
+        self.mean.copy_(torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
+        self.std.copy_(torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
 
     def forward(self, x: Tensor) -> Tensor:
         levels = self.feature_extractor((x - self.mean) / self.std)
@@ -347,11 +353,13 @@ def load_checkpoint(path: str | Path) -> SliceNet:
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path}: its 'state_dict' does not hold tensors by name")
     config = _config(path, payload)
-    with torch.device("meta"):  # shapes only, before memory is taken
-        expected = {key: tuple(value.shape) for key, value in SliceNet(config).state_dict().items()}
+    with torch.device("meta"):  # shapes only: nothing is filled with numbers that are replaced at once
+        model = SliceNet(config)
+    expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     _check_state(f"{path}: does not fit {config.backbone}, {config.height} x {config.width}", state, expected)
-    model = SliceNet(config)
+    model.to_empty(device="cpu")
     model.load_state_dict(state, strict=True)
+    model.set_normalisation()
     return model.eval()
 
 

@@ -7,9 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tiny_onnx
 
 from instant_ic.cli.commands import depth
-from instant_ic.depth.manifest import load_manifest
+from instant_ic.cli.errors import UserError
+from instant_ic.depth.manifest import ModelManifest, save_manifest
 
 
 def ic(*words: str) -> int:
@@ -19,37 +21,53 @@ def ic(*words: str) -> int:
     return int(args.func(args))
 
 
-def test_train_export_estimate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cache, weights = str(tmp_path / "rooms"), str(tmp_path / "small.pt")
-    words = ("train", "--cache", cache, "--worlds", "2", "--poses", "1", "--batch-size", "1", "--workers", "0",
-             "--checkpoint", weights)  # fmt: skip
-    assert ic(*words, "--epochs", "1", "--export", str(tmp_path / "first.onnx")) == 0
-    assert (tmp_path / "rooms" / "complete").exists()
-    record = json.loads((tmp_path / "first.json").read_text())
-    assert record["steps"] == 1 and record["data"]["first_world"] == 100_000
-    assert load_manifest(tmp_path / "first.yaml").input_height == 256
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    """A metric model whose depth is ten times the red channel."""
+    path = tmp_path / "tiny.onnx"
+    nodes = tiny_onnx.channel("image", 0, "depth")
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
+    save_manifest(ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_scale=10.0), path.with_suffix(".yaml"))
+    return path
 
-    assert ic(*words, "--epochs", "2", "--resume") == 0  # the cache is not rendered again
-    assert "rendered" not in capsys.readouterr().out.split("step")[-1]
-    assert ic("export", weights, "--output", str(tmp_path / "second.onnx"), "--half", "--max-range", "12") == 0
-    assert load_manifest(tmp_path / "second.yaml").max_range_m == 12.0
-    assert json.loads((tmp_path / "second.json").read_text())["steps"] == 2
 
-    picture = np.random.default_rng(0).integers(0, 256, (512, 1024, 3), np.uint8)
+def test_estimate(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = np.zeros((128, 256, 3), np.uint8)
+    picture[..., 2] = 102  # red, as OpenCV orders it: 0.4, 4 m
     cv2.imwrite(str(tmp_path / "pano.png"), picture)
     out, npy = tmp_path / "depth.png", tmp_path / "depth.npy"
-    model = str(tmp_path / "second.onnx")
-    assert ic("estimate", str(tmp_path / "pano.png"), "--model", model, "--output", str(out), "--npy", str(npy)) == 0
-    assert cv2.imread(str(out)).shape == (256, 512, 3)
-    assert np.load(npy).shape == (256, 512) and np.load(npy).max() <= 12.0
-    assert "on cpu" in capsys.readouterr().out
+    words = ("estimate", str(tmp_path / "pano.png"), "--model", str(tiny), "-o", str(out), "--npy", str(npy))
+    assert ic(*words, "--provider", "cpu") == 0
+    assert cv2.imread(str(out)).shape == (64, 128, 3)
+    np.testing.assert_allclose(np.load(npy), 4.0, rtol=1e-5)
+    assert "tiny on cpu" in capsys.readouterr().out
+    assert ic(*words, "--provider", "cuda") == 0
+    assert "runs on cpu; cuda: " in capsys.readouterr().err
 
 
-def test_faults_are_told_and_end_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert ic("estimate", str(tmp_path / "absent.jpg")) == 1
-    assert "absent.jpg: not a readable picture" in capsys.readouterr().err
-    cv2.imwrite(str(tmp_path / "pano.png"), np.zeros((64, 128, 3), np.uint8))
-    assert ic("estimate", str(tmp_path / "pano.png"), "--model", str(tmp_path / "absent.onnx")) == 1
-    assert "no manifest" in capsys.readouterr().err
-    assert ic("export", str(tmp_path / "absent.pt"), "--output", str(tmp_path / "x.onnx")) == 1
-    assert "absent.pt: no such file" in capsys.readouterr().err
+def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert ic("check", str(tiny), "--threads", "1") == 0
+    told = capsys.readouterr().out
+    for part in ("licence  MIT", "image: tensor(float) [1, 3, 64, 128]", "cpu, CPU threads: 1", "s a panorama"):
+        assert part in told
+    assert ic("check", str(tiny.with_suffix(".yaml")), "--json", "--runs", "1") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["manifest"]["name"] == "tiny" and record["provider"] == "cpu"
+    assert record["depth_shape"] == [64, 128] and 0 < record["depth_range"][1] <= 10.0
+    assert 0 < record["seconds"] < 60
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("estimate", "absent.jpg"), "absent.jpg: not a readable picture"),
+        (("estimate", "{pano}", "--model", "absent.onnx"), "absent.yaml: no manifest"),
+        (("estimate", "{pano}", "--model", "{tiny}", "-o", "/proc/nowhere/x.png"), "cannot write"),
+        (("check", "absent.onnx"), "absent.yaml: no manifest"),
+    ],
+)
+def test_faults_are_told(tiny: Path, tmp_path: Path, words: tuple[str, ...], message: str) -> None:
+    pano = tmp_path / "pano.png"
+    cv2.imwrite(str(pano), np.zeros((64, 128, 3), np.uint8))
+    with pytest.raises(UserError, match=message):
+        ic(*(word.format(pano=pano, tiny=tiny) for word in words))

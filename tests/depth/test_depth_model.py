@@ -1,18 +1,20 @@
-"""Export, manifest and ONNX inference of a tiny network; the shipped model."""
+"""Manifest and ONNX inference; the shipped model."""
 
 import hashlib
 import json
-from dataclasses import replace
+import tempfile
+from dataclasses import fields, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import torch
+import tiny_onnx
 import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from instant_ic.depth.colour import depth_picture
-from instant_ic.depth.export import export_model, export_onnx
 from instant_ic.depth.manifest import (
     ManifestError,
     ModelManifest,
@@ -21,95 +23,50 @@ from instant_ic.depth.manifest import (
     save_manifest,
 )
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-from instant_ic.depth.slicenet import SliceNet, SliceNetConfig
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.paths import shipped_file
 
-TINY = SliceNetConfig(
-    backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=16, column_stride=2, decoder_floor=8
-)
-
-
-def random_network(seed: int = 0) -> SliceNet:
-    """Random weights with norms that have seen pictures, so that the output varies over a few metres."""
-    torch.manual_seed(seed)
-    model = SliceNet(TINY)
-    for module in model.modules():
-        if isinstance(module, torch.nn.BatchNorm2d):
-            module.momentum = None  # plain mean over the batches that follow
-            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
-            torch.nn.init.normal_(module.bias, 0.0, 0.2)
-    torch.nn.init.constant_(model.decoder[-1].layers[1].bias, 3.0)
-    with torch.no_grad():
-        for _ in range(2):
-            model(torch.rand(2, 3, 64, 128))
-    return model.eval()
-
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SliceNet]:
-    folder = tmp_path_factory.mktemp("model")
-    model = random_network()
-    export_model(model, folder / "tiny.onnx", "tiny", "Apache-2.0", 16.0, record={"steps": 3}, half_weights=False)
-    return folder / "tiny.onnx", model
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network whose depth is the red channel as it comes in."""
+    path = tmp_path_factory.mktemp("model") / "tiny.onnx"
+    nodes = tiny_onnx.channel("image", 0, "depth")
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
+    save_manifest(ModelManifest("tiny.onnx", "tiny", "Apache-2.0", 64, 128), manifest_path(path))
+    return path
 
 
 def panorama(height: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (height, 2 * height, 3), np.uint8)
+    return np.random.default_rng(seed).integers(1, 256, (height, 2 * height, 3), np.uint8)
 
 
-def test_onnx_computes_what_torch_does(exported: tuple[Path, SliceNet]) -> None:
-    path, network = exported
-    picture = panorama(64)
-    with torch.inference_mode():
-        expected = network(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255)[0].numpy()
-    got = DepthModel.load(path, threads=1).estimate(picture)
-    assert got.shape == (64, 128) and got.dtype == np.float32
-    assert np.ptp(expected) > 0.5  # the comparison means something
-    np.testing.assert_allclose(got, expected.clip(0.1, 16.0), atol=1e-5 * np.abs(expected).max(), rtol=1e-5)
-
-
-def test_same_picture_same_bits(exported: tuple[Path, SliceNet]) -> None:
-    picture = panorama(64)
-    first = DepthModel.load(exported[0], threads=2)
-    second = DepthModel.load(exported[0], threads=2)
+def test_same_picture_same_bits() -> None:
+    picture, path = panorama(64), shipped_file("models", DEFAULT_MODEL)
+    first, second = DepthModel.load(path, threads=2), DepthModel.load(path, threads=2)
     results = [m.estimate(picture).tobytes() for m in (first, first, second)]
     assert results[0] == results[1] == results[2]
 
 
-def test_training_record_stands_beside_the_model(exported: tuple[Path, SliceNet]) -> None:
-    record = json.loads(exported[0].with_suffix(".json").read_text())
-    assert record["steps"] == 3
-    assert record["export"]["difference"] < 1e-5
-
-
-def test_half_weights_halve_the_file(tmp_path: Path) -> None:
-    model = random_network()
-    export_onnx(model, tmp_path / "full.onnx")
-    result = export_onnx(model, tmp_path / "half.onnx", half_weights=True)
-    assert (tmp_path / "half.onnx").stat().st_size < 0.65 * (tmp_path / "full.onnx").stat().st_size
-    assert 0 < result["half_difference"] < 1e-2
-
-
-def test_large_pictures_are_averaged(exported: tuple[Path, SliceNet]) -> None:
+def test_large_pictures_are_averaged(plain: Path) -> None:
     small = panorama(64)
     large = small.repeat(4, axis=0).repeat(4, axis=1)
-    model = DepthModel.load(exported[0])
+    model = DepthModel.load(plain)
     np.testing.assert_array_equal(model.prepare(large), model.prepare(small))
     checkered = np.zeros((128, 256, 3), np.uint8)
     checkered[::2, ::2] = checkered[1::2, 1::2] = 200  # every 2 x 2 block averages to 100
     np.testing.assert_allclose(model.prepare(checkered), 100 / 255, rtol=1e-6)
 
 
-def load_with(exported: tuple[Path, SliceNet], tmp_path: Path, **changes: object) -> DepthModel:
-    manifest = replace(load_manifest(manifest_path(exported[0])), **changes)
-    (tmp_path / "tiny.onnx").write_bytes(exported[0].read_bytes())
+def load_with(plain: Path, tmp_path: Path, **changes: object) -> DepthModel:
+    manifest = replace(load_manifest(manifest_path(plain)), **changes)
+    (tmp_path / "tiny.onnx").write_bytes(plain.read_bytes())
     save_manifest(manifest, tmp_path / "tiny.yaml")
     return DepthModel.load(tmp_path / "tiny.onnx")
 
 
-def test_normalisation_and_channel_order(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
-    model = load_with(exported, tmp_path, channels="bgr", mean=(0.5, 0.0, 0.0), std=(1.0, 2.0, 4.0))
+def test_normalisation_and_channel_order(plain: Path, tmp_path: Path) -> None:
+    model = load_with(plain, tmp_path, channels="bgr", mean=(0.5, 0.0, 0.0), std=(1.0, 2.0, 4.0))
     picture = np.zeros((64, 128, 3), np.uint8)
     picture[..., 2] = 255  # blue, the first channel of bgr
     prepared = model.prepare(picture)[0, :, 0, 0]
@@ -118,8 +75,8 @@ def test_normalisation_and_channel_order(exported: tuple[Path, SliceNet], tmp_pa
     np.testing.assert_allclose(model.prepare(picture)[0, :, 0, 0], [0.5, 0.0, 0.25])
 
 
-def test_exposure_is_brought_to_the_trainings(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
-    model = load_with(exported, tmp_path, brightness=120.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
+def test_exposure_is_brought_to_the_trainings(plain: Path, tmp_path: Path) -> None:
+    model = load_with(plain, tmp_path, brightness=120.0, mean=(0.0, 0.0, 0.0), std=(1.0, 1.0, 1.0))
     picture = np.full((64, 128, 3), 40, np.uint8)
     picture[32:] = 80  # mean 60: everything is doubled
     prepared = model.prepare(picture)[0, 0, :, 0] * 255
@@ -128,22 +85,22 @@ def test_exposure_is_brought_to_the_trainings(exported: tuple[Path, SliceNet], t
     np.testing.assert_allclose(model.prepare(np.full_like(picture, 240)) * 255, 120, atol=0.5)
 
 
-def test_scale_range_and_planar(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
-    plain = load_with(exported, tmp_path, output_kind="relative").estimate(panorama(64))
-    scaled = load_with(exported, tmp_path, output_kind="relative", output_scale=2.0).estimate(panorama(64))
-    np.testing.assert_allclose(scaled, 2 * plain, rtol=1e-6)
-    planar = load_with(exported, tmp_path, output_kind="relative", geometry="planar").estimate(panorama(64))
+def test_scale_range_and_planar(plain: Path, tmp_path: Path) -> None:
+    before = load_with(plain, tmp_path, output_kind="relative").estimate(panorama(64))
+    scaled = load_with(plain, tmp_path, output_kind="relative", output_scale=2.0).estimate(panorama(64))
+    np.testing.assert_allclose(scaled, 2 * before, rtol=1e-6)
+    planar = load_with(plain, tmp_path, output_kind="relative", geometry="planar").estimate(panorama(64))
     # Planar depth is along the axis of the cube face: forward the same, towards a cube's corner 1/sqrt(3) of radial.
     factor = 1 / np.abs(equirect_directions(128, 64)).max(axis=-1)
     assert factor.max() == pytest.approx(np.sqrt(3), rel=0.03)
-    np.testing.assert_allclose(planar, plain * factor, rtol=1e-5)
-    cut = load_with(exported, tmp_path, min_range_m=0.2, max_range_m=0.3).estimate(panorama(64))
+    np.testing.assert_allclose(planar, before * factor, rtol=1e-5)
+    cut = load_with(plain, tmp_path, min_range_m=0.2, max_range_m=0.3).estimate(panorama(64))
     assert cut.min() >= np.float32(0.2) and cut.max() <= np.float32(0.3)
 
 
-def test_picture_of_another_type_is_refused(exported: tuple[Path, SliceNet]) -> None:
+def test_picture_of_another_type_is_refused(plain: Path) -> None:
     with pytest.raises(ValueError, match="uint8"):
-        DepthModel.load(exported[0]).estimate(np.zeros((64, 128, 3), np.float32))
+        DepthModel.load(plain).estimate(np.zeros((64, 128, 3), np.float32))
 
 
 def write_manifest(folder: Path, **changes: object) -> Path:
@@ -169,6 +126,17 @@ def write_manifest(folder: Path, **changes: object) -> Path:
         ({"max_range_m": -1}, "max_range_m must be a number above 0"),
         ({"max_range_m": 0.05}, "max_range_m must be above min_range_m"),
         ({"name": 7}, "name must be text"),
+        ({"name": ""}, "name must not be empty"),
+        ({"input_scale": "1e-3"}, "YAML wants a point in it"),
+        ({"output_scale": float("nan")}, "output_scale must be a number above 0"),
+        ({"input_height": True}, "input_height must be a whole number"),
+        ({"input_layout": "hwc"}, "input_layout must be one of nchw, nhwc"),
+        ({"mask_means": "sky"}, "mask_means must be one of valid, invalid"),
+        ({"mask_threshold": "half"}, "mask_threshold must be a number"),
+        ({"output_form": "inverse", "output_kind": "disparity"}, "output_form inverse needs output_kind metric"),
+        ({"output_form": "points", "geometry": "planar"}, "geometry must be radial with output_form points"),
+        ({"mask_output": "m", "depth_output": "m"}, "mask_output and depth_output are the same"),
+        ({"sha256": "abc"}, "sha256 must be 64 digits"),
     ],
 )
 def test_bad_manifest_says_what_is_wrong(tmp_path: Path, changes: dict[str, object], message: str) -> None:
@@ -176,6 +144,34 @@ def test_bad_manifest_says_what_is_wrong(tmp_path: Path, changes: dict[str, obje
     with pytest.raises(ManifestError, match=message) as caught:
         load_manifest(path)
     assert str(path) in str(caught.value)
+
+
+def test_the_line_of_a_fault_and_keys_that_stand_twice(tmp_path: Path) -> None:
+    path = tmp_path / "m.yaml"
+    head = "model: m.onnx\nname: m\nlicence: x\ninput_height: 64\ninput_width: 128\n"
+    path.write_text(head + "geometry: flat\n")
+    with pytest.raises(ManifestError, match=r"m\.yaml:6: geometry must be one of"):
+        load_manifest(path)
+    path.write_text(head + "colour: rgb\n")
+    with pytest.raises(ManifestError, match=r"m\.yaml:6: unknown key colour"):
+        load_manifest(path)
+    path.write_text(head + "name: n\n")
+    with pytest.raises(ManifestError, match=r"m\.yaml:6: name stands here again \(first in line 2\)"):
+        load_manifest(path)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(max_size=60) | st.dictionaries(st.sampled_from([f.name for f in fields(ModelManifest)]), st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.lists(st.integers(), max_size=3)
+)).map(yaml.safe_dump))  # fmt: skip
+def test_any_text_is_a_manifest_or_a_manifest_error(text: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "m.yaml"
+        path.write_text(text, encoding="utf-8", newline="")
+        try:
+            load_manifest(path)
+        except ManifestError as error:
+            assert str(path) in str(error)
 
 
 def test_missing_and_unreadable_manifests(tmp_path: Path) -> None:
@@ -195,15 +191,15 @@ def test_manifest_round_trip(tmp_path: Path) -> None:
     assert load_manifest(tmp_path / "a.yaml") == manifest
 
 
-def test_model_that_does_not_fit_its_manifest(exported: tuple[Path, SliceNet], tmp_path: Path) -> None:
+def test_model_that_does_not_fit_its_manifest(plain: Path, tmp_path: Path) -> None:
     with pytest.raises(ManifestError, match="the manifest says"):
-        load_with(exported, tmp_path, input_height=128, input_width=256)
+        load_with(plain, tmp_path, input_height=128, input_width=256)
     with pytest.raises(ManifestError, match="no output 'valid' for the mask"):
-        load_with(exported, tmp_path, mask_output="valid")
+        load_with(plain, tmp_path, mask_output="valid")
     with pytest.raises(ManifestError, match="no output besides the mask"):
-        load_with(exported, tmp_path, mask_output="depth")
+        load_with(plain, tmp_path, mask_output="depth")
     with pytest.raises(ManifestError, match="SHA-256"):
-        load_with(exported, tmp_path, sha256="0" * 64)
+        load_with(plain, tmp_path, sha256="0" * 64)
     path = write_manifest(tmp_path)
     with pytest.raises(ManifestError, match="does not exist"):
         DepthModel.load(path)

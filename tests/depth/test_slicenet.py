@@ -1,6 +1,8 @@
 """The network: published names and shapes, geometry of a panorama, checkpoints."""
 
-import hashlib
+import os
+import pickle
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -18,8 +20,51 @@ from instant_ic.depth.slicenet import (
 
 TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=16)
 KEYS = Path(__file__).resolve().parents[2].parent / "shared" / "facts" / "slicenet_keys.txt"
-# SHA-256 over the sorted lines "name shape" of the published ResNet-50 model, 512 x 1024.
-KEYS_SHA256 = "f48ab914fb4008517cb50e93d2328b7655f92c78b4f2d21d957df6403a59d7e7"
+
+
+def norm(name: str, channels: int) -> dict[str, tuple[int, ...]]:
+    parts = ("weight", "bias", "running_mean", "running_var")
+    return {f"{name}.{part}": (channels,) for part in parts} | {f"{name}.num_batches_tracked": ()}
+
+
+def stage(name: str, inputs: int, outputs: int) -> dict[str, tuple[int, ...]]:
+    conv = {f"{name}.layers.0.1.weight": (outputs, inputs, 3, 3), f"{name}.layers.0.1.bias": (outputs,)}
+    return conv | norm(f"{name}.layers.1", outputs) | {f"{name}.layers.2.weight": (outputs,)}
+
+
+def published_keys(full_size: bool = True) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the authors' ResNet-50 checkpoints, written out without the network under test."""
+    root = "feature_extractor.encoder"
+    keys = {f"{root}.conv1.1.weight": (64, 3, 7, 7)} | norm(f"{root}.bn1", 64)
+    inputs = 64
+    for level, (blocks, planes) in enumerate(((3, 64), (4, 128), (6, 256), (3, 512)), start=1):
+        for block in range(blocks):
+            name = f"{root}.layer{level}.{block}"
+            keys |= {f"{name}.conv1.weight": (planes, inputs, 1, 1)} | norm(f"{name}.bn1", planes)
+            keys |= {f"{name}.conv2.1.weight": (planes, planes, 3, 3)} | norm(f"{name}.bn2", planes)
+            keys |= {f"{name}.conv3.weight": (4 * planes, planes, 1, 1)} | norm(f"{name}.bn3", 4 * planes)
+            if block == 0:
+                keys |= {f"{name}.downsample.0.weight": (4 * planes, inputs, 1, 1)}
+                keys |= norm(f"{name}.downsample.1", 4 * planes)
+            inputs = 4 * planes
+    for level, channels in enumerate((256, 512, 1024, 2048)):
+        for part in range(3):
+            wide, narrow = channels // 2**part, channels // 2 ** (part + 1)
+            keys |= stage(f"slicing_module.slc_lst.{level}.layer.{part}", wide, narrow)
+    for layer, features in enumerate((2048 if full_size else 1024, 1024)):
+        for way in ("", "_reverse"):
+            keys |= {
+                f"bi_rnn.weight_ih_l{layer}{way}": (2048, features),
+                f"bi_rnn.weight_hh_l{layer}{way}": (2048, 512),
+            }
+            keys |= {f"bi_rnn.bias_{part}_l{layer}{way}": (2048,) for part in ("ih", "hh")}
+    inputs = 1024
+    for index in range(9 if full_size else 8):
+        last = index == (8 if full_size else 7)
+        outputs = 1 if last else max(4, inputs // 2)
+        keys |= stage(f"decoder.{index}", inputs, outputs)
+        inputs = outputs
+    return keys
 
 
 def names_and_shapes(model: SliceNet) -> list[str]:
@@ -33,15 +78,21 @@ def published() -> SliceNet:
 
 
 def test_published_names_and_shapes(published: SliceNet) -> None:
-    lines = names_and_shapes(published)
+    lines = [f"{key} {shape}" for key, shape in published_keys().items()]
     assert len(lines) == 502
-    assert hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest() == KEYS_SHA256
+    assert sorted(names_and_shapes(published)) == sorted(lines)
     assert sum(p.numel() for p in published.parameters()) == 79_511_672
+    with torch.device("meta"):
+        half = SliceNet(SliceNetConfig(height=256))
+    assert sorted(names_and_shapes(half)) == sorted(f"{key} {shape}" for key, shape in published_keys(False).items())
 
 
+@pytest.mark.real_data
 @pytest.mark.skipif(not KEYS.is_file(), reason="the list of published keys is not beside the checkout")
 def test_published_names_line_by_line(published: SliceNet) -> None:
-    assert names_and_shapes(published) == KEYS.read_text().splitlines()
+    lines = KEYS.read_text().splitlines()
+    assert names_and_shapes(published) == lines
+    assert sorted(f"{key} {shape}" for key, shape in published_keys().items()) == sorted(lines)
 
 
 def test_half_size_has_the_published_sequence(published: SliceNet) -> None:
@@ -91,36 +142,124 @@ def test_own_checkpoint_loads_strictly(tmp_path: Path) -> None:
         assert torch.equal(loaded(picture), model(picture))
 
 
-def test_published_layout_loads_strictly(tmp_path: Path, published: SliceNet) -> None:
-    # A checkpoint of the published layout, filled with numbers that tell each tensor from the others.
-    state = {
-        key: torch.full(value.shape, float(index), dtype=value.dtype)
-        for index, (key, value) in enumerate(published.state_dict().items())
+def random_state(keys: dict[str, tuple[int, ...]]) -> dict[str, torch.Tensor]:
+    """Random numbers, one for each output channel, so that 75 million parameters make a small file."""
+    generator = torch.Generator().manual_seed(0)
+    return {
+        key: torch.rand((shape[0], *[1] * len(shape[1:])), generator=generator).expand(shape)
+        if shape
+        else torch.tensor(7)
+        for key, shape in keys.items()
     }
+
+
+def test_published_layout_loads_strictly(tmp_path: Path) -> None:
+    state = random_state(published_keys())
     path = tmp_path / "resnet50.pth"
     torch.save({"kwargs": {"backbone": "resnet50", "full_size": True}, "state_dict": state}, path)
-    loaded = load_checkpoint(path).state_dict()
-    assert all(loaded[key].flatten()[0] == index for index, key in enumerate(state))
-    del state["bi_rnn.weight_ih_l0"]
-    torch.save({"kwargs": {"backbone": "resnet50", "full_size": True}, "state_dict": state}, path)
-    with pytest.raises(CheckpointError, match=r"bi_rnn\.weight_ih_l0"):
+    model = load_checkpoint(path)
+    assert (model.config.height, model.training) == (512, False)
+    assert model.mean.flatten().tolist() == pytest.approx([0.485, 0.456, 0.406])
+    loaded = model.state_dict()
+    assert all(torch.equal(loaded[key], value) for key, value in state.items())
+
+
+@pytest.mark.parametrize(("backbone", "full_size"), [("resnet18", False), ("resnet34", True)])
+def test_smaller_backbones_load_strictly(tmp_path: Path, backbone: str, full_size: bool) -> None:
+    with torch.device("meta"):
+        expected = SliceNet(SliceNetConfig(backbone=backbone, height=512 if full_size else 256)).state_dict()
+    state = random_state({key: tuple(value.shape) for key, value in expected.items()})
+    path = tmp_path / "small.pth"
+    torch.save({"kwargs": {"backbone": backbone, "full_size": full_size}, "state_dict": state}, path)
+    assert load_checkpoint(path).config.backbone == backbone
+
+
+def tiny_checkpoint(path: Path, **changes: object) -> Path:
+    """A checkpoint of ours with another value for a key of the file, or of its state (None: left out)."""
+    state = SliceNet(TINY).state_dict()
+    payload: dict[str, object] = {"config": TINY.as_dict(), "state_dict": state}
+    for key, value in changes.items():
+        target = payload if key in ("config", "kwargs", "state_dict") else state
+        target.pop(key.replace("__", "."), None)
+        if value is not None:
+            target[key.replace("__", ".")] = value
+    torch.save(payload, path)
+    return path
+
+
+class Evil:
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.system, ("exit 3",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"bi_rnn__weight_ih_l0": None}, r"of 280 tensors 1 missing \(bi_rnn\.weight_ih_l0\)"),
+        ({"extra": torch.zeros(1)}, r"of 280 tensors 1 unknown \(extra\)"),
+        ({"bi_rnn__bias_ih_l0": torch.zeros(3)}, r"1 of another shape .*_l0 is \(3,\) instead of \(64,\)\)"),
+        ({"bi_rnn__bias_ih_l0": torch.full((64,), torch.nan)}, r"1 tensors hold values that are no numbers"),
+        ({"bi_rnn__bias_ih_l0": "text"}, "does not hold tensors by name"),
+        ({"state_dict": [1]}, "does not hold tensors by name"),
+        ({"state_dict": None}, r"no 'state_dict' in the file \(it has: config\)"),
+        ({"config": None}, "neither 'config' nor 'kwargs' in the file .* 2021-08-13"),
+        ({"config": {"backbone": "vgg"}}, "'config' is not of a SliceNet: backbone must be one of"),
+        ({"config": {"heigth": 64}}, "'config' is not of a SliceNet: .*heigth"),
+        ({"config": None, "kwargs": "resnet50"}, "'kwargs' must be names and values"),
+        ({"config": None, "kwargs": {"backbone": "resnet18", "tiny": True}}, "not of a SliceNet: unknown tiny"),
+        ({"config": None, "kwargs": {"full_size": "no"}}, "full_size must be true or false"),
+        ({"config": None, "kwargs": {"backbone": "resnet18"}}, "resnet18, 512 x 1024: of 304 tensors 24 missing"),
+        ({"config": Evil()}, "more than tensors and plain values .*system.* could run code"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_told(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    path = tiny_checkpoint(tmp_path / "tiny.pt", **changes)
+    with pytest.raises(CheckpointError, match=message) as caught:
         load_checkpoint(path)
+    assert str(path) in str(caught.value)
 
 
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no such file"):
         load_checkpoint(tmp_path / "absent.pt")
-    text = tmp_path / "text.pt"
-    text.write_text("not a checkpoint")
-    with pytest.raises(CheckpointError, match="not a torch checkpoint"):
-        load_checkpoint(text)
-    empty = tmp_path / "empty.pt"
-    torch.save({"weights": {}}, empty)
-    with pytest.raises(CheckpointError, match="no 'state_dict'"):
-        load_checkpoint(empty)
-    torch.save({"state_dict": {}}, empty)
-    with pytest.raises(CheckpointError, match="neither 'config' nor 'kwargs'"):
-        load_checkpoint(empty)
+    with pytest.raises(CheckpointError, match="cannot be read: Is a directory"):
+        load_checkpoint(tmp_path)
+    path = tmp_path / "x.pt"
+    for content in (b"", b"<html>404 not found", pickle.dumps(Evil())):
+        path.write_bytes(content)
+        with pytest.raises(CheckpointError, match="not a torch checkpoint, or damaged or cut off"):
+            load_checkpoint(path)
+    torch.save([1, 2], path)
+    with pytest.raises(CheckpointError, match="holds list instead of a checkpoint"):
+        load_checkpoint(path)
+    torch.save(SliceNet(TINY).state_dict(), path)
+    with pytest.raises(CheckpointError, match="a bare state dict: no 'state_dict'"):
+        load_checkpoint(path)
+
+
+def test_damage_anywhere_is_seen(tmp_path: Path) -> None:
+    path = tiny_checkpoint(tmp_path / "tiny.pt")
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError, match="damaged or cut off"):
+        load_checkpoint(path)
+    largest = SliceNet(TINY).state_dict()["slicing_module.slc_lst.3.layer.0.layers.0.1.weight"].numel()
+    assert largest > 10_000
+    flipped = bytearray(whole)
+    flipped[len(whole) // 3] ^= 1  # one bit of some weight
+    path.write_bytes(flipped)
+    with pytest.raises(CheckpointError, match="another check sum"):
+        load_checkpoint(path)
+
+
+def test_weights_that_the_authors_replaced_are_refused(tmp_path: Path) -> None:
+    path = tiny_checkpoint(tmp_path / "old.pth", config=None, kwargs={"backbone": "resnet18"})
+    july = datetime(2021, 7, 1, tzinfo=UTC).timestamp()
+    os.utime(path, (july, july))
+    with pytest.raises(
+        CheckpointError, match="dates from 2021-07-01; the authors replaced their weights on 2021-08-13"
+    ):
+        load_checkpoint(path)
 
 
 def test_configuration_is_checked() -> None:

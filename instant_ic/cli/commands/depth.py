@@ -1,76 +1,76 @@
-"""``ic depth``: train, export and try depth models."""
+"""``ic depth``: train, convert, check and try depth models."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:
-    from instant_ic.depth.dataset import PanoramaDataset
-    from instant_ic.depth.rooms import RoomsConfig
+from instant_ic.cli import depth_train
+from instant_ic.cli.arguments import positive, positive_int
+from instant_ic.cli.errors import UserError
 
-LICENCE = "Apache-2.0"
+if TYPE_CHECKING:
+    from instant_ic.depth.model import DepthModel
+
+PROVIDERS = ("auto", "tensorrt", "cuda", "cpu")
 
 
 def add_parser(subparsers: Any) -> None:
     """Adds ``depth`` with its own subcommands."""
     parser = subparsers.add_parser(
         "depth",
-        help="train, export and try 360° depth models",
-        description="Train, export and try 360° depth models (docs/depth.md).",
+        help="train, convert, check and try 360° depth models",
+        description="Train, convert, check and try 360° depth models (docs/depth.md).",
         epilog="example: ic depth estimate panorama.jpg --output depth.png",
     )
     commands = parser.add_subparsers(dest="depth_command", required=True)
-    _add_train(commands)
-    _add_export(commands)
+    depth_train.add_parser(commands)
+    _add_convert(commands)
+    _add_check(commands)
     _add_estimate(commands)
 
 
-def _add_train(commands: Any) -> None:
+def _add_convert(commands: Any) -> None:
     parser = commands.add_parser(
-        "train",
-        help="train the small SliceNet on generated rooms",
-        description="Renders panoramas of random rooms into a cache folder (once), trains the small SliceNet on them "
-        "and exports it. Ctrl-C ends early: the last weights are evaluated, saved and exported.",
-        epilog="example: ic depth train --cache ~/rooms --minutes 60 --checkpoint runs/small.pt "
-        "--export models/slicenet_small.onnx",
-    )
-    parser.add_argument("--cache", type=Path, required=True, help="folder of rendered panoramas, made when absent")
-    parser.add_argument("--worlds", type=int, default=400, help="random worlds to render (%(default)s)")
-    parser.add_argument("--poses", type=int, default=6, help="panoramas in each (%(default)s)")
-    parser.add_argument("--minutes", type=float, default=60.0, help="wall time of the training (%(default)s)")
-    parser.add_argument("--epochs", type=int, default=60, help="most passes over the data (%(default)s)")
-    parser.add_argument("--batch-size", type=int, default=8, help="panoramas a step (%(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads; more only on idle cores (%(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of weights, order and augmentation (%(default)s)")
-    parser.add_argument("--checkpoint", type=Path, default=Path("runs/depth/slicenet_small.pt"),
-                        help="file of the weights (%(default)s)")  # fmt: skip
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint")
-    parser.add_argument("--export", type=Path, help="ONNX file to write at the end, with manifest and record")
-    parser.set_defaults(func=train)
-
-
-def _add_export(commands: Any) -> None:
-    parser = commands.add_parser(
-        "export",
-        help="turn a checkpoint into ONNX with its manifest",
-        description="Turns a checkpoint (ours, or published SliceNet weights) into ONNX with its manifest, and holds "
-        "the result against torch.",
-        epilog="example: ic depth export runs/depth/slicenet_small.pt --output models/slicenet_small.onnx --half",
+        "convert",
+        help="turn SliceNet weights into ONNX with its manifest",
+        description="Turns a checkpoint (published SliceNet weights, or ours) into ONNX with its manifest beside it, "
+        "and holds what ONNX computes against torch. Nothing is written when they differ.",
+        epilog="example: ic depth convert resnet50_m3d.pth -o slicenet_m3d.onnx",
     )
     parser.add_argument("weights", type=Path, help="checkpoint file")
-    parser.add_argument("--output", type=Path, required=True, help="ONNX file to write")
-    parser.add_argument("--half", action="store_true", help="store the weights as float16")
-    parser.add_argument("--brightness", type=float, default=0.0, help="mean byte of the training pictures; 0: any")
-    parser.add_argument("--max-range", type=float, default=16.0, help="metres (%(default)s)")
-    parser.add_argument("--licence", default=LICENCE, help="of the weights, for the manifest (%(default)s)")
-    parser.set_defaults(func=export)
+    parser.add_argument("-o", "--output", type=Path, help="ONNX file to write (default: WEIGHTS.onnx)")
+    parser.add_argument("--half", action="store_true", help="store the weights as float16: half the size")
+    parser.add_argument("--brightness", type=float, default=0.0, metavar="BYTE",
+                        help="mean byte of the training pictures, 0 for any (%(default)s)")  # fmt: skip
+    parser.add_argument("--max-range", type=positive, default=16.0, metavar="M", help="metres (%(default)s)")
+    parser.add_argument("--name", help="for the manifest (default: the file's)")
+    parser.add_argument("--licence", help="of the weights, for the manifest (default: unknown; Apache-2.0 for ours)")
+    parser.set_defaults(func=convert)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--provider", choices=PROVIDERS, default="auto", help="what runs it (%(default)s)")
+    parser.add_argument("--threads", type=positive_int, default=2, help="CPU threads (%(default)s)")
+
+
+def _add_check(commands: Any) -> None:
+    parser = commands.add_parser(
+        "check",
+        help="look at a model file and its manifest, and run it once",
+        description="Loads a model as the node does and tells what it is, what it takes and gives, what runs it, and "
+        "how long a panorama takes.",
+        epilog="example: ic depth check models/da2.onnx --provider cuda",
+    )
+    parser.add_argument("model", type=Path, nargs="?", help="ONNX file or its manifest (default: the shipped one)")
+    _add_model(parser)
+    parser.add_argument("--runs", type=positive_int, default=3, metavar="N", help="timed runs (%(default)s)")
+    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.set_defaults(func=check)
 
 
 def _add_estimate(commands: Any) -> None:
@@ -82,78 +82,107 @@ def _add_estimate(commands: Any) -> None:
     )
     parser.add_argument("image", type=Path, help="equirect picture")
     parser.add_argument("--model", type=Path, help="ONNX file with a manifest beside it (default: the shipped one)")
-    parser.add_argument("--output", type=Path, default=Path("depth.png"), help="coloured depth (%(default)s)")
+    _add_model(parser)
+    parser.add_argument("-o", "--output", type=Path, default=Path("depth.png"), help="coloured depth (%(default)s)")
     parser.add_argument("--npy", type=Path, help="depth as float32 array")
-    parser.add_argument("--threads", type=int, default=2, help="CPU threads (%(default)s)")
     parser.set_defaults(func=estimate)
 
 
-def open_cache(folder: Path, recipe: RoomsConfig) -> PanoramaDataset:
-    """The data folder, rendered first where it is absent or not complete."""
-    from instant_ic.depth.dataset import PanoramaDataset, write_dataset
-    from instant_ic.depth.rooms import render_rooms
+def convert(args: argparse.Namespace) -> int:
+    """``ic depth convert``."""
+    import torch
 
-    done = folder / "complete"
-    if not done.exists():
-        begin = time.monotonic()
-        size = (recipe.height, 2 * recipe.height)
-        for count in write_dataset(folder, render_rooms(recipe), recipe.count, size, recipe.as_dict()):
-            if count % 100 == 0 or count == recipe.count:
-                rate = count / (time.monotonic() - begin)
-                print(f"rendered {count} of {recipe.count} panoramas, {rate:.1f} a second", flush=True)
-        done.touch()
-    return PanoramaDataset(folder)
+    from instant_ic.depth.export import ExportError, export_model
+    from instant_ic.depth.slicenet import CheckpointError, load_checkpoint
 
+    output = args.output or args.weights.with_suffix(".onnx")
+    if output.suffix != ".onnx":
+        raise UserError(
+            f"{output}: the name must end in .onnx; its manifest becomes {output.with_suffix('.yaml').name}"
+        )
+    begin = time.monotonic()
 
-def train(args: argparse.Namespace) -> int:
-    """``ic depth train``."""
-    from instant_ic.depth.export import export_model
-    from instant_ic.depth.rooms import RoomsConfig
-    from instant_ic.depth.slicenet import SMALL, load_checkpoint
-    from instant_ic.depth.training import Trainer, TrainingConfig
+    def report(line: str) -> None:
+        print(f"{time.monotonic() - begin:5.1f} s  {line}", flush=True)
 
-    data = open_cache(args.cache, RoomsConfig(worlds=args.worlds, poses=args.poses, height=SMALL.height))
-    config = TrainingConfig(
-        minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, threads=args.threads, seed=args.seed
-    )
-    trainer = Trainer(data, SMALL, config, args.checkpoint, report=lambda line: print(line, flush=True))
-    if args.resume:
-        trainer.resume(args.checkpoint)
-
-    def end_early(number: int, frame: FrameType | None) -> None:
-        trainer.stop = True
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, end_early)
-    metrics = trainer.run()
-    print(json.dumps(metrics.as_dict()), flush=True)
-    if args.export:
-        manifest = export_model(
-            load_checkpoint(args.checkpoint), args.export, args.export.stem, LICENCE, config.max_range_m,
-            record=trainer.record(), half_weights=True, brightness=data.brightness(),
+    report(f"reading {args.weights}")
+    try:
+        model = load_checkpoint(args.weights)
+        own = torch.load(args.weights, map_location="cpu", weights_only=True)
+        count = sum(parameter.numel() for parameter in model.parameters())
+        report(f"SliceNet {model.config.backbone}, {model.config.width} x {model.config.height}, {count / 1e6:.1f} M")
+        licence = args.licence or ("Apache-2.0" if "config" in own else "unknown: ask the authors of the weights")
+        export_model(
+            model, output, args.name or output.stem, licence, args.max_range, own.get("record"), args.half,
+            args.brightness, report,
         )  # fmt: skip
-        print(f"wrote {args.export} ({args.export.stat().st_size / 1e6:.1f} MB, {manifest.sha256[:12]})", flush=True)
+    except (CheckpointError, ExportError, ValueError) as error:
+        raise UserError(str(error)) from error
+    except OSError as error:
+        raise UserError(f"{error.filename or output}: {error.strerror or error}") from error
+    report(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) and {output.with_suffix('.yaml').name}")
     return 0
 
 
-def export(args: argparse.Namespace) -> int:
-    """``ic depth export``."""
-    import torch
-
-    from instant_ic.depth.export import export_model
-    from instant_ic.depth.slicenet import CheckpointError, load_checkpoint
+def _load(args: argparse.Namespace) -> DepthModel:
+    from instant_ic.depth.manifest import ManifestError
+    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+    from instant_ic.paths import shipped_file
 
     try:
-        model = load_checkpoint(args.weights)
-    except CheckpointError as error:
-        print(f"ic depth export: {error}", file=sys.stderr)
-        return 1
-    record = torch.load(args.weights, map_location="cpu", weights_only=True).get("record")
-    manifest = export_model(
-        model, args.output, args.output.stem, args.licence, args.max_range, record, args.half, args.brightness
-    )
-    print(f"wrote {args.output} ({args.output.stat().st_size / 1e6:.1f} MB), input "
-          f"{manifest.input_width} x {manifest.input_height}")  # fmt: skip
+        model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), args.threads, args.provider)
+    except (ManifestError, FileNotFoundError) as error:
+        raise UserError(str(error)) from error
+    if args.provider not in ("auto", model.provider):
+        print(f"runs on {model.provider}; {'; '.join(model.notes)}", file=sys.stderr)
+    return model
+
+
+def check(args: argparse.Namespace) -> int:
+    """``ic depth check``."""
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from instant_ic.depth.manifest import ManifestError
+    from instant_ic.depth.model import InferenceError
+
+    begin = time.perf_counter()
+    model = _load(args)
+    took = [time.perf_counter() - begin]
+    manifest = model.manifest
+    # Smooth random colours: a picture of one colour would not show an output that is always the same.
+    coarse = np.random.default_rng(0).integers(0, 256, (8, 16, 3), np.uint8)
+    picture = coarse.repeat(max(1, manifest.input_height // 8), 0).repeat(max(1, manifest.input_width // 16), 1)
+    try:
+        for _ in range(1 + args.runs):
+            begin = time.perf_counter()
+            depth = model.estimate(picture)
+            took.append(time.perf_counter() - begin)
+    except (ManifestError, InferenceError) as error:
+        raise UserError(str(error)) from error
+    load_s, first_s, seconds = took[0], took[1], float(np.median(took[2:]))
+    known = depth[depth > 0]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if args.json:
+        told = {
+            "manifest": asdict(manifest), "provider": model.provider, "notes": model.notes, "threads": args.threads,
+            "inputs": model.inputs, "outputs": model.outputs, "depth_shape": depth.shape, "depth_range": [low, high],
+            "known": known.size / depth.size, "load_s": load_s, "first_s": first_s, "seconds": seconds,
+        }  # fmt: skip
+        print(json.dumps(told, indent=1))
+        return 0
+    for key, value in asdict(manifest).items():
+        print(f"{key:>14}  {value if value != '' else '-'}")
+    for kind, ends in (("input", model.inputs), ("output", model.outputs)):
+        for name, dtype, shape in ends:
+            print(f"{kind:>14}  {name}: {dtype} {shape}")
+    print(f"{'runs on':>14}  {model.provider}, CPU threads: {args.threads}")
+    for note in model.notes:
+        print(f"{'not on':>14}  {note}")
+    print(f"{'gives':>14}  {depth.shape[1]} x {depth.shape[0]}, {low:.3g} to {high:.3g}, "
+          f"{known.size / depth.size:.0%} known (of a meaningless picture)")  # fmt: skip
+    print(f"{'takes':>14}  {seconds:.3f} s a panorama (the first {first_s:.3f} s, to load {load_s:.2f} s)")
     return 0
 
 
@@ -164,29 +193,29 @@ def estimate(args: argparse.Namespace) -> int:
 
     from instant_ic.depth.colour import depth_picture
     from instant_ic.depth.manifest import ManifestError
-    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-    from instant_ic.paths import shipped_file
+    from instant_ic.depth.model import InferenceError
 
     picture = cv2.imread(str(args.image), cv2.IMREAD_COLOR)
     if picture is None:
-        print(f"ic depth estimate: {args.image}: not a readable picture", file=sys.stderr)
-        return 1
-    try:
-        model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads)
-    except (ManifestError, FileNotFoundError) as error:
-        print(f"ic depth estimate: {error}", file=sys.stderr)
-        return 1
+        raise UserError(f"{args.image}: not a readable picture")
+    model = _load(args)
     rgb = np.ascontiguousarray(picture[..., ::-1])
-    model.estimate(rgb)  # the first run allocates; time the second
-    begin = time.perf_counter()
-    depth = model.estimate(rgb)
+    try:
+        model.estimate(rgb)  # the first run allocates; time the second
+        begin = time.perf_counter()
+        depth = model.estimate(rgb)
+    except (ManifestError, InferenceError) as error:
+        raise UserError(str(error)) from error
     took = time.perf_counter() - begin
-    if args.npy:
-        np.save(args.npy, depth)
-    if not cv2.imwrite(str(args.output), depth_picture(depth)[..., ::-1]):
-        print(f"ic depth estimate: cannot write {args.output}", file=sys.stderr)
-        return 1
-    low, middle, high = np.percentile(depth, (1, 50, 99))
+    try:
+        if args.npy:
+            np.save(args.npy, depth)
+        written = cv2.imwrite(str(args.output), depth_picture(depth)[..., ::-1])
+    except (OSError, cv2.error) as error:
+        raise UserError(f"cannot write: {error}") from error
+    if not written:
+        raise UserError(f"cannot write {args.output}")
+    low, middle, high = np.percentile(depth[depth > 0], (1, 50, 99)) if (depth > 0).any() else (0.0, 0.0, 0.0)
     print(f"{model.manifest.name} on {model.provider}: {took:.3f} s, {model.manifest.output_kind}, "
           f"1 % {low:.2f}, median {middle:.2f}, 99 % {high:.2f}; wrote {args.output}")  # fmt: skip
     return 0

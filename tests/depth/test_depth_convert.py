@@ -1,0 +1,195 @@
+"""Checkpoint to ONNX: ``ic depth convert``, and the folded decoder that it writes."""
+
+import contextlib
+import io
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from instant_ic.cli.main import main
+from instant_ic.depth import export
+from instant_ic.depth.export import ExportError, export_onnx
+from instant_ic.depth.folding import fold_kernel, fold_upsampling, unfold_kernel
+from instant_ic.depth.manifest import load_manifest
+from instant_ic.depth.model import DepthModel
+from instant_ic.depth.slicenet import ConvStage, SliceNet, SliceNetConfig
+
+torch.set_num_threads(1)
+TINY = SliceNetConfig(
+    backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=16, column_stride=2, decoder_floor=8
+)
+
+
+def random_network(config: SliceNetConfig = TINY) -> SliceNet:
+    """Random weights, with norms of random strength that have seen pictures: a depth that varies by metres."""
+    torch.manual_seed(0)
+    model = SliceNet(config)
+    for module in model.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            module.momentum = None  # plain mean over the batches that follow
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, 0.0, 0.2)
+        if isinstance(module, torch.nn.PReLU):
+            torch.nn.init.uniform_(module.weight, 0.1, 0.5)
+    torch.nn.init.constant_(model.decoder[-1].layers[1].bias, 3.0)
+    with torch.no_grad():
+        for _ in range(2):
+            model(torch.rand(2, 3, config.height, config.width))
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.pt"
+    torch.save({"config": TINY.as_dict(), "state_dict": random_network().state_dict(), "record": {"steps": 3}}, path)
+    return path
+
+
+@pytest.mark.parametrize("upscale", [(2, 1), (2, 2)])
+def test_folded_stage_by_definition(upscale: tuple[int, int]) -> None:
+    torch.manual_seed(1)
+    stage = ConvStage(6, 5, upscale=upscale).eval()
+    torch.nn.init.normal_(stage.layers[1].running_mean)
+    torch.nn.init.uniform_(stage.layers[2].weight)
+    x = torch.randn(2, 6, 4, 8)
+    holder = SliceNet(SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8))
+    holder.decoder = torch.nn.ModuleList([stage])
+    (folded,) = fold_upsampling(holder).decoder
+    with torch.inference_mode():
+        torch.testing.assert_close(folded(x), stage(x), rtol=1e-5, atol=1e-5)
+
+
+def test_folded_kernel_by_hand() -> None:
+    kernel = torch.tensor([1.0, 2.0, 4.0]).view(1, 1, 3, 1).expand(1, 1, 3, 3)
+    even, odd = fold_kernel(kernel, (2, 1))[:, 0, :, 0].tolist()
+    assert (even, odd) == ([1, 6, 0], [0, 3, 4])  # (w0, w1 + w2, 0) and (0, w0 + w1, w2)
+    kernel = torch.randn(3, 2, 3, 3)
+    for upscale in ((1, 1), (2, 1), (2, 2)):
+        folded = fold_kernel(kernel, upscale)
+        assert folded.shape == (3 * upscale[0] * upscale[1], 2, 3, 3)
+        torch.testing.assert_close(unfold_kernel(folded, upscale), kernel)
+
+
+@pytest.fixture(scope="module")
+def converted(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("converted") / "new" / "tiny.onnx"
+    words = ["depth", "convert", str(checkpoint), "-o", str(output), "--half", "--max-range", "12", "--licence", "MIT"]
+    told = io.StringIO()
+    write = torch.onnx.export
+
+    def write_and_keep(*args: object, **options: object) -> None:
+        write(*args, **options)
+        shutil.copy(args[2], output.parents[1] / "plain.onnx")
+
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(told):
+        patch.setattr(torch.onnx, "export", write_and_keep)
+        assert main(words) == 0
+    (output.parents[1] / "told.txt").write_text(told.getvalue())
+    return output
+
+
+@pytest.fixture(scope="module")
+def exported(converted: Path) -> bytes:
+    """What torch wrote, before its weights became float16."""
+    return (converted.parents[1] / "plain.onnx").read_bytes()
+
+
+def test_convert_writes_model_manifest_and_record(converted: Path) -> None:
+    output, told = converted, (converted.parents[1] / "told.txt").read_text()
+    assert "SliceNet resnet18, 128 x 64" in told and "torch writes ONNX" in told
+    difference = float(told.split("largest difference to torch: ")[1].split()[0])
+    assert 0 < difference < 1e-5
+    record = json.loads(output.with_suffix(".json").read_text())
+    assert record["steps"] == 3 and record["export"]["difference"] == pytest.approx(difference, rel=0.1)
+    manifest = load_manifest(output.with_suffix(".yaml"))
+    assert (manifest.max_range_m, manifest.licence, manifest.name) == (12.0, "MIT", "tiny")
+    assert [p.name for p in sorted(output.parent.iterdir())] == ["tiny.json", "tiny.onnx", "tiny.yaml"]
+
+    # float16 weights: about half of what the network's numbers take in float32.
+    floats = sum(value.numel() for value in fold_upsampling(random_network()).state_dict().values())
+    assert output.stat().st_size < 0.75 * 4 * floats
+
+    picture = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    with torch.inference_mode():
+        expected = random_network()(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255)[0].numpy()
+    assert np.ptp(expected) > 0.5
+    depth = DepthModel.load(output, threads=1).estimate(picture)
+    np.testing.assert_allclose(depth, expected.clip(0.1, 12.0), atol=2e-2 * np.abs(expected).max())
+
+
+def test_folded_file_has_no_norms_and_fewer_enlargements(converted: Path) -> None:
+    operators = [node.op_type for node in onnx.load(str(converted)).graph.node]
+    assert operators.count("LSTM") == 2
+    assert "BatchNormalization" not in operators
+    assert operators.count("Resize") == 4  # those of the contractions; the decoder's six are folded
+
+
+def test_convert_without_output_writes_beside(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[object, ...]] = []
+
+    def export_model(model: SliceNet, path: Path, *rest: object) -> None:
+        asked.append((path, *rest[:-1]))
+        path.write_bytes(b"model")
+
+    monkeypatch.setattr(export, "export_model", export_model)
+    assert main(["depth", "convert", str(checkpoint), "--brightness", "120"]) == 0
+    assert asked == [(checkpoint.with_suffix(".onnx"), "tiny", "Apache-2.0", 16.0, {"steps": 3}, False, 120.0)]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["absent.pt"], "absent.pt: no such file"),
+        (["absent.pt", "-o", "model.bin"], "the name must end in .onnx"),
+        (["{checkpoint}", "-o", "/proc/nowhere/x.onnx"], "/proc/nowhere"),
+    ],
+)
+def test_convert_tells_faults_in_a_line(
+    checkpoint: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [word.format(checkpoint=checkpoint) for word in words]
+    assert main(["depth", "convert", *words]) == 1
+    told = capsys.readouterr().err
+    assert message in told and "Traceback" not in told
+
+
+@pytest.fixture
+def ready(exported: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch's exporter gives the file that it gave before, which takes no time."""
+    monkeypatch.setattr(torch.onnx, "export", lambda model, args, path, **options: Path(path).write_bytes(exported))
+
+
+@pytest.mark.usefixtures("ready")
+def test_what_onnx_computes_otherwise_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.onnx"
+    path.write_bytes(b"the model before")
+    honest = export._run
+    monkeypatch.setattr(export, "_run", lambda *args: honest(*args) * np.float32(1.0001))
+    with pytest.raises(ExportError, match=r"difference to torch: 1\.0e-04 .* to float64"):
+        export_onnx(random_network(), path)
+    assert path.read_bytes() == b"the model before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.usefixtures("ready")
+def test_weights_that_amplify_rounding_are_held_against_float64(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A bound that no float32 keeps stands for weights that no float32 keeps the real bound with.
+    monkeypatch.setattr(export, "MAX_RELATIVE_DIFFERENCE", 1e-9)
+    lines: list[str] = []
+    result = export_onnx(random_network(), tmp_path / "m.onnx", report=lines.append)
+    assert 1e-9 < result["rounding"] < 1e-5 and 1e-9 < result["difference"] < 1e-5
+    assert any("float32 alone costs torch" in line for line in lines)
+
+
+def test_a_network_that_says_nothing_is_refused(tmp_path: Path) -> None:
+    model = random_network()
+    torch.nn.init.zeros_(model.decoder[-1].layers[1].weight)
+    with pytest.raises(ExportError, match="gives no depth"):
+        export_onnx(model, tmp_path / "m.onnx")
