@@ -1,0 +1,134 @@
+"""The depth_estimator node: what it says of its model, and what it does when an inference fails or hangs."""
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tiny_onnx
+
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.camera.jpeg import JpegError, decode_rgb
+from instant_ic.depth.manifest import ModelManifest, save_manifest
+from instant_ic.depth.model import InferenceError
+from instant_ic.msg import compressed_image_message, image_array
+from instant_ic.nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
+
+S = 1_000_000_000
+START = 1_700_000_000 * S
+TOPIC = "/camera/image/compressed"
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> DepthEstimatorConfig:
+    """A model whose depth is ten times the red channel."""
+    path = tmp_path / "tiny.onnx"
+    nodes = tiny_onnx.channel("image", 0, "depth")
+    tiny_onnx.write(path, {"image": (1, 3, 64, 128)}, {"depth": (1, 1, 64, 128)}, nodes, tiny_onnx.CHANNELS)
+    manifest = ModelManifest("tiny.onnx", "tiny", "MIT", 64, 128, output_kind="relative", output_scale=10.0)
+    save_manifest(manifest, path.with_suffix(".yaml"))
+    return DepthEstimatorConfig(model=str(path), timeout_s=5.0)
+
+
+def picture(suffix: str = ".jpg", height: int = 64) -> bytes:
+    bgr = np.zeros((height, 2 * height, 3), np.uint8)
+    bgr[..., 2] = 128
+    return cv2.imencode(suffix, bgr)[1].tobytes()
+
+
+class Failing:
+    """Stands for a model on a GPU that fails at every picture."""
+
+    provider = "cuda"
+    cancelled = 0
+
+    def __init__(self, manifest: ModelManifest) -> None:
+        self.manifest = manifest
+
+    def estimate(self, rgb: np.ndarray) -> np.ndarray:
+        raise InferenceError("tiny on cuda: out of memory")
+
+    def cancel(self) -> None:
+        self.cancelled += 1
+
+
+def test_tells_what_its_numbers_are(config: DepthEstimatorConfig) -> None:
+    with LockstepBus(START) as bus:
+        bus.add(DepthEstimatorNode, config)
+        (info,) = bus.messages("/depth/model")
+        bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
+        (depth,) = bus.messages("/depth/raw")
+    assert (info.name, info.licence, info.output_kind, info.provider) == ("tiny", "MIT", "relative", "cpu")
+    np.testing.assert_allclose(image_array(depth), 10 * 128 / 255, rtol=0.02)
+
+
+def test_png_is_taken_as_well(config: DepthEstimatorConfig) -> None:
+    with LockstepBus(START) as bus:
+        bus.add(DepthEstimatorNode, config)
+        bus.publish(TOPIC, compressed_image_message(picture(".png"), "camera", START), stamp_ns=START)
+        (depth,) = bus.messages("/depth/raw")
+    np.testing.assert_allclose(image_array(depth), 10 * 128 / 255, rtol=1e-5)
+
+
+def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthEstimatorNode, config)
+        node.model, node.told = Failing(node.model.manifest), "cuda"
+        bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
+        level, message, values = node.diagnoses()["depth"]
+        assert (level, values["failures"]) == (2, 1)
+        assert message == "tiny on cuda: out of memory; going on with the CPU"
+        bus.publish(TOPIC, compressed_image_message(picture(), "camera", START + S), stamp_ns=START + S)
+        assert len(bus.messages("/depth/raw")) == 1
+        assert [info.provider for info in bus.messages("/depth/model")] == ["cpu", "cpu"]
+        assert node.diagnoses()["depth"][0] == 0
+
+
+def test_failing_cpu_is_told_and_the_next_picture_tried(config: DepthEstimatorConfig) -> None:
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthEstimatorNode, config)
+        working, failing = node.model, Failing(node.model.manifest)
+        failing.provider = "cpu"
+        node.model = failing
+        bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
+        assert node.diagnoses()["depth"][:2] == (2, "tiny on cuda: out of memory")
+        node.model = working
+        bus.publish(TOPIC, compressed_image_message(picture(), "camera", START + S), stamp_ns=START + S)
+        assert node.diagnoses()["depth"][0] == 0 and len(bus.messages("/depth/raw")) == 1
+
+
+def test_hanging_inference_is_ended_and_then_the_process(
+    config: DepthEstimatorConfig, caplog: pytest.LogCaptureFixture
+) -> None:
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthEstimatorNode, config)
+        node.model = hanging = Failing(node.model.manifest)
+        node.began_ns = node.clock.steady_ns()  # as the worker's thread leaves it while it computes
+        bus.advance_to(START + 4 * S)
+        assert "depth" not in node.diagnoses() and not hanging.cancelled
+        bus.advance_to(START + 6 * S)
+        level, message, _ = node.diagnoses()["depth"]
+        assert level == 2 and "has run for" in message and hanging.cancelled
+        assert not node.stopping
+        with caplog.at_level(logging.ERROR):
+            bus.advance_to(START + 16 * S)
+        assert node.stopping and "hangs: ending, to be started anew" in caplog.text
+
+
+def test_unknown_provider_is_refused() -> None:
+    with pytest.raises(ValueError, match="provider must be one of auto, tensorrt, cuda, cpu"):
+        DepthEstimatorConfig(provider="gpu")
+
+
+@pytest.mark.parametrize(("need", "rows"), [(512, 512), (256, 256), (200, 256), (128, 128), (64, 64), (16, 64)])
+def test_decoding_to_what_is_needed(need: int, rows: int) -> None:
+    rgb = decode_rgb(picture(height=512), 2 * need, need)
+    assert rgb.shape == (rows, 2 * rows, 3)
+    np.testing.assert_allclose(rgb[0, 0], (128, 0, 0), atol=3)
+
+
+def test_what_cannot_be_decoded() -> None:
+    for data in (b"", b"\xff\xd8", b"no picture"):
+        with pytest.raises(JpegError, match="cannot be decoded"):
+            decode_rgb(data, 16, 8)
