@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ssl
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Self
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import aiohttp
 
@@ -28,8 +30,26 @@ class ConsoleClient:
     ``frames[FrameKind.PANORAMA]`` the newest frame.
     """
 
-    def __init__(self, url: str = "http://127.0.0.1:8080/", *, acknowledge: bool = True) -> None:
-        self.url = url
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8080/",
+        *,
+        acknowledge: bool = True,
+        token: str = "",
+        ca_file: str | Path | None = None,
+    ) -> None:
+        """Not connected yet.
+
+        Args:
+            url: the page's address; ``?token=`` in it serves as ``token``.
+            acknowledge: whether frames are acknowledged, so that the next comes.
+            token: of the sign-in, where one is needed.
+            ca_file: PEM file of the authority, or of the server's own certificate, for ``https``.
+        """
+        parts = urlsplit(url)
+        self.url = parts._replace(query="").geturl()
+        self._token = token or parse_qs(parts.query).get("token", [""])[0]
+        self._ssl = ssl.create_default_context(cafile=ca_file) if parts.scheme == "https" else True
         self.acknowledge = acknowledge
         self.messages: dict[str, dict[str, Any]] = {}
         self.frames: dict[FrameKind, Frame] = {}
@@ -53,14 +73,23 @@ class ConsoleClient:
         await self.close()
 
     async def connect(self, timeout_s: float = 10.0) -> None:
-        """Connects and waits until the clock offset to the server is known."""
+        """Connects and waits until the clock offset to the server is known.
+
+        Raises:
+            aiohttp.WSServerHandshakeError: the server refuses; 401 where the token is missing or wrong.
+            TimeoutError: it does not answer.
+        """
         self._http = aiohttp.ClientSession()
         parts = urlsplit(self.url)
         try:
             self._socket = await asyncio.wait_for(
                 self._http.ws_connect(
                     f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}/ws",
-                    headers={"Origin": f"{parts.scheme}://{parts.netloc}"},
+                    headers={
+                        "Origin": f"{parts.scheme}://{parts.netloc}",
+                        **({"Authorization": f"Bearer {self._token}"} if self._token else {}),
+                    },
+                    ssl=self._ssl,
                     max_msg_size=32 << 20,
                 ),
                 timeout_s,

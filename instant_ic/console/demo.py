@@ -63,6 +63,7 @@ class Demo:
         self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
+        self._drawn, self._drawn_from = b"", np.zeros((4, 4))  # the last panorama, and where the camera was
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=run, name=f"console-demo-{run.__name__}", daemon=True)
@@ -201,9 +202,11 @@ class Demo:
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()
         camera = _camera(self.robot)
-        picture = demo_world.shade(_position(camera), _turned(self._directions, camera))
+        if not np.array_equal(self._drawn_from, camera):  # a robot that stands sees the same
+            self._drawn = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
+            self._drawn_from = camera
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist()}
-        self.server.send_frame(FrameKind.PANORAMA, header, _jpeg(picture))
+        self.server.send_frame(FrameKind.PANORAMA, header, self._drawn)
 
     def _send_view(self, request_id: int) -> None:
         captured_ms = self.server.now_ms()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import html
 import ipaddress
 import json
 import logging
@@ -17,10 +18,11 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Protocol
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, tls_context
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
 from instant_ic.console.protocol import FrameKind, ProtocolError, number, parse_text, whole
 from instant_ic.console.session import PendingFrame, Session
@@ -34,12 +36,14 @@ MAX_BAD_MESSAGES = 20
 SILENT_CLIENT_S = 15.0
 START_TIMEOUT_S = 10.0
 SECURITY_HEADERS = {
-    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; form-action 'self'; "
+    "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-cache",  # a new version of the page must not meet an old module
 }
 logger = logging.getLogger("instant_ic.console")
+_ROLE: web.RequestKey[Role | None] = web.RequestKey("role", Role | None)  # type: ignore[arg-type]
 
 
 class ConsoleError(RuntimeError):
@@ -68,6 +72,7 @@ class ServerConfig:
     allowed_hosts: tuple[str, ...] = ()  # names by which browsers may reach the page besides localhost
     max_clients: PositiveInt = 16
     background_picture_hz: Positive = 2.0  # pictures that are not shown (camera in the v-space)
+    access: AccessConfig = field(default_factory=AccessConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
 
     def __post_init__(self) -> None:
@@ -90,6 +95,11 @@ class ConsoleServer:
         self.config = config or ServerConfig()
         self.page = page or {}
         self.gate = DriveGate(self.config.drive)
+        try:
+            self.access = Access(self.config.access, self.config.host)
+            self._tls = tls_context(self.config.access)
+        except AccessError as error:
+            raise ConsoleError(f"console: {error}") from error
         self.port = 0
         self._sessions: dict[int, Session] = {}
         self._next_number = 1
@@ -134,7 +144,14 @@ class ConsoleServer:
     def url(self) -> str:
         """Address of the page."""
         host = "127.0.0.1" if self.config.host in ("0.0.0.0", "::") else self.config.host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}/"
+        scheme = "http" if self._tls is None else "https"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
+
+    @property
+    def sign_in_url(self) -> str:
+        """Address of the page, with the token where one was made at this start: opens it without more ado."""
+        token = self.access.made_token
+        return f"{self.url}?token={quote(token)}" if token else self.url
 
     @staticmethod
     def now_ms() -> float:
@@ -176,12 +193,14 @@ class ConsoleServer:
         app = web.Application(middlewares=[self._guard])
         app.router.add_get("/", self._index)
         app.router.add_get("/health", self._health)
+        app.router.add_post("/sign-in", self._sign_in)
+        app.router.add_post("/sign-out", self._sign_out)
         app.router.add_get("/ws", self._websocket)
         app.router.add_static("/static/", STATIC)
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
         await runner.setup()
         try:
-            site = web.TCPSite(runner, self.config.host, self.config.port)
+            site = web.TCPSite(runner, self.config.host, self.config.port, ssl_context=self._tls)
             await site.start()
             self.port = runner.addresses[0][1]
             drive_task = asyncio.create_task(self._drive_forever())
@@ -201,12 +220,75 @@ class ConsoleServer:
     ) -> web.StreamResponse:
         if not host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts):
             raise web.HTTPForbidden(text="unknown Host; name it in server.allowed_hosts\n")
-        response = await handler(request)
+        request[_ROLE] = role = self._role(request)
+        open_to_all = request.path == "/sign-in" or request.path.startswith("/static/")
+        if role is None and not open_to_all:
+            response = self._turn_away(request)
+        else:
+            response = await handler(request)
         if not response.prepared:
             response.headers.update(SECURITY_HEADERS)
         return response
 
+    def _role(self, request: web.Request) -> Role | None:
+        """What whoever asks may do; programs bring their token in the header, pages the cookie of their sign-in."""
+        if not self.access.required:
+            return Role.DRIVE
+        now, (scheme, _, token) = time.monotonic(), request.headers.get("Authorization", "").partition(" ")
+        if scheme.lower() == "bearer" and token:
+            return self._role_of_token(request, token.strip())
+        return self.access.role_of_session(request.cookies.get(COOKIE, ""), now)
+
+    def _role_of_token(self, request: web.Request, token: str) -> Role | None:
+        now, address = time.monotonic(), request.remote or ""
+        role = self.access.role_of_token(token, address, now)
+        if role is None:
+            logger.warning("wrong token from %s", address)
+        return role
+
+    def _turn_away(self, request: web.Request) -> web.StreamResponse:
+        """Without a sign-in: the form for browsers that open the page, words for everything else."""
+        if request.path == "/" and request.method == "GET":
+            if token := request.query.get("token", ""):
+                return self._enter(request, token)
+            return _sign_in_page("Sign in to see the robot.", 401)
+        return web.Response(
+            status=401, text="sign in first, or send 'Authorization: Bearer TOKEN'\n",
+            headers={"WWW-Authenticate": "Bearer"},
+        )  # fmt: skip
+
+    def _enter(self, request: web.Request, token: str) -> web.Response:
+        """Signs a browser in: a cookie in place of the token, which goes out of the address and the history."""
+        now, address = time.monotonic(), request.remote or ""
+        role = self._role_of_token(request, token)
+        if role is None:
+            if wait_s := self.access.wait_s(address, now):
+                return _sign_in_page(f"Too many wrong tokens. Try again in {wait_s:.0f} s.", 429)
+            return _sign_in_page("This token is wrong.", 401)
+        response = web.Response(status=303, headers={"Location": "/"})
+        response.set_cookie(
+            COOKIE, self.access.open_session(role, now), httponly=True, samesite="Strict",
+            secure=self._tls is not None, max_age=round(self.config.access.session_hours * 3600),
+        )  # fmt: skip
+        logger.info("%s has signed in to %s", address, role.value)
+        return response
+
+    async def _sign_in(self, request: web.Request) -> web.StreamResponse:
+        if not self.access.required:
+            raise web.HTTPSeeOther("/")
+        token = (await request.post()).get("token", "")
+        return self._enter(request, token.strip() if isinstance(token, str) else "")
+
+    async def _sign_out(self, request: web.Request) -> web.StreamResponse:
+        if self.access.required:
+            self.access.close_session(request.cookies.get(COOKIE, ""))
+        response = web.HTTPSeeOther("/")
+        response.del_cookie(COOKIE)
+        raise response
+
     async def _index(self, request: web.Request) -> web.StreamResponse:
+        if "token" in request.query:  # signed in already: out of the address
+            raise web.HTTPSeeOther("/")
         return web.FileResponse(STATIC / "index.html")
 
     async def _health(self, request: web.Request) -> web.StreamResponse:
@@ -228,7 +310,7 @@ class ConsoleServer:
             raise web.HTTPServiceUnavailable(text=f"{self.config.max_clients} clients already\n")
         socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=1.0)
         await socket.prepare(request)
-        session = Session(self._next_number, socket)
+        session = Session(self._next_number, socket, may_drive=request[_ROLE] is Role.DRIVE)
         self._next_number += 1
         self._sessions[session.number] = session
         self._greet(session)
@@ -255,6 +337,7 @@ class ConsoleServer:
                 "max_linear": drive.max_linear_mps,
                 "max_angular": drive.max_angular_rps,
                 "rate_hz": drive.rate_hz,
+                "may_drive": session.may_drive,
                 "page": self.page,
             }
         )
@@ -332,6 +415,9 @@ class ConsoleServer:
         take = message.get("take", False)
         if not isinstance(take, bool):
             raise ProtocolError(f"lease.take must be true or false (got {take!r:.40})")
+        if not session.may_drive:
+            session.reply({"type": "refused", "reason": "watch_only", "text": "this sign-in may watch only"})
+            return
         self.gate.request(session.number, now, take=take)
         self._emit_due()
         self._tell_session()
@@ -425,6 +511,11 @@ class ConsoleServer:
         self._foreground = kind
         for session in self._sessions.values():
             session.set_foreground(kind, 1.0 / self.config.background_picture_hz)
+
+
+def _sign_in_page(text: str, status: int) -> web.Response:
+    page = (STATIC / "sign-in.html").read_text(encoding="utf-8").replace("{text}", html.escape(text))
+    return web.Response(status=status, text=page, content_type="text/html")
 
 
 def host_allowed(host: str, allowed: tuple[str, ...]) -> bool:

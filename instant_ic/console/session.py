@@ -32,9 +32,10 @@ class Session:
     waits; the next frame of a kind goes when the last was acknowledged.
     """
 
-    def __init__(self, number: int, socket: web.WebSocketResponse) -> None:
+    def __init__(self, number: int, socket: web.WebSocketResponse, may_drive: bool = True) -> None:
         self.number = number
         self.socket = socket
+        self.may_drive = may_drive
         self.bad_messages = 0
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}

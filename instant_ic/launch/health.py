@@ -253,5 +253,6 @@ def find_console(infos: Iterable[registry.NodeInfo], names: Iterable[str]) -> st
         server = info.params.get("server", {})
         if info.name in wanted and server.get("port"):
             host = str(server.get("host") or "127.0.0.1")
-            return f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{server['port']}"
+            scheme = "https" if server.get("access", {}).get("tls_certificate") else "http"
+            return f"{scheme}://{'127.0.0.1' if host == '0.0.0.0' else host}:{server['port']}"
     return None

@@ -102,13 +102,16 @@ class ConsoleNode(Node[ConsoleConfig]):
             "footprint": [config.footprint_length_m, config.footprint_width_m],
             "camera": [0.0, 0.0, config.camera_height_m],
         }
-        self.server = ConsoleServer(self, config.server, page)
-        if not self.lockstep:
-            try:
+        try:
+            self.server = ConsoleServer(self, config.server, page)
+            if not self.lockstep:
                 self.server.start()
-            except ConsoleError as error:
-                raise NodeError(str(error)) from error
-            self.log.info("open %s in a browser", self.server.url)
+        except ConsoleError as error:
+            raise NodeError(str(error)) from error
+        if not self.lockstep:
+            self.log.info("open %s in a browser", self.server.sign_in_url)
+        if self.server.access.unguarded:
+            self.log.warning("everybody on the network may drive: server.access.sign_in is never")
         self.timer(1.0 / config.state_rate_hz, self.send_state)
         self.timer(0.2, self.send_plan)
         self.timer(1.0, self.send_health)

@@ -330,8 +330,9 @@ def likeness(page, expected):
 
 
 def wait_alike(page, expected):
+    """Until the page shows what ``expected()`` draws."""
     deadline = time.monotonic() + WAIT_MS / 1000
-    while (found := likeness(page, expected)) < 0.97:
+    while (found := likeness(page, expected())) < 0.97:
         assert time.monotonic() < deadline, f"correlation with what should be seen: {found:.3f}"
         page.wait_for_timeout(100)
 
@@ -349,9 +350,10 @@ def test_picture_is_what_stands_in_the_look_direction(open_page, sharp_demo, mod
     page.mouse.move(330, 350, steps=3)  # turns right and up
     page.mouse.up()
     wait_until(lambda: demo.look.yaw < -0.2, page, "the look direction arrives")
+    # The look is told while the pointer moves: its last word may still be on the way.
+    wait_alike(page, lambda: room_seen(demo.robot, demo.look.yaw, demo.look.pitch))
     look = demo.look
     assert look.pitch > math.radians(-10)
-    wait_alike(page, room_seen(demo.robot, look.yaw, look.pitch))
     # The test can fail: the mirrored room, and a look 10° beside, are less alike.
     assert likeness(page, room_seen(demo.robot, look.yaw, look.pitch)[:, ::-1]) < 0.93
     assert likeness(page, room_seen(demo.robot, look.yaw + math.radians(10), look.pitch)) < 0.95
@@ -365,7 +367,7 @@ def test_old_panorama_is_aimed_anew_when_the_robot_turns(open_page, sharp_demo):
     demo.pictures = False
     page.wait_for_timeout(300)
     demo.robot = np.array([0.0, 0.0, 0.5])
-    wait_alike(page, room_seen(demo.robot, 0.0, math.radians(-10)))
+    wait_alike(page, lambda: room_seen(demo.robot, 0.0, math.radians(-10)))
 
 
 def touch(page, kind, x, y):

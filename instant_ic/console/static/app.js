@@ -36,6 +36,7 @@ let plan = { trajectory: [], path: [], subgoal: null };
 let everConnected = false;
 let sentLook = "", sentLookAt = 0;
 let yielded = false; // the operator handed the lease over
+let mayDrive = true; // false: signed in to watch
 let mapChanged = true, lastFrame = performance.now(), lastHud = 0, lastMap = 0;
 let lastPicture = "", lastGuide = "", lastMapKey = "";
 
@@ -55,7 +56,7 @@ function makeViewer() {
 link.addEventListener("open", () => {
   everConnected = true;
   sentLook = "";
-  link.send({ type: "lease", take: false });
+  if (mayDrive) link.send({ type: "lease", take: false });
   showBanner();
 });
 link.addEventListener("lost", () => {
@@ -63,10 +64,13 @@ link.addEventListener("lost", () => {
   drive.setEnabled(false);
   showBanner();
 });
+link.addEventListener("signed-out", () => location.reload()); // to the form
 link.addEventListener("message", ({ detail: message }) => {
   switch (message.type) {
     case "hello":
       page = { ...page, ...message.page };
+      mayDrive = message.may_drive;
+      document.body.dataset.mayDrive = mayDrive;
       pictures.dissolveMs = reducedMotion.matches ? 0 : page.dissolve_ms;
       drive.limits = { linear: message.max_linear, angular: message.max_angular };
       break;
@@ -157,7 +161,8 @@ window.addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   SHORTCUTS[event.code]?.();
   // Whoever wants to drive while nobody does, may.
-  if (isDriveKey(event) && session.driver === "none") link.send({ type: "lease", take: false });
+  if (isDriveKey(event) && !mayDrive) hud.toast("This sign-in may watch and stop the robot, not drive it.");
+  else if (isDriveKey(event) && session.driver === "none") link.send({ type: "lease", take: false });
   else if (isDriveKey(event) && session.driver === "other") hud.toast("Another operator drives. Take over to drive.");
 }, { capture: true });
 window.addEventListener("keyup", (event) => {

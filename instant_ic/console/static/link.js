@@ -8,7 +8,7 @@ const VERSION = 1;
 export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4;
 
 /**
- * Events: "open", "lost" (once a loss), "message" (detail: object), "frame" (detail: frame).
+ * Events: "open", "lost" (once a loss), "signed-out" (the server wants a token), "message" (detail: object), "frame" (detail: frame).
  * A frame is {kind, sequence, header, payload: Blob}; whoever takes it calls acknowledge(frame).
  */
 export class Link extends EventTarget {
@@ -62,7 +62,10 @@ export class Link extends EventTarget {
     socket.onmessage = (event) => {
       if (socket === this._socket) this._receive(event.data);
     };
+    let opened = false;
+    socket.addEventListener("open", () => { opened = true; });
     socket.onclose = () => {
+      if (!opened) this._askWhy();
       if (socket === this._socket) this._reconnect();
     };
   }
@@ -72,6 +75,16 @@ export class Link extends EventTarget {
     this._socket = null;
     setTimeout(() => this._connect(), this._retryMs);
     this._retryMs = Math.min(this._retryMs * 2, 2000);
+  }
+
+  /** A refused WebSocket tells a page no reason; an ordinary request does. */
+  async _askWhy() {
+    try {
+      const answer = await fetch("/health", { cache: "no-store" });
+      if (answer.status === 401) this.dispatchEvent(new Event("signed-out"));
+    } catch {
+      // No server there: the next try tells.
+    }
   }
 
   _lose() {

@@ -1,0 +1,197 @@
+"""Who may use the page: sign-in by token, cookies of those who have signed in, TLS. Knows HTTP's words, not its server.
+
+Times are seconds of one monotonic clock, given by the caller, so that tests need not wait.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import ipaddress
+import math
+import secrets
+import ssl
+import stat
+from collections import OrderedDict, deque
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+from ..ranges import Positive, Range, check_ranges
+
+COOKIE = "instant_ic_session"
+SIGN_IN = ("auto", "always", "never")
+MIN_TOKEN = 16
+_MOST_SESSIONS = 256
+_MOST_ADDRESSES = 1024
+
+
+class AccessError(ValueError):
+    """A token or certificate cannot be used; says which and what to do."""
+
+
+class Role(Enum):
+    """What a signed-in page may do. An emergency stop may come from either."""
+
+    DRIVE = "drive"
+    WATCH = "watch"
+
+
+@dataclass(frozen=True)
+class AccessConfig:
+    """Sign-in and TLS.
+
+    Attributes:
+        sign_in: ``auto``: needed where the page is open to the network or a token file is given; ``always``; ``never``.
+        token_file: file with the token of whoever may drive, readable by its owner alone; empty: one is made at each
+            start and told in the log.
+        watch_token_file: likewise of those who may only watch (and stop the robot); empty: there are none.
+        session_hours: a page stays signed in for so long.
+        tries_per_minute: wrong tokens of one address; further ones are refused unread.
+        tls_certificate, tls_key: PEM files; both empty: plain HTTP.
+    """
+
+    sign_in: str = "auto"
+    token_file: str = ""
+    watch_token_file: str = ""
+    session_hours: Positive = 12.0
+    tries_per_minute: Annotated[int, Range(1, 1000)] = 10
+    tls_certificate: str = ""
+    tls_key: str = ""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if self.sign_in not in SIGN_IN:
+            raise ValueError(f"sign_in must be one of {', '.join(SIGN_IN)} (got {self.sign_in!r})")
+        if bool(self.tls_certificate) != bool(self.tls_key):
+            raise ValueError("tls_certificate and tls_key must be given together")
+
+
+def read_token(file: str) -> str:
+    """The token in a file.
+
+    Raises:
+        AccessError: no such file, others may read it, or no token that would be hard to guess.
+    """
+    path = Path(file).expanduser()
+    try:
+        mode = path.stat().st_mode
+        text = path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise AccessError(f"token file {path}: {getattr(error, 'strerror', None) or error}") from error
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise AccessError(f"token file {path} may be read by others: chmod 600 {path}")
+    if len(text) < MIN_TOKEN or not text.isascii() or any(c.isspace() for c in text):
+        raise AccessError(
+            f"token file {path}: a token has at least {MIN_TOKEN} ASCII characters and no spaces; make one by "
+            f"`python3 -c 'import secrets; print(secrets.token_urlsafe())' > {path}`"
+        )
+    return text
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a server bound to ``host`` is reached from this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def tls_context(config: AccessConfig) -> ssl.SSLContext | None:
+    """For the server; None for plain HTTP.
+
+    Raises:
+        AccessError: certificate or key cannot be used.
+    """
+    if not config.tls_certificate:
+        return None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    files = [str(Path(file).expanduser()) for file in (config.tls_certificate, config.tls_key)]
+    try:
+        context.load_cert_chain(*files)
+    except (OSError, ssl.SSLError) as error:
+        raise AccessError(f"TLS certificate {files[0]} with key {files[1]}: {error}") from error
+    return context
+
+
+class Access:
+    """Decides who may come in.
+
+    Args:
+        config: parameters.
+        host: address that the server is bound to.
+
+    Raises:
+        AccessError: a token file cannot be used.
+    """
+
+    def __init__(self, config: AccessConfig, host: str) -> None:
+        self.config = config
+        open_to_network = not is_loopback(host)
+        self.required = config.sign_in == "always" or (
+            config.sign_in == "auto" and (open_to_network or bool(config.token_file or config.watch_token_file))
+        )
+        self.unguarded = open_to_network and not self.required
+        self.made_token = ""
+        self._digests: dict[Role, bytes] = {}
+        self._sessions: OrderedDict[bytes, tuple[Role, float]] = OrderedDict()
+        self._failures: OrderedDict[str, deque[float]] = OrderedDict()
+        if not self.required:
+            return
+        drive = read_token(config.token_file) if config.token_file else secrets.token_urlsafe(24)
+        self.made_token = "" if config.token_file else drive
+        self._digests[Role.DRIVE] = _digest(drive)
+        if config.watch_token_file:
+            watch = read_token(config.watch_token_file)
+            if hmac.compare_digest(watch, drive):
+                raise AccessError("token_file and watch_token_file hold the same token: whoever watches could drive")
+            self._digests[Role.WATCH] = _digest(watch)
+
+    def role_of_token(self, token: str, address: str, now_s: float) -> Role | None:
+        """What a token allows; None for a wrong one, which is counted against the address."""
+        if self.wait_s(address, now_s) > 0:
+            return None
+        digest = _digest(token)
+        # Every token is compared, each in constant time: how long it takes tells nothing.
+        roles = [role for role, known in self._digests.items() if hmac.compare_digest(known, digest)]
+        if roles:
+            self._failures.pop(address, None)
+            return roles[0]
+        failures = self._failures.setdefault(address, deque(maxlen=self.config.tries_per_minute))
+        self._failures.move_to_end(address)
+        failures.append(now_s)
+        while len(self._failures) > _MOST_ADDRESSES:
+            self._failures.popitem(last=False)
+        return None
+
+    def wait_s(self, address: str, now_s: float) -> float:
+        """Seconds until the address may try again; 0 where it may now."""
+        failures = self._failures.get(address)
+        if failures is None or len(failures) < self.config.tries_per_minute:
+            return 0.0
+        return max(0.0, math.ceil(failures[0] + 60.0 - now_s))
+
+    def open_session(self, role: Role, now_s: float) -> str:
+        """A new cookie's value."""
+        value = secrets.token_urlsafe(32)
+        self._sessions[_digest(value)] = (role, now_s + self.config.session_hours * 3600.0)
+        while len(self._sessions) > _MOST_SESSIONS:
+            self._sessions.popitem(last=False)
+        return value
+
+    def role_of_session(self, cookie: str, now_s: float) -> Role | None:
+        """What a cookie allows; None for one that is not known or too old."""
+        found = self._sessions.get(_digest(cookie))
+        return found[0] if found is not None and now_s < found[1] else None
+
+    def close_session(self, cookie: str) -> None:
+        """Signs a page out."""
+        self._sessions.pop(_digest(cookie), None)
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode("utf-8", "surrogateescape")).digest()

@@ -1,0 +1,279 @@
+"""Sign-in by token, watchers, TLS: over real sockets where a browser or program would come in."""
+
+import asyncio
+import shutil
+import ssl
+import subprocess
+
+import aiohttp
+import pytest
+
+from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ServerConfig
+from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, is_loopback, read_token
+
+DRIVE, WATCH = "drive-token-0123456789", "watch-token-0123456789"
+
+
+class Nobody:
+    """Backend that takes everything."""
+
+    def __init__(self):
+        self.commands, self.estops = [], []
+
+    def on_drive(self, linear, angular):
+        self.commands.append((linear, angular))
+
+    def on_estop(self, stop):
+        self.estops.append(stop)
+
+    def on_look(self, look):
+        pass
+
+
+def token_file(folder, name, token, mode=0o600):
+    path = folder / name
+    path.write_text(token + "\n")
+    path.chmod(mode)
+    return str(path)
+
+
+@pytest.fixture
+def files(tmp_path):
+    return {
+        "token_file": token_file(tmp_path, "drive", DRIVE),
+        "watch_token_file": token_file(tmp_path, "watch", WATCH),
+    }
+
+
+@pytest.fixture
+def serve():
+    servers = []
+
+    def start(**access):
+        server = ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(**access)))
+        server.start()
+        servers.append(server)
+        return server
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+def run(scenario):
+    async def bounded():
+        async with asyncio.timeout(60):
+            await scenario()
+
+    asyncio.run(bounded())
+
+
+@pytest.mark.parametrize(
+    ("host", "sign_in", "with_file", "required", "unguarded"),
+    [
+        ("127.0.0.1", "auto", False, False, False),
+        ("localhost", "auto", False, False, False),
+        ("::1", "auto", False, False, False),
+        ("0.0.0.0", "auto", False, True, False),
+        ("192.168.1.5", "auto", False, True, False),
+        ("127.0.0.1", "auto", True, True, False),
+        ("127.0.0.1", "always", False, True, False),
+        ("0.0.0.0", "never", False, False, True),
+        ("127.0.0.1", "never", True, False, False),
+    ],
+)
+def test_when_a_sign_in_is_needed(files, host, sign_in, with_file, required, unguarded):
+    given = {"token_file": files["token_file"]} if with_file else {}
+    access = Access(AccessConfig(sign_in=sign_in, **given), host)
+    assert (access.required, access.unguarded) == (required, unguarded)
+    assert bool(access.made_token) == (required and not with_file)
+    assert is_loopback(host) == (host in ("127.0.0.1", "localhost", "::1"))
+
+
+def test_tokens_are_told_apart_and_sessions_end(files):
+    access = Access(AccessConfig(session_hours=1.0, **files), "0.0.0.0")
+    assert access.role_of_token(DRIVE, "a", 0.0) is Role.DRIVE
+    assert access.role_of_token(WATCH, "a", 0.0) is Role.WATCH
+    assert access.role_of_token("", "a", 0.0) is None
+    cookie = access.open_session(Role.WATCH, 100.0)
+    assert access.role_of_session(cookie, 3699.0) is Role.WATCH
+    assert access.role_of_session(cookie, 3701.0) is None
+    assert access.role_of_session("other", 100.0) is None
+    access.close_session(cookie)
+    assert access.role_of_session(cookie, 200.0) is None
+
+
+def test_guessing_is_slowed_down_for_each_address(files):
+    access = Access(AccessConfig(tries_per_minute=3, **files), "0.0.0.0")
+    for second in (0.0, 1.0, 2.0):
+        assert access.wait_s("a", second) == 0
+        assert access.role_of_token("x", "a", second) is None
+    assert access.wait_s("a", 2.0) == 58
+    assert access.role_of_token(DRIVE, "a", 30.0) is None  # not even read
+    assert access.role_of_token(DRIVE, "b", 30.0) is Role.DRIVE
+    assert access.role_of_token(DRIVE, "a", 60.5) is Role.DRIVE
+    assert access.wait_s("a", 60.5) == 0
+
+
+def test_bad_token_files_are_named(tmp_path):
+    with pytest.raises(AccessError, match=r"missing: No such file"):
+        read_token(str(tmp_path / "missing"))
+    with pytest.raises(AccessError, match=r"open may be read by others: chmod 600"):
+        read_token(token_file(tmp_path, "open", DRIVE, 0o640))
+    for name, token in (("short", "abc"), ("spaced", "a token with some spaces"), ("accents", "jétonjétonjétonjéton")):
+        with pytest.raises(AccessError, match=rf"{name}: a token has at least 16 ASCII characters"):
+            read_token(token_file(tmp_path, name, token))
+    same = token_file(tmp_path, "a", DRIVE), token_file(tmp_path, "b", DRIVE)
+    with pytest.raises(ConsoleError, match="the same token"):
+        ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(token_file=same[0], watch_token_file=same[1])))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"sign_in": "maybe"}, "sign_in must be one of"),
+        ({"tls_key": "x"}, "must be given together"),
+        ({"session_hours": 0.0}, "session_hours"),
+    ],
+)
+def test_wrong_parameters_are_refused(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        AccessConfig(**wrong)
+
+
+def test_without_a_token_nothing_but_the_form_comes_out(serve, files):
+    server = serve(**files)
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http:
+            async with http.get(server.url) as response:
+                page = await response.text()
+                assert response.status == 401
+                assert 'type="password"' in page and "app.js" not in page
+                assert "form-action 'self'" in response.headers["Content-Security-Policy"]
+            for path in ("health", "ws", "nowhere"):
+                async with http.get(server.url + path) as response:
+                    assert response.status == 401
+            async with http.get(server.url + "static/style.css") as response:
+                assert response.status == 200
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await http.ws_connect(server.url + "ws", headers={"Authorization": "Bearer wrong"})
+            assert refused.value.status == 401
+
+    run(scenario)
+
+
+def test_a_browser_signs_in_by_address_or_form_and_out_again(serve, files):
+    server = serve(**files)
+
+    async def scenario():
+        jar = aiohttp.CookieJar(unsafe=True)  # cookies of an address without a name, as browsers keep them
+        async with aiohttp.ClientSession(cookie_jar=jar) as http:
+            async with http.get(f"{server.url}?token={DRIVE}", allow_redirects=False) as response:
+                assert (response.status, response.headers["Location"]) == (303, "/")
+                cookie = response.headers["Set-Cookie"]
+                assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and DRIVE not in cookie
+            async with http.get(server.url) as response:
+                assert response.status == 200 and "app.js" in await response.text()
+            async with http.post(server.url + "sign-out", allow_redirects=False) as response:
+                assert response.status == 303
+            async with http.get(server.url) as response:
+                assert response.status == 401
+            async with http.post(server.url + "sign-in", data={"token": "wrong"}) as response:
+                assert response.status == 401 and "This token is wrong." in await response.text()
+            async with http.post(server.url + "sign-in", data={"token": f" {WATCH} "}) as response:
+                assert response.status == 200 and "app.js" in await response.text()
+            # A signed-out cookie does not come back to life.
+            async with http.get(server.url, headers={"Cookie": cookie.partition(";")[0]}) as response:
+                assert COOKIE in cookie
+                assert response.status == 200  # the jar's newer one goes with it
+        async with aiohttp.ClientSession() as http:
+            async with http.get(server.url, headers={"Cookie": cookie.partition(";")[0]}) as response:
+                assert response.status == 401
+
+    run(scenario)
+
+
+def test_after_too_many_wrong_tokens_the_form_says_how_long_to_wait(serve, files):
+    server = serve(tries_per_minute=2, **files)
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http:
+            statuses = []
+            for _ in range(3):
+                async with http.post(server.url + "sign-in", data={"token": "wrong"}) as response:
+                    statuses.append(response.status)
+                    text = await response.text()
+            assert statuses == [401, 429, 429]
+            assert "Try again in" in text
+
+    run(scenario)
+
+
+def test_watchers_see_and_stop_but_do_not_drive(serve, files):
+    server = serve(**files)
+
+    async def scenario():
+        async with ConsoleClient(server.url, token=WATCH) as watcher:
+            assert watcher.messages["hello"]["may_drive"] is False
+            await watcher.send({"type": "lease", "take": True})
+            await watcher.wait_for(lambda c: "watch_only" in c.refused)
+            assert watcher.session["driver"] == "none"
+            async with ConsoleClient(f"{server.url}?token={DRIVE}") as driver:
+                await driver.acquire()
+                await watcher.send({"type": "estop"})
+                await driver.wait_for(lambda c: c.session.get("estop") is True)
+        assert server.backend.estops == [True]
+        assert [c for c in server.backend.commands if c != (0.0, 0.0)] == []
+
+    run(scenario)
+
+
+def test_a_token_made_at_start_stands_in_the_address(serve):
+    server = serve(sign_in="always")
+    assert server.sign_in_url.startswith(server.url + "?token=")
+
+    async def scenario():
+        async with ConsoleClient(server.sign_in_url) as client:
+            assert client.messages["hello"]["may_drive"] is True
+
+    run(scenario)
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory):
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not here to make a certificate")
+    folder = tmp_path_factory.mktemp("tls")
+    command = (
+        "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 -subj /CN=robot "
+        "-addext subjectAltName=IP:127.0.0.1 -keyout key.pem -out cert.pem"
+    )
+    subprocess.run(command.split(), cwd=folder, check=True, capture_output=True, timeout=60)
+    return {"tls_certificate": str(folder / "cert.pem"), "tls_key": str(folder / "key.pem")}
+
+
+def test_tls_from_page_to_websocket(serve, files, certificate):
+    server = serve(**files, **certificate)
+    assert server.url.startswith("https://")
+
+    async def scenario():
+        async with ConsoleClient(server.url, token=DRIVE, ca_file=certificate["tls_certificate"]) as client:
+            await client.acquire()
+        trusting = ssl.create_default_context(cafile=certificate["tls_certificate"])
+        async with aiohttp.ClientSession() as http:
+            address = f"{server.url}?token={DRIVE}"
+            async with http.get(address, ssl=trusting, allow_redirects=False) as response:
+                assert "Secure" in response.headers["Set-Cookie"]
+            with pytest.raises(aiohttp.ClientConnectorCertificateError):
+                await http.get(server.url)
+
+    run(scenario)
+
+
+def test_bad_certificates_are_named(tmp_path):
+    (tmp_path / "c.pem").write_text("no certificate")
+    for name in ("c.pem", "missing.pem"):
+        files = {"tls_certificate": str(tmp_path / name), "tls_key": str(tmp_path / "c.pem")}
+        with pytest.raises(ConsoleError, match=rf"TLS certificate .*{name}"):
+            ConsoleServer(Nobody(), ServerConfig(port=0, access=AccessConfig(**files)))
