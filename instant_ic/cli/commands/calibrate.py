@@ -1,0 +1,181 @@
+"""``ic calibrate``: where the sensors are on the robot, from a recording."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from instant_ic.cli import completion
+from instant_ic.cli.errors import UserError
+
+if TYPE_CHECKING:
+    from instant_ic.depth.calibration import Calibration
+    from instant_ic.evaluation.calibration_bag import CalibrationRecording
+    from instant_ic.geometry.poses import Matrix
+
+
+def add_parser(subparsers: Any) -> None:
+    """Adds ``calibrate`` to the ``ic`` command."""
+    parser = subparsers.add_parser(
+        "calibrate",
+        help="mounts of the sensors from a recording",
+        description="Mounts of the sensors (docs/calibration.md).",
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+    camera = verbs.add_parser(
+        "camera-lidar",
+        help="where the camera is, seen from the LiDAR",
+        description=(
+            "Estimates the pose of the camera against the LiDAR from a recording, by the edges that both see, and says "
+            "which degrees of freedom the recording constrains. Writes the camera's mount as a parameter file. "
+            "Record a minute of slow driving in a furnished room (docs/calibration.md)."
+        ),
+        epilog="example: ic calibrate camera-lidar drive -o config/mount.yaml --plot overlay.png; "
+        "ic launch robot params:=config/mount.yaml",
+    )
+    completion.offer(camera.add_argument("bag", type=Path, metavar="BAG"), completion.bags)
+    camera.add_argument("-o", "--out", type=Path, default=Path("camera_mount.yaml"), metavar="FILE",
+                        help="parameter file to write (%(default)s)")  # fmt: skip
+    camera.add_argument("--plot", type=Path, metavar="PNG", help="points over the pictures, before and after")
+    camera.add_argument("--json", type=Path, metavar="FILE", help="the result in numbers")
+    camera.add_argument("--images", default="", metavar="TOPIC", help="pictures (default: /camera/image/compressed)")
+    camera.add_argument("--points", default="", metavar="TOPIC",
+                        help="revolutions (default: /lidar/points, else /lidar/packets)")  # fmt: skip
+    camera.add_argument("--frames", type=int, default=24, metavar="N", help="most pictures (%(default)s)")
+    camera.add_argument("--guess", metavar="X,Y,Z,ROLL,PITCH,YAW",
+                        help="the camera seen from the LiDAR (m, degrees), where /tf_static does not tell it")  # fmt: skip
+    camera.add_argument("--near", action="store_true", help="the yaw is right within a few degrees: no full circle")
+    camera.set_defaults(func=camera_lidar)
+
+
+def camera_lidar(args: argparse.Namespace) -> int:
+    """Runs ``ic calibrate camera-lidar``; returns the exit status."""
+    from instant_ic.depth.calibration import CalibrationConfig, calibrate
+    from instant_ic.evaluation.calibration_bag import Selection, read_recording
+
+    if args.frames < 1:
+        raise UserError(f"--frames must be at least 1 (got {args.frames})", 2)
+    guess = _guess(args.guess) if args.guess else None
+    for path in (args.out, args.plot, args.json):
+        if path is not None and not path.expanduser().absolute().parent.is_dir():
+            raise UserError(f"{path}: its folder does not exist", 2)
+    print(f"reading {args.bag}", flush=True)
+    recording = read_recording(args.bag, Selection(args.images, args.points, most_frames=args.frames))
+    given = guess if guess is not None else recording.camera_from_lidar
+    if given is None:
+        raise UserError(
+            f"{args.bag}: /tf_static does not tell the camera and the LiDAR against each other: record it too, or give "
+            "--guess X,Y,Z,ROLL,PITCH,YAW"
+        )
+    print(f"{recording.pictures} pictures, {len(recording.frames)} taken, from {recording.places} places"
+          + ("" if recording.moves else "; no odometry on /tf: the robot is taken to stand"), flush=True)  # fmt: skip
+    result = calibrate(
+        recording.frames, given, CalibrationConfig(full_circle=not args.near), lambda line: print(line, flush=True)
+    )
+    summary = _summary(args.bag, recording, given, result)
+    _tell(summary)
+    if args.json:
+        args.json.write_text(json.dumps(summary, indent=2) + "\n")
+        print(f"wrote {args.json}")
+    if args.plot:
+        _plot(args.plot, recording, given, result)
+    if not any(summary["constrained"].values()):
+        raise UserError(
+            f"{args.bag}: nothing is constrained, so no mount is written: record slow driving from several places of a "
+            "furnished room (docs/calibration.md)"
+        )
+    args.out.write_text(_yaml(summary))
+    print(f"wrote {args.out}; use it with: ic launch robot params:={args.out}")
+    return 0
+
+
+def _guess(text: str) -> Matrix:
+    """``camera_from_lidar`` of the camera's pose on the LiDAR."""
+    import numpy as np
+
+    from instant_ic.geometry.poses import inverse, pose_matrix
+
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != 6 or not np.isfinite(values).all():
+        raise UserError(f"--guess must be six numbers X,Y,Z,ROLL,PITCH,YAW (got {text!r})", 2)
+    return inverse(pose_matrix(*values[:3], *np.radians(values[3:])))
+
+
+def _xyz_rpy(pose: Matrix) -> tuple[list[float], list[float]]:
+    """Metres, and roll, pitch, yaw in degrees about fixed axes, rounded."""
+    import numpy as np
+
+    r = pose[:3, :3]
+    rpy = np.degrees([np.arctan2(r[2, 1], r[2, 2]), np.arcsin(np.clip(-r[2, 0], -1, 1)), np.arctan2(r[1, 0], r[0, 0])])
+    return [round(float(v), 4) + 0.0 for v in pose[:3, 3]], [round(float(v), 3) + 0.0 for v in rpy]
+
+
+def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: Calibration) -> dict[str, Any]:
+    import numpy as np
+
+    from instant_ic.depth.calibration import AXES
+    from instant_ic.geometry.poses import inverse, pose_matrix
+
+    # Without a mount of the LiDAR in the bag: the one of config/lidar.yaml.
+    base_from_lidar = recording.base_from_lidar if recording.base_from_lidar is not None else pose_matrix(z=0.6)
+    xyz, rpy = _xyz_rpy(base_from_lidar @ inverse(result.camera_from_lidar))
+    xyz_before, rpy_before = _xyz_rpy(base_from_lidar @ inverse(given))
+    in_units = np.concatenate([result.sigma[:3], np.degrees(result.sigma[3:])])
+    return {
+        "bag": str(bag),
+        "frames": len(recording.frames),
+        "places": recording.places,
+        "edges": result.edges,
+        "mount_xyz": xyz,
+        "mount_rpy_deg": rpy,
+        "mount_xyz_before": xyz_before,
+        "mount_rpy_deg_before": rpy_before,
+        "sigma_m_deg": {axis: round(float(value), 4) for axis, value in zip(AXES, in_units, strict=True)},
+        "constrained": {axis: bool(value) for axis, value in zip(AXES, result.constrained, strict=True)},
+        "score_before": round(result.score_before, 3),
+        "score_after": round(result.score_after, 3),
+        "yaw_rival": round(result.yaw_rival, 3),
+        "camera_from_lidar": result.camera_from_lidar.round(6).tolist(),
+    }
+
+
+def _tell(summary: dict[str, Any]) -> None:
+    before = summary["mount_xyz_before"] + summary["mount_rpy_deg_before"]
+    after = summary["mount_xyz"] + summary["mount_rpy_deg"]
+    print(f"{'camera on base_link':20} {'before':>9} {'after':>9} {'+-':>8}")
+    for number, (axis, sigma) in enumerate(summary["sigma_m_deg"].items()):
+        unit = "m" if number < 3 else "deg"
+        note = "" if summary["constrained"][axis] else "   not constrained by this recording"
+        print(f"  {axis:5} {unit:12} {before[number]:9.3f} {after[number]:9.3f} {sigma:8.3f}{note}")
+    print(f"edges of the LiDAR on edges of the pictures: {summary['score_before']:.2f} times chance before, "
+          f"{summary['score_after']:.2f} after")  # fmt: skip
+    if summary["yaw_rival"] > 0.8:
+        print("another yaw fits nearly as well: the place looks alike in two directions; check the overlay (--plot)")
+
+
+def _yaml(summary: dict[str, Any]) -> str:
+    loose = [axis for axis, known in summary["constrained"].items() if not known]
+    sigma = ", ".join(f"{axis} {value:g}" for axis, value in summary["sigma_m_deg"].items())
+    kept = f"# Not constrained by the recording, kept as given: {', '.join(loose)}.\n" if loose else ""
+    return (
+        f"# Camera's mount by ic calibrate camera-lidar {summary['bag']}, {summary['frames']} pictures.\n"
+        f"# Standard deviations (m, degrees): {sigma}.\n{kept}"
+        "theta_camera:\n  ros__parameters:\n"
+        f"    mount_xyz: {summary['mount_xyz']}\n    mount_rpy_deg: {summary['mount_rpy_deg']}\n"
+    )
+
+
+def _plot(path: Path, recording: CalibrationRecording, given: Matrix, result: Calibration) -> None:
+    import cv2
+
+    from instant_ic.depth.calibration_overlay import before_and_after
+
+    sheet = before_and_after(recording.frames, given, result.camera_from_lidar)
+    if not cv2.imwrite(str(path), sheet[..., ::-1]):
+        raise UserError(f"{path} cannot be written: give a name that ends in .png or .jpg")
+    print(f"wrote {path}")
