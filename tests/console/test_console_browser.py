@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from instant_ic.console import demo_world
+from instant_ic.console.access import AccessConfig
 from instant_ic.console.demo import Demo, DemoConfig
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.server import ServerConfig
@@ -51,12 +52,12 @@ def browser():
         browser.close()
 
 
-def make_demo(port=0, panorama_width=192, view_width=160):
+def make_demo(port=0, panorama_width=192, view_width=160, **access):
     # No watchdog in the server's way: what stops the robot here must be the page.
     drive = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
     view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
     config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
-    demo = Demo(ServerConfig(port=port, drive=drive), config)
+    demo = Demo(ServerConfig(port=port, drive=drive, access=AccessConfig(**access)), config)
     demo.start()
     return demo
 
@@ -406,3 +407,37 @@ def test_faults_and_silence_are_told(open_page, demo):
     assert page.locator("#faults li").inner_text() == f"vlp16_driver {text}"  # as text, not as HTML
     demo.pictures = False
     expect_body(page, "picture", "stale")
+
+
+def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(browser, tmp_path):
+    files = {}
+    for role in ("token_file", "watch_token_file"):
+        path = tmp_path / role
+        path.write_text(f"{role}-0123456789")
+        path.chmod(0o600)
+        files[role] = str(path)
+    demo = make_demo(**files)
+    try:
+        contexts = [browser.new_context(viewport=SIZE) for _ in range(2)]
+        driver, watcher = (context.new_page() for context in contexts)
+        for page, token in ((watcher, "watch_token_file-0123456789"), (driver, "token_file-0123456789")):
+            page.set_default_timeout(WAIT_MS)
+            page.goto(demo.server.url)
+            page.get_by_label("Token").fill("wrong")
+            page.keyboard.press("Enter")
+            page.get_by_text("This token is wrong.").wait_for()
+            page.get_by_label("Token").fill(token)
+            page.get_by_role("button", name="Sign in").click()
+            expect_body(page, "picture", "live")
+        expect_body(driver, "driver", "you")
+        expect_body(watcher, "driver", "other")
+        assert not watcher.locator("#take").is_visible() and not watcher.locator("#stick").is_visible()
+        watcher.keyboard.press("w")
+        watcher.get_by_text("This sign-in may watch and stop the robot, not drive it.").wait_for()
+        assert not moving(demo)
+        watcher.keyboard.press("Space")
+        wait_until(lambda: demo.estop, watcher, "the watcher's emergency stop")
+        for context in contexts:
+            context.close()
+    finally:
+        demo.stop()
