@@ -319,7 +319,9 @@ class _Building:
             (ceiling, Origin.CEILING) if ceiling is not None else (ceiling_guess, Origin.ASSUMED)
         )
         if self.top is None and floor is not None:
-            self.top = max(config.ceiling_height_m - floor, _highest(z[~of_plane]))
+            self.top = config.ceiling_height_m - floor
+        if self.top is not None and ceiling is None:
+            self.top = max(self.top, _highest(z[~of_plane]))
 
     def fill(self) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
         """Depth, origin and angle to the next point, each (H, W)."""

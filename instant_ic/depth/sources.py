@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ranges import check_ranges
-from .fusion import Corrected, FusionConfig, ceiling_height, correct, fuse, fused_sigma
+from .fusion import Corrected, FusionConfig, ceiling_height, correct, fuse, fused_sigma, likely_ceiling
 from .lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, rays
 from .scaler import DepthScaler, ScaleFit, ScalerConfig
 from .visibility import nearest_points
@@ -156,6 +156,9 @@ class DepthSource:
         network = correct(fit.depth_m, self.structure.ranges(points, size), self.config.fusion)
         rise = rays(*size) @ np.asarray(up, np.float32)
         top = ceiling_height(network.depth_m, rise)
+        if top is not None and camera_height_m is not None:
+            usual = max(self.config.lidar.ceiling_height_m - camera_height_m, 0.3)
+            top = likely_ceiling(top, network, usual)
         return network, self.structure.estimate(points, up, camera_height_m, size, top)
 
     def _lidar(self, points: Floats, up: Floats, camera_height_m: float | None, size: tuple[int, int]) -> DepthResult:

@@ -1,0 +1,298 @@
+"""Depth from the LiDAR alone and fused with a network's, in a room whose truth is known by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+
+from instant_ic.depth.fusion import FusionConfig, ceiling_height, correct, fused_sigma
+from instant_ic.depth.lidar_depth import (
+    LEAST_SIGMA,
+    LidarDepthConfig,
+    LidarStructure,
+    Origin,
+    level_from_camera,
+    lonely,
+    plane_height,
+)
+from instant_ic.depth.scaler import ScalerConfig
+from instant_ic.depth.sources import SOURCES, DepthSource, SourceConfig, without_body
+from instant_ic.geometry.poses import rotation_matrix
+from instant_ic.geometry.projections import equirect_directions
+
+SIZE = (96, 192)
+UP = np.array([0.0, 0.0, 1.0])
+LEVEL = np.eye(3)
+CAMERA_M, LIDAR_M = 1.2, 0.6
+# A room around the camera (its frame): 4 m and 5 m along x, 3.4 m and 2.5 m along y, ceiling 1.4 m over the camera.
+ROOM = (np.array([-4.0, -2.5, -CAMERA_M]), np.array([5.0, 3.4, 1.4]))
+HALL = (np.array([-9.0, -8.0, -CAMERA_M]), np.array([12.0, 8.0, 1.4]))
+# A cupboard that stands in the room, 2 to 2.6 m ahead, as high as 0.5 m under the camera.
+CUPBOARD = (np.array([2.0, -0.6, -CAMERA_M]), np.array([2.6, 0.6, -0.5]))
+
+
+def cast(origin: np.ndarray, rays: np.ndarray, room=ROOM, box=None) -> np.ndarray:
+    """Distances (N,) from a point inside the room along unit rays (N, 3) to its walls or the box."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_low, to_high = ((bound - origin) / rays for bound in room)
+        reach = np.where(rays > 0, to_high, np.where(rays < 0, to_low, np.inf)).min(axis=1)
+        if box is not None:
+            a, b = ((bound - origin) / rays for bound in box)
+            near, far = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+            reach = np.where((near < far) & (near > 0), np.minimum(reach, near), reach)
+    return reach
+
+
+def truth(room=ROOM, box=None, turn=LEVEL) -> np.ndarray:
+    rays = equirect_directions(SIZE[1], SIZE[0]).reshape(-1, 3).astype(float) @ turn.T
+    return cast(np.zeros(3), rays, room, box).reshape(SIZE)
+
+
+def revolution(room=ROOM, box=None, noise_m=0.0) -> np.ndarray:
+    """(N, 3) points in the camera's frame: 16 rings, 720 azimuths, the LiDAR 0.6 m under the camera."""
+    omega, azimuth = np.meshgrid(np.radians(np.arange(-15, 16, 2.0)), np.radians(np.arange(0, 360, 0.5)))
+    flat = np.cos(omega)
+    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(omega)], axis=-1).reshape(-1, 3)
+    mount = np.array([0.0, 0.0, LIDAR_M - CAMERA_M])
+    reach = cast(mount, rays, room, box)
+    reach = reach + np.random.default_rng(0).normal(0, 1, len(reach)) * noise_m
+    return mount + rays * reach[:, None]
+
+
+def error(depth: np.ndarray, true: np.ndarray) -> np.ndarray:
+    return np.abs(depth / true - 1)
+
+
+STRUCTURE = LidarStructure(LidarDepthConfig(ceiling_height_m=2.6))
+POINTS = revolution()
+
+
+def test_box_room_from_points_alone() -> None:
+    built = STRUCTURE.estimate(POINTS, UP, CAMERA_M, SIZE)
+    assert built.message == "" and built.points == 16 * 720
+    off = error(built.depth_m, truth())
+    # A pixel is 1.9 degrees: where wall and floor meet it shows either.
+    assert np.quantile(off, 0.99) < 0.03 and off.max() < 0.2
+    assert (built.depth_m > 0).all() and np.isfinite(built.sigma).all()
+    # Straight down the floor, straight up the ceiling, ahead the wall.
+    assert built.depth_m[-1].mean() == pytest.approx(1.2, rel=1e-3) and (built.origin[-1] == Origin.FLOOR).all()
+    assert built.depth_m[0].mean() == pytest.approx(1.4, rel=1e-3) and (built.origin[0] == Origin.ASSUMED).all()
+    assert built.depth_m[SIZE[0] // 2, SIZE[1] // 2] == pytest.approx(5.0, rel=0.01)
+
+
+def test_uncertainty_grows_away_from_the_points() -> None:
+    built = STRUCTURE.estimate(POINTS, UP, CAMERA_M, SIZE)
+    median = {each: float(np.median(built.sigma[built.origin == each])) for each in np.unique(built.origin)}
+    assert median[Origin.BEAM] < median[Origin.UP] < median[Origin.ASSUMED]
+    column = built.sigma[:, SIZE[1] // 2][built.origin[:, SIZE[1] // 2] == Origin.UP]
+    assert (np.diff(column) <= 0).all()  # from the top of the wall down to the uppermost point
+
+
+def test_a_tilted_camera_sees_the_same_room() -> None:
+    camera_from_level = rotation_matrix(roll=np.radians(6), pitch=np.radians(-9))
+    built = STRUCTURE.estimate(POINTS @ camera_from_level.T, camera_from_level @ UP, CAMERA_M, SIZE)
+    off = error(built.depth_m, truth(turn=camera_from_level.T))
+    assert np.quantile(off, 0.95) < 0.05
+
+
+def test_floor_and_ceiling_are_found_where_the_rings_reach_them() -> None:
+    built = LidarStructure().estimate(revolution(HALL, noise_m=0.02), UP, None, SIZE)
+    assert built.camera_height_m == pytest.approx(1.2, abs=0.03)
+    assert built.ceiling_height_m == pytest.approx(1.4, abs=0.03)
+    assert np.quantile(error(built.depth_m, truth(HALL)), 0.95) < 0.06
+
+
+def test_a_cupboard_is_kept_as_seen_and_the_wall_over_it() -> None:
+    built = STRUCTURE.estimate(revolution(box=CUPBOARD), UP, CAMERA_M, SIZE)
+    true = truth(box=CUPBOARD)
+    front = (true < 2.3) & (np.abs(np.arange(SIZE[1]) - SIZE[1] / 2) < 6)
+    front &= np.abs(np.arange(SIZE[0])[:, None] - SIZE[0] * 0.64) < 4
+    assert front.sum() > 20 and np.median(error(built.depth_m, true)[front]) < 0.02
+    ahead = built.depth_m[: SIZE[0] // 2, SIZE[1] // 2]
+    assert np.quantile(error(ahead, true[: SIZE[0] // 2, SIZE[1] // 2]), 0.9) < 0.03
+
+
+def test_outliers_do_not_show() -> None:
+    rng = np.random.default_rng(1)
+    points = revolution(noise_m=0.02)
+    wrong = rng.permutation(len(points))[: len(points) // 20]
+    mount = np.array([0.0, 0.0, LIDAR_M - CAMERA_M])
+    points[wrong] = mount + (points[wrong] - mount) * rng.uniform(0.2, 3.0, len(wrong))[:, None]
+    off = error(STRUCTURE.estimate(points, UP, CAMERA_M, SIZE).depth_m, truth())
+    assert np.quantile(off, 0.97) < 0.05
+
+
+def test_an_open_side_is_unknown_and_a_narrow_gap_is_bridged() -> None:
+    azimuth = np.degrees(np.arctan2(POINTS[:, 1], POINTS[:, 0]))
+    built = STRUCTURE.estimate(POINTS[np.abs(azimuth) > 30], UP, CAMERA_M, SIZE)
+    middle = built.depth_m[:, SIZE[1] // 2]
+    assert (middle[: SIZE[0] // 2] == 0).all() and not np.isfinite(built.sigma[0, SIZE[1] // 2])
+    assert middle[-1] == pytest.approx(1.2, rel=1e-3)  # what the robot stands on
+    bridged = STRUCTURE.estimate(POINTS[np.abs(azimuth) > 3], UP, CAMERA_M, SIZE)
+    assert bridged.depth_m[SIZE[0] // 2, SIZE[1] // 2] == pytest.approx(5.0, rel=0.03)
+
+
+def test_what_is_not_to_be_trusted_says_why() -> None:
+    assert "20 LiDAR points" in STRUCTURE.estimate(POINTS[:20], UP, CAMERA_M, SIZE).message
+    azimuth = np.degrees(np.arctan2(POINTS[:, 1], POINTS[:, 0]))
+    narrow = STRUCTURE.estimate(POINTS[np.abs(azimuth) < 30], UP, CAMERA_M, SIZE)
+    assert "deg of azimuth, 90 are needed" in narrow.message
+    low = STRUCTURE.estimate(POINTS, UP, 0.7, SIZE)
+    assert "lie under the floor (0.70 m under the camera)" in low.message
+    with pytest.raises(ValueError, match=r"points must be \(N, 3\)"):
+        STRUCTURE.estimate(POINTS[:, :2], UP)
+    with pytest.raises(ValueError, match="upside down"):
+        STRUCTURE.estimate(POINTS, -UP)
+    with pytest.raises(ValueError, match="three finite numbers"):
+        STRUCTURE.estimate(POINTS, np.full(3, np.nan))
+    with pytest.raises(ValueError, match="min_range_m must be under max_range_m"):
+        LidarDepthConfig(min_range_m=3, max_range_m=2)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    npst.arrays(np.float64, (400, 3), elements=st.floats(-30, 30, width=32) | st.just(np.nan) | st.just(np.inf)),
+    st.floats(0.3, 2.0) | st.none(),
+)
+def test_any_points_give_finite_depth_or_none(points: np.ndarray, height: float | None) -> None:
+    built = LidarStructure().estimate(points, UP, height, (32, 64))
+    assert np.isfinite(built.depth_m).all() and (built.depth_m >= 0).all()
+    assert ((built.depth_m > 0) == np.isfinite(built.sigma)).all() and (built.sigma > 0).all()
+
+
+def test_level_from_camera_by_hand() -> None:
+    np.testing.assert_allclose(level_from_camera(np.array([0, 0, 5.0])), np.eye(3), atol=1e-12)
+    tilted = level_from_camera(np.array([np.sin(0.3), 0, np.cos(0.3)]))
+    np.testing.assert_allclose(tilted @ [np.sin(0.3), 0, np.cos(0.3)], UP, atol=1e-12)
+    np.testing.assert_allclose(tilted @ [0, 1, 0], [0, 1, 0], atol=1e-12)  # the smallest turn: about y alone
+
+
+def test_plane_height_by_hand() -> None:
+    # In each of 30 columns: two points on a table (0.7 m under the camera), one of the floor, wall points at 4 m.
+    across = np.tile([1.0, 1.5, 3.0, 3.5, 4.0, 4.0, 4.0], 30)
+    z = np.tile([-0.7, -0.7, -1.2, -1.2, -1.0, -0.5, 0.3], 30)
+    columns = np.repeat(np.arange(30), 7)
+    lower = z < -0.2
+    assert plane_height(z[lower], across[lower], columns[lower]) == pytest.approx(-1.2)
+    wall = across == 4.0
+    assert plane_height(z[wall], across[wall], columns[wall]) is None
+
+
+def test_lonely_points_by_hand() -> None:
+    measured = np.zeros((20, 40))
+    measured[10, :] = 3.0
+    measured[10, 20] = 2.0
+    rows, columns = np.nonzero(measured)
+    assert np.flatnonzero(lonely(measured, rows, columns)).tolist() == [20]
+    sparse = np.where(np.arange(40) % 8 == 0, measured, 0)  # nothing is near anything: nobody can tell
+    rows, columns = np.nonzero(sparse)
+    assert not lonely(sparse, rows, columns).any()
+
+
+def test_ceiling_height_by_hand() -> None:
+    rise = equirect_directions(64, 32)[..., 2]
+    depth = np.where(rise > 0.3, 1.5 / np.maximum(rise, 0.1), 4.0)
+    assert ceiling_height(depth, rise) == pytest.approx(1.5, rel=0.02)
+    assert ceiling_height(np.zeros_like(depth), rise) is None
+    assert ceiling_height(np.full_like(depth, 30.0), rise) is None  # the sky of a wrong network
+
+
+def test_a_wall_that_the_network_sees_too_near_is_put_right() -> None:
+    true = truth()
+    azimuth = np.pi - (np.arange(SIZE[1]) + 0.5) * (2 * np.pi / SIZE[1])
+    factor = np.where(np.abs(azimuth) < 0.6, 0.75, 1.0)
+    measured = STRUCTURE.ranges(POINTS, SIZE)
+    found = correct((true * factor).astype(np.float32), measured, FusionConfig())
+    middle = slice(SIZE[0] // 3, 2 * SIZE[0] // 3), np.abs(azimuth) < 0.35
+    assert np.abs(found.depth_m[middle] / true[middle] - 1).max() < 0.06
+    assert found.sigma < 0.05 and found.wrong.max() < 0.3
+    assert (correct(np.zeros(SIZE, np.float32), measured, FusionConfig()).depth_m == 0).all()
+
+
+def test_sigma_grows_with_disagreement_and_has_a_floor() -> None:
+    origin = np.array([[Origin.UP, Origin.UP, Origin.FLOOR]], np.uint8)
+    found = fused_sigma(origin, np.zeros((1, 3)), np.array([[0.0, 0.4, 0.0]]), np.zeros((1, 3)))[0]
+    assert found[1] > 10 * found[0] and found[2] == np.float32(LEAST_SIGMA)
+
+
+def raw_of(true: np.ndarray) -> np.ndarray:
+    """A network that is half a factor and smoothly wrong by up to 8 %."""
+    wave = 1 + 0.08 * np.sin(np.linspace(0, 4 * np.pi, SIZE[1]))
+    return (true / 2 * wave).astype(np.float32)
+
+
+@pytest.mark.parametrize("source", SOURCES)
+def test_each_source_in_the_room(source: str) -> None:
+    config = SourceConfig(source=source, lidar=LidarDepthConfig(ceiling_height_m=2.6))
+    raw = None if source == "lidar" else raw_of(truth())
+    found = DepthSource(config).estimate(raw, POINTS, UP, CAMERA_M, size=SIZE)
+    assert found.ok and found.source == source and found.depth_m.shape == SIZE
+    assert found.depth_m.dtype == found.sigma.dtype == np.float32
+    off = error(found.depth_m, truth())
+    assert off.mean() < {"network": 0.06, "lidar": 0.02, "fused": 0.02}[source]
+    assert 0.9 < found.quality <= 1 and 0 < found.relative_sigma < 0.1 and found.points > 3000
+    if source != "lidar":
+        assert found.scale == pytest.approx(2, rel=0.08)
+
+
+def test_fused_takes_from_the_network_what_the_lidar_cannot_know() -> None:
+    """A high ceiling, and a side without any return."""
+    tall = (ROOM[0], np.array([5.0, 3.4, 2.9]))
+    points = revolution(tall)
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    found = DepthSource().estimate(raw_of(truth(tall)), points[np.abs(azimuth) > 30], UP, CAMERA_M)
+    off = error(found.depth_m, truth(tall))
+    assert found.ok and off[:5].max() < 0.08  # the ceiling straight up
+    assert off[SIZE[0] // 2 - 5 : SIZE[0] // 2 + 5, SIZE[1] // 2].max() < 0.2
+    ahead, aside = found.sigma[SIZE[0] // 2, SIZE[1] // 2], found.sigma[SIZE[0] // 2, SIZE[1] // 4]
+    assert ahead > 2 * aside  # where only the network knows
+
+
+@pytest.mark.parametrize("source", ["fused", "lidar"])
+def test_unfit_with_the_reason(source: str) -> None:
+    config = SourceConfig(source=source)
+    raw = raw_of(truth())
+    few = DepthSource(config).estimate(raw, POINTS[:100], UP, CAMERA_M)
+    assert not few.ok and "100 LiDAR points" in few.message
+    low = DepthSource(config).estimate(raw, POINTS, UP, 0.7)
+    assert not low.ok and "under the floor" in low.message
+    none = DepthSource(config).refuse(raw if source == "fused" else None, "no LiDAR", SIZE)
+    assert not none.ok and none.message == "no LiDAR" and none.depth_m.shape == SIZE
+
+
+def test_another_places_picture_is_not_fused() -> None:
+    """Half of the points agree with one scale, half with another: picture and LiDAR do not belong together."""
+    true = truth()
+    raw = np.where(np.arange(SIZE[1]) < SIZE[1] // 2, true, true / 2.4).astype(np.float32)
+    found = DepthSource().estimate(raw, POINTS, UP, CAMERA_M)
+    assert not found.ok and "two scales fit" in found.message
+    # What is told besides is the LiDAR's.
+    assert np.median(error(found.depth_m, true)) < 0.02
+
+
+def test_as_estimated_asks_no_lidar_in_the_fused_source() -> None:
+    config = SourceConfig(scaler=ScalerConfig(method="as_estimated"))
+    raw = raw_of(truth())
+    found = DepthSource(config).estimate(raw, np.empty((0, 3)), UP, None)
+    assert found.ok and found.source == "network" and "LiDAR was not asked" in found.message
+    np.testing.assert_allclose(found.depth_m, raw)
+
+
+def test_the_robot_under_the_camera_becomes_floor() -> None:
+    result = DepthSource(SourceConfig(source="network")).estimate(raw_of(truth()), POINTS, UP, CAMERA_M)
+    rise = equirect_directions(SIZE[1], SIZE[0])[..., 2]
+    body = rise < np.sin(np.radians(-60))
+    masked = without_body(result, UP, CAMERA_M, -60.0)
+    np.testing.assert_allclose(masked.depth_m[body], truth()[body], rtol=1e-4)
+    assert (masked.depth_m[~body] == result.depth_m[~body]).all()
+    unknown = without_body(result, UP, None, -60.0)
+    assert (unknown.depth_m[body] == 0).all() and np.isinf(unknown.sigma[body]).all()
+    assert without_body(result, UP, CAMERA_M, -90.0) is result
+
+
+def test_wrong_use_is_told() -> None:
+    with pytest.raises(ValueError, match="source must be one of network, lidar, fused"):
+        SourceConfig(source="sonar")
+    with pytest.raises(ValueError, match="source fused needs the network's depth"):
+        DepthSource().estimate(None, POINTS, UP, CAMERA_M)
