@@ -86,7 +86,7 @@ def measure(
     if not math.isfinite(below_m):
         raise ValueError(f"heights must be numbers (got {lidar_height_m}, {camera_height_m})")
     height = len(depth_m)
-    known = np.isfinite(depth_m) & (depth_m > 0)
+    known = np.isfinite(depth_m) & (depth_m > 1e-3)
     inverse = np.where(known, 1.0 / np.where(known, depth_m, 1.0), 0.0)
     azimuth = math.pi - (np.arange(AZIMUTHS) + 0.5) * (2 * math.pi / AZIMUTHS)
     profile = _profiles(inverse, azimuth)

@@ -185,6 +185,16 @@ def test_scores_before_and_after_scaling():
     json.dumps(figures, allow_nan=False)
 
 
+def test_a_disparity_has_no_metres_before_scaling():
+    truth = box_room((128, 256))
+    scored = Evaluator(Settings("network", LidarSettings()), KnownModel(0.4 / truth + 0.1, "disparity")).score(
+        "room", RGB, truth
+    )
+    assert scored.before is None
+    assert scored.after.mre < 0.02
+    assert report([scored.as_dict()], Settings("network", LidarSettings()), None)["before"] is None
+
+
 def test_without_lidar_the_network_s_metres_count():
     truth, raw = box_room(), 1.1 * box_room()
     truth[:8] = 0
