@@ -441,3 +441,72 @@ def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(brow
             context.close()
     finally:
         demo.stop()
+
+
+PAD = """
+    const buttons = Array.from({length: 17}, () => ({pressed: false, value: 0}));
+    window.pad = {index: 0, id: 'Pad', mapping: 'standard', connected: true, axes: [0, 0, 0, 0], buttons};
+    navigator.getGamepads = () => [window.pad.connected ? window.pad : null];
+    window.plug = (mapping) => {
+        window.pad.mapping = mapping;
+        const event = new Event('gamepadconnected');
+        event.gamepad = window.pad;
+        window.dispatchEvent(event);
+    };
+    window.press = (button, pressed) => { window.pad.buttons[button] = {pressed, value: +pressed}; };
+"""
+RB, B = 5, 1
+
+
+@pytest.fixture
+def pad_page(open_page):
+    page = open_page()
+    page.evaluate(f"() => {{ {PAD} }}")
+    page.bring_to_front()
+    return page
+
+
+def hold_and_push(page):
+    """The stick goes forward with the shoulder button held."""
+    page.evaluate(f"plug('standard'); press({RB}, false); pad.axes = [0, -1, 0, 0]")
+    page.wait_for_timeout(100)
+    page.evaluate(f"press({RB}, true)")
+
+
+def test_gamepad_drives_only_while_its_shoulder_button_is_held(pad_page, demo):
+    pad_page.evaluate("plug('standard'); pad.axes = [0, -1, 0, 0]")
+    expect_body(pad_page, "pad", "ready")
+    pad_page.wait_for_timeout(200)
+    assert not moving(demo)
+    pad_page.evaluate(f"press({RB}, true)")
+    wait_until(lambda: moving(demo), pad_page, "the gamepad drives")
+    assert demo.commands[-1] == pytest.approx((0.28, 0.0), abs=1e-6)  # 70 % of 0.4 m/s
+    pad_page.evaluate(f"press({RB}, false)")
+    wait_stopped(pad_page, demo)
+
+
+@pytest.mark.parametrize(
+    "loss", ["pad.connected = false", "window.dispatchEvent(new Event('blur'))", f"press({B}, true)"]
+)
+def test_gamepad_lost_blurred_or_stopped_ends_the_drive_until_it_is_pressed_anew(pad_page, demo, loss):
+    hold_and_push(pad_page)
+    wait_until(lambda: moving(demo), pad_page, "the gamepad drives")
+    pad_page.evaluate(loss)
+    wait_stopped(pad_page, demo)
+    assert demo.estop == (loss == f"press({B}, true)")
+    if demo.estop:  # released with the shoulder button still held: nothing moves
+        pad_page.locator("#release").focus()
+        pad_page.keyboard.down("Enter")
+        wait_until(lambda: not demo.estop, pad_page, "the release")
+        pad_page.keyboard.up("Enter")
+        expect_body(pad_page, "pad", "ready")
+        pad_page.wait_for_timeout(200)
+        assert not moving(demo)
+
+
+def test_gamepads_right_stick_looks_and_an_unknown_layout_is_told(pad_page, demo):
+    pad_page.evaluate("plug('')")
+    pad_page.get_by_text("the browser does not know this gamepad's layout").wait_for()
+    pad_page.evaluate("plug('standard'); pad.axes = [0, 0, 1, 0]")
+    wait_until(lambda: demo.look.yaw < -0.2, pad_page, "the look turns right")
+    assert not moving(demo)

@@ -1,6 +1,7 @@
 // The operator's page: joins link, drive, look, pictures, map and overlay.
 
 import { attachStick, Drive, isDriveKey } from "./drive.js";
+import { Gamepads } from "./gamepad.js";
 import { FlatViewer } from "./flatviewer.js";
 import { drawCompass, drawGuide } from "./guide.js";
 import * as hud from "./hud.js";
@@ -122,6 +123,13 @@ function stopNow() {
   if (!link.connected) hud.toast("No link: the stop could not be sent");
 }
 
+/** Whoever wants to drive while nobody does, may. */
+function askForTheLease() {
+  if (!mayDrive) hud.toast("This sign-in may watch and stop the robot, not drive it.");
+  else if (session.driver === "none") link.send({ type: "lease", take: false });
+  else if (session.driver === "other") hud.toast("Another operator drives. Take over to drive.");
+}
+
 function setScale(percent) {
   const value = Math.min(Math.max(percent, 10), 100);
   byId("scale").value = value;
@@ -160,10 +168,7 @@ window.addEventListener("keydown", (event) => {
   }
   if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
   SHORTCUTS[event.code]?.();
-  // Whoever wants to drive while nobody does, may.
-  if (isDriveKey(event) && !mayDrive) hud.toast("This sign-in may watch and stop the robot, not drive it.");
-  else if (isDriveKey(event) && session.driver === "none") link.send({ type: "lease", take: false });
-  else if (isDriveKey(event) && session.driver === "other") hud.toast("Another operator drives. Take over to drive.");
+  if (isDriveKey(event)) askForTheLease();
 }, { capture: true });
 window.addEventListener("keyup", (event) => {
   if (event.code === "Space") event.preventDefault();
@@ -188,6 +193,12 @@ byId("scale").addEventListener("input", (event) => setScale(+event.target.value)
 byId("scale").addEventListener("change", (event) => event.target.blur());
 hud.holdToConfirm(byId("release"), () => link.send({ type: "estop_release" }));
 attachStick(byId("stick"), drive);
+const pads = new Gamepads(drive, look);
+pads.addEventListener("drive", askForTheLease);
+pads.addEventListener("stop", stopNow);
+pads.addEventListener("centre", () => look.centre());
+pads.addEventListener("scale", ({ detail: change }) => setScale(+byId("scale").value + change));
+pads.addEventListener("tell", ({ detail: words }) => hud.toast(words));
 drive.addEventListener("stop", ({ detail: why }) => hud.toast(`Stopped: ${why}`));
 document.addEventListener("visibilitychange", () => { lastFrame = performance.now(); });
 

@@ -1,4 +1,4 @@
-// Hold to drive: keyboard and touch stick. Whatever may hide a release counts as one.
+// Hold to drive: keyboard, touch stick and gamepad. Whatever may hide a release counts as one.
 
 import { clamp } from "./math.js";
 
@@ -150,7 +150,8 @@ export function attachStick(element, drive) {
   });
 }
 
-function deadZone(value) {
+/** A stick's axis, [-1, 1], without the play round its middle. */
+export function deadZone(value) {
   const size = Math.abs(value);
   return size < 0.12 ? 0 : (Math.sign(value) * (size - 0.12)) / 0.88;
 }

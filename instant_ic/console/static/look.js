@@ -49,6 +49,12 @@ export class Look {
     this._centring = { yaw: this.yaw, pitch: this.pitch, start: performance.now() };
   }
 
+  /** Turns by angles in radians, left and up. */
+  turn(yaw, pitch) {
+    this._centring = null;
+    this._turn(yaw, pitch);
+  }
+
   zoom(factor) {
     this.vfov = clamp(this.vfov * factor, MIN_VFOV, MAX_VFOV);
   }
@@ -56,8 +62,7 @@ export class Look {
   /** Moves on by `seconds`. */
   step(seconds) {
     for (const code of this._held) {
-      this._centring = null;
-      this._turn(KEYS[code][0] * KEY_RATE * seconds, KEYS[code][1] * KEY_RATE * seconds);
+      this.turn(KEYS[code][0] * KEY_RATE * seconds, KEYS[code][1] * KEY_RATE * seconds);
     }
     if (this._centring) {
       const t = clamp((performance.now() - this._centring.start) / CENTRE_MS, 0, 1);
