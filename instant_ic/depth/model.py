@@ -96,7 +96,7 @@ class DepthModel:
         """Depth in the model's own unit (metres for metric models), radial, 0 = unknown.
 
         Args:
-            rgb: equirect panorama of any size, (H, W, 3) uint8.
+            rgb: equirect panorama of any size, (H, W, 3) uint8, twice as wide as high.
 
         Returns:
             (h, 2h) float32 with the rows of the network's output. Metric depth is cut to the manifest's range.
@@ -128,11 +128,13 @@ class DepthModel:
         """The network's input, (1, 3, h, w) or (1, h, w, 3): resized by area averaging, then normalised.
 
         Raises:
-            ValueError: ``rgb`` is not (H, W, 3) uint8.
+            ValueError: ``rgb`` is not (H, W, 3) uint8, or no panorama.
         """
         manifest = self.manifest
         if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8 or 0 in rgb.shape:
             raise ValueError(f"rgb must be (H, W, 3) uint8 (got {rgb.shape} {rgb.dtype})")
+        if not 1.9 <= rgb.shape[1] / rgb.shape[0] <= 2.1:
+            raise ValueError(f"a panorama is twice as wide as high (got {rgb.shape[1]} x {rgb.shape[0]})")
         size = (manifest.input_width, manifest.input_height)
         if (rgb.shape[1], rgb.shape[0]) != size:
             shrinks = rgb.shape[1] >= size[0] and rgb.shape[0] >= size[1]

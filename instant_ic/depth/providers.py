@@ -60,6 +60,8 @@ def open_session(model_file: Path, threads: int, provider: str = "auto") -> Open
             continue
         # onnxruntime falls back by itself and says so on stdout; here each one is tried alone and told by the caller.
         wanted: list[Any] = [(full, _options(name))] if name != "cpu" else []
+        if name == "tensorrt" and PROVIDERS["cuda"] in available:
+            wanted.append(PROVIDERS["cuda"])  # for layers that TensorRT does not know
         try:
             if wanted and hasattr(onnxruntime, "preload_dlls"):
                 onnxruntime.preload_dlls()  # CUDA and cuDNN from pip's packages

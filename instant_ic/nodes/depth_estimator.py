@@ -113,7 +113,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             return message.header, self.model.estimate(rgb), ""
         except JpegError as error:
             return message.header, None, f"the picture {error}"
-        except ManifestError as error:
+        except ValueError as error:  # no panorama, or (ManifestError) outputs that only a run shows
             return message.header, None, str(error)
         except InferenceError as error:
             if self.model.provider == "cpu":

@@ -71,6 +71,15 @@ def test_png_is_taken_as_well(config: DepthEstimatorConfig) -> None:
     np.testing.assert_allclose(image_array(depth), 10 * 128 / 255, rtol=1e-5)
 
 
+def test_what_is_no_panorama_is_told(config: DepthEstimatorConfig) -> None:
+    square = cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes()
+    with LockstepBus(START) as bus:
+        node = bus.add(DepthEstimatorNode, config)
+        bus.publish(TOPIC, compressed_image_message(square, "camera", START), stamp_ns=START)
+        assert node.diagnoses()["depth"][:2] == (2, "a panorama is twice as wide as high (got 64 x 64)")
+        assert bus.messages("/depth/raw") == []
+
+
 def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthEstimatorNode, config)

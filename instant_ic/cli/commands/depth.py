@@ -118,6 +118,8 @@ def convert(args: argparse.Namespace) -> int:
         )  # fmt: skip
     except (CheckpointError, ExportError, ValueError) as error:
         raise UserError(str(error)) from error
+    except ModuleNotFoundError as error:
+        raise UserError(f"needs the package {error.name}: pip install 'instant-ic[train]'") from error
     except OSError as error:
         raise UserError(f"{error.filename or output}: {error.strerror or error}") from error
     report(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) and {output.with_suffix('.yaml').name}")
@@ -192,7 +194,6 @@ def estimate(args: argparse.Namespace) -> int:
     import numpy as np
 
     from instant_ic.depth.colour import depth_picture
-    from instant_ic.depth.manifest import ManifestError
     from instant_ic.depth.model import InferenceError
 
     picture = cv2.imread(str(args.image), cv2.IMREAD_COLOR)
@@ -204,7 +205,9 @@ def estimate(args: argparse.Namespace) -> int:
         model.estimate(rgb)  # the first run allocates; time the second
         begin = time.perf_counter()
         depth = model.estimate(rgb)
-    except (ManifestError, InferenceError) as error:
+    except ValueError as error:  # ManifestError is one
+        raise UserError(f"{args.image}: {error}") from error
+    except InferenceError as error:
         raise UserError(str(error)) from error
     took = time.perf_counter() - begin
     try:
