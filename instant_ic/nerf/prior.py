@@ -184,6 +184,18 @@ def fill_holes(
         return values
     channels = values if values.ndim == 3 else values[..., None]
     w = valid.astype(np.float32) if weight is None else np.where(valid, weight, 0).astype(np.float32)
+    try:
+        from .fill_kernels import fill
+    except ImportError:  # no numba
+        filled = _fill(channels, w)
+    else:
+        filled = fill(channels, w)
+    return filled if values.ndim == 3 else filled[..., 0]
+
+
+def _fill(channels: NDArray[np.float32], w: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``fill_holes`` in numpy: (H, W, C), and weights (H, W) that are 0 in the holes."""
+    valid = w > 0
     total = channels * w[..., None]
     levels = [(total, w)]
     while min(levels[-1][1].shape) > 1:
@@ -198,7 +210,7 @@ def fill_holes(
         total[known], w[known] = finer_total[known], finer_w[known]
     coarse = (total / np.maximum(w, np.float32(1e-30))[..., None]).astype(np.float32)
     coarse[valid] = channels[valid]
-    return coarse if values.ndim == 3 else coarse[..., 0]
+    return coarse
 
 
 def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
