@@ -103,7 +103,7 @@ class DepthSource:
             points: (N, 3) LiDAR points in the camera's frame at the picture's time, metres.
             up: (3,) gravity's up in the camera's frame.
             camera_height_m: of the camera over the floor; None where it is not known.
-            rgb: (H, W, 3) uint8 the picture; edges of it guide the fusion.
+            rgb: (H, W, 3) uint8 the picture, for sources that look at it; none of these does.
             size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
 
         Raises:
