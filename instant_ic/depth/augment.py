@@ -77,14 +77,18 @@ def _uniform(like: Tensor, generator: torch.Generator, low: float, high: float, 
 
 
 def camera_colours(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Exposure (over- and under-), contrast, white balance, saturation and sensor noise; (B, 3, H, W) in 0..1."""
-    gamma = torch.exp(_uniform(rgb, generator, -0.4, 0.5))
-    rgb = rgb.clamp_min(1e-4).pow(gamma) * torch.exp(_uniform(rgb, generator, -0.6, 0.45))
-    rgb = rgb * torch.exp(_uniform(rgb, generator, -0.15, 0.15, 3))
+    """Exposure (over- and under-), contrast, white balance, saturation and sensor noise; (B, 3, H, W) in 0..1.
+
+    Some pictures are changed much, some hardly: the network should do no worse on those of a good camera.
+    """
+    strength = _uniform(rgb, generator, 0.0, 1.0)
+    gamma = torch.exp(strength * _uniform(rgb, generator, -0.4, 0.5))
+    rgb = rgb.clamp_min(1e-4).pow(gamma) * torch.exp(strength * _uniform(rgb, generator, -0.6, 0.45))
+    rgb = rgb * torch.exp(strength * _uniform(rgb, generator, -0.15, 0.15, 3))
     grey = rgb.mean(dim=1, keepdim=True)
-    rgb = grey + (rgb - grey) * _uniform(rgb, generator, 0.2, 1.4)
+    rgb = grey + (rgb - grey) * (1 + strength * _uniform(rgb, generator, -0.8, 0.4))
     noise = torch.randn(rgb.shape, generator=generator).to(rgb.device)
-    return (rgb + noise * _uniform(rgb, generator, 0.0, 0.035)).clamp(0.0, 1.0)
+    return (rgb + strength * noise * _uniform(rgb, generator, 0.0, 0.035)).clamp(0.0, 1.0)
 
 
 def vignetting(rgb: Tensor, generator: torch.Generator) -> Tensor:

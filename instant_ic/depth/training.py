@@ -30,6 +30,9 @@ from .slicenet import CheckpointError, SliceNet, SliceNetConfig
 from .training_log import TrainingLog
 from .weights import Start, unfold_norms
 
+POLE_WEIGHT = 0.1
+"""Least weight of a row in the loss, the mean row being 1. By solid angle alone the rows at the poles are hardly trained,
+and stand as spikes over and under the camera in the point cloud."""
 TEAM_TIMEOUT = timedelta(minutes=20)
 """A process that waits longer for the others ends with an error."""
 
@@ -216,7 +219,8 @@ class Trainer:
         torch.set_num_threads(self.config.threads)
         torch.manual_seed(self.config.seed)
         self._ahead = Ahead(self.feed)
-        self.row_weights = torch.from_numpy(solid_angle_weights(self.network.height)).to(self.team.device)
+        rows = np.maximum(solid_angle_weights(self.network.height), POLE_WEIGHT)
+        self.row_weights = torch.from_numpy(rows).to(self.team.device)
         rgb, depth = self.feed.batch(0)
         if rgb.shape[1:3] != (self.network.height, self.network.width):
             raise ValueError(f"the panoramas are {rgb.shape[1]} x {rgb.shape[2]}, the network takes "
