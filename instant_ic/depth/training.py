@@ -31,8 +31,8 @@ from .training_log import TrainingLog
 from .weights import Start, unfold_norms
 
 POLE_WEIGHT = 0.1
-"""Least weight of a row in the loss, the mean row being 1. By solid angle alone the rows at the poles are hardly trained,
-and stand as spikes over and under the camera in the point cloud."""
+"""Least weight of a row in the loss, the mean row being 1. By solid angle alone the rows at the poles are hardly
+trained, and stand as spikes over and under the camera in the point cloud."""
 TEAM_TIMEOUT = timedelta(minutes=20)
 """A process that waits longer for the others ends with an error."""
 
