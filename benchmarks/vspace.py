@@ -92,7 +92,7 @@ def keyframes(world: str, start: tuple[float, float, float] | None, size: tuple[
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mesh", type=Path, help="also a world from a mesh file")
-    parser.add_argument("--mesh-start", type=float, nargs=3, default=(3.2, -2.2, 180.0), metavar=("X", "Y", "DEG"))
+    parser.add_argument("--mesh-start", type=float, nargs=3, default=(6.3, -2.4, 180.0), metavar=("X", "Y", "DEG"))
     parser.add_argument("--size", default="640x360")
     parser.add_argument("--seconds", type=float, default=8.0, help="CPU s of training a keyframe (default 8)")
     parser.add_argument("--only", default=",".join(PARTS), help=f"some of {', '.join(PARTS)} (default all)")
