@@ -35,7 +35,7 @@ class Origin(IntEnum):
     DOWN = 5  # upright surface, continued below its lowest point
     FLOOR = 6  # level floor
     CEILING = 7  # level ceiling that points were seen on
-    ASSUMED = 8  # level ceiling at the assumed height
+    ASSUMED = 8  # level ceiling, or floor, at an assumed height
 
 
 @dataclass(frozen=True)
@@ -315,13 +315,12 @@ class _Building:
         self.flat = np.zeros(size, bool)
         self.flat[rows, columns] = of_plane
         self.some = self.hit > 0
-        self.top, self.top_origin = (
-            (ceiling, Origin.CEILING) if ceiling is not None else (ceiling_guess, Origin.ASSUMED)
-        )
-        if self.top is None and floor is not None:
-            self.top = config.ceiling_height_m - floor
-        if self.top is not None and ceiling is None:
-            self.top = max(self.top, _highest(z[~of_plane]))
+        # Where nobody knows the floor, it lies as low as the lowest points, or lower.
+        self.ground = floor if floor is not None else _highest(-z)
+        self.ground_origin = Origin.FLOOR if floor is not None else Origin.ASSUMED
+        usual = config.ceiling_height_m - self.ground if ceiling_guess is None else ceiling_guess
+        self.top = max(usual, _highest(z[~of_plane])) if ceiling is None else ceiling
+        self.top_origin = Origin.ASSUMED if ceiling is None else Origin.CEILING
 
     def fill(self) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
         """Depth, origin and angle to the next point, each (H, W)."""
@@ -410,12 +409,9 @@ class _Building:
 
     def _planes(self, depth: Floats, origin: NDArray[np.uint8], wall: Floats) -> None:
         """Floor and ceiling hide what lies behind them."""
-        if self.floor is not None:
-            to_floor = np.where(self.sin < 0, -self.floor / self.sin, np.inf)
-            origin[to_floor < depth] = Origin.FLOOR
-            np.minimum(depth, to_floor, out=depth)
-        if self.top is None:
-            return
+        to_floor = np.where(self.sin < 0, -self.ground / self.sin, np.inf)
+        origin[to_floor < depth] = self.ground_origin
+        np.minimum(depth, to_floor, out=depth)
         # Never lower than what was seen upright in this column: there the ceiling is higher.
         seen = _middle(np.where(self.some & ~self.flat, self.hit * self.tan, 0).max(axis=0)) + 0.05
         roofed = (wall > 0) | np.any(self.flat & (self.hit * self.tan > 0), axis=0)

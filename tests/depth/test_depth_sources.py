@@ -1,5 +1,7 @@
 """Depth from the LiDAR alone and fused with a network's, in a room whose truth is known by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,8 +20,12 @@ from instant_ic.depth.lidar_depth import (
 )
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.depth.sources import SOURCES, DepthSource, SourceConfig, without_body
+from instant_ic.depth.visibility import nearest_points
 from instant_ic.geometry.poses import rotation_matrix
 from instant_ic.geometry.projections import equirect_directions
+from instant_ic.lidar.recording import Recording
+
+DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 
 SIZE = (96, 192)
 UP = np.array([0.0, 0.0, 1.0])
@@ -101,6 +107,33 @@ def test_floor_and_ceiling_are_found_where_the_rings_reach_them() -> None:
     assert built.camera_height_m == pytest.approx(1.2, abs=0.03)
     assert built.ceiling_height_m == pytest.approx(1.4, abs=0.03)
     assert np.quantile(error(built.depth_m, truth(HALL)), 0.95) < 0.06
+
+
+def test_without_any_floor_it_is_as_low_as_the_lowest_points() -> None:
+    small = (np.array([-1.5, -1.5, -CAMERA_M]), np.array([1.5, 1.5, 1.4]))  # no ring reaches floor or ceiling
+    points = revolution(small)
+    built = LidarStructure().estimate(points, UP, None, SIZE)
+    lowest = 0.6 + 1.5 * np.sqrt(2) * np.tan(np.radians(15))  # in the corners
+    assert built.camera_height_m is None and built.depth_m[-1].mean() == pytest.approx(lowest, rel=0.05)
+    assert (built.origin[-1] == Origin.ASSUMED).all() and built.sigma[-1].min() > 0.1
+
+
+@pytest.mark.real_data
+def test_a_real_revolution_tells_the_ranges_that_it_was_not_shown() -> None:
+    path = DATA / "vlp16" / "einride_recording.pcap"
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    revolution = next(each for each in Recording(path) if each.complete)
+    points = revolution.xyz.astype(np.float64) - [0, 0, 0.6]
+    # Every fourth sector of three degrees is kept back.
+    kept_back = (np.degrees(np.arctan2(points[:, 1], points[:, 0])) // 3) % 4 == 0
+    built = LidarStructure().estimate(points[~kept_back], UP, None)
+    rows, columns, range_m = nearest_points(points[kept_back], 512, 256)
+    depth, sigma = built.depth_m[rows, columns], built.sigma[rows, columns]
+    off = np.abs(depth / range_m - 1)
+    # A cluttered room; 0.011 (median) and 0.91 were measured.
+    assert (depth > 0).mean() > 0.95 and np.median(off) < 0.03
+    assert (off < 0.25).mean() > 0.85 and 0.5 < (off < sigma).mean() < 0.85
 
 
 def test_a_cupboard_is_kept_as_seen_and_the_wall_over_it() -> None:
