@@ -20,8 +20,9 @@ from .prior import PanoramaPrior
 
 SAME_SURFACE = 0.06
 """Depths within this share of each other are one surface."""
-_SHARPNESS = 3.0
+_SHARPNESS = 6.0
 _LEAST_PENALTY = 0.05
+_EDGE = 0.25  # less confidence at an edge
 _STEP_ROWS = 128  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
 _MAX_GAIN = 2.5
@@ -43,18 +44,21 @@ class Layer:
 def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats]:
     """Colours (P, 3), depth (P,) and confidence (P,) of the layers together, newest first.
 
-    Of surfaces at different depths the nearest counts. What a newer keyframe has looked through is left out of the
+    Of surfaces at different depths the nearest counts; one at an edge of its keyframe's depth, where colours of two
+    surfaces mix, only where no keyframe has a plain one. What a newer keyframe has looked through is left out of the
     older: it has moved away since.
     """
     depth = np.stack([layer.depth for layer in layers])
     confidence = np.stack([layer.confidence for layer in layers])
-    for number, layer in enumerate(layers[1:], start=1):
+    rank = confidence.copy()
+    for number, layer in enumerate(layers):
         at = np.flatnonzero(confidence[number])
         points = rays.origin + depth[number, at, None] * rays.directions[at]
+        rank[number, at] -= _EDGE * _at_edge(layer.prior, points)
         for newer in layers[:number]:
-            confidence[number, at[looked_through(newer.prior, points, layer.prior)]] = 0
-    best = confidence.max(axis=0)
-    candidate = (confidence > 0) & (confidence == best)
+            rank[number, at[looked_through(newer.prior, points, layer.prior)]] = 0
+    best = rank.max(axis=0)
+    candidate = (rank > 0) & (rank == best)
     nearest = np.where(candidate, depth, np.inf).min(axis=0)
     candidate &= depth <= nearest * np.float32(1 + SAME_SURFACE)
     met = best > 0
@@ -70,7 +74,8 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     weight[0, ~met] = 1  # nobody has seen it: as the newest has it
     weight /= weight.sum(axis=0)
     colour = sum(w[:, None] * layer.gain * layer.colour for w, layer in zip(weight, layers, strict=True))
-    return np.asarray(colour, np.float32), (weight * depth).sum(axis=0), best
+    shown = np.where(candidate, confidence, 0).max(axis=0)
+    return np.asarray(colour, np.float32), (weight * depth).sum(axis=0), shown
 
 
 def looked_through(prior: PanoramaPrior, points: Floats, theirs: PanoramaPrior) -> NDArray[np.bool_]:
@@ -86,6 +91,11 @@ def looked_through(prior: PanoramaPrior, points: Floats, theirs: PanoramaPrior) 
             least = np.minimum(least, np.where(prior.known[v, u] == 1, 1 / prior.inverse_depth[v, u], 0))
     room = max(0.15, 3 * math.hypot(_sigma(prior), _sigma(theirs)))
     return distance * np.float32(1 + room) < least
+
+
+def _at_edge(prior: PanoramaPrior, points: Floats) -> NDArray[np.bool_]:
+    row, column, _ = _seen_from(prior, points)
+    return prior.torn[row, column % prior.torn.shape[1]] > 0
 
 
 def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats:
