@@ -226,8 +226,10 @@ class Ahead:
         return batch
 
     def close(self) -> None:
-        self._thread.shutdown(cancel_futures=True)
+        """Ends the feed first: a batch that is being waited for would hold this up."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
         self.feed.close()
+        self._thread.shutdown()
 
 
 class Renderers:

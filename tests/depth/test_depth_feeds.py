@@ -1,5 +1,7 @@
 """Batches of a training: a function of their number, whoever renders them, and errors instead of waiting for ever."""
 
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -123,6 +125,21 @@ def test_next_batch_is_made_ahead_and_its_error_arrives() -> None:
         ahead.batch(2)
     ahead.close()
     assert asked == [0, 1, 2, "closed"]
+
+
+def test_closing_does_not_wait_for_a_batch_that_does_not_come() -> None:
+    closed = threading.Event()
+
+    def batch(step: int) -> feeds.Batch:
+        if step and not closed.wait(60):
+            raise AssertionError("closing waited for the batch")
+        return marked(step).rgb[None], marked(step).depth_m[None]
+
+    ahead = Ahead(SimpleNamespace(batch=batch, close=closed.set))
+    ahead.batch(0)
+    begin = time.monotonic()
+    ahead.close()
+    assert time.monotonic() - begin < 50
 
 
 def test_worlds_come_in_order_from_processes_and_a_dead_one_is_told() -> None:
