@@ -75,8 +75,11 @@ def resolution(renderer: EquirectRenderer, pose: Any, depth_m: Any, full: Any, s
     }
     result = {}
     for name, rgb in panoramas.items():
-        psnr, ssim = scores(PanoramaWarp(rgb, depth_m, pose).render(view, *size, FOV).rgb, truth)
-        result[name] = {"psnr_db": round(psnr, 2), "ssim": round(ssim, 4)}
+        drawn = PanoramaWarp(rgb, depth_m, pose).render(view, *size, FOV)
+        psnr, ssim = scores(drawn.rgb, truth)
+        error = (drawn.rgb.astype(np.float64) - truth)[drawn.confidence > 0]
+        seen = 10 * math.log10(255**2 / float(np.mean(error**2)))
+        result[name] = {"psnr_db": round(psnr, 2), "ssim": round(ssim, 4), "psnr_db_of_what_is_seen": round(seen, 2)}
     return result
 
 

@@ -17,6 +17,7 @@ from .vspace_sources import (
     Picture,
     Shot,
     depth_figures,
+    field_alone,
     make_source,
     make_space,
     take_shot,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 PATHS = ("straight", "curve")
 SOURCES = {
     "ours": "depth of the shipped model scaled by the LiDAR, field trained from it",
+    "field": "the same, the field alone from its first step on, never the warp",
     "true-depth": "the same with the world's own depth: the ceiling",
     "no-depth": "field trained from colours alone (paper: -depth)",
     "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
@@ -51,7 +53,7 @@ class Settings:
     Attributes:
         paths: of ``PATHS``; sources: of ``SOURCES``.
         seconds: CPU seconds of training.
-        times: training times, CPU seconds, at which ``ours`` is also measured at the panorama and 1 m ahead of it.
+        times: training times, CPU seconds, at which ``ours`` and ``field`` are measured at the panorama and 1 m ahead.
         size: width and height of the views; fov_deg: their horizontal field of view.
         panorama_width: of the keyframes, pixels.
         keyframes: 1, or more: each a metre behind the next on the path.
@@ -118,7 +120,7 @@ class Report:
     depth: dict[str, Any]
     rows: list[Row] = field(default_factory=list)
     training: list[Row] = field(default_factory=list)
-    """``ours`` at the panorama (distance 0) and 1 m ahead by training time, on the first path."""
+    """``ours`` and ``field`` at the panorama (distance 0) and 1 m ahead by training time, on the first path."""
     strips: dict[str, dict[float, dict[str, Picture]]] = field(default_factory=dict)
     """Path → distance → source → picture; ``truth`` among them."""
 
@@ -341,9 +343,12 @@ def evaluate(
             spent = seconds
             for distance, pose, truth in zip(settings.distances_m, routes[path], truths[path], strict=False):
                 if distance in (0.0, 1.0):
-                    view = space.render(pose, width, height, fov)
-                    confidence = float(view.confidence.mean())
-                    report.training.append(_row(path, "ours", distance, view.rgb, truth, seconds, confidence))
+                    for source, shown in (("ours", config), ("field", field_alone(config))):
+                        space.config = shown
+                        view = space.render(pose, width, height, fov)
+                        confidence = float(view.confidence.mean())
+                        report.training.append(_row(path, source, distance, view.rgb, truth, seconds, confidence))
+            space.config = config
     return report
 
 

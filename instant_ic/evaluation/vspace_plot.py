@@ -21,10 +21,11 @@ def save_plot(path: Path, report: Report) -> None:
     for panel, pair in zip(panels, axes, strict=True):
         for axis, (key, label) in zip(pair, _LABELS.items(), strict=True):
             if panel == "time":
-                for distance in sorted({row.distance_m for row in report.training}):
-                    rows = [row for row in report.training if row.distance_m == distance]
+                for source, distance in sorted({(row.source, row.distance_m) for row in report.training}):
+                    rows = [row for row in report.training if (row.source, row.distance_m) == (source, distance)]
                     times, reached = [row.seconds for row in rows], [getattr(row, key) for row in rows]
-                    axis.plot(times, reached, marker="o", markersize=3, label=f"ours, {distance:g} m")
+                    axis.plot(times, reached, marker="o", markersize=3, label=f"{source}, {distance:g} m")
+                axis.legend(fontsize=7)
                 axis.set_xlabel("training, CPU s")
             else:
                 for source, values in report.table(key).get(panel, {}).items():
@@ -33,7 +34,8 @@ def save_plot(path: Path, report: Report) -> None:
                 axis.set_xlabel(f"{panel}: distance from the last panorama, m")
             axis.set_ylabel(label)
             axis.grid(alpha=0.3)
-        pair[0].legend(fontsize=7, ncols=2)
+        if panel != "time":
+            pair[0].legend(fontsize=7, ncols=2)
     drawn.suptitle(f"{Path(report.world).name}, {report.settings.keyframes} keyframe(s)", fontsize=10)
     save_figure(drawn, path)
 

@@ -112,6 +112,11 @@ def make_space(shots: list[Shot], depth: str, settings: Settings, config: Virtua
     return space
 
 
+def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
+    """The same, with pictures of the field however young it is."""
+    return replace(config, picture=replace(config.picture, field_from_db=config.picture.panorama_until_db))
+
+
 def make_source(
     name: str, shots: list[Shot], settings: Settings, config: VirtualSpaceConfig, before: Callable[[], World]
 ) -> tuple[Drawer, float]:
@@ -131,9 +136,9 @@ def make_source(
 
         return draw
 
-    if name in ("ours", "no-scale", "true-depth"):
-        depth = {"ours": "scaled", "no-scale": "raw", "true-depth": "true"}[name]
-        space = make_space(shots, depth, settings, config)
+    if name in ("ours", "field", "no-scale", "true-depth"):
+        depth = {"no-scale": "raw", "true-depth": "true"}.get(name, "scaled")
+        space = make_space(shots, depth, settings, field_alone(config) if name == "field" else config)
         train(space, settings.seconds)
         return of_view(space), time.process_time() - start
     if name == "no-depth":

@@ -178,7 +178,9 @@ def test_every_source_has_its_rows(report):
     assert all(0 < row.psnr_db <= 99 and -1 <= row.ssim <= 1 and row.seconds >= 0 for row in report.rows)
     assert words[-1][1] == words[-1][2] == len(report.rows)
     assert {row.seconds for row in report.training} == {0.1, 0.2}
-    assert {row.distance_m for row in report.training} == {0.0, 1.0}
+    assert {(row.source, row.distance_m) for row in report.training} == {
+        (source, distance) for source in ("ours", "field") for distance in (0.0, 1.0)
+    }
     psnr = report.table("psnr_db")["straight"]
     # At the panorama itself no depth is needed; away from it the panorama alone will not do.
     assert abs(psnr["panorama"][0.0] - psnr["depth-warp"][0.0]) < 1

@@ -19,9 +19,10 @@ def add_kind(kinds: Any) -> None:
         description=(
             "Takes a panorama in a simulated world, makes each source ready, and compares its pictures with the "
             "world's own at distances from the panorama: PSNR and SSIM. Sources: ours (the shipped depth model, scaled "
-            "by a simulated LiDAR, and the field), true-depth (the same with the world's depth: the ceiling), no-depth "
-            "(colours alone), no-scale (the model's depth as it comes), panorama (turned, no depth), depth-warp, "
-            "point-warp and true-warp (the panorama warped by depth), mesh (the world scanned at another time)."
+            "by a simulated LiDAR, and the virtual space), field (its field alone, never the warp), true-depth (ours "
+            "with the world's depth: the ceiling), no-depth (colours alone), no-scale (the model's depth as it comes), "
+            "panorama (turned, no depth), depth-warp, point-warp and true-warp (the panorama warped by depth), mesh "
+            "(the world scanned at another time)."
         ),
         epilog=(
             "example: ic evaluate vspace --world corridor --path straight --sources ours,panorama,depth-warp "
@@ -35,7 +36,7 @@ def add_kind(kinds: Any) -> None:
     )
     parser.add_argument("--start", metavar="X,Y,YAW", help="place of the last panorama, metres and degrees")
     parser.add_argument("--seconds", type=float, default=8.0, metavar="S", help="CPU s of training (default: 8)")
-    parser.add_argument("--times", metavar="S,S,...", help="training times at which ours is measured too")
+    parser.add_argument("--times", metavar="S,S,...", help="training times at which ours and field are measured")
     parser.add_argument("--size", default="640x360", metavar="WxH", help="of the pictures (default: %(default)s)")
     parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="horizontal (default: 90)")
     parser.add_argument("--panorama-width", type=int, default=2048, metavar="PX", help="default: %(default)s")
