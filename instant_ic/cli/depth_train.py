@@ -261,12 +261,14 @@ def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, repo
 
 @contextlib.contextmanager
 def _ends_early(trainer: Trainer) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the training as its schedule would."""
+    """Ctrl-C and SIGTERM end the training as its schedule would; a second one ends it at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def end(number: int, frame: FrameType | None) -> None:
+        if trainer.stop:
+            raise KeyboardInterrupt
         trainer.stop = True
 
     before = [(number, signal.signal(number, end)) for number in (signal.SIGINT, signal.SIGTERM)]

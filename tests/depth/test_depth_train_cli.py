@@ -3,10 +3,12 @@
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -101,6 +103,16 @@ def test_cache_is_rendered_once_and_never_by_another_recipe(tmp_path: Path, caps
     assert len(SEEDS) == 3
     with pytest.raises(UserError, match="another kind, interiors"):
         ic(*words, "--generated", "random", "--checkpoint", str(tmp_path / "w.pt"))
+
+
+def test_ctrl_c_ends_as_the_schedule_would_and_a_second_at_once() -> None:
+    trainer = SimpleNamespace(stop=False)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), depth_train._ends_early(trainer):
+        signal.raise_signal(signal.SIGTERM)
+        assert trainer.stop
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.parametrize(
