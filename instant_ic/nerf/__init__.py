@@ -12,12 +12,14 @@ from .prior import KeyframeError
 from .saved import SpaceFileError
 from .space import NotReadyError, State, Status, TrainStats, VirtualSpace
 from .view import View
+from .warp import PanoramaWarp
 
 __all__ = [
     "FieldConfig",
     "GeometryConfig",
     "KeyframeError",
     "NotReadyError",
+    "PanoramaWarp",
     "PictureConfig",
     "ReadinessConfig",
     "SpaceFileError",
