@@ -98,17 +98,24 @@ def point_warp(
 
 
 def make_space(shots: list[Shot], depth: str, settings: Settings, config: VirtualSpaceConfig) -> Any:
-    """A virtual space with the keyframes, oldest first, by ``scaled``, ``raw`` or ``true`` depth; not trained yet."""
+    """A virtual space with the keyframes, oldest first, by ``scaled``, ``raw`` or ``true`` depth.
+
+    The last is not trained yet; those before it are, until they are fit, as on the way (at most ``settings.seconds``).
+    """
     from ..nerf import VirtualSpace
 
     space = VirtualSpace(config)
-    for shot in shots:
+    for number, shot in enumerate(shots):
         if depth == "scaled":
             space.set_keyframe(shot.rgb, shot.result.depth_m, shot.pose, shot.result.relative_sigma)
         elif depth == "raw":
             space.set_keyframe(shot.rgb, shot.raw, shot.pose, shot.result.relative_sigma)
         else:
             space.set_keyframe(shot.rgb, shot.true_depth_m, shot.pose, 0.02)
+        if number < len(shots) - 1:
+            start = time.process_time()
+            while not space.status.ready_iterations and time.process_time() - start < settings.seconds:
+                space.train(iterations=5)
     return space
 
 
