@@ -152,10 +152,10 @@ def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
     """Height of a ceiling over the camera, by what a network shows and what is usual, metres.
 
     Ceilings vary by a fifth around the usual one; a network's is off by about as much as it is at the points, and by
-    half of the share that is plainly wrong there (measured on the worlds of benchmarks/depth_sigma.py).
+    a third of the share that is plainly wrong there (measured on the worlds of benchmarks/depth_sigma.py).
     """
-    variance = 0.02**2 + network.sigma**2 + (0.5 * float(network.wrong.mean())) ** 2
-    share = variance / (variance + 0.2**2)
+    variance = 0.02**2 + network.sigma**2 + (0.3 * float(network.wrong.mean())) ** 2
+    share = variance / (variance + 0.22**2)
     return float(np.exp((1 - share) * np.log(seen_m) + share * np.log(usual_m)))
 
 

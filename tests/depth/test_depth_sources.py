@@ -194,6 +194,22 @@ def test_any_points_give_finite_depth_or_none(points: np.ndarray, height: float 
     assert ((built.depth_m > 0) == np.isfinite(built.sigma)).all() and (built.sigma > 0).all()
 
 
+@settings(max_examples=15, deadline=None)
+@given(
+    npst.arrays(np.float32, (34, 70), elements=st.floats(0, 20, width=32) | st.just(0.0)),
+    st.integers(0, 2**32 - 1),
+)
+def test_any_network_is_fused_to_finite_depth(raw: np.ndarray, seed: int) -> None:
+    """Whatever the network says, of any size: no NaN, nothing negative, an uncertainty wherever there is depth."""
+    rng = np.random.default_rng(seed)
+    points = POINTS[rng.random(len(POINTS)) < rng.uniform(0.05, 1)]
+    found = DepthSource().estimate(raw, points, UP, CAMERA_M)
+    assert found.depth_m.shape == raw.shape and np.isfinite(found.depth_m).all() and (found.depth_m >= 0).all()
+    assert found.message and (found.sigma > 0).all()
+    if found.ok:
+        assert ((found.depth_m > 0) == np.isfinite(found.sigma)).all()
+
+
 def test_level_from_camera_by_hand() -> None:
     np.testing.assert_allclose(level_from_camera(np.array([0, 0, 5.0])), np.eye(3), atol=1e-12)
     tilted = level_from_camera(np.array([np.sin(0.3), 0, np.cos(0.3)]))
