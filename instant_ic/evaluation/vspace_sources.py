@@ -107,7 +107,7 @@ def make_space(shots: list[Shot], depth: str, settings: Settings, config: Virtua
     space = VirtualSpace(config)
     for number, shot in enumerate(shots):
         if depth == "scaled":
-            space.set_keyframe(shot.rgb, shot.result.depth_m, shot.pose, shot.result.relative_sigma)
+            space.set_keyframe(shot.rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
         elif depth == "raw":
             space.set_keyframe(shot.rgb, shot.raw, shot.pose, shot.result.relative_sigma)
         else:

@@ -104,10 +104,11 @@ def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: b
         image: (H, W, 3); depth_m, confidence: (H, W).
         wraps: the left edge is the right edge's neighbour, as in a panorama.
     """
-    if np.all(confidence > 0):
+    seen = confidence > 0
+    if seen.all() or not seen.any():  # where nothing is known there is nothing to continue
         return image
     if not wraps:
-        return fill_holes(image, confidence > 0, weight=depth_m * depth_m)
+        return fill_holes(image, seen, weight=depth_m * depth_m)
     width = image.shape[1]
     side = width // 4
     around = np.r_[width - side : width, 0:width, 0:side]

@@ -144,7 +144,7 @@ class PanoramaWarp:
 
     def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,) of a perspective view's rays, as
-        ``field.Device.draw``; what has no confidence has no colour.
+        ``field.Device.draw``; what has no confidence has no colour, unless nothing has any.
         """
         from . import warp_kernels
 
@@ -164,7 +164,9 @@ class PanoramaWarp:
         np.divide(1 / rays.axial, nearness.reshape(-1), out=depth, where=nearness.reshape(-1) > 0)
         confidence = np.array([0, 0.5, 1, 0], np.float32)[marks.reshape(-1)]
         colour = np.zeros((len(depth), 3), np.float32)
-        self.pyramid.look_up(self._camera_from_map, rays, depth, confidence, 1.0, colour)
+        # From beyond every surface only backs are met: their colours, with no confidence, say more than black.
+        wanted = confidence if confidence.any() else depth
+        self.pyramid.look_up(self._camera_from_map, rays, depth, wanted, 1.0, colour)
         return colour, depth, confidence
 
 

@@ -96,6 +96,7 @@ def test_from_outside_backs_are_unknown():
     view = warp.render(pose_matrix(-5.0), 64, 64, 0.5)
     assert view.confidence.max() == 0
     assert (view.depth_m > 0).mean() > 0.9
+    assert view.rgb.max() > 50  # not black: the backs' colours
 
 
 def test_a_wall_that_passes_through_the_views_plane_is_drawn_up_to_the_edge():
