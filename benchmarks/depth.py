@@ -142,6 +142,8 @@ def main() -> int:
         "--sheets", type=Path, metavar="DIR", help="sheets of pictures of the fused source, 5 %% outliers"
     )
     args = parser.parse_args()
+    if args.sheets:
+        args.sheets.mkdir(parents=True, exist_ok=True)
     model = Remembered(DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads))
     results: dict[str, Any] = {}
     for kind in args.kinds.split(","):
