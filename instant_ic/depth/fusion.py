@@ -161,7 +161,7 @@ def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
 
 def fused_sigma(origin: NDArray[np.uint8], gap_rad: Floats, off: Floats, wrong: Floats) -> NDArray[np.float32]:
     """Relative standard deviation (H, W) of fused depth; all of (H, W), see ``_SIGMA``."""
-    base, by_off, by_gap, by_wrong = np.moveaxis(_SIGMA[origin], -1, 0)
+    base, by_off, by_gap, by_wrong = (np.ascontiguousarray(column)[origin] for column in _SIGMA.T)
     sigma = np.sqrt(base**2 + (by_off * off) ** 2 + (by_gap * gap_rad) ** 2 + (by_wrong * wrong) ** 2)
     return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
 
@@ -176,14 +176,14 @@ def fuse(network: Corrected, structure: LidarDepth) -> tuple[NDArray[np.float32]
         Depth (H, W) in metres, 0 where both are unknown, and the log ratio (H, W) of network and structure, 0 where
         one is unknown.
     """
-    sigma_s, nearer, farther = np.moveaxis(_TRUST[structure.origin], -1, 0)
+    sigma_s, nearer, farther = (np.ascontiguousarray(column)[structure.origin] for column in _TRUST.T)
     sigma_n = np.float32(network.sigma)
     known_n, known_s = network.depth_m > 0, structure.depth_m > 0
     both = known_n & known_s
     n = np.log(np.where(known_n, network.depth_m, np.float32(1)))
     s = np.log(np.where(known_s, structure.depth_m, np.float32(1)))
     off = np.where(both, n - s, np.float32(0))
-    conflict = both & (np.abs(off) > 3 * np.hypot(sigma_s, sigma_n))
+    conflict = both & (off * off > 9 * (sigma_s**2 + sigma_n**2))
     likely = np.where(off > 0, farther, nearer) * (1 - network.wrong)
     takes_network = conflict & (likely > network.wrong * (1 - nearer - farther))
     w_n = (known_n & (~conflict | takes_network)) / sigma_n**2

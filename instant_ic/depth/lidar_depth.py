@@ -21,7 +21,7 @@ from ..ranges import NotNegative, Positive, Range, Share, check_ranges
 from .visibility import project_points
 
 Floats = NDArray[np.floating]
-Indices = NDArray[np.intp]
+Indices = NDArray[np.signedinteger]
 
 
 class Origin(IntEnum):
@@ -325,10 +325,10 @@ class _Building:
     def fill(self) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.float32]]:
         """Depth, origin and angle to the next point, each (H, W)."""
         height, width = self.size
-        column = np.arange(width)
-        index = np.arange(height)[:, None]
-        above = np.maximum.accumulate(np.where(self.some, index, -1), axis=0)
-        below = np.minimum.accumulate(np.where(self.some, index, height)[::-1], axis=0)[::-1]
+        column = np.arange(width, dtype=np.int32)
+        index = np.arange(height, dtype=np.int32)[:, None]
+        above = np.maximum.accumulate(np.where(self.some, index, np.int32(-1)), axis=0)
+        below = np.minimum.accumulate(np.where(self.some, index, np.int32(height))[::-1], axis=0)[::-1]
         up, down = np.maximum(above, 0), np.minimum(below, height - 1)
         gap = np.minimum(np.where(above < 0, height, index - above), np.where(below == height, height, below - index))
         wall, origin = self._walls(above, below, up, down, column)
@@ -336,9 +336,11 @@ class _Building:
             depth = np.where(wall > 0, wall / self.cos, np.inf)
             self._plates(depth, origin, above, below, up, down, column)
             self._planes(depth, origin, wall)
-        depth[self.some], origin[self.some] = self.measured[self.some], Origin.BEAM
+        np.copyto(depth, self.measured, where=self.some)
+        np.copyto(origin, np.uint8(Origin.BEAM), where=self.some)
         unknown = ~np.isfinite(depth) | (depth > self.config.max_range_m)
-        depth[unknown], origin[unknown] = 0, Origin.UNKNOWN
+        np.copyto(depth, np.float32(0), where=unknown)
+        np.copyto(origin, np.uint8(Origin.UNKNOWN), where=unknown)
 
         used = self._bridged(np.any(self.some, axis=0))
         bridged = (used >= 0) & (used != column)
@@ -360,7 +362,7 @@ class _Building:
 
         ``above`` and ``below`` are the rows of the next points, ``up`` and ``down`` the same within the picture.
         """
-        index = np.arange(self.size[0])[:, None]
+        index = np.arange(self.size[0], dtype=np.int32)[:, None]
         wall_above = (above >= 0) & ~self.flat[up, column]
         wall_below = (below < len(index)) & ~self.flat[down, column]
         flat_above = (above >= 0) & ~wall_above
@@ -379,9 +381,10 @@ class _Building:
             (wall_below & flat_above & (self.sin > 0), r_below, Origin.UP),
             # Something low with floor seen over it: its top is somewhere between.
             (wall_below & flat_above & (self.sin <= 0) & ~nearer_above, r_below, Origin.EDGE),
-            (wall_below & (above < 0) & (crown > 0), np.broadcast_to(crown, self.size), Origin.UP),
+            (wall_below & (above < 0) & (crown > 0), crown, Origin.UP),
         ):
-            wall[where], origin[where] = value[where], how
+            np.copyto(wall, value, where=where)
+            np.copyto(origin, np.uint8(how), where=where)
         return wall, origin
 
     def _crown(self) -> NDArray[np.float32]:
@@ -404,19 +407,19 @@ class _Building:
         high, low = self.hit[up, column] * self.tan[up, 0], self.hit[down, column] * self.tan[down, 0]
         edge = (origin == Origin.EDGE) & (above >= 0) & (below < self.size[0])
         plate = edge & ~self.flat[up, column] & (high < -0.15) & (np.abs(high - low) < 0.05)
-        depth[plate] = (0.5 * (high + low) / self.sin)[plate]
-        origin[plate] = Origin.BETWEEN
+        np.copyto(depth, 0.5 * (high + low) / self.sin, where=plate)
+        np.copyto(origin, np.uint8(Origin.BETWEEN), where=plate)
 
     def _planes(self, depth: Floats, origin: NDArray[np.uint8], wall: Floats) -> None:
         """Floor and ceiling hide what lies behind them."""
         to_floor = np.where(self.sin < 0, -self.ground / self.sin, np.inf)
-        origin[to_floor < depth] = self.ground_origin
+        np.copyto(origin, np.uint8(self.ground_origin), where=to_floor < depth)
         np.minimum(depth, to_floor, out=depth)
         # Never lower than what was seen upright in this column: there the ceiling is higher.
         seen = _middle(np.where(self.some & ~self.flat, self.hit * self.tan, 0).max(axis=0)) + 0.05
         roofed = (wall > 0) | np.any(self.flat & (self.hit * self.tan > 0), axis=0)
         to_top = np.where((self.sin > 0) & roofed, np.maximum(self.top, seen) / self.sin, np.inf)
-        origin[to_top < depth] = self.top_origin
+        np.copyto(origin, np.uint8(self.top_origin), where=to_top < depth)
         np.minimum(depth, to_top, out=depth)
 
     def _bridged(self, seen: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -445,7 +448,8 @@ LEAST_SIGMA = 0.005
 
 def structure_sigma(origin: NDArray[np.uint8], gap_rad: Floats) -> NDArray[np.float32]:
     """Relative standard deviation (H, W) of pixels of an ``Origin`` whose next point is ``gap_rad`` away."""
-    sigma = np.hypot(_SIGMA[origin, 0], _SIGMA[origin, 1] * gap_rad.astype(np.float32))
+    base, by_gap = (np.ascontiguousarray(column)[origin] for column in _SIGMA.T)
+    sigma = np.hypot(base, by_gap * gap_rad)
     return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
 
 
