@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import Matrix, pose_matrix, transform_points
-from instant_ic.geometry.projections import equirect_pixels
 from instant_ic.ranges import Positive, Range, check_ranges
 
 from .calibration_edges import CUES, UPRIGHT, find_floor, lidar_edges, picture_edges
@@ -130,25 +129,35 @@ class _Level:
     """Score of a pose at one blur of the pictures' edges."""
 
     def __init__(self, edges: _Edges, frames: Sequence[Frame], blur_px: float) -> None:
-        strengths = [picture_edges(frame.rgb, blur_px * frame.rgb.shape[1] / 1024.0) for frame in frames]
+        sigma_px = blur_px * frames[0].rgb.shape[1] / 1024.0
+        # What is blurred that much needs no more pixels.
+        smaller = 2 ** max(int(math.log2(sigma_px / 2)), 0) if sigma_px >= 4 else 1
+        strengths = [picture_edges(_reduced(frame.rgb, smaller), sigma_px / smaller) for frame in frames]
         stack = np.stack([pair[kind] for kind in (0, 1) for pair in strengths])
         # One column more, so that a point on the seam lies between the last and the first.
-        self.strengths = np.concatenate([stack, stack[:, :, :1]], axis=2)
+        self.strengths = np.ascontiguousarray(np.concatenate([stack, stack[:, :, :1]], axis=2))
         self.edges = edges
-        self.plane = edges.frame + np.where(edges.upright, 0, len(frames))
+        self.plane = (edges.frame + np.where(edges.upright, 0, len(frames))).astype(np.int64)
 
     def each(self, camera_from_lidar: Matrix) -> NDArray[np.float64]:
         """Weighted strength under each edge point, (N,)."""
-        from scipy.ndimage import map_coordinates
+        from .calibration_kernels import strength_under
 
-        _, height, width = self.strengths.shape
-        u, v = equirect_pixels(transform_points(camera_from_lidar, self.edges.points), width - 1, height)
-        at = [self.plane, v, u % (width - 1)]
-        return np.asarray(self.edges.weight * map_coordinates(self.strengths, at, order=1, mode="nearest"))
+        strength = np.empty(len(self.plane))
+        strength_under(self.edges.points, self.plane, self.strengths, camera_from_lidar, strength)
+        return np.asarray(self.edges.weight * strength)
 
     def score(self, camera_from_lidar: Matrix) -> float:
         """Weighted mean strength under the edge points."""
         return float(self.each(camera_from_lidar).sum() / self.edges.weight.sum())
+
+
+def _reduced(rgb: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    import cv2
+
+    height, width = rgb.shape[:2]
+    small = cv2.resize(rgb, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
 
 
 def calibrate(
@@ -174,7 +183,7 @@ def calibrate(
     if len({frame.rgb.shape for frame in frames}) != 1:
         raise CalibrationError(f"pictures of different sizes: {sorted({frame.rgb.shape for frame in frames})}")
     edges = _edges(frames, camera_from_lidar, config)
-    report(f"{len(frames)} frames, " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
+    report(f"{len(frames)} frames, edges: " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
     start, rival = camera_from_lidar, 0.0
     level = _Level(edges, frames, config.blur_px[0])
     if config.full_circle:
@@ -191,6 +200,7 @@ def calibrate(
         centimetres = ", ".join(f"{value:+.1f}" for value in shift[:3] * 100)
         report(f"a pose {centimetres} cm away fits as well")
     chance = float(np.mean([level.score(_turned(found, yaw)) for yaw in np.radians(np.arange(15, 360, 15))]))
+    chance = max(chance, 1e-9)  # a picture without any edge
     before, after = level.score(camera_from_lidar) / chance, level.score(found) / chance
     if after < 1.05:
         raise CalibrationError(
@@ -293,16 +303,18 @@ def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfi
     from scipy.optimize import minimize
 
     reach = np.array([config.reach_m] * 3 + [math.radians(config.reach_deg)] * 3) / _UNIT
-    base = level.score(found)
+    base = max(level.score(found), 1e-9)
 
     def cost(units: Floats) -> float:
         return -level.score(_moved(start, units)) / base + 0.005 * float(((units / reach) ** 2).sum())
 
+    def slope(units: Floats) -> NDArray[np.float64]:
+        # Over a third of a unit: nearer, the steps of the bilinear pictures would be seen.
+        steps = np.eye(6) / 3
+        return np.array([(cost(units + step) - cost(units - step)) * 1.5 for step in steps])
+
     first = _correction(start, found) / _UNIT
-    directions = np.eye(6)
-    result = minimize(
-        cost, first, method="Powell", options={"xtol": 0.03, "ftol": 1e-6, "maxiter": 8, "direc": directions}
-    )
+    result = minimize(cost, first, jac=slope, method="BFGS", options={"gtol": 2e-4, "maxiter": 25})
     return _moved(start, result.x)
 
 

@@ -110,9 +110,12 @@ def read_recording(path: Path, selection: Selection | None = None) -> Calibratio
             stamp = stamp_ns(picture)
             if stamp in clouds:
                 rgb = _decoded(path, picture)
-                frames.append(
-                    _frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None, selection)
-                )
+                try:
+                    frames.append(
+                        _frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None, selection)
+                    )
+                except TransformError as error:
+                    raise CalibrationError(f"{path}: the motion at {stamp / 1e9:.3f} s is not known: {error}") from None
     lidar = next(iter(clouds.values())).frame_id
     return CalibrationRecording(
         frames=frames,

@@ -45,7 +45,7 @@ def add_parser(subparsers: Any) -> None:
                         help="revolutions (default: /lidar/points, else /lidar/packets)")  # fmt: skip
     camera.add_argument("--frames", type=int, default=24, metavar="N", help="most pictures (%(default)s)")
     camera.add_argument("--guess", metavar="X,Y,Z,ROLL,PITCH,YAW",
-                        help="the camera seen from the LiDAR (m, degrees), where /tf_static does not tell it")  # fmt: skip
+                        help="camera on the LiDAR (m, degrees), where /tf_static does not tell it")  # fmt: skip
     camera.add_argument("--near", action="store_true", help="the yaw is right within a few degrees: no full circle")
     camera.set_defaults(func=camera_lidar)
 
