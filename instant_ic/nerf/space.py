@@ -24,11 +24,13 @@ from .config import VirtualSpaceConfig
 from .field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
+from .readiness import Texture, error_terms, expected_psnr_db
 from .saved import Progress, SavedKeyframe, SavedSpace, read, write
 from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
 from .warp import PanoramaWarp, dissolve
 
 T = TypeVar("T")
+_PROBE = (64, 36)  # pixels of the picture that readiness is judged by
 
 
 class State(enum.IntEnum):
@@ -117,6 +119,7 @@ class VirtualSpace:
         self._scene: Scene | None = None
         self._kept: list[_Learnt] = []  # keyframes before the newest that were fit, newest first
         self._warps: list[PanoramaWarp] = []
+        self._texture: tuple[PanoramaPrior, Texture] | None = None
         self._can_warp = importlib.util.find_spec("numba") is not None
         self._gains: list[Floats] = [np.ones(3, np.float32)]  # of the keyframes that pictures show
         self._rng = np.random.default_rng(self.config.train.seed)
@@ -310,23 +313,43 @@ class VirtualSpace:
         )
         return View(rgb, depth, confidence, "cube")
 
+    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
+        """PSNR that a view from a pose will have, judged without its truth (``readiness``); −inf without a keyframe.
+
+        From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
+        """
+        if self._scene is None:
+            return -math.inf
+        rays = perspective_rays(checked_pose(map_from_camera), *_PROBE, fov_rad)
+        shown = self._shown
+        _, depth, confidence = self._draw_shown(rays, warps=True)
+        priors = [one.scene.prior for one in shown]
+        if self._texture is None or self._texture[0] is not priors[0]:
+            self._texture = priors[0], Texture.of(priors[0].rgb)
+        terms = error_terms(priors, self._texture[1], rays, depth, confidence)
+        return expected_psnr_db(terms, shown[0].progress.psnr_db, self._panorama_share(shown[0]))
+
     def _view(self, rays: Rays, projection: str) -> View:
         if self._scene is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         height, width = rays.shape
+        colour, depth, confidence = self._draw_shown(rays, warps=projection != "equirect")
+        depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
+        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        return View(rgb, depth, confidence, projection)
+
+    def _draw_shown(self, rays: Rays, warps: bool) -> tuple[Floats, Floats, Floats]:
+        """Colour, depth and confidence of a view's rays by all that pictures show."""
 
         def draw(device: Device) -> tuple[Floats, Floats, Floats]:
-            drawn = [self._draw(device, rays, shown, warps=projection != "equirect") for shown in self._shown]
+            drawn = [self._draw(device, rays, shown, warps) for shown in self._shown]
             if len(drawn) == 1:
                 return drawn[0]
             parts = zip(self._shown, self._gains, drawn, strict=True)
             return compose([Layer(shown.scene.prior, gain, *part) for shown, gain, part in parts], rays)
 
-        colour, depth, confidence = self._on_device(draw)
-        depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
-        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
-        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence, projection)
+        return self._on_device(draw)
 
     def _draw(self, device: Device, rays: Rays, shown: _Learnt, warps: bool) -> tuple[Floats, Floats, Floats]:
         """A keyframe's part of a view: its panorama warped, then the field as it becomes better."""
