@@ -54,7 +54,8 @@ def add_parser(commands: Any) -> None:
                       "plain random rooms, or none (wide, and none with --data)")  # fmt: skip
     data.add_argument("--generated-share", type=float, default=0.5, metavar="SHARE",
                       help="of a batch, beside --data (%(default)s)")  # fmt: skip
-    data.add_argument("--worlds", type=positive_int, default=100_000, help="generated worlds (%(default)s)")
+    data.add_argument("--worlds", type=positive_int, default=None, help="generated worlds (100000; "
+                      "400 with --cache)")  # fmt: skip
     data.add_argument("--poses", type=positive_int, default=6, help="panoramas in each (%(default)s)")
     data.add_argument("--first-world", type=not_negative, default=100_000, metavar="SEED",
                       help="seed of the first (%(default)s)")  # fmt: skip
@@ -188,6 +189,7 @@ def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report:
     )
     if folders and size - own < len(folders):
         raise ValueError(f"a batch of {size} leaves no place for each of {len(folders)} folders; raise --batch-size")
+    worlds = args.worlds or (400 if args.cache else 100_000)
     feeds: list[Feed] = []
     held_out: list[Subset] = []
     for number, folder in enumerate(folders):
@@ -197,7 +199,7 @@ def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report:
         feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers or 1))
         held_out.append(Subset(folder, kept))
     if own:
-        recipe = RoomsConfig(worlds=args.worlds, poses=args.poses, first_world=args.first_world, height=network.height,
+        recipe = RoomsConfig(worlds=worlds, poses=args.poses, first_world=args.first_world, height=network.height,
                              interiors=generated)  # fmt: skip
         if args.cache:
             data = open_cache(args.cache, recipe, args.workers, team, report)
@@ -205,10 +207,11 @@ def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report:
             feeds.append(FileFeed(data, training, own, args.seed, team.rank, team.ranks, data.info))
             held_out.append(Subset(data, kept))
         else:
-            worlds = max(2, args.held_out // 2)
-            held = RoomsConfig(worlds=worlds, poses=2, first_world=FIRST_HELD_OUT - worlds, height=network.height,
+            kept_worlds = max(2, args.held_out // 2)
+            first = FIRST_HELD_OUT - kept_worlds
+            held = RoomsConfig(worlds=kept_worlds, poses=2, first_world=first, height=network.height,
                                interiors=generated)  # fmt: skip
-            if args.first_world + args.worlds > held.first_world:
+            if args.first_world + worlds > held.first_world:
                 raise ValueError(f"worlds from seed {held.first_world} on are for evaluation; lower --worlds")
             feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
                                       team.rank, team.ranks))  # fmt: skip

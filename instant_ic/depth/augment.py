@@ -54,16 +54,17 @@ def turn_and_mirror(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> t
 def photograph(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:
     """What a real panorama camera on a robot adds to a picture (B, 3, H, W) in 0..1; each effect on some pictures.
 
-    In the order in which they arise: reflections in the floor, the robot or its stand over the bottom, lens
+    Four in ten pictures change in their colours alone: those of a good camera are not to be forgotten. The others in
+    the order in which things arise: reflections in the floor, the robot or its stand over the bottom, lens
     (vignetting, blur), sensor (exposure, colours, noise), JPEG. The depth (B, H, W) stays: under the robot it is the
     floor's, so that the network learns to go on with the floor there.
     """
-    rgb = _some(rgb, floor_reflection(rgb, depth, generator), 0.2, generator)
-    rgb = _some(rgb, robot_body(rgb, generator), 0.4, generator)
-    rgb = _some(rgb, vignetting(rgb, generator), 0.4, generator)
-    rgb = _some(rgb, blur(rgb, generator), 0.25, generator)
-    rgb = camera_colours(rgb, generator)
-    return _some(rgb, jpeg(rgb, generator), 0.4, generator)
+    changed = _some(rgb, floor_reflection(rgb, depth, generator), 0.2, generator)
+    changed = _some(changed, robot_body(changed, generator), 0.4, generator)
+    changed = _some(changed, vignetting(changed, generator), 0.4, generator)
+    changed = camera_colours(_some(changed, blur(changed, generator), 0.25, generator), generator)
+    changed = _some(changed, jpeg(changed, generator), 0.4, generator)
+    return _some(camera_colours(rgb, generator), changed, 0.6, generator)
 
 
 def _some(before: Tensor, after: Tensor, share: float, generator: torch.Generator) -> Tensor:
