@@ -431,7 +431,7 @@ class _Building:
 _SIGMA = np.array(
     [
         (np.inf, 0.0),  # UNKNOWN
-        (0.0131, 0.0171),  # BEAM
+        (0.0131, 0.0),  # BEAM
         (0.0005, 0.6406),  # BETWEEN
         (0.0735, 3.9778),  # EDGE
         (0.0125, 0.0333),  # UP

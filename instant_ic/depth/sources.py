@@ -121,15 +121,13 @@ class DepthSource:
         result = _of_fit(fit)
         if not fit.ok or built.message:
             # What the LiDAR alone tells is the better guess, but somebody is wrong: not fit.
-            reasons = [] if fit.ok else [fit.message]
-            reasons += [built.message] if built.message else []
             known = built.depth_m > 0
             return replace(
                 result,
                 depth_m=np.where(known, built.depth_m, fit.depth_m),
                 sigma=np.where(known, built.sigma, result.sigma),
                 ok=False,
-                message="; ".join(reasons),
+                message=built.message if fit.ok else fit.message,
                 source="fused",
             )
         depth, off = fuse(network, built)
