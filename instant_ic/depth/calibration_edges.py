@@ -61,6 +61,9 @@ def find_floor(points: Floats, most_tilt_deg: float = 15.0, seed: int = 0) -> Fl
     if best < max(200 * len(some) / len(low), 0.1 * len(some)):
         return None
     on_it = low[np.abs(low @ normal - height) < 0.03]
+    near, far = np.quantile(np.hypot(on_it[:, 0], on_it[:, 1]), (0.1, 0.9))
+    if far - near < 0.2:
+        return None  # one ring on walls around, flat by itself
     centre = on_it.mean(axis=0)
     normal = np.linalg.svd(on_it - centre, full_matrices=False)[2][2]
     normal *= np.sign(normal[2])
