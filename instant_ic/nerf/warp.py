@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .config import GeometryConfig
 from .field import Floats, Rays
-from .prior import PanoramaPrior, area_average, prepare, torn_quads
+from .prior import PanoramaPrior, prepare, torn_quads
 from .view import View, check_size, checked_pose, continue_unseen, perspective_rays
 
 TORN_RATIO = 0.05
@@ -42,8 +42,8 @@ class Pyramid:
         """Of a panorama (H, 2 H, 3); levels as long as both sides can be halved, down to 8 rows."""
         levels = [rgb]
         while levels[-1].shape[0] >= 16 and levels[-1].shape[0] % 2 == 0:
-            height, width = levels[-1].shape[:2]
-            levels.append(area_average(levels[-1], height // 2, width // 2))
+            rows = levels[-1][::2].astype(np.uint16) + levels[-1][1::2]
+            levels.append(((rows[:, ::2] + rows[:, 1::2] + 2) >> 2).astype(np.uint8))
         sizes = np.array([level.shape[:2] for level in levels], np.int64)
         start = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int64)
         return cls(np.concatenate([level.reshape(-1, 3) for level in levels]), start, sizes)
