@@ -81,7 +81,7 @@ def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corr
     height, width = network_m.shape
     seen = (measured_m > 0) & (network_m > 0)
     ratio = np.zeros((height, width), np.float32)
-    ratio[seen] = np.clip(np.log(measured_m[seen] / network_m[seen]), -0.7, 0.7)
+    ratio[seen] = np.clip(np.log(measured_m[seen]) - np.log(network_m[seen]), -0.7, 0.7)
     small = (width // 4, height // 4)
     sigma = (config.across_deg * small[0] / 360, config.along_deg * small[1] / 180)
     pad = int(3 * sigma[0]) + 1
