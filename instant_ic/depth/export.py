@@ -51,10 +51,7 @@ def export_onnx(
     Raises:
         ExportError: a difference is above what rounding explains, or the network gives no numbers.
         OSError: the file cannot be written.
-        ModuleNotFoundError: there is no ``onnx`` package (extra ``train``).
     """
-    import onnx  # noqa: F401 - torch's exporter needs it: better told before the work than after it
-
     path = Path(path)
     model.eval()
     shape = (1, 3, model.config.height, model.config.width)

@@ -64,13 +64,9 @@ def load_start(path: str | Path, network: SliceNetConfig) -> Start:
 
 def _from_onnx(path: Path, content: bytes, network: SliceNetConfig) -> SliceNet:
     """The exporter names no weights, but keeps the order in which modules run; the result is held against the file."""
-    try:
-        import onnx
-        from onnx import numpy_helper
-    except ModuleNotFoundError as error:
-        raise CheckpointError(f"{path}: reading ONNX weights needs the onnx package: pip install 'instant-ic[train]'"
-                              ) from error  # fmt: skip
+    import onnx
     import onnxruntime
+    from onnx import numpy_helper
 
     try:
         graph = onnx.load_from_string(content).graph

@@ -4,7 +4,6 @@ import contextlib
 import io
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -157,14 +156,6 @@ def test_convert_tells_faults_in_a_line(
     assert main(["depth", "convert", *words]) == 1
     told = capsys.readouterr().err
     assert message in told and "Traceback" not in told
-
-
-def test_convert_names_the_package_that_it_needs(
-    checkpoint: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    assert main(["depth", "convert", str(checkpoint)]) == 1
-    assert "needs the package onnx: pip install 'instant-ic[train]'" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -118,8 +118,6 @@ def convert(args: argparse.Namespace) -> int:
         )  # fmt: skip
     except (CheckpointError, ExportError, ValueError) as error:
         raise UserError(str(error)) from error
-    except ModuleNotFoundError as error:
-        raise UserError(f"needs the package {error.name}: pip install 'instant-ic[train]'") from error
     except OSError as error:
         raise UserError(f"{error.filename or output}: {error.strerror or error}") from error
     report(f"wrote {output} ({output.stat().st_size / 1e6:.1f} MB) and {output.with_suffix('.yaml').name}")
