@@ -161,7 +161,7 @@ def _across_rings(
 
 
 def picture_edges(rgb: NDArray[np.uint8], sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Strength of upright and of lying edges of a panorama (H, W, 3), blurred, each (H, W) with mean near 1.
+    """Strength of upright and of lying edges of a panorama (H, W, 3), blurred, each (H, W) over its mean.
 
     Of the logarithm of the brightness, so that a dark corner counts like a bright one; the strongest twentieth is cut,
     so that no lamp outweighs everything else.

@@ -94,7 +94,6 @@ def test_picture_edges_of_a_door_at_the_seam():
     upright, lying = picture_edges(rgb, 1.0)
     assert upright[35, [127, 0, 23, 24]].min() > 4 * upright[35, [8, 12, 60, 100]].max()
     assert lying[[19, 20, 49, 50], 12].min() > 2 * lying[[5, 35, 60], 12].max()
-    np.testing.assert_allclose([upright.mean(), lying.mean()], 1.0, atol=0.2)
 
 
 def test_small_motions_by_scipys_rotations():
