@@ -210,9 +210,9 @@ def calibrate(
     covariance = _covariance(level, found)
     if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
         covariance[2, 2] += _UNCHECKED_HEIGHT**2
-    for other in rivals:
+    for other in rivals:  # either may be true: the one believed is off by nothing or by all of the way
         shift = _correction(found, other) / _UNIT
-        covariance += 0.25 * np.outer(shift, shift)
+        covariance += 0.5 * np.outer(shift, shift)
     units = _correction(start, found) / _UNIT
     values, vectors = np.linalg.eigh(covariance)
     limit = np.array([config.most_sigma_m] * 3 + [math.radians(config.most_sigma_deg)] * 3)

@@ -183,7 +183,7 @@ def sector_factors(
     apart = np.minimum(np.arange(count), count - np.arange(count))
     kernel = np.exp(-0.5 * (apart / 0.5) ** 2)
     smooth = np.asarray(np.fft.ifft(np.fft.fft(shrunk) * np.fft.fft(kernel / kernel.sum())).real, np.float64)
-    centres: NDArray[np.float64] = (np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi
+    centres = np.asarray((np.arange(count) + 0.5) * (2 * np.pi / count) - np.pi, np.float64)
     return centres, smooth
 
 
