@@ -68,10 +68,11 @@ def samples(kind: str, scene: Scene) -> list[dict[str, Any]]:
 
 
 def fit(rows: list[dict[str, Any]]) -> list[float]:
-    """Base and gains, none negative, that bring the relative error of the squared error to its least."""
+    """Base and gains, none negative, of the least relative error of the squared error; unbiased in dB."""
     mse = np.array([10 ** (-row["psnr_db"] / 10) for row in rows])
     matrix = np.array([[1e-3, *row["terms"]] for row in rows]) / mse[:, None]
     gains = nnls(matrix, np.ones(len(rows)))[0]
+    gains /= np.exp(np.mean(np.log(matrix @ gains)))
     return [float(gains[0] * 1e-3), *map(float, gains[1:])]
 
 
