@@ -20,8 +20,11 @@ from .prior import PanoramaPrior
 
 SAME_SURFACE = 0.06
 """Depths within this share of each other are one surface."""
+SAME_PLACE = 0.15
+"""Surfaces within this share of the nearest are one that the keyframes' depths disagree about: the best seen counts."""
 _SHARPNESS = 6.0
 _LEAST_PENALTY = 0.05
+_ASIDE_RAD = 0.02  # less is the keyframe's own view, whose edges are right
 _EDGE = 0.25  # less confidence at an edge
 _STEP_ROWS = 128  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
@@ -44,7 +47,8 @@ class Layer:
 def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats]:
     """Colours (P, 3), depth (P,) and confidence (P,) of the layers together, newest first.
 
-    Of surfaces at different depths the nearest counts; one at an edge of its keyframe's depth, where colours of two
+    Of surfaces at different depths the nearest counts, of those that depths only disagree about the one that is seen
+    most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two
     surfaces mix, only where no keyframe has a plain one. What a newer keyframe has looked through is left out of the
     older: it has moved away since.
     """
@@ -54,28 +58,38 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     for number, layer in enumerate(layers):
         at = np.flatnonzero(confidence[number])
         points = rays.origin + depth[number, at, None] * rays.directions[at]
-        rank[number, at] -= _EDGE * _at_edge(layer.prior, points)
+        # From the keyframe's own place its edges are as it saw them.
+        aside = _angle(layer.prior, points, rays.directions[at]) > _ASIDE_RAD
+        rank[number, at] -= _EDGE * (aside & _at_edge(layer.prior, points))
         for newer in layers[:number]:
             rank[number, at[looked_through(newer.prior, points, layer.prior)]] = 0
     best = rank.max(axis=0)
     candidate = (rank > 0) & (rank == best)
-    nearest = np.where(candidate, depth, np.inf).min(axis=0)
-    candidate &= depth <= nearest * np.float32(1 + SAME_SURFACE)
     met = best > 0
-    weight = np.zeros_like(depth)
+    nearest = np.where(candidate, depth, np.inf).min(axis=0)
+    candidate &= depth <= nearest * np.float32(1 + SAME_PLACE)
     points = rays.origin + nearest[met, None] * rays.directions[met]
+    penalty = np.full(depth.shape, np.inf, np.float32)
     for number, layer in enumerate(layers):
-        back = layer.prior.map_from_camera[:3, 3].astype(np.float32) - points
-        away = np.linalg.norm(back, axis=1)
-        cosine = -np.einsum("ij,ij->i", back, rays.directions[met]) / np.maximum(away, 1e-6)
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        penalty = _LEAST_PENALTY + angle + np.maximum(0, away / nearest[met] - 1)
-        weight[number, met] = candidate[number, met] * penalty**-_SHARPNESS
+        angle = _angle(layer.prior, points, rays.directions[met])
+        away = np.linalg.norm(points - layer.prior.map_from_camera[:3, 3].astype(np.float32), axis=1)
+        penalty[number, met] = _LEAST_PENALTY + angle + np.maximum(0, away / nearest[met] - 1)
+    penalty[~candidate] = np.inf
+    surface = np.take_along_axis(depth, penalty.argmin(axis=0)[None], axis=0)[0]
+    candidate &= np.abs(depth - surface) <= surface * np.float32(SAME_SURFACE)
+    weight = np.where(candidate, penalty, np.inf) ** -_SHARPNESS
     weight[0, ~met] = 1  # nobody has seen it: as the newest has it
     weight /= weight.sum(axis=0)
     colour = sum(w[:, None] * layer.gain * layer.colour for w, layer in zip(weight, layers, strict=True))
     shown = np.where(candidate, confidence, 0).max(axis=0)
     return np.asarray(colour, np.float32), (weight * depth).sum(axis=0), shown
+
+
+def _angle(prior: PanoramaPrior, points: Floats, directions: Floats) -> Floats:
+    """Radians between a view's rays (N, 3) to points (N, 3) and the keyframe's."""
+    seen = points - prior.map_from_camera[:3, 3].astype(np.float32)
+    cosine = np.einsum("ij,ij->i", seen, directions) / np.maximum(np.linalg.norm(seen, axis=1), 1e-6)
+    return np.asarray(np.arccos(np.clip(cosine, -1, 1)), np.float32)
 
 
 def looked_through(prior: PanoramaPrior, points: Floats, theirs: PanoramaPrior) -> NDArray[np.bool_]:
