@@ -71,6 +71,8 @@ def add_parser(commands: Any) -> None:
     training.add_argument("--network", default="small", metavar="NAME",
                           help="small, or BACKBONE:HEIGHT such as resnet50:512 (%(default)s)")  # fmt: skip
     training.add_argument("--init", type=Path, metavar="FILE", help="begin with the weights of this checkpoint or ONNX")
+    training.add_argument("--mix", type=positive, default=1.0, metavar="SHARE", help="of the trained weights in the "
+                          "result, the rest are --init's: a short training forgets less (%(default)s)")  # fmt: skip
     training.add_argument("--minutes", type=positive, default=60.0, help="wall time (%(default)s)")
     training.add_argument("--epochs", type=positive_int, default=1000, help="most passes over the data (%(default)s)")
     training.add_argument("--batch-size", type=positive_int, default=8, help="panoramas a step and GPU (%(default)s)")
@@ -157,7 +159,7 @@ def _trainer(args: argparse.Namespace, network: SliceNetConfig, team: Team, repo
 
     config = TrainingConfig(
         minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, learning_rate=args.learning_rate,
-        threads=args.threads, seed=args.seed, checkpoint_s=args.checkpoint_s,
+        threads=args.threads, seed=args.seed, checkpoint_s=args.checkpoint_s, mix=args.mix,
     )  # fmt: skip
     start = load_start(args.init, network) if args.init else None
     report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas a step")

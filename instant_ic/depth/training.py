@@ -49,6 +49,9 @@ class TrainingConfig:
         weight_decay: of AdamW.
         warmup: share of the schedule in which the learning rate rises.
         average: decay of the weight average a step.
+        mix: share of the trained weights in the result, the rest are the start's. A short training on other pictures
+            forgets what it does not see; between both ends of the line lies what does well on old and new (Wortsman et
+            al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         edge_share: weight of the edge loss.
         photograph: pictures are augmented with what a real camera adds.
         brightness: mean byte that each picture is brought to before the network, as inference does; 0: as it is.
@@ -68,6 +71,7 @@ class TrainingConfig:
     weight_decay: float = 0.02
     warmup: float = 0.04
     average: float = 0.998
+    mix: float = 1.0
     edge_share: float = 0.5
     photograph: bool = True
     brightness: float = 178.5
@@ -85,6 +89,8 @@ class TrainingConfig:
                 raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
         if not 0 < self.warmup < 1 or not 0 <= self.average < 1:
             raise ValueError(f"warmup and average must lie in 0..1 (got {self.warmup}, {self.average})")
+        if not 0 < self.mix <= 1:
+            raise ValueError(f"mix must lie in 0..1, above 0 (got {self.mix})")
         if not 0 <= self.brightness <= 255:
             raise ValueError(f"brightness must lie in 0..255 (got {self.brightness})")
 
@@ -194,6 +200,7 @@ class Trainer:
         output: checkpoint file.
         team: the processes of this training; by default this one on the CPU.
         start: weights to begin with; by default random ones.
+        result: the weights that are evaluated and saved: the average, in the end mixed with the start's.
         command: for the record, what the user typed.
         report: takes lines for people.
         bar: is told the progress 0..1 after each step.
@@ -233,6 +240,10 @@ class Trainer:
             unfold_norms(self.model, self._augmented(pictures, truth)[0])
         self.model = self.model.to(self.team.device)
         self.average = copy.deepcopy(self.model).eval()
+        if self.config.mix < 1 and self.start is None:
+            raise ValueError("mix needs weights to start from")
+        self._initial = copy.deepcopy(self.average) if self.config.mix < 1 else None
+        self.result = self.average
         if self.team.ranks > 1 and self.team.device.type == "cuda":
             self.model = nn.SyncBatchNorm.convert_sync_batchnorm(self.model)
         self._parallel: nn.Module = self.model
@@ -339,6 +350,9 @@ class Trainer:
             if log is None:
                 return None
             self._row(log, losses, *last_row)
+            if self._initial is not None:
+                self.result = copy.deepcopy(self.average)
+                update_average(self.result, self._initial, self.config.mix)
             final = self._evaluate(self.held_out)
             self._checkpoint(log, final, losses)
             return final
@@ -365,7 +379,7 @@ class Trainer:
         return now, self.step
 
     def _evaluate(self, samples: Samples) -> DepthMetrics:
-        return evaluate(self.average, samples, self.config.max_range_m, self.config.brightness)
+        return evaluate(self.result, samples, self.config.max_range_m, self.config.brightness)
 
     def _checkpoint(self, log: TrainingLog, metrics: DepthMetrics, losses: list[float]) -> None:
         entry: dict[str, Any] = {"step": self.step, "minutes": round(self.elapsed_s / 60, 1), **metrics.as_dict()}
@@ -373,10 +387,11 @@ class Trainer:
         self.history.append(entry)
         state = {
             "config": self.network.as_dict(),
-            "state_dict": self.average.state_dict(),
+            "state_dict": self.result.state_dict(),
             "record": self.record(),
             "resume": {
                 "model": self.model.state_dict(),
+                "average": self.average.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "scaler": self.scaler.state_dict(),
                 "step": self.step,
@@ -420,7 +435,7 @@ class Trainer:
             raise CheckpointError(f"{path}: not a checkpoint of tensors and plain values ({error})") from error
         if not isinstance(state, dict) or "resume" not in state or state.get("config") != self.network.as_dict():
             raise CheckpointError(f"{path}: not a checkpoint of a run with {self.network}")
-        self.average.load_state_dict(state["state_dict"])
+        self.average.load_state_dict(state["resume"].get("average", state["state_dict"]))
         self.model.load_state_dict(state["resume"]["model"])
         self.optimizer.load_state_dict(state["resume"]["optimizer"])
         self.scaler.load_state_dict(state["resume"]["scaler"])

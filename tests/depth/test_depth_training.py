@@ -14,6 +14,7 @@ from instant_ic.depth.feeds import FileFeed
 from instant_ic.depth.slicenet import CheckpointError, SliceNet, SliceNetConfig, load_checkpoint
 from instant_ic.depth.training import Team, Trainer, TrainingConfig, evaluate, schedule, to_tensors, update_average
 from instant_ic.depth.training_log import TrainingLog
+from instant_ic.depth.weights import load_start
 
 TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
 
@@ -29,11 +30,11 @@ def stripes(count: int, height: int = 64) -> list[Sample]:
     return samples
 
 
-def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, **options) -> Trainer:
+def trainer(output: Path, epochs: int, samples: list[Sample] | None = None, mix: float = 1.0, **options) -> Trainer:
     samples = samples or stripes(12)
     config = TrainingConfig(
         minutes=60, epochs=epochs, batch_size=3, threads=1, mixed_precision=False, average=0.8, learning_rate=1e-2,
-        photograph=False, brightness=0.0,
+        photograph=False, brightness=0.0, mix=mix,
     )  # fmt: skip
     feed = FileFeed(samples, np.arange(9), 3, info={"kind": "stripes"})
     return Trainer(feed, Subset(samples, range(9, 12)), TINY, config, output, report=lambda line: None, **options)
@@ -55,6 +56,21 @@ def test_training_learns(trained: SimpleNamespace) -> None:
     assert trained.run.step == 36
     assert trained.metrics.mre < 0.5 < trained.first_loss
     assert trained.shares == sorted(trained.shares) and trained.shares[-1] == 1.0
+
+
+def test_result_can_be_mixed_with_the_start(trained: SimpleNamespace, tmp_path: Path) -> None:
+    start = load_start(trained.path, TINY)
+    before = {key: value.clone() for key, value in start.model.state_dict().items()}
+    run = trainer(tmp_path / "m.pt", 1, start=start, mix=0.25)
+    run.run()
+    run.close()
+    saved, average = load_checkpoint(tmp_path / "m.pt").state_dict(), run.average.state_dict()
+    key = "bi_rnn.weight_hh_l0"
+    assert not torch.equal(average[key], before[key])
+    torch.testing.assert_close(saved[key], 0.75 * before[key] + 0.25 * average[key])
+    assert run.record()["training"]["mix"] == 0.25
+    with pytest.raises(ValueError, match="mix needs weights to start from"):
+        trainer(tmp_path / "n.pt", 1, mix=0.25)
 
 
 def test_record_tells_what_made_the_weights(trained: SimpleNamespace) -> None:
