@@ -24,16 +24,6 @@ from .foxglove_commands import Commands
 from .foxglove_parameters import Parameters
 
 _SETTLE_S = 0.1
-_PARAMETER_FIELDS = {
-    1: "bool_value",
-    2: "integer_value",
-    3: "double_value",
-    4: "string_value",
-    6: "bool_array_value",
-    7: "integer_array_value",
-    8: "double_array_value",
-    9: "string_array_value",
-}
 
 
 class FoxgloveError(RuntimeError):
@@ -224,17 +214,6 @@ class FoxgloveServer:
             del self._newcomers[topic]
             if topic in self._channels:
                 self._channels[topic].renew()
-
-    def parameter_event(self, event: Any) -> None:
-        """Tells clients of parameters that somebody else has changed."""
-        values = []
-        for parameter in [*event.new_parameters, *event.changed_parameters]:
-            if (name := _PARAMETER_FIELDS.get(int(parameter.value.type))) is not None:
-                value = getattr(parameter.value, name)
-                plain = value.tolist() if hasattr(value, "tolist") else value
-                values.append(self._sdk.Parameter(f"/{event.node.strip('/')}.{parameter.name}", value=plain))
-        if values:
-            self._server.publish_parameter_values(values)
 
     # -- from any thread -------------------------------------------------------------------------
 

@@ -12,8 +12,7 @@ from instant_ic.bag.choice import TopicChoice
 from instant_ic.bridge.commands import CommandGate, CommandLimits
 from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerSettings, is_loopback
 from instant_ic.bridge.topic_watch import TopicWatch
-from instant_ic.bus import OK, RELIABLE, WARN, Node, NodeError, main, registry
-from instant_ic.msg import ParameterEvent
+from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.ranges import Range, check_ranges
 
 _TIME_S = 0.05
@@ -90,7 +89,6 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             raise NodeError(str(error)) from None
         scheme = "wss" if config.tls_cert else "ws"
         self.log.info("Foxglove: open %s://%s:%d", scheme, config.host, self.server.port)
-        self.subscribe("/parameter_events", ParameterEvent, self.server.parameter_event, qos=RELIABLE)
         may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
         if may and not is_loopback(config.host):
             self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {' and '.join(may)}")

@@ -377,22 +377,6 @@ def test_parameters_of_every_node_are_served_and_changed_where_the_node_allows_i
     assert (talker.config.rate_hz, talker.config.words) == (5.0, "hello")
 
 
-def test_a_change_made_elsewhere_is_told_to_those_who_asked(world, talker):
-    world.bridge()
-    client = world.client()
-    client.parameters("/talker.rate_hz")
-    client.send(op="subscribeParameterUpdates", parameterNames=["/talker.rate_hz"])
-
-    def changed():
-        talker.call_soon(talker.set_parameters, {"rate_hz": 3.0 + len(client.texts) % 2})
-        client.spin(0.05)
-        answers = [t for t in client.texts if t["op"] == "parameterValues" and "id" not in t]
-        return any(p["value"] == talker.config.rate_hz for t in answers for p in t["parameters"])
-
-    client.texts.clear()
-    client.until(changed, "the changed value")
-
-
 def test_a_node_that_is_not_there_is_told(world):
     world.bridge()
     client = world.client()
