@@ -28,7 +28,7 @@ from .losses import depth_loss, edge_loss
 from .metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
 from .slicenet import CheckpointError, SliceNet, SliceNetConfig
 from .training_log import TrainingLog
-from .weights import Start, unfold_norms
+from .weights import Start, fold_norms, unfold_norms
 
 POLE_WEIGHT = 0.1
 """Least weight of a row in the loss, the mean row being 1. By solid angle alone the rows at the poles are hardly
@@ -166,6 +166,17 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
             kept.copy_(new)
 
 
+def mixed(trained: SliceNet, initial: SliceNet, share: float) -> SliceNet:
+    """``share`` of the weights of ``trained``, the rest of ``initial``; with batch norms folded, as their numbers mean
+    different things in each.
+    """
+    result, start = copy.deepcopy(trained).cpu().eval(), copy.deepcopy(initial).cpu().eval()
+    fold_norms(result)
+    fold_norms(start)
+    update_average(result, start, share)
+    return result.to(next(trained.parameters()).device)
+
+
 def to_tensors(rgb: np.ndarray, depth: np.ndarray, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor]:
     """A batch (B, 3, H, W) in 0..1 and its truth (B, H, W), 0 where it is unknown or too far."""
     pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
@@ -233,6 +244,11 @@ class Trainer:
             raise ValueError(f"the panoramas are {rgb.shape[1]} x {rgb.shape[2]}, the network takes "
                              f"{self.network.height} x {self.network.width}")  # fmt: skip
         self.model = self.start.model if self.start else SliceNet(self.network)
+        self._initial: SliceNet | None = None
+        if self.config.mix < 1:
+            if self.start is None:
+                raise ValueError("mix needs weights to start from")
+            self._initial = copy.deepcopy(self.model)
         if self.start is None:
             self._start_at_typical_depth(depth)
         elif self.start.folded:
@@ -240,9 +256,6 @@ class Trainer:
             unfold_norms(self.model, self._augmented(pictures, truth)[0])
         self.model = self.model.to(self.team.device)
         self.average = copy.deepcopy(self.model).eval()
-        if self.config.mix < 1 and self.start is None:
-            raise ValueError("mix needs weights to start from")
-        self._initial = copy.deepcopy(self.average) if self.config.mix < 1 else None
         self.result = self.average
         if self.team.ranks > 1 and self.team.device.type == "cuda":
             self.model = nn.SyncBatchNorm.convert_sync_batchnorm(self.model)
@@ -351,8 +364,7 @@ class Trainer:
                 return None
             self._row(log, losses, *last_row)
             if self._initial is not None:
-                self.result = copy.deepcopy(self.average)
-                update_average(self.result, self._initial, self.config.mix)
+                self.result = mixed(self.average, self._initial, self.config.mix)
             final = self._evaluate(self.held_out)
             self._checkpoint(log, final, losses)
             return final

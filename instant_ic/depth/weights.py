@@ -176,6 +176,25 @@ def _copy_lstm(
 
 
 @torch.inference_mode()
+def fold_norms(model: SliceNet) -> None:
+    """Takes each batch norm into the convolution before it, without changing what the network computes.
+
+    Args:
+        model: in evaluation mode.
+    """
+    for conv, norm in _run_order(model)["Conv"]:
+        scale = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+        bias = torch.zeros_like(norm.bias) if conv.bias is None else conv.bias
+        norm.bias.add_((bias - norm.running_mean) * scale)
+        conv.weight.mul_(scale[:, None, None, None])
+        if conv.bias is not None:
+            conv.bias.zero_()
+        norm.running_mean.zero_()
+        norm.running_var.fill_(1.0 - norm.eps)
+        norm.weight.fill_(1.0)
+
+
+@torch.inference_mode()
 def unfold_norms(model: SliceNet, pictures: Tensor) -> None:
     """Gives folded batch norms the mean and spread of what they see, without changing what the network computes.
 

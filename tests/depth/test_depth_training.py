@@ -1,5 +1,6 @@
 """Training on a few striped pictures: it learns, repeats, is taken up again, and records what it did."""
 
+import copy
 import csv
 import json
 from pathlib import Path
@@ -14,7 +15,7 @@ from instant_ic.depth.feeds import FileFeed
 from instant_ic.depth.slicenet import CheckpointError, SliceNet, SliceNetConfig, load_checkpoint
 from instant_ic.depth.training import Team, Trainer, TrainingConfig, evaluate, schedule, to_tensors, update_average
 from instant_ic.depth.training_log import TrainingLog
-from instant_ic.depth.weights import load_start
+from instant_ic.depth.weights import fold_norms, load_start
 
 TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
 
@@ -60,14 +61,22 @@ def test_training_learns(trained: SimpleNamespace) -> None:
 
 def test_result_can_be_mixed_with_the_start(trained: SimpleNamespace, tmp_path: Path) -> None:
     start = load_start(trained.path, TINY)
-    before = {key: value.clone() for key, value in start.model.state_dict().items()}
+    before = copy.deepcopy(start.model)
     run = trainer(tmp_path / "m.pt", 1, start=start, mix=0.25)
     run.run()
     run.close()
-    saved, average = load_checkpoint(tmp_path / "m.pt").state_dict(), run.average.state_dict()
-    key = "bi_rnn.weight_hh_l0"
-    assert not torch.equal(average[key], before[key])
-    torch.testing.assert_close(saved[key], 0.75 * before[key] + 0.25 * average[key])
+    saved, key = load_checkpoint(tmp_path / "m.pt").state_dict(), "bi_rnn.weight_hh_l0"
+    assert not torch.equal(run.average.state_dict()[key], before.state_dict()[key])
+    pictures = torch.rand(1, 3, 64, 128, generator=torch.Generator().manual_seed(0))
+    folded = []
+    for model in (before, run.average):
+        folded.append(copy.deepcopy(model).eval())
+        fold_norms(folded[-1])
+        torch.testing.assert_close(folded[-1](pictures), model.eval()(pictures), rtol=1e-4, atol=1e-4)
+    for name, value in saved.items():
+        ends = [model.state_dict()[name] for model in folded]
+        if value.is_floating_point():
+            torch.testing.assert_close(value, 0.75 * ends[0] + 0.25 * ends[1], rtol=1e-4, atol=1e-6)
     assert run.record()["training"]["mix"] == 0.25
     with pytest.raises(ValueError, match="mix needs weights to start from"):
         trainer(tmp_path / "n.pt", 1, mix=0.25)
