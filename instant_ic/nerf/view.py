@@ -51,6 +51,21 @@ class View:
         weight = np.sin((np.arange(height) + 0.5) * (math.pi / height))
         return float(self.confidence.mean(axis=1) @ weight / weight.sum())
 
+    def mask_png(self, width: int = 64) -> bytes:
+        """Confidence of a flat picture as a small grey PNG, 0 unseen to 255 seen; empty where all of it was seen."""
+        import cv2
+
+        if (self.confidence >= 1).all():
+            return b""
+        rows, columns = self.confidence.shape
+        width = min(width, columns)
+        size = (width, max(1, round(rows * width / columns)))
+        small = cv2.resize(np.asarray(self.confidence, np.float32), size, interpolation=cv2.INTER_AREA)
+        ok, png = cv2.imencode(".png", np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
+        if not ok:
+            raise ValueError(f"PNG encoder refused a mask of shape {small.shape}")
+        return bytes(png.tobytes())
+
 
 def check_size(width: int, height: int) -> None:
     """Raises ValueError for a picture that is too small or too large to draw."""

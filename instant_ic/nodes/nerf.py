@@ -83,6 +83,7 @@ class Outcome:
     status: Status | None = None
     view: View | None = None
     jpeg: bytes = b""
+    mask_png: bytes = b""
     elapsed_ms: float = 0.0
     refused: str = ""
     error: Exception | None = None
@@ -217,7 +218,7 @@ class NerfNode(Node[NerfConfig]):
             view = self.space.render(pose_matrix(request.pose), request.width, request.height, request.fov_rad)
             quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality]
             _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], quality)
-            return Outcome(job, view=view, jpeg=jpeg.tobytes())
+            return Outcome(job, view=view, jpeg=jpeg.tobytes(), mask_png=view.mask_png())
         return Outcome(job)
 
     def yield_to_others(self) -> None:
@@ -310,6 +311,7 @@ class NerfNode(Node[NerfConfig]):
                 confidence=float(view.confidence.mean()),
                 render_ms=self.render_ms,
                 image=image,
+                confidence_png=np.frombuffer(outcome.mask_png, np.uint8),
             )
         )
         self.image_out.publish(image)

@@ -121,6 +121,7 @@ def view_message(bus, request_id, fov=1.8):
         confidence=0.9,
         render_ms=math.nan,
         image=compressed_image_message(b"VIEW", "map", bus.clock.now_ns()),
+        confidence_png=np.frombuffer(b"MASK", np.uint8),
     )
 
 
