@@ -192,7 +192,7 @@ class VirtualSpace:
             lattice = self._scene.lattice
         elif self._scene is not None:
             self._device.load(FieldParameters.random(config.field, config.train.seed))
-        scene = Scene(prior, lattice, occupancy)
+        scene = Scene((prior,), lattice, occupancy)
         try:
             self._on_device(lambda device: device.set_scene(scene))
         except Exception:
@@ -321,12 +321,20 @@ class VirtualSpace:
         if self._scene is None:
             return -math.inf
         rays = perspective_rays(checked_pose(map_from_camera), *_PROBE, fov_rad)
-        shown = self._shown
         _, depth, confidence = self._draw_shown(rays, warps=True)
+        return self._judge(rays, depth, confidence)
+
+    def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
+        """Expected PSNR of a view as it was drawn, (P,) each; a few thousand pixels tell it."""
+        step = max(1, rays.shape[1] // _PROBE[0])
+        height, width = rays.shape
+        chosen = np.arange(height * width).reshape(height, width)[step // 2 :: step, step // 2 :: step].reshape(-1)
+        some = Rays(rays.origin, rays.directions[chosen], rays.axial[chosen], (len(chosen), 1))
+        shown = self._shown
         priors = [one.scene.prior for one in shown]
         if self._texture is None or self._texture[0] is not priors[0]:
             self._texture = priors[0], Texture.of(priors[0].rgb)
-        terms = error_terms(priors, self._texture[1], rays, depth, confidence)
+        terms = error_terms(priors, self._texture[1], some, depth[chosen], confidence[chosen])
         return expected_psnr_db(terms, shown[0].progress.psnr_db, self._panorama_share(shown[0]))
 
     def _view(self, rays: Rays, projection: str) -> View:
@@ -334,10 +342,11 @@ class VirtualSpace:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         height, width = rays.shape
         colour, depth, confidence = self._draw_shown(rays, warps=projection != "equirect")
+        expected = self._judge(rays, depth, confidence)
         depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
         image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence, projection)
+        return View(rgb, depth, confidence, projection, expected)
 
     def _draw_shown(self, rays: Rays, warps: bool) -> tuple[Floats, Floats, Floats]:
         """Colour, depth and confidence of a view's rays by all that pictures show."""
@@ -434,7 +443,8 @@ class VirtualSpace:
         saved = read(path)
         space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
         scenes = [
-            Scene(one.prior, one.lattice, build_occupancy(one.prior, saved.config.geometry)) for one in saved.keyframes
+            Scene((one.prior,), one.lattice, build_occupancy(one.prior, saved.config.geometry))
+            for one in saved.keyframes
         ]
         newest = saved.keyframes[0]
         kept: list[_Learnt] = []

@@ -30,12 +30,19 @@ class View:
         confidence: (H, W): 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled from
             around, 0 where none has: unknown.
         projection: ``perspective``, ``equirect`` or ``cube``.
+        expected_psnr_db: that the picture has, judged without its truth (``readiness``); NaN of a cube map.
     """
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.float32]
     confidence: NDArray[np.float32]
     projection: str = "perspective"
+    expected_psnr_db: float = math.nan
+
+    @property
+    def unseen_share(self) -> float:
+        """Of the picture's pixels, 0..1: what no keyframe has seen."""
+        return float(np.count_nonzero(self.confidence == 0)) / self.confidence.size
 
     @property
     def opacity(self) -> NDArray[np.float32]:

@@ -111,6 +111,7 @@ class NerfNode(Node[NerfConfig]):
         self.keyframe_ns = self.ready_ns = 0
         self.shown_seconds = 0.0
         self.render_ms = 0.0
+        self.expected_psnr_db = self.unseen_share = 0.0  # of the picture drawn last; 0 = unknown
         self.drawn_ns: deque[int] = deque(maxlen=20)
         self.view_out = self.publisher("/vspace/view", RenderedView, qos=SENSOR)
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
@@ -297,6 +298,7 @@ class NerfNode(Node[NerfConfig]):
         # Wall time would make a replay differ from run to run.
         self.render_ms = 0.0 if self.lockstep else outcome.elapsed_ms
         self.drawn_ns.append(now)
+        self.expected_psnr_db, self.unseen_share = view.expected_psnr_db, view.unseen_share
         self.diagnose("view", OK, f"{request.width} x {request.height} in {self.render_ms:.0f} ms")
         image = compressed_image_message(outcome.jpeg, "map", now)
         self.view_out.publish(
@@ -359,6 +361,8 @@ class NerfNode(Node[NerfConfig]):
             keyframe_stamp=to_time(0),
             ready_radius_m=0.0,
             psnr_db=0.0,
+            expected_psnr_db=self.expected_psnr_db,
+            unseen_share=self.unseen_share,
             train_seconds=0.0,
             ready_seconds=0.0,
             iterations=0,

@@ -83,6 +83,10 @@ def control(bus, mode, **values):
         "pose_gap_m": 0.0,
         "yaw_gap_rad": 0.0,
         "time_to_obstacle_s": math.inf,
+        "shown": int(mode in (ControlState.VIRTUAL, ControlState.RETURNING)),
+        "vbot_action": 0,
+        "vbot_target": pose,
+        "robot_twist": twist_message(),
     }
     return ControlState(**(fields | values))
 
@@ -104,8 +108,9 @@ def publish_tree(bus, x=1.0, y=2.0, yaw=math.pi / 2):
 def vspace_status(state):
     return VspaceStatus(
         header=header("", 0), state=state, keyframe_id=1, keyframe_pose=pose_message(np.eye(4)),
-        keyframe_stamp=to_time(0), ready_radius_m=2.0, psnr_db=27.5, train_seconds=9.0, ready_seconds=8.0,
-        iterations=1, ms_per_iteration=1.0, render_ms=20.0, render_fps=10.0, device="cpu", message="",
+        keyframe_stamp=to_time(0), ready_radius_m=2.0, psnr_db=27.5, expected_psnr_db=26.0, unseen_share=0.1,
+        train_seconds=9.0, ready_seconds=8.0, iterations=1, ms_per_iteration=1.0, render_ms=20.0, render_fps=10.0,
+        device="cpu", message="",
     )  # fmt: skip
 
 
