@@ -59,6 +59,7 @@ class Demo:
         self.plan: dict[str, Any] = {"trajectory": [], "path": [], "subgoal": None}
         self.costmap: GridImage | None = None
         self._command = (0.0, 0.0)
+        self._placing = threading.Lock()
         self._transitions = 0
         self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
@@ -120,8 +121,17 @@ class Demo:
             if self._views.due(now, virtual=self.mode == "virtual"):
                 self._send_view(self._views.asked(now))
 
+    def place(self, x: float, y: float, yaw: float) -> None:
+        """Puts both robots there (m, rad)."""
+        with self._placing:
+            self.robot, self.vbot = np.array([x, y, yaw]), np.array([x, y, yaw])
+
     def step(self, seconds: float) -> None:
         """Moves both robots on."""
+        with self._placing:
+            self._step(seconds)
+
+    def _step(self, seconds: float) -> None:
         v, w = (0.0, 0.0) if self.estop else self._command
         before = self.mode
         if self.estop:

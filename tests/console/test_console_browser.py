@@ -2,143 +2,31 @@
 
 import io
 import math
-import os
-import shutil
-import time
 
-import cv2
 import numpy as np
 import pytest
+from console_pages import (
+    BROWSER_TEST,
+    RB,
+    SIZE,
+    WAIT_MS,
+    B,
+    expect_body,
+    hold_and_push,
+    likeness,
+    make_demo,
+    moving,
+    picture_of,
+    release_by_enter,
+    room_seen,
+    start_driving,
+    touch,
+    wait_alike,
+    wait_stopped,
+    wait_until,
+)
 
-from instant_ic.console import demo_world
-from instant_ic.console.access import AccessConfig
-from instant_ic.console.demo import Demo, DemoConfig
-from instant_ic.console.drive import DriveConfig
-from instant_ic.console.server import ServerConfig
-from instant_ic.console.view import ViewConfig
-from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import perspective_directions
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLAGS = [
-    "--no-sandbox",
-    "--disable-gpu",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-WAIT_MS = 60_000
-SIZE = {"width": 960, "height": 600}
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(
-        CHROMIUM is None and os.environ.get("CI") != "true", reason="chromium is missing: apt install chromium"
-    ),
-]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    from playwright.sync_api import sync_playwright
-
-    assert CHROMIUM, "chromium is missing: apt install chromium"
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
-
-
-def make_demo(port=0, panorama_width=192, view_width=160, **access):
-    # No watchdog in the server's way: what stops the robot here must be the page.
-    drive = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
-    view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
-    config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
-    demo = Demo(ServerConfig(port=port, drive=drive, access=AccessConfig(**access)), config)
-    demo.start()
-    return demo
-
-
-@pytest.fixture
-def demo():
-    demo = make_demo()
-    yield demo
-    demo.stop()
-
-
-@pytest.fixture
-def sharp_demo():
-    """With pictures fine enough to be compared with the room."""
-    demo = make_demo(panorama_width=640, view_width=384)
-    yield demo
-    demo.stop()
-
-
-@pytest.fixture
-def open_page(browser, demo):
-    contexts = []
-
-    def open_one(query="", driver="you", at=None, **options):
-        context = browser.new_context(**({"viewport": SIZE} | options))
-        context.set_default_timeout(WAIT_MS)
-        contexts.append(context)
-        page = context.new_page()
-        page.faults = []
-        page.on("pageerror", lambda error: page.faults.append(str(error)))
-        page.on("console", lambda m: page.faults.append(m.text) if m.type == "error" else None)
-        page.goto((at or demo).server.url + query)
-        expect_body(page, "driver", driver)
-        return page
-
-    yield open_one
-    faults = [fault for context in contexts for page in context.pages for fault in page.faults]
-    for context in contexts:
-        context.close()
-    assert not faults
-
-
-def expect_body(page, name, value):
-    from playwright.sync_api import expect
-
-    expect(page.locator("body")).to_have_attribute(f"data-{name}", value, timeout=WAIT_MS)
-
-
-def wait_until(predicate, page, what):
-    """Waits for something on the robot's side while the page lives on."""
-    deadline = time.monotonic() + WAIT_MS / 1000
-    while not predicate():
-        assert time.monotonic() < deadline, what
-        page.wait_for_timeout(20)
-
-
-def moving(demo):
-    return bool(demo.commands) and demo.commands[-1] != (0.0, 0.0)
-
-
-def start_driving(page, demo, key="w"):
-    page.keyboard.down(key)
-    wait_until(lambda: moving(demo), page, "the key drives")
-
-
-def wait_stopped(page, demo):
-    """Waits for the stop, and sees that nothing moves again while the page sends what it still would."""
-    wait_until(lambda: not moving(demo), page, f"stopped; last commands {demo.commands[-3:]}")
-    count = len([c for c in demo.commands if c != (0.0, 0.0)])
-    page.wait_for_timeout(200)  # four times the page's sending period
-    assert len([c for c in demo.commands if c != (0.0, 0.0)]) == count
-
-
-def picture_of(page):
-    """Pixels of the picture alone, (H, W, 3) float."""
-    from PIL import Image
-
-    page.add_style_tag(content="body > :not(#picture) { visibility: hidden !important }")
-    shot = page.screenshot(type="png")
-    page.evaluate("document.head.lastElementChild.remove()")
-    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
+pytestmark = BROWSER_TEST
 
 
 @pytest.mark.parametrize(("query", "viewer"), [("", "webgl"), ("?viewer=canvas", "canvas")])
@@ -315,34 +203,11 @@ def test_looking_round_by_drag_turns_the_picture_at_once_and_tells_the_robot(ope
     wait_until(lambda: abs(demo.look.yaw) < 0.01, page, "straight ahead again")
 
 
-def room_seen(pose, yaw, pitch, vfov_deg=60.0):
-    """What the page should show, drawn from the room itself: (H, W, 3) RGB."""
-    width, height = SIZE["width"] // 4, SIZE["height"] // 4
-    hfov = 2 * math.atan(math.tan(math.radians(vfov_deg) / 2) * width / height)
-    map_from_look = pose_matrix(yaw=pose[2]) @ pose_matrix(pitch=-pitch, yaw=yaw)
-    directions = perspective_directions(width, height, hfov) @ map_from_look[:3, :3].T.astype(np.float32)
-    return demo_world.shade((pose[0], pose[1], 1.2), directions)[..., ::-1].astype(float)
-
-
-def likeness(page, expected):
-    """Correlation of the page's picture with ``expected``, softened to the same sharpness."""
-    shown = cv2.resize(picture_of(page), expected.shape[1::-1], interpolation=cv2.INTER_AREA)
-    return np.corrcoef(cv2.blur(shown, (5, 5)).ravel(), cv2.blur(expected, (5, 5)).ravel())[0, 1]
-
-
-def wait_alike(page, expected):
-    """Until the page shows what ``expected()`` draws."""
-    deadline = time.monotonic() + WAIT_MS / 1000
-    while (found := likeness(page, expected())) < 0.97:
-        assert time.monotonic() < deadline, f"correlation with what should be seen: {found:.3f}"
-        page.wait_for_timeout(100)
-
-
 @pytest.mark.parametrize("mode", ["real", "virtual"])
 def test_picture_is_what_stands_in_the_look_direction(open_page, sharp_demo, mode):
     """Camera and rendered view through the same projection, against the room drawn without either."""
     demo = sharp_demo
-    demo.robot = demo.vbot = np.array([-1.0, -0.5, 0.4])
+    demo.place(-1.0, -0.5, 0.4)
     demo.forced_mode = mode
     page = open_page(at=demo, bypass_csp=True)
     expect_body(page, "blend", "1.00" if mode == "virtual" else "0.00")
@@ -367,18 +232,8 @@ def test_old_panorama_is_aimed_anew_when_the_robot_turns(open_page, sharp_demo):
     expect_body(page, "picture", "live")
     demo.pictures = False
     page.wait_for_timeout(300)
-    demo.robot = np.array([0.0, 0.0, 0.5])
+    demo.place(0.0, 0.0, 0.5)
     wait_alike(page, lambda: room_seen(demo.robot, 0.0, math.radians(-10)))
-
-
-def touch(page, kind, x, y):
-    page.evaluate(
-        """([kind, x, y]) => {
-        const stick = document.getElementById('stick');
-        stick.setPointerCapture = () => {};
-        stick.dispatchEvent(new PointerEvent(kind, {pointerId: 7, clientX: x, clientY: y, bubbles: true})); }""",
-        [kind, x, y],
-    )
 
 
 @pytest.mark.parametrize("end", ["pointerup", "pointercancel"])
@@ -443,36 +298,6 @@ def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(brow
         demo.stop()
 
 
-PAD = """
-    const buttons = Array.from({length: 17}, () => ({pressed: false, value: 0}));
-    window.pad = {index: 0, id: 'Pad', mapping: 'standard', connected: true, axes: [0, 0, 0, 0], buttons};
-    navigator.getGamepads = () => [window.pad.connected ? window.pad : null];
-    window.plug = (mapping) => {
-        window.pad.mapping = mapping;
-        const event = new Event('gamepadconnected');
-        event.gamepad = window.pad;
-        window.dispatchEvent(event);
-    };
-    window.press = (button, pressed) => { window.pad.buttons[button] = {pressed, value: +pressed}; };
-"""
-RB, B = 5, 1
-
-
-@pytest.fixture
-def pad_page(open_page):
-    page = open_page()
-    page.evaluate(f"() => {{ {PAD} }}")
-    page.bring_to_front()
-    return page
-
-
-def hold_and_push(page):
-    """The stick goes forward with the shoulder button held."""
-    page.evaluate(f"plug('standard'); press({RB}, false); pad.axes = [0, -1, 0, 0]")
-    page.wait_for_timeout(100)
-    page.evaluate(f"press({RB}, true)")
-
-
 def test_gamepad_drives_only_while_its_shoulder_button_is_held(pad_page, demo):
     pad_page.evaluate("plug('standard'); pad.axes = [0, -1, 0, 0]")
     expect_body(pad_page, "pad", "ready")
@@ -495,10 +320,7 @@ def test_gamepad_lost_blurred_or_stopped_ends_the_drive_until_it_is_pressed_anew
     wait_stopped(pad_page, demo)
     assert demo.estop == (loss == f"press({B}, true)")
     if demo.estop:  # released with the shoulder button still held: nothing moves
-        pad_page.locator("#release").focus()
-        pad_page.keyboard.down("Enter")
-        wait_until(lambda: not demo.estop, pad_page, "the release")
-        pad_page.keyboard.up("Enter")
+        release_by_enter(pad_page, demo)
         expect_body(pad_page, "pad", "ready")
         pad_page.wait_for_timeout(200)
         assert not moving(demo)

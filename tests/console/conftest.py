@@ -1,0 +1,59 @@
+"""Chromium, the robot that the pages drive, and pages in which nothing may go wrong."""
+
+import pytest
+from console_pages import CHROMIUM, FLAGS, PAD, SIZE, WAIT_MS, expect_body, make_demo, watched_page
+
+
+@pytest.fixture(scope="module")
+def browser():
+    from playwright.sync_api import sync_playwright
+
+    assert CHROMIUM, "chromium is missing: apt install chromium"
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def demo():
+    demo = make_demo()
+    yield demo
+    demo.stop()
+
+
+@pytest.fixture
+def sharp_demo():
+    """With pictures fine enough to be compared with the room."""
+    demo = make_demo(panorama_width=640, view_width=384)
+    yield demo
+    demo.stop()
+
+
+@pytest.fixture
+def open_page(browser, request):
+    """Opens pages of ``demo`` (or ``at``), and closes them; an error in one fails the test."""
+    contexts = []
+
+    def open_one(query="", driver="you", at=None, **options):
+        context = browser.new_context(**({"viewport": SIZE} | options))
+        context.set_default_timeout(WAIT_MS)
+        contexts.append(context)
+        page = watched_page(context)
+        page.goto((at or request.getfixturevalue("demo")).server.url + query)
+        expect_body(page, "driver", driver)
+        return page
+
+    yield open_one
+    faults = [fault for context in contexts for page in context.pages for fault in page.faults]
+    for context in contexts:
+        context.close()
+    assert not faults
+
+
+@pytest.fixture
+def pad_page(open_page):
+    page = open_page()
+    page.evaluate(f"() => {{ {PAD} }}")
+    page.bring_to_front()
+    return page

@@ -1,0 +1,166 @@
+"""What the browser tests share: how Chromium is started, and how a page and its robot are watched."""
+
+import io
+import math
+import os
+import shutil
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from instant_ic.console import demo_world
+from instant_ic.console.access import AccessConfig
+from instant_ic.console.demo import Demo, DemoConfig
+from instant_ic.console.drive import DriveConfig
+from instant_ic.console.server import ServerConfig
+from instant_ic.console.view import ViewConfig
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import perspective_directions
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-gpu",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WAIT_MS = 60_000
+SIZE = {"width": 960, "height": 600}
+SETTLE_MS = 150  # three times the page's sending period: what it still would send has come by then
+
+BROWSER_TEST = [
+    pytest.mark.browser,
+    pytest.mark.xdist_group("console browser"),  # one Chromium at a time
+    pytest.mark.skipif(
+        CHROMIUM is None and os.environ.get("CI") != "true", reason="chromium is missing: apt install chromium"
+    ),
+]
+
+
+def make_demo(port=0, panorama_width=192, view_width=160, **access):
+    # No watchdog in the server's way: what stops the robot here must be the page.
+    drive = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, max_command_age_s=10.0)
+    view = ViewConfig(width=view_width, height=view_width * 5 // 8, virtual_rate_hz=5)
+    config = DemoConfig(panorama_width=panorama_width, panorama_hz=4, view=view)
+    demo = Demo(ServerConfig(port=port, drive=drive, access=AccessConfig(**access)), config)
+    demo.start()
+    return demo
+
+
+def watched_page(context):
+    """A page that keeps what goes wrong in it."""
+    page = context.new_page()
+    page.faults = []
+    page.on("pageerror", lambda error: page.faults.append(str(error)))
+    page.on("console", lambda m: page.faults.append(m.text) if m.type == "error" else None)
+    return page
+
+
+def expect_body(page, name, value):
+    from playwright.sync_api import expect
+
+    expect(page.locator("body")).to_have_attribute(f"data-{name}", value, timeout=WAIT_MS)
+
+
+def wait_until(predicate, page, what):
+    """Waits for something on the robot's side while the page lives on."""
+    deadline = time.monotonic() + WAIT_MS / 1000
+    while not predicate():
+        assert time.monotonic() < deadline, what
+        page.wait_for_timeout(20)
+
+
+def moving(demo):
+    return bool(demo.commands) and demo.commands[-1] != (0.0, 0.0)
+
+
+def start_driving(page, demo, key="w"):
+    page.keyboard.down(key)
+    wait_until(lambda: moving(demo), page, "the key drives")
+
+
+def wait_stopped(page, demo):
+    """Waits for the stop, and sees that nothing moves again while the page sends what it still would."""
+    wait_until(lambda: not moving(demo), page, f"stopped; last commands {demo.commands[-3:]}")
+    count = len([c for c in demo.commands if c != (0.0, 0.0)])
+    page.wait_for_timeout(SETTLE_MS)
+    assert len([c for c in demo.commands if c != (0.0, 0.0)]) == count
+
+
+def release_by_enter(page, demo):
+    """Ends an emergency stop as the driver does without a pointer: Enter held on the button."""
+    page.locator("#release").focus()
+    page.keyboard.down("Enter")
+    wait_until(lambda: not demo.estop, page, "the release")
+    page.keyboard.up("Enter")
+
+
+def picture_of(page):
+    """Pixels of the picture alone, (H, W, 3) float."""
+    from PIL import Image
+
+    page.add_style_tag(content="body > :not(#picture) { visibility: hidden !important }")
+    shot = page.screenshot(type="png")
+    page.evaluate("document.head.lastElementChild.remove()")
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
+
+
+def room_seen(pose, yaw, pitch, vfov_deg=60.0):
+    """What the page should show, drawn from the room itself: (H, W, 3) RGB."""
+    width, height = SIZE["width"] // 4, SIZE["height"] // 4
+    hfov = 2 * math.atan(math.tan(math.radians(vfov_deg) / 2) * width / height)
+    map_from_look = pose_matrix(yaw=pose[2]) @ pose_matrix(pitch=-pitch, yaw=yaw)
+    directions = perspective_directions(width, height, hfov) @ map_from_look[:3, :3].T.astype(np.float32)
+    return demo_world.shade((pose[0], pose[1], 1.2), directions)[..., ::-1].astype(float)
+
+
+def likeness(page, expected):
+    """Correlation of the page's picture with ``expected``, softened to the same sharpness."""
+    shown = cv2.resize(picture_of(page), expected.shape[1::-1], interpolation=cv2.INTER_AREA)
+    return np.corrcoef(cv2.blur(shown, (5, 5)).ravel(), cv2.blur(expected, (5, 5)).ravel())[0, 1]
+
+
+def wait_alike(page, expected):
+    """Until the page shows what ``expected()`` draws."""
+    deadline = time.monotonic() + WAIT_MS / 1000
+    while (found := likeness(page, expected())) < 0.97:
+        assert time.monotonic() < deadline, f"correlation with what should be seen: {found:.3f}"
+        page.wait_for_timeout(100)
+
+
+def touch(page, kind, x, y):
+    page.evaluate(
+        """([kind, x, y]) => {
+        const stick = document.getElementById('stick');
+        stick.setPointerCapture = () => {};
+        stick.dispatchEvent(new PointerEvent(kind, {pointerId: 7, clientX: x, clientY: y, bubbles: true})); }""",
+        [kind, x, y],
+    )
+
+
+PAD = """
+    const buttons = Array.from({length: 17}, () => ({pressed: false, value: 0}));
+    window.pad = {index: 0, id: 'Pad', mapping: 'standard', connected: true, axes: [0, 0, 0, 0], buttons};
+    navigator.getGamepads = () => [window.pad.connected ? window.pad : null];
+    window.plug = (mapping) => {
+        window.pad.mapping = mapping;
+        const event = new Event('gamepadconnected');
+        event.gamepad = window.pad;
+        window.dispatchEvent(event);
+    };
+    window.press = (button, pressed) => { window.pad.buttons[button] = {pressed, value: +pressed}; };
+"""
+RB, B = 5, 1
+
+
+def hold_and_push(page):
+    """The stick goes forward with the shoulder button held."""
+    page.evaluate(f"plug('standard'); press({RB}, false); pad.axes = [0, -1, 0, 0]")
+    page.wait_for_timeout(60)  # three of the page's looks at the pad
+    page.evaluate(f"press({RB}, true)")
