@@ -370,6 +370,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 pose_gap_m=decision.pose_gap_m,
                 yaw_gap_rad=decision.yaw_gap_rad,
                 time_to_obstacle_s=decision.time_to_obstacle_s,
+                shown=ControlState.SHOWN_VIRTUAL if decision.mode == Mode.VIRTUAL else ControlState.SHOWN_REAL,
+                vbot_action=ControlState.VBOT_DRIVEN if decision.mode == Mode.VIRTUAL else ControlState.VBOT_WITH_ROBOT,
+                vbot_target=pose_message(matrix_from_pose2(pose)),
+                robot_twist=twist_message(*inputs.robot_velocity),
             )
         )
         if decision.changed:

@@ -40,7 +40,7 @@ from instant_ic.msg import (
 )
 from instant_ic.ranges import Positive, Range, check_ranges
 
-MODES = {0: "real", 1: "virtual", 2: "stopped"}
+MODES = {0: "real", 1: "virtual", 2: "stopped", 3: "entering", 4: "returning"}
 VSPACE_STATES = {0: "empty", 1: "training", 2: "ready", 3: "failed"}
 HEARTBEAT_TIMEOUT_S = 3.0
 PICTURE_TIMEOUT_S = 2.0
@@ -90,7 +90,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.subscribe("/heartbeat", NodeStatus, self.on_heartbeat, qos=RELIABLE)
         self.look = Look()
         self.views = ViewScheduler(config.view)
-        self.mode = "none"
+        self.mode = self.shown = "none"
         self._picture_ns: int | None = None
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
@@ -180,7 +180,7 @@ class ConsoleNode(Node[ConsoleConfig]):
     def request_view(self) -> None:
         """Asks the virtual space for the picture where the operator looks, if one is due."""
         now, steady_s = self.clock.now_ns(), self.clock.steady_ns() / 1e9
-        virtual = self.mode == "virtual"
+        virtual = self.with_vbot()
         if not self.views.due(steady_s, virtual=virtual) or not (virtual or self.vspace_alive()):
             return
         map_from_base = self.vbot_pose() if virtual else self.robot_pose()
@@ -201,6 +201,10 @@ class ConsoleNode(Node[ConsoleConfig]):
             )
         )
 
+    def with_vbot(self) -> bool:
+        """Whether the v-bot's view is shown, or about to be."""
+        return self.mode in ("entering", "virtual", "returning")
+
     def vspace_alive(self) -> bool:
         """Whether the virtual space has anything to draw."""
         status = self.vspace.message
@@ -212,12 +216,15 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Tells the page mode, poses and commands; asks for views at the rate of the mode."""
         control = self.control.message
         self.mode = "none" if control is None else MODES.get(int(control.mode), "none")
-        self.server.show(FrameKind.VIEW if self.mode == "virtual" else FrameKind.PANORAMA)
+        virtual = control is not None and int(control.shown) == ControlState.SHOWN_VIRTUAL
+        self.shown = "none" if control is None else "virtual" if virtual else "real"
+        self.server.show(FrameKind.VIEW if virtual else FrameKind.PANORAMA)
         state: dict[str, Any] = {
             "at_ms": self.server.now_ms(),
             "mode": self.mode,
+            "shown": self.shown,
             "robot": _planar(self.robot_pose()),
-            "vbot": _planar(self.vbot_pose()) if self.mode == "virtual" else None,
+            "vbot": _planar(self.vbot_pose()) if self.with_vbot() else None,
         }
         if control is not None:
             state |= {

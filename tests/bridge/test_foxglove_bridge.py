@@ -187,8 +187,9 @@ def empty_state():
     from instant_ic.msg import header, pose_message
 
     pose = pose_message(matrix_from_pose2(np.zeros(3)))
+    still = twist_message()
     return ControlState(
-        header("map", 0), 0, "", False, False, 0, pose, pose, pose, twist_message(), twist_message(), 0.0, 0.0, 0.0
+        header("map", 0), 0, "", False, False, 0, pose, pose, pose, still, still, 0.0, 0.0, 0.0, 0, 0, pose, still
     )
 
 

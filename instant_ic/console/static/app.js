@@ -242,13 +242,13 @@ function sendLook(tanHalf, now) {
 }
 
 function cameraPosition() {
-  const pose = state?.mode === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
+  const pose = (state?.shown ?? state?.mode) === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
   if (!pose) return null;
   const [x, y, yaw] = pose, [cx, cy, cz] = page.camera;
   return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
 }
 
-const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
+const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
 
 const rounded = (values, digits) => (values ? values.map((value) => value.toFixed(digits)).join() : "");
 
@@ -311,7 +311,7 @@ function drawMap(scene, tanHalf, now) {
   lastMap = now;
   mapChanged = false;
   minimap.draw({
-    mode: state?.mode ?? "none",
+    mode: state?.shown ?? state?.mode ?? "none",
     robot: state?.robot ?? null,
     vbot: state?.vbot ?? null,
     plan,

@@ -6,6 +6,8 @@ import { PANORAMA, VIEW } from "./link.js";
 const MODES = {
   real: ["REAL", "You drive the robot"],
   virtual: ["VIRTUAL", "The robot follows you round the obstacle"],
+  entering: ["ENTERING", "The virtual space is about to be shown"],
+  returning: ["RETURNING", "The real view is about to come back"],
   stopped: ["STOPPED", "The robot is held"],
   none: ["WAITING", "No controller is running"],
 };

@@ -1,13 +1,14 @@
 // The newest panorama and rendered view, and what to show of them now.
 
+import { coloured, fitColour, plain, Releasing } from "./colour.js";
 import { PANORAMA, VIEW } from "./link.js";
-import { clamp, fromQuaternion, identity, lookRotation, multiply, rotationZ, transpose, wrapAngle } from "./math.js";
+import { fromQuaternion, identity, lookRotation, multiply, rotationZ, transpose } from "./math.js";
+import { Motion } from "./motion.js";
 
 const STALE_MS = 2000;
-const WAIT_FOR_VIEW_MS = 500; // for a view made after the change of mode
-const HEADING_EXTRAPOLATION_MS = 200;
-const HEADING_SMOOTHING_MS = 50;
-const SNAP_RAD = 0.6; // a larger jump of the heading is a new pose, not a motion
+// For a picture made after the change of mode; then the best there is.
+const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
+const RELEASE_STEP_MS = 100; // the colour is let go in steps too small to be seen
 
 export class Pictures {
   constructor(viewer, link) {
@@ -19,23 +20,35 @@ export class Pictures {
     this.dissolveMs = 250;
     this.decodeErrors = 0;
     this.changed = true;
-    this._heading = null;
-    this._virtualSince = null;
+    this.motion = new Motion();
+    this._virtual = false;
+    this._since = 0; // when the shown robot last changed, by the server's clock
+    this._toward = 0;
+    this._colours = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
+    this._colouredAt = 0;
     this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
+  }
+
+  /** Time in which a colour that was matched at a switch is let go; 0: colours are not matched. */
+  set colourReleaseMs(value) {
+    for (const colour of Object.values(this._colours)) colour.releaseMs = value;
   }
 
   /** Decodes a picture frame, puts it into the viewer, then acknowledges it. */
   async take(frame) {
     try {
-      const bitmap = await createImageBitmap(frame.payload, { colorSpaceConversion: "none" });
+      const [bitmap, mask] = await Promise.all([decoded(frame.payload), decodedMask(frame.header.mask)]);
       if (frame.kind === PANORAMA) {
         this.viewer.setPanorama(bitmap);
         this.panorama = frame.header;
       } else {
-        this.viewer.setView(bitmap);
+        this.viewer.setView(bitmap, mask);
         this.view = { ...frame.header, aspect: bitmap.width / bitmap.height };
       }
-      if (this.viewer.name === "webgl") bitmap.close();
+      if (this.viewer.name === "webgl") {
+        bitmap.close();
+        mask?.close();
+      }
       this.changed = true;
       const arrivals = this._arrivals[frame.kind];
       arrivals.push(performance.now());
@@ -74,54 +87,91 @@ export class Pictures {
 
   /** Scene for the viewer after `elapsedMs` more. `state` is the newest state message. */
   scene(state, look, tanHalf, elapsedMs) {
-    this._step(state, elapsedMs);
+    const now = performance.now();
+    const starts = this._step(state, elapsedMs);
+    this._follow(state, elapsedMs, now);
     const lookTurn = lookRotation(look.yaw, look.pitch);
-    const mapFromLook = multiply(rotationZ(this._heading ?? 0), lookTurn);
+    const mapFromLook = multiply(rotationZ(this.motion.yaw ?? 0), lookTurn);
     const relative = (header) => multiply(transpose(fromQuaternion(header.q)), mapFromLook);
-    const panoramaKnown = this.panorama?.q && this._heading !== null;
+    const panoramaKnown = this.panorama?.q && this.motion.yaw !== null;
     const viewTan = this.view ? Math.tan(this.view.fov / 2) : 1;
-    return {
+    const scene = {
       tanHalf,
       mapFromLook,
       panoramaFromLook: panoramaKnown ? relative(this.panorama) : lookTurn,
       viewFromLook: this.view ? relative(this.view) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
       blend: this.blend * this.blend * (3 - 2 * this.blend),
+      panoramaColour: plain,
+      viewColour: plain,
     };
+    if (starts && this.panorama && this.view) this._match(scene, now);
+    this._release(now);
+    scene.panoramaColour = this._colours[PANORAMA].at(now);
+    scene.viewColour = this._colours[VIEW].at(now);
+    return scene;
   }
 
+  /** Goes on with the dissolve; true when one starts from a picture that was shown alone. */
   _step(state, elapsedMs) {
-    const virtual = state?.mode === "virtual";
-    if (!virtual) this._virtualSince = null;
-    else this._virtualSince ??= state.at_ms;
-    const toward = virtual && this._viewFits() ? 1 : 0;
+    const virtual = shows(state) === "virtual";
+    if (virtual !== this._virtual) {
+      this._virtual = virtual;
+      this._since = state?.at_ms ?? 0;
+    }
+    // A stop shows the real view, however old; so does the loss of the controller.
+    const waits = virtual || state?.mode === "real";
+    const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
+    const toward = this.blend === wanted || this._toward === wanted || !waits || this._fits(kind) ? wanted : 1 - wanted;
+    const starts = toward !== this._toward && (this.blend === 0 || this.blend === 1);
+    this._toward = toward;
     if (toward !== this.blend) {
       const step = this.dissolveMs > 0 ? elapsedMs / this.dissolveMs : 1;
       this.blend = toward ? Math.min(1, this.blend + step) : Math.max(0, this.blend - step);
       this.changed = true;
     }
-    this._turn(state, virtual, elapsedMs);
+    return starts;
   }
 
-  /** Whether the newest view may be shown: made in this mode, or the best there is after a wait. */
-  _viewFits() {
-    if (!this.view) return false;
-    if (this.blend > 0 || this.view.captured_ms >= this._virtualSince) return true;
-    return this.link.serverNow() - this._virtualSince > WAIT_FOR_VIEW_MS;
+  /** Whether the newest picture of a kind may be shown: made since the switch, or the best there is after a wait. */
+  _fits(kind) {
+    const header = kind === VIEW ? this.view : this.panorama;
+    if (!header) return kind === PANORAMA;
+    return header.captured_ms >= this._since || this.link.serverNow() - this._since > WAIT_MS[kind];
   }
 
-  /** Follows the shown robot's heading between the state messages. */
-  _turn(state, virtual, elapsedMs) {
-    const pose = virtual ? (state.vbot ?? state.robot) : state?.robot;
-    if (!pose) return;
-    const turned = virtual ? state.command?.[1] : state.applied?.[1];
-    const since = clamp((this.link.serverNow() ?? state.at_ms) - state.at_ms, 0, HEADING_EXTRAPOLATION_MS);
-    const target = pose[2] + ((turned ?? 0) * since) / 1000;
-    if (this._heading === null || Math.abs(wrapAngle(target - this._heading)) > SNAP_RAD) {
-      this._heading = target;
-      return;
-    }
-    const move = wrapAngle(target - this._heading) * (1 - Math.exp(-elapsedMs / HEADING_SMOOTHING_MS));
-    this._heading = wrapAngle(this._heading + move);
+  /** Gives the picture that comes the colours of the one that goes, as both show the same place. */
+  _match(scene, now) {
+    if (this._colours[VIEW].releaseMs <= 0) return;
+    const seen = this.viewer.sample(scene);
+    const [comes, goes] = this._toward ? [VIEW, PANORAMA] : [PANORAMA, VIEW];
+    const shown = coloured(seen[goes], this._colours[goes].at(now));
+    this._colours[comes].set(fitColour(seen[comes], shown, seen.weights), now);
   }
+
+  _release(now) {
+    const active = Object.values(this._colours).some((colour) => colour.active);
+    if (!active || now - this._colouredAt < RELEASE_STEP_MS) return;
+    this._colouredAt = now;
+    this.changed = true;
+  }
+
+  /** Follows the shown robot between the state messages. */
+  _follow(state, elapsedMs, now) {
+    const robot = shows(state);
+    const pose = robot === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
+    const age = state ? (this.link.serverNow() ?? state.at_ms) - state.at_ms : 0;
+    this.motion.follow(robot, pose, state?.twist ?? [0, 0], age, elapsedMs, now);
+  }
+}
+
+/** Which robot the operator sees and drives: "real" or "virtual". */
+export const shows = (state) => state?.shown ?? (state?.mode === "virtual" ? "virtual" : "real");
+
+const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none" });
+
+/** The mask of a view, base64 of a PNG; null where all of it was seen. */
+function decodedMask(text) {
+  if (!text) return null;
+  return decoded(new Blob([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], { type: "image/png" }));
 }
