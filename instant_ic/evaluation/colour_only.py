@@ -37,7 +37,7 @@ class ColourOnlyField:
         prior = prepare(rgb, sphere, map_from_camera, 0.1, config.geometry, config.panorama_width)
         self._rgb, self._pose = prior.rgb, prior.map_from_camera
         lattice = Lattice.for_prior(prior, config.field)
-        focus = np.array([*self._pose[:3, 3], 2 * math.pi / prior.rgb.shape[1]], np.float32)
+        focus = np.array([[*self._pose[:3, 3], 2 * math.pi / prior.rgb.shape[1]]], np.float32)
         self._lattice = lattice.cells_per_m, lattice.origin, focus
         self._p = FieldParameters.random(config.field, config.train.seed)
         self._rng = np.random.default_rng(config.train.seed)

@@ -80,17 +80,114 @@ class FieldParameters:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a device trains on and renders from: keyframe, lattice and occupancy."""
+    """What a device trains on and renders from: keyframes, lattice and occupancy.
 
-    prior: PanoramaPrior
+    Attributes:
+        priors: the keyframes, newest first; all of one size.
+        lattice: of the field.
+        occupancy: round the surfaces of all keyframes.
+        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3) float32; 1 where None.
+    """
+
+    priors: tuple[PanoramaPrior, ...]
     lattice: Lattice
     occupancy: Occupancy
+    gains: Floats | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where there is no keyframe, or their sizes or the gains' do not fit."""
+        if not self.priors:
+            raise ValueError("a scene needs a keyframe")
+        sizes = {(prior.rgb.shape, prior.inverse_depth.shape) for prior in self.priors}
+        if len(sizes) > 1:
+            raise ValueError(f"keyframes of one scene must have one size, panorama and depth (got {sorted(sizes)})")
+        if self.gains is not None and self.gains.shape != (len(self.priors), 3):
+            raise ValueError(f"gains must be ({len(self.priors)}, 3), a row a keyframe (got {self.gains.shape})")
+
+    @property
+    def prior(self) -> PanoramaPrior:
+        """The newest keyframe."""
+        return self.priors[0]
+
+    @property
+    def exposure(self) -> Floats:
+        """``gains``, (K, 3) float32."""
+        return np.ones((len(self.priors), 3), np.float32) if self.gains is None else self.gains.astype(np.float32)
 
     @property
     def focus(self) -> Floats:
-        """Place of the keyframe's camera and radians of a panorama's pixel, (4,): how fine the field may be where."""
+        """Places of the keyframes' cameras and radians of a panorama's pixel, (K, 4): how fine the field may be."""
         pixel = 2 * math.pi / self.prior.rgb.shape[1]
-        return np.array([*self.prior.map_from_camera[:3, 3], pixel], np.float32)
+        return np.array([[*prior.map_from_camera[:3, 3], pixel] for prior in self.priors], np.float32)
+
+
+def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
+    """Which keyframe each tile of a batch looks from, (tiles,): half of them from the newest, the rest from the others.
+
+    Over the steps each keyframe looks everywhere: by a lattice of two irrational steps, so that no tile is left out
+    for long.
+
+    Args:
+        keyframes: of the scene.
+        tiles: of 8 × 8 rays in a batch.
+        step: of this run, from 1.
+    """
+    if keyframes == 1:
+        return np.zeros(tiles, np.int32)
+    place = (np.arange(tiles) * 0.7548776662 + step * 0.5698402910) % 1.0  # the plastic number's lattice
+    older = 1 + np.floor((2 * place - 1) * (keyframes - 1))
+    return np.where(place < 0.5, 0, older).astype(np.int32)
+
+
+LEAST_TRUST = 0.1
+"""Weight of depth that is guessed, against depth of the picture's median uncertainty."""
+
+
+@dataclass(frozen=True)
+class StackedPriors:
+    """A scene's keyframes as the kernels take them, newest first: ``PanoramaPrior``'s arrays with a leading axis (K,).
+
+    ``trust``: weight of each pixel's depth in the loss by its uncertainty, (K, h, w), 1 at the picture's median.
+    """
+
+    rgb: NDArray[np.uint8]
+    inverse_depth: Floats
+    known: NDArray[np.uint8]
+    torn: NDArray[np.uint8]
+    usable: NDArray[np.uint8]
+    trust: Floats
+    map_from_camera: Floats
+    camera_from_map: Floats
+    band: Floats
+    gains: Floats
+
+    @classmethod
+    def of(cls, scene: Scene) -> StackedPriors:
+        def stacked(key: str) -> Any:
+            if len(scene.priors) == 1:
+                return getattr(scene.prior, key)[None]  # no copy
+            return np.stack([getattr(prior, key) for prior in scene.priors])
+
+        poses = [prior.map_from_camera for prior in scene.priors]
+        return cls(
+            rgb=stacked("rgb"),
+            inverse_depth=stacked("inverse_depth"),
+            known=stacked("known"),
+            torn=stacked("torn"),
+            usable=stacked("usable"),
+            trust=np.stack([depth_trust(prior) for prior in scene.priors]),
+            map_from_camera=np.array(poses, np.float32),
+            camera_from_map=np.linalg.inv(poses).astype(np.float32),
+            band=np.array([prior.band for prior in scene.priors], np.float32),
+            gains=scene.exposure,
+        )
+
+
+def depth_trust(prior: PanoramaPrior) -> Floats:
+    """Weight of each pixel's depth, (h, w) float32: by the square of its uncertainty against the picture's median."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(prior.sigma > prior.relative_sigma, prior.relative_sigma / prior.sigma, 1.0)
+    return np.clip(ratio * ratio, LEAST_TRUST, 1.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -119,7 +216,7 @@ class Device(Protocol):
         """Trains and renders this scene from now on, with the present parameters; forgets the moments."""
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """One iteration on the rays drawn by ``uniform`` (N, 3).
+        """One iteration on the rays drawn by ``uniform`` (N, 3) from the keyframes by turns (``ray_sources``).
 
         Returns:
             Mean squared colour error (0..1 units) and mean squared distance error (units of the band).

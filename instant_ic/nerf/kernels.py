@@ -23,46 +23,61 @@ _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "err
 
 
 @njit(**_OPTIONS)
-def level_share(points, index, focus, scale):  # type: ignore[no-untyped-def]
-    """How much a level counts at a point: 1 while its cells are wider than a picture's pixel there, 0 from half of it.
+def pixel_block(points, start, count, focus, pixel):  # type: ignore[no-untyped-def]
+    """Width of a panorama's pixel at ``points[start:start + count]``, metres, of the keyframe that saw it finest.
 
-    ``focus``: place of the keyframe's camera and radians of a pixel, (4,).
+    ``focus``: places of the keyframes' cameras and radians of a pixel, (K, 4).
     """
-    dx, dy, dz = points[index, 0] - focus[0], points[index, 1] - focus[1], points[index, 2] - focus[2]
-    pixel = np.float32(math.sqrt(dx * dx + dy * dy + dz * dz)) * focus[3]
-    return min(max(np.float32(2) - pixel * scale, np.float32(0)), np.float32(1))
+    for i in range(count):
+        x, y, z = points[start + i, 0], points[start + i, 1], points[start + i, 2]
+        finest = np.float32(1e9)
+        for k in range(focus.shape[0]):
+            dx, dy, dz = x - focus[k, 0], y - focus[k, 1], z - focus[k, 2]
+            finest = min(finest, np.float32(math.sqrt(dx * dx + dy * dy + dz * dz)) * focus[k, 3])
+        pixel[i] = finest
+
+
+@njit(**_OPTIONS)
+def corners(points, index, origin, scale, mask):  # type: ignore[no-untyped-def]
+    """Table entries of the eight corners of a point's cell, and their trilinear weights."""
+    px = (points[index, 0] - origin[0]) * scale
+    py = (points[index, 1] - origin[1]) * scale
+    pz = (points[index, 2] - origin[2]) * scale
+    flx, fly, flz = math.floor(px), math.floor(py), math.floor(pz)
+    fx, fy, fz = px - np.float32(flx), py - np.float32(fly), pz - np.float32(flz)
+    x0, y0, z0 = np.int64(flx), np.int64(fly) * _P1, np.int64(flz) * _P2
+    x1, y1, z1 = x0 + 1, y0 + _P1, z0 + _P2
+    gx, gy, gz = np.float32(1) - fx, np.float32(1) - fy, np.float32(1) - fz
+    w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
+    return (
+        ((x0 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z0) & mask, (x0 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z0) & mask,
+         (x0 ^ y0 ^ z1) & mask, (x1 ^ y0 ^ z1) & mask, (x0 ^ y1 ^ z1) & mask, (x1 ^ y1 ^ z1) & mask),
+        (gx * w00, fx * w00, gx * w10, fx * w10, gx * w01, fx * w01, gx * w11, fx * w11),
+    )  # fmt: skip
 
 
 @njit(**_OPTIONS)
 def encode_block(table, cells_per_m, origin, focus, points, start, count, x):  # type: ignore[no-untyped-def]
-    """Trilinear features of ``points[start:start + count]`` into ``x`` (levels·features, BLOCK)."""
+    """Trilinear features of ``points[start:start + count]`` into ``x`` (levels·features, BLOCK).
+
+    A level counts whole while its cells are wider than the keyframe's pixel there, not at all from half of it.
+    """
     levels, size, features = table.shape
     mask = size - 1
-    ox, oy, oz = origin[0], origin[1], origin[2]
+    pixel = np.empty(BLOCK, np.float32)
+    pixel_block(points, start, count, focus, pixel)
     for level in range(levels):
         scale = cells_per_m[level]
         row = level * features
         for i in range(count):
-            share = level_share(points, start + i, focus, scale)
+            share = min(max(np.float32(2) - pixel[i] * scale, np.float32(0)), np.float32(1))
             if share == 0:
                 for f in range(features):
                     x[row + f, i] = 0
                 continue
-            px = (points[start + i, 0] - ox) * scale
-            py = (points[start + i, 1] - oy) * scale
-            pz = (points[start + i, 2] - oz) * scale
-            flx, fly, flz = math.floor(px), math.floor(py), math.floor(pz)
-            fx, fy, fz = px - np.float32(flx), py - np.float32(fly), pz - np.float32(flz)
-            x0, y0, z0 = np.int64(flx), np.int64(fly) * _P1, np.int64(flz) * _P2
-            x1, y1, z1 = x0 + 1, y0 + _P1, z0 + _P2
-            gx, gy, gz = np.float32(1) - fx, np.float32(1) - fy, np.float32(1) - fz
-            i0, i1 = (x0 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z0) & mask
-            i2, i3 = (x0 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z0) & mask
-            i4, i5 = (x0 ^ y0 ^ z1) & mask, (x1 ^ y0 ^ z1) & mask
-            i6, i7 = (x0 ^ y1 ^ z1) & mask, (x1 ^ y1 ^ z1) & mask
-            w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
-            w0, w1, w2, w3 = gx * w00, fx * w00, gx * w10, fx * w10
-            w4, w5, w6, w7 = gx * w01, fx * w01, gx * w11, fx * w11
+            (i0, i1, i2, i3, i4, i5, i6, i7), (w0, w1, w2, w3, w4, w5, w6, w7) = corners(
+                points, start + i, origin, scale, mask
+            )
             for f in range(features):
                 x[row + f, i] = share * (
                     w0 * table[level, i0, f]
@@ -83,29 +98,18 @@ def encode_backward_block(  # type: ignore[no-untyped-def]
     """Adds the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``."""
     levels, size, features = table_grad.shape
     mask = size - 1
-    ox, oy, oz = origin[0], origin[1], origin[2]
+    pixel = np.empty(BLOCK, np.float32)
+    pixel_block(points, start, count, focus, pixel)
     for level in range(levels):
         scale = cells_per_m[level]
         row = level * features
         for i in range(count):
-            share = level_share(points, start + i, focus, scale)
+            share = min(max(np.float32(2) - pixel[i] * scale, np.float32(0)), np.float32(1))
             if share == 0:
                 continue
-            px = (points[start + i, 0] - ox) * scale
-            py = (points[start + i, 1] - oy) * scale
-            pz = (points[start + i, 2] - oz) * scale
-            flx, fly, flz = math.floor(px), math.floor(py), math.floor(pz)
-            fx, fy, fz = px - np.float32(flx), py - np.float32(fly), pz - np.float32(flz)
-            x0, y0, z0 = np.int64(flx), np.int64(fly) * _P1, np.int64(flz) * _P2
-            x1, y1, z1 = x0 + 1, y0 + _P1, z0 + _P2
-            gx, gy, gz = np.float32(1) - fx, np.float32(1) - fy, np.float32(1) - fz
-            i0, i1 = (x0 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z0) & mask
-            i2, i3 = (x0 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z0) & mask
-            i4, i5 = (x0 ^ y0 ^ z1) & mask, (x1 ^ y0 ^ z1) & mask
-            i6, i7 = (x0 ^ y1 ^ z1) & mask, (x1 ^ y1 ^ z1) & mask
-            w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
-            w0, w1, w2, w3 = gx * w00, fx * w00, gx * w10, fx * w10
-            w4, w5, w6, w7 = gx * w01, fx * w01, gx * w11, fx * w11
+            (i0, i1, i2, i3, i4, i5, i6, i7), (w0, w1, w2, w3, w4, w5, w6, w7) = corners(
+                points, start + i, origin, scale, mask
+            )
             for f in range(features):
                 d = share * dx[row + f, i]
                 table_grad[level, i0, f] += w0 * d

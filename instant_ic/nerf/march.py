@@ -16,6 +16,8 @@ FIRST_STEP = 0.7
 """Smallest step through empty cells, in cells."""
 NOT_SEEN = np.float32(1e9)
 """Stands for "no distance known before"."""
+LOOKED_THROUGH = 3.0
+"""A keyframe whose surface lies so many bands behind a point has looked through it: nothing is there."""
 
 
 @njit(**_OPTIONS)
@@ -36,30 +38,36 @@ def prior_inverse_depth(inverse, torn, u, v):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def sample_rays(  # type: ignore[no-untyped-def]
-    uniform, columns, rows, rgb, inverse, torn, map_from_camera, band, points, target
-):
+    uniform, columns, rows, sources, rgb, inverse, torn, usable, trust, map_from_camera, gains, band,
+    points, target, weight
+):  # fmt: skip
     """One ray in each of ``columns × rows`` strata of equal solid angle; two samples a ray.
 
     Args:
         uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
-        rgb, inverse, torn, band: of the ``PanoramaPrior``.
-        map_from_camera: (4, 4) float32.
-        points: out, (2 N, 3). Rays go by tiles of 8 × 8 strata: 64 points on the surface, then 64 in the band.
-        target: out, (2 N, 4): colour minus 0.5, the ray's for both; signed distance in units of the band (in front
-            positive).
+        sources: (N / 64,): the keyframe that each tile of 8 × 8 strata looks from.
+        rgb, inverse, torn, usable, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        trust: (K, h, w): weight of the depth by its uncertainty, 0..1.
+        map_from_camera: (K, 4, 4) float32; gains: (K, 3).
+        points: out, (2 N, 3). Rays go by tiles: 64 points on the surface, then 64 in the band.
+        target: out, (2 N, 4): colour minus 0.5, the ray's for both; signed distance in units of the newest's band (in
+            front positive).
+        weight: out, (2 N, 2): of the colour and of the distance, 0 where no ray may be drawn.
     """
-    height, width = rgb.shape[:2]
-    h, w = inverse.shape
+    height, width = rgb.shape[1:3]
+    h, w = inverse.shape[1:]
     tiles = columns // 8
+    one, half = np.float32(1), np.float32(0.5)
     for n in range(columns * rows):
         tile, inside = n // 64, n % 64
+        k = sources[tile]
         column = (tile % tiles) * 8 + inside % 8
         row = (tile // tiles) * 8 + inside // 8
         turn = (np.float32(column) + uniform[n, 0]) / np.float32(columns)
-        z = np.float32(1) - np.float32(2) * (np.float32(row) + uniform[n, 1]) / np.float32(rows)
-        azimuth = np.float32(math.pi) * (np.float32(1) - np.float32(2) * turn)
-        fall = np.float32(0.5) - np.float32(math.asin(z)) / np.float32(math.pi)
-        u, v = turn * np.float32(width) - np.float32(0.5), fall * np.float32(height) - np.float32(0.5)
+        z = one - np.float32(2) * (np.float32(row) + uniform[n, 1]) / np.float32(rows)
+        azimuth = np.float32(math.pi) * (one - np.float32(2) * turn)
+        fall = half - np.float32(math.asin(z)) / np.float32(math.pi)
+        u, v = turn * np.float32(width) - half, fall * np.float32(height) - half
         v = min(max(v, np.float32(0)), np.float32(height - 1))
         u0, v0 = math.floor(u), math.floor(v)
         fu, fv = u - np.float32(u0), v - np.float32(v0)
@@ -68,24 +76,29 @@ def sample_rays(  # type: ignore[no-untyped-def]
         surface = tile * 128 + inside
         near = surface + 64
         for c in range(3):
-            top = np.float32(rgb[v0, left, c]) * (np.float32(1) - fu) + np.float32(rgb[v0, right, c]) * fu
-            bottom = np.float32(rgb[v1, left, c]) * (np.float32(1) - fu) + np.float32(rgb[v1, right, c]) * fu
-            value = top * (np.float32(1) - fv) + bottom * fv
-            target[surface, c] = value * np.float32(1 / 255) - np.float32(0.5)
+            top = np.float32(rgb[k, v0, left, c]) * (one - fu) + np.float32(rgb[k, v0, right, c]) * fu
+            bottom = np.float32(rgb[k, v1, left, c]) * (one - fu) + np.float32(rgb[k, v1, right, c]) * fu
+            value = (top * (one - fv) + bottom * fv) * gains[k, c]
+            target[surface, c] = min(value * np.float32(1 / 255), one) - half
             target[near, c] = target[surface, c]
-        depth = np.float32(1) / prior_inverse_depth(
-            inverse, torn, turn * np.float32(w) - np.float32(0.5), fall * np.float32(h) - np.float32(0.5)
-        )
-        offset = np.float32(2) * uniform[n, 2] - np.float32(1)
+        depth = one / prior_inverse_depth(inverse[k], torn[k], turn * np.float32(w) - half, fall * np.float32(h) - half)
+        offset = np.float32(2) * uniform[n, 2] - one
+        length = depth * (one + band[k] * offset)
+        flat = np.float32(math.sqrt(max(np.float32(0), one - z * z)))
+        dx, dy = flat * np.float32(math.cos(azimuth)), flat * np.float32(math.sin(azimuth))
+        away = np.float32(0)
+        for c in range(3):
+            direction = map_from_camera[k, c, 0] * dx + map_from_camera[k, c, 1] * dy + map_from_camera[k, c, 2] * z
+            points[surface, c] = map_from_camera[k, c, 3] + depth * direction
+            points[near, c] = map_from_camera[k, c, 3] + length * direction
+            away += (points[surface, c] - map_from_camera[0, c, 3]) ** 2
         target[surface, 3] = 0
         target[near, 3] = -offset
-        length = depth * (np.float32(1) + band * offset)
-        flat = np.float32(math.sqrt(max(np.float32(0), np.float32(1) - z * z)))
-        dx, dy = flat * np.float32(math.cos(azimuth)), flat * np.float32(math.sin(azimuth))
-        for c in range(3):
-            direction = map_from_camera[c, 0] * dx + map_from_camera[c, 1] * dy + map_from_camera[c, 2] * z
-            points[surface, c] = map_from_camera[c, 3] + depth * direction
-            points[near, c] = map_from_camera[c, 3] + length * direction
+        if k > 0:
+            target[near, 3] *= band[k] * depth / (band[0] * max(np.float32(math.sqrt(away)), depth * half))
+        at = min(int(fall * np.float32(h)), h - 1), min(int(turn * np.float32(w)), w - 1)
+        weight[surface, 0] = weight[near, 0] = usable[k, at[0], at[1]]
+        weight[surface, 1] = weight[near, 1] = usable[k, at[0], at[1]] * trust[k, at[0], at[1]]
 
 
 @njit(**_OPTIONS)
@@ -128,6 +141,41 @@ def prior_distance(x, y, z, inverse, torn, band):  # type: ignore[no-untyped-def
 
 
 @njit(**_OPTIONS)
+def nearest_prior(x, y, z, inverse, torn, known, camera_from_map, band, all_agree):  # type: ignore[no-untyped-def]
+    """The keyframe whose surface is nearest to a point of the map frame, of those that no newer one has looked through.
+
+    Args: as in ``trace``; all_agree: whether to tell the agreement at all (else it is 0).
+
+    Returns:
+        Signed distance in units of the newest's band, and what ``prior_agrees`` says (the best of all keyframes).
+    """
+    best, best_agrees, unit = np.float32(NOT_SEEN), 0, np.float32(1)
+    seen_through = False
+    for k in range(inverse.shape[0]):
+        px, py, pz = transformed(camera_from_map[k], x, y, z)
+        value = np.float32(prior_distance(px, py, pz, inverse[k], torn[k], band[k]))
+        away = np.float32(math.sqrt(px * px + py * py + pz * pz)) * band[k]
+        if k == 0:
+            best, unit = value, away
+        elif not seen_through and abs(value) * away < abs(best) * unit:
+            best = value * away / unit
+        if all_agree and not seen_through:
+            best_agrees = max(best_agrees, prior_agrees(px, py, pz, inverse[k], torn[k], known[k], band[k]))
+        if value > LOOKED_THROUGH and prior_known(px, py, pz, known[k]):
+            seen_through = True
+    return best, best_agrees
+
+
+@njit(**_OPTIONS)
+def prior_known(x, y, z, known):  # type: ignore[no-untyped-def]
+    """Whether the depth is known in the direction of a point of the camera frame."""
+    height, width = known.shape
+    u = (math.pi - math.atan2(y, x)) * (width / (2 * math.pi))
+    v = (math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi)
+    return known[min(int(v), height - 1), min(int(u), width - 1)] != 0
+
+
+@njit(**_OPTIONS)
 def grid_span(origin, direction, low, cell, shape):  # type: ignore[no-untyped-def]
     """Where a ray enters and leaves the grid; entry > exit when it misses it."""
     enter, leave = 0.0, 1e9
@@ -162,9 +210,21 @@ def next_occupied(origin, direction, t, leave, grid, low, cell):  # type: ignore
 
 
 @njit(**_OPTIONS)
+def at_length(origin, direction, t):  # type: ignore[no-untyped-def]
+    """The place ``t`` along a ray."""
+    return origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
+
+
+@njit(**_OPTIONS)
 def along(target_from_source, origin, direction, t):  # type: ignore[no-untyped-def]
     """The place ``t`` along a ray, in another frame."""
-    x, y, z = origin[0] + t * direction[0], origin[1] + t * direction[1], origin[2] + t * direction[2]
+    x, y, z = at_length(origin, direction, t)
+    return transformed(target_from_source, x, y, z)
+
+
+@njit(**_OPTIONS)
+def transformed(target_from_source, x, y, z):  # type: ignore[no-untyped-def]
+    """A point in another frame."""
     m = target_from_source
     return (
         m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3],
@@ -178,18 +238,19 @@ def trace(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, grid, low, cell,
     inverse, torn, known, camera_from_map, band, share, origin, directions, pixels, depth, confidence
 ):  # fmt: skip
-    """Marches rays to the first zero of the signed distance that agrees with the keyframe's depth.
+    """Marches rays to the first zero of the signed distance that agrees with a keyframe's depth.
 
     The distance is the field's and the prior's own, mixed: a young field's surfaces are rough.
 
     Args:
         grid, low, cell: of the ``Occupancy``.
-        inverse, torn, known, band: of the ``PanoramaPrior``; camera_from_map: (4, 4) float32.
+        inverse, torn, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …); camera_from_map: (K, 4, 4)
+            float32.
         share: of the prior in the distance, 0..1; with 1 the field is not asked at all.
         origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
         pixels: (N,) which of them to march.
         depth: out, (P,): metres along the ray, 0 where it meets nothing.
-        confidence: out, (P,): 1 on a surface that the keyframe has seen from its front, 0.5 where its depth was filled.
+        confidence: out, (P,): 1 on a surface that a keyframe has seen from its front, 0.5 where its depth was filled.
     """
     count = pixels.shape[0]
     t = np.zeros(count, np.float32)
@@ -243,16 +304,17 @@ def trace(  # type: ignore[no-untyped-def]
                 pixel = pixels[n]
                 value, before = s[0, i], last_s[n]
                 if share > 0:
-                    px, py, pz = along(camera_from_map, origin, directions[pixel], t[n])
-                    value += share * (prior_distance(px, py, pz, inverse, torn, band) - value)
+                    px, py, pz = at_length(origin, directions[pixel], t[n])
+                    seen, _ = nearest_prior(px, py, pz, inverse, torn, known, camera_from_map, band, False)
+                    value += share * (seen - value)
                 if t[n] - last_t[n] > 3 * cell:
                     before = NOT_SEEN
                 hit = t[n]
                 crossed = before != NOT_SEEN and (before > 0) != (value > 0)
                 if crossed:
                     hit = last_t[n] + (t[n] - last_t[n]) * before / (before - value)
-                px, py, pz = along(camera_from_map, origin, directions[pixel], hit)
-                agrees = prior_agrees(px, py, pz, inverse, torn, known, band)
+                px, py, pz = at_length(origin, directions[pixel], hit)
+                _, agrees = nearest_prior(px, py, pz, inverse, torn, known, camera_from_map, band, True)
                 if agrees > 0:
                     if value <= 0 or crossed:
                         depth[pixel] = hit
@@ -260,8 +322,8 @@ def trace(  # type: ignore[no-untyped-def]
                         continue
                     if agrees == 2 and value < spare_s[n]:
                         spare[n], spare_s[n] = hit, value
-                px, py, pz = along(camera_from_map, origin, directions[pixel], t[n])
-                reach = abs(value) * band * math.sqrt(px * px + py * py + pz * pz)
+                px, py, pz = along(camera_from_map[0], origin, directions[pixel], t[n])
+                reach = abs(value) * band[0] * math.sqrt(px * px + py * py + pz * pz)
                 last_t[n], last_s[n] = t[n], value
                 t[n] += min(max(np.float32(0.9) * reach, np.float32(0.5) * cell), 2 * cell)
                 active[size] = n
@@ -269,21 +331,27 @@ def trace(  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
-def mix_panorama(rgb, camera_from_map, origin, directions, depth, confidence, share, colour):  # type: ignore[no-untyped-def]
-    """Mixes the panorama's colour into that of surfaces which the keyframe has seen.
+def mix_panorama(  # type: ignore[no-untyped-def]
+    rgb, inverse, torn, known, camera_from_map, gains, band, origin, directions, depth, confidence, share, colour
+):
+    """Mixes the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
 
     Args:
-        rgb: panorama (H, W, 3) uint8.
+        rgb, inverse, torn, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        camera_from_map: (K, 4, 4); gains: (K, 3).
         depth, confidence: (P,), of ``trace``; nothing happens where either is 0.
         share: of the panorama, 0..1.
         colour: in and out, (P, 3) in 0..1.
     """
-    height, width = rgb.shape[:2]
+    count, height, width = rgb.shape[:3]
     one = np.float32(1)
     for n in range(depth.shape[0]):
         if depth[n] <= 0 or confidence[n] <= 0:
             continue
-        x, y, z = along(camera_from_map, origin, directions[n], depth[n])
+        for k in range(count):
+            x, y, z = along(camera_from_map[k], origin, directions[n], depth[n])
+            if k == count - 1 or prior_agrees(x, y, z, inverse[k], torn[k], known[k], band[k]) > 0:
+                break
         u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
         v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
         v = min(max(v, np.float32(0)), np.float32(height - 1))
@@ -292,9 +360,9 @@ def mix_panorama(rgb, camera_from_map, origin, directions, depth, confidence, sh
         v1 = min(v0 + 1, height - 1)
         left, right = u0 % width, (u0 + 1) % width
         for c in range(3):
-            top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
-            bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
-            seen = (top * (one - fv) + bottom * fv) * np.float32(1 / 255)
+            top = np.float32(rgb[k, v0, left, c]) * (one - fu) + np.float32(rgb[k, v0, right, c]) * fu
+            bottom = np.float32(rgb[k, v1, left, c]) * (one - fu) + np.float32(rgb[k, v1, right, c]) * fu
+            seen = min((top * (one - fv) + bottom * fv) * np.float32(1 / 255) * gains[k, c], one)
             colour[n, c] += share * (seen - colour[n, c])
 
 

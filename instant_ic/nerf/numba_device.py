@@ -16,8 +16,10 @@ from .field import (
     Floats,
     Rays,
     Scene,
+    StackedPriors,
     adam_step_size,
     level_rates,
+    ray_sources,
     sample_weights,
 )
 
@@ -35,7 +37,7 @@ class DrawnField:
     parameters: FieldParameters
     scene: Scene
     focus: Floats
-    camera_from_map: Floats
+    priors: StackedPriors
 
 
 class NumbaDevice:
@@ -49,6 +51,7 @@ class NumbaDevice:
         self._rays = train.ray_columns * train.ray_rows
         self._points = np.zeros((2 * self._rays, 3), np.float32)
         self._target = np.zeros((2 * self._rays, 4), np.float32)
+        self._weight = np.zeros((2 * self._rays, 2), np.float32)
         self._colour_weight, self._distance_weight = sample_weights(train)
         self._level_rates = level_rates(train, field.levels)
         self.load(FieldParameters.random(field, train.seed))
@@ -64,28 +67,27 @@ class NumbaDevice:
         self._steps = 0
 
     def set_scene(self, scene: Scene) -> None:
-        self._scene = scene
-        self._focus = scene.focus
-        self._map_from_camera = scene.prior.map_from_camera.astype(np.float32)
-        camera_from_map = np.linalg.inv(scene.prior.map_from_camera).astype(np.float32)
-        self._drawn = DrawnField(self._p, scene, self._focus, camera_from_map)
+        self._drawn = DrawnField(self._p, scene, scene.focus, StackedPriors.of(scene))
         for moments in (self._table_moments, *self._network_moments):
             for moment in moments:
                 moment[...] = 0
         self._steps = 0
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        prior, lattice, p = self._scene.prior, self._scene.lattice, self._p
+        drawn, lattice, p = self._drawn, self._drawn.scene.lattice, self._p
+        priors, weight, columns, rows = drawn.priors, self._weight, self._train.ray_columns, self._train.ray_rows
+        self._steps += 1
         march.sample_rays(
-            uniform, self._train.ray_columns, self._train.ray_rows, prior.rgb, prior.inverse_depth, prior.torn,
-            self._map_from_camera, np.float32(prior.band), self._points, self._target,
+            uniform, columns, rows, ray_sources(len(priors.band), self._rays // 64, self._steps),
+            priors.rgb, priors.inverse_depth, priors.torn, priors.usable, priors.trust,
+            priors.map_from_camera, priors.gains, priors.band, self._points, self._target, weight,
         )  # fmt: skip
         g1, gb1, g2, gb2 = self._network_grads
         colour, distance = kernels.gradient(
-            p.table, *p.network(), lattice.cells_per_m, lattice.origin, self._focus, self._points, self._target,
-            self._colour_weight, self._distance_weight, self._table_grad, self._touched, g1, gb1, g2, gb2,
+            p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, self._points, self._target,
+            self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1],
+            self._table_grad, self._touched, g1, gb1, g2, gb2,
         )  # fmt: skip
-        self._steps += 1
         betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
         step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, self._steps))
         kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_sizes, *betas)
@@ -95,7 +97,9 @@ class NumbaDevice:
             v += (1 - betas[1]) * (grad * grad - v)
             value -= step_size * m / (np.sqrt(v) + betas[2])
             grad[...] = 0
-        return colour / (1 + self._train.band_colour_weight), distance / self._train.distance_weight
+        drawn_share = max(float(weight[:, 0].mean()), 1e-3)
+        colour_error = colour / ((1 + self._train.band_colour_weight) * drawn_share)
+        return colour_error, distance / (self._train.distance_weight * max(float(weight[:, 1].mean()), 1e-3))
 
     def freeze(self) -> DrawnField:
         return replace(self._drawn, parameters=self.parameters())
@@ -111,9 +115,10 @@ class NumbaDevice:
         if panorama_share < 1:
             self._query(drawn, rays, depth, colour)
         if panorama_share > 0:
+            priors = drawn.priors
             march.mix_panorama(
-                drawn.scene.prior.rgb, drawn.camera_from_map, rays.origin, rays.directions, depth, confidence,
-                np.float32(panorama_share), colour,
+                priors.rgb, priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.gains,
+                priors.band, rays.origin, rays.directions, depth, confidence, np.float32(panorama_share), colour,
             )  # fmt: skip
         return colour, depth, confidence
 
@@ -153,11 +158,11 @@ class NumbaDevice:
         self, drawn: DrawnField, rays: Rays, depth_share: float, pixels: np.ndarray, depth: Floats, confidence: Floats
     ) -> None:
         scene, p = drawn.scene, drawn.parameters
-        prior, grid = scene.prior, scene.occupancy
+        priors, grid = drawn.priors, scene.occupancy
         march.trace(
             p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, drawn.focus,
             grid.distance, grid.origin, np.float32(grid.cell_m),
-            prior.inverse_depth, prior.torn, prior.known, drawn.camera_from_map, np.float32(prior.band),
+            priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.band,
             np.float32(depth_share), rays.origin, rays.directions, pixels, depth, confidence,
         )  # fmt: skip
         depth[pixels] *= rays.axial[pixels]

@@ -29,6 +29,8 @@ class PanoramaPrior:
         map_from_camera: pose, (4, 4).
         relative_sigma: standard deviation of the depth, relative to it: median over the picture.
         band: half width, relative to the depth, of the band in which the signed distance is learnt.
+        sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
+        usable: 1 where training may draw rays, (h, w) uint8.
     """
 
     rgb: NDArray[np.uint8]
@@ -38,6 +40,8 @@ class PanoramaPrior:
     map_from_camera: NDArray[np.float64]
     relative_sigma: float
     band: float
+    sigma: NDArray[np.float32]
+    usable: NDArray[np.uint8]
 
     @property
     def median_depth_m(self) -> float:
@@ -71,7 +75,7 @@ def prepare(
     _check_panorama(rgb)
     _check_pose(map_from_camera)
     depth = _checked_depth(depth_m, config)
-    sigma, sure = _checked_sigma(relative_sigma, depth_m, depth)
+    sigma, each = _checked_sigma(relative_sigma, depth_m, depth)
     if rgb.shape[1] > panorama_width:
         rgb = area_average(rgb, panorama_width // 2, panorama_width)
     known = depth > 0
@@ -82,11 +86,13 @@ def prepare(
     return PanoramaPrior(
         rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile anew
         inverse_depth=np.ascontiguousarray(inverse),
-        known=(known & sure).astype(np.uint8),
+        known=(known & (each <= MOST_SIGMA)).astype(np.uint8),
         torn=torn_quads(inverse, config.torn_ratio),
         map_from_camera=np.array(map_from_camera, np.float64),
         relative_sigma=sigma,
         band=band,
+        sigma=np.where(known, np.minimum(each, np.float32(MOST_SIGMA)), np.float32(MOST_SIGMA)),
+        usable=np.ones(depth.shape, np.uint8),
     )
 
 
@@ -130,13 +136,13 @@ def _checked_depth(depth_m: NDArray[np.floating], config: GeometryConfig) -> NDA
 
 def _checked_sigma(
     relative_sigma: float | NDArray[np.floating], depth_m: NDArray[np.floating], depth: NDArray[np.float32]
-) -> tuple[float, NDArray[np.bool_]]:
-    """One number for the picture, and where the depth (after ``_checked_depth``) is sure enough, (h, w)."""
+) -> tuple[float, NDArray[np.float32]]:
+    """One number for the picture, and of each pixel of the depth (after ``_checked_depth``), (h, w), inf = unknown."""
     sigma = np.asarray(relative_sigma, np.float32)
     if sigma.ndim == 0:
         if not np.isfinite(sigma) or sigma < 0:
             raise KeyframeError(f"relative_sigma must be finite and not negative (got {relative_sigma})")
-        return float(relative_sigma), np.ones(depth.shape, bool)
+        return float(relative_sigma), np.full(depth.shape, min(float(relative_sigma), MOST_SIGMA), np.float32)
     if sigma.shape != depth_m.shape:
         raise KeyframeError(f"relative_sigma must be one number or as the depth {depth_m.shape} (got {sigma.shape})")
     step = max(1, depth_m.shape[1] // 1024)
@@ -144,7 +150,7 @@ def _checked_sigma(
     known = (depth > 0) & np.isfinite(sigma)
     if not known.any() or float(sigma[known].min()) < 0:
         raise KeyframeError("relative_sigma must be finite somewhere and nowhere negative")
-    return float(np.median(sigma[known])), known & (sigma <= MOST_SIGMA)
+    return float(np.median(sigma[known])), np.where(known, sigma, np.float32(np.inf))
 
 
 def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

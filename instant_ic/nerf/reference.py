@@ -15,6 +15,7 @@ _P1 = 2654435761
 _P2 = 805459861
 NOT_SEEN = 1e9
 FIRST_STEP = 0.7
+LOOKED_THROUGH = 3.0
 
 
 @dataclass
@@ -36,15 +37,21 @@ class TorchField:
 
 @dataclass
 class TorchPrior:
-    """A ``prior.PanoramaPrior`` as tensors; ``rgb`` float32 in 0..255, ``known`` and ``torn`` bool."""
+    """A ``prior.PanoramaPrior`` as tensors; ``rgb`` float32 in 0..255, ``known``, ``torn`` and ``usable`` bool.
+
+    ``trust``: weight of each pixel's depth, (h, w); ``gain``: to the newest keyframe's exposure, (3,).
+    """
 
     rgb: Tensor
     inverse_depth: Tensor
     known: Tensor
     torn: Tensor
+    usable: Tensor
+    trust: Tensor
     map_from_camera: Tensor
     camera_from_map: Tensor
     band: float
+    gain: Tensor
 
 
 @dataclass
@@ -63,15 +70,15 @@ def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, focus: Tensor, po
         table: (levels, size, features); size is a power of two.
         cells_per_m: (levels,).
         origin: (3,).
-        focus: place of the keyframe's camera and radians of a picture's pixel, (4,): levels whose cells are narrower
-            than a pixel count less, from half a pixel on not at all.
+        focus: places of the keyframes' cameras and radians of a panorama's pixel, (K, 4): levels whose cells are
+            narrower than a pixel of the keyframe that saw the place finest count less, from half a pixel on not at all.
         points: (N, 3).
 
     Returns:
         (N, levels · features).
     """
     levels, size, _ = table.shape
-    pixel = (points - focus[:3]).norm(dim=1) * focus[3]
+    pixel = ((points[:, None] - focus[:, :3]).norm(dim=2) * focus[:, 3]).amin(dim=1)
     features = []
     for level in range(levels):
         place = (points - origin) * cells_per_m[level]
@@ -149,11 +156,27 @@ def prior_inverse_depth(prior: TorchPrior, u: Tensor, v: Tensor) -> Tensor:
     return torch.where(prior.torn[top, left], nearest, _bilinear(inverse, u, v))
 
 
-def sample_rays(uniform: Tensor, columns: int, rows: int, prior: TorchPrior) -> tuple[Tensor, Tensor]:
-    """Points (2 N, 3) and targets (2 N, 4) of one ray in each stratum; see ``march.sample_rays``."""
+def sample_rays(
+    uniform: Tensor, columns: int, rows: int, priors: list[TorchPrior], sources: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Points (2 N, 3), targets (2 N, 4) and weights (2 N, 2) of one ray in each stratum; see ``march.sample_rays``."""
+    points = torch.zeros(2 * columns * rows, 3, device=uniform.device)
+    target = torch.zeros(2 * columns * rows, 4, device=uniform.device)
+    weight = torch.zeros(2 * columns * rows, 2, device=uniform.device)
+    for k, prior in enumerate(priors):
+        tiles = torch.nonzero(sources == k)[:, 0]
+        n = (tiles[:, None] * 64 + torch.arange(64, device=uniform.device)).reshape(-1)
+        at = (tiles[:, None] * 128 + torch.arange(128, device=uniform.device)).reshape(-1)
+        points[at], target[at], weight[at] = _sample_rays(uniform[n], n, columns, rows, prior, priors[0])
+    return points, target, weight
+
+
+def _sample_rays(
+    uniform: Tensor, n: Tensor, columns: int, rows: int, prior: TorchPrior, newest: TorchPrior
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The rays of number ``n`` (N,) of a batch, all of one keyframe."""
     height, width = prior.rgb.shape[:2]
     h, w = prior.inverse_depth.shape
-    n = torch.arange(columns * rows, device=uniform.device)
     tile, inside = n // 64, n % 64
     tiles = columns // 8
     column, row = (tile % tiles) * 8 + inside % 8, (tile // tiles) * 8 + inside // 8
@@ -161,7 +184,8 @@ def sample_rays(uniform: Tensor, columns: int, rows: int, prior: TorchPrior) -> 
     z = 1 - 2 * (row + uniform[:, 1]) / rows
     azimuth = math.pi * (1 - 2 * turn)
     fall = 0.5 - torch.asin(z) / math.pi
-    colour = _bilinear(prior.rgb, turn * width - 0.5, fall * height - 0.5) / 255 - 0.5
+    colour = _bilinear(prior.rgb, turn * width - 0.5, fall * height - 0.5) * prior.gain
+    colour = (colour / 255).clamp(max=1) - 0.5
     depth = 1 / prior_inverse_depth(prior, turn * w - 0.5, fall * h - 0.5)
     offset = 2 * uniform[:, 2] - 1
     flat = (1 - z * z).clamp(min=0).sqrt()
@@ -169,23 +193,29 @@ def sample_rays(uniform: Tensor, columns: int, rows: int, prior: TorchPrior) -> 
     camera = prior.map_from_camera[:3, 3]
     surface = camera + depth[:, None] * direction
     near = camera + (depth * (1 + prior.band * offset))[:, None] * direction
-    zero = torch.zeros_like(offset)[:, None]
-    surface_target = torch.cat([colour, zero], dim=1)
-    near_target = torch.cat([colour, -offset[:, None]], dim=1)
-    points = torch.stack([surface.view(-1, 64, 3), near.view(-1, 64, 3)], dim=1).reshape(-1, 3)
-    target = torch.stack([surface_target.view(-1, 64, 4), near_target.view(-1, 64, 4)], dim=1).reshape(-1, 4)
-    return points, target
+    distance = -offset
+    if prior is not newest:
+        away = (surface - newest.map_from_camera[:3, 3]).norm(dim=1)
+        distance = distance * prior.band * depth / (newest.band * torch.maximum(away, 0.5 * depth))
+    surface_target = torch.cat([colour, torch.zeros_like(offset)[:, None]], dim=1)
+    near_target = torch.cat([colour, distance[:, None]], dim=1)
+    at = (fall * h).long().clamp(max=h - 1), (turn * w).long().clamp(max=w - 1)
+    usable = prior.usable[at].float()
+    weight = torch.stack([usable, usable * prior.trust[at]], dim=1)
+
+    def by_tiles(on_surface: Tensor, in_band: Tensor) -> Tensor:
+        parts = on_surface.view(-1, 64, on_surface.shape[1]), in_band.view(-1, 64, in_band.shape[1])
+        return torch.stack(parts, dim=1).reshape(-1, on_surface.shape[1])
+
+    return by_tiles(surface, near), by_tiles(surface_target, near_target), by_tiles(weight, weight)
 
 
 def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
     """0, 1 or 2 for points (N, 3) of the camera frame; see ``march.prior_agrees``."""
     inverse = prior.inverse_depth
     height, width = inverse.shape
-    x, y, z = points.unbind(1)
-    flat = torch.hypot(x, y)
-    distance = torch.hypot(flat, z)
-    u = (math.pi - torch.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
-    v = (math.pi / 2 - torch.atan2(z, flat)) * (height / math.pi) - 0.5
+    distance = points.norm(dim=1)
+    u, v = _pixels(points, inverse)
     left, right, top, bottom, fu, fv = _corners(u, v, width, height)
     seen = 1 + prior.known[torch.where(fv >= 0.5, bottom, top), torch.where(fu >= 0.5, right, left)].long()
     ratios = torch.stack([inverse[r, c] for r in (top, bottom) for c in (left, right)]) * distance
@@ -197,16 +227,45 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
 
 def prior_distance(prior: TorchPrior, points: Tensor) -> Tensor:
     """Signed distance of points (N, 3) of the camera frame to the prior's surface, in bands; as in ``march``."""
-    height, width = prior.inverse_depth.shape
+    nearness = prior_inverse_depth(prior, *_pixels(points, prior.inverse_depth))
+    return (1 - points.norm(dim=1) * nearness) / prior.band
+
+
+def _camera_frame(prior: TorchPrior, points: Tensor) -> Tensor:
+    return points @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]
+
+
+def nearest_prior(priors: list[TorchPrior], points: Tensor) -> tuple[Tensor, Tensor]:
+    """Signed distance to the nearest keyframe's surface, and agreement, of map points (N, 3); see ``march``."""
+    seen_through = torch.zeros(points.shape[0], dtype=torch.bool, device=points.device)
+    for k, prior in enumerate(priors):
+        local = _camera_frame(prior, points)
+        value = prior_distance(prior, local)
+        away = local.norm(dim=1) * prior.band
+        if k == 0:
+            best, unit, agrees = value, away, prior_agrees(prior, local)
+        else:
+            closer = ~seen_through & (value.abs() * away < best.abs() * unit)
+            best = torch.where(closer, value * away / unit, best)
+            agrees = torch.where(seen_through, agrees, torch.maximum(agrees, prior_agrees(prior, local)))
+        u, v = _pixels(local, prior.known)
+        row, column = (v + 0.5).long().clamp(0, prior.known.shape[0] - 1), (u + 0.5).long() % prior.known.shape[1]
+        seen_through |= (value > LOOKED_THROUGH) & prior.known[row, column]
+    return best, agrees
+
+
+def _pixels(points: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:
+    """Index coordinates (u, v) in an equirect image of points (N, 3) of its camera's frame."""
+    height, width = image.shape[:2]
     x, y, z = points.unbind(1)
     u = (math.pi - torch.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
     v = (math.pi / 2 - torch.atan2(z, torch.hypot(x, y))) * (height / math.pi) - 0.5
-    return (1 - points.norm(dim=1) * prior_inverse_depth(prior, u, v)) / prior.band
+    return u, v
 
 
 @torch.no_grad()
 def mix_panorama(
-    prior: TorchPrior,
+    priors: list[TorchPrior],
     origin: Tensor,
     directions: Tensor,
     depth: Tensor,
@@ -216,17 +275,17 @@ def mix_panorama(
 ) -> None:
     """Mixes the panorama's colour into ``colour`` (P, 3) in place; see ``march.mix_panorama``."""
     at = torch.nonzero((depth > 0) & (confidence > 0))[:, 0]
-    points = origin + depth[at, None] * directions[at]
-    x, y, z = (points @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]).unbind(1)
-    height, width = prior.rgb.shape[:2]
-    u = (math.pi - torch.atan2(y, x)) * (width / (2 * math.pi)) - 0.5
-    v = (math.pi / 2 - torch.atan2(z, torch.hypot(x, y))) * (height / math.pi) - 0.5
-    colour[at] += share * (_bilinear(prior.rgb, u, v) / 255 - colour[at])
+    for k, prior in enumerate(priors):
+        points = _camera_frame(prior, origin + depth[at, None] * directions[at])
+        here = prior_agrees(prior, points) > 0 if k < len(priors) - 1 else torch.ones_like(at, dtype=torch.bool)
+        seen = (_bilinear(prior.rgb, *_pixels(points[here], prior.rgb)) * prior.gain / 255).clamp(max=1)
+        colour[at[here]] += share * (seen - colour[at[here]])
+        at = at[~here]
 
 
 @torch.no_grad()
 def trace(
-    field: TorchField, grid: TorchGrid, prior: TorchPrior, share: float, origin: Tensor, directions: Tensor
+    field: TorchField, grid: TorchGrid, priors: list[TorchPrior], share: float, origin: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Depth along each ray, 0 where it meets nothing, and confidence, both (N,); see ``march.trace``."""
     count = directions.shape[0]
@@ -238,14 +297,13 @@ def trace(
     last_s = torch.full_like(t, NOT_SEEN)
     spare = torch.zeros_like(t)
     spare_s = torch.full_like(t, NOT_SEEN)
-    camera = prior.map_from_camera[:3, 3]
+    camera = priors[0].map_from_camera[:3, 3]
     while active.numel():
         t[active] = _next_occupied(origin, directions[active], t[active], leave[active], grid)
         active = active[t[active] >= 0]
         here = t[active]
         points = origin + here[:, None] * directions[active]
-        local = points @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]
-        value = share * prior_distance(prior, local)
+        value = share * nearest_prior(priors, points)[0]
         if share < 1:
             value = value + (1 - share) * query(field, points)[:, 3]
         gap = here - last_t[active] > 3 * grid.cell_m
@@ -253,17 +311,15 @@ def trace(
         crossing = last_t[active] + (here - last_t[active]) * before / (before - value)
         crossed = (before != NOT_SEEN) & ((before > 0) != (value > 0))
         hit = torch.where(crossed, crossing, here)
-        places = origin + hit[:, None] * directions[active]
-        places = places @ prior.camera_from_map[:3, :3].T + prior.camera_from_map[:3, 3]
         front = (value <= 0) & (before > 0)
-        agrees = prior_agrees(prior, places)
+        agrees = nearest_prior(priors, origin + hit[:, None] * directions[active])[1]
         closer = (agrees == 2) & (value > 0) & ~crossed & (value < spare_s[active])
         spare[active[closer]], spare_s[active[closer]] = hit[closer], value[closer]
         met = ((value <= 0) | crossed) & (agrees > 0)
         depth[active[met]] = hit[met]
         confidence[active[met]] = torch.where(front, 0.5 * agrees, torch.zeros_like(value))[met]
         last_t[active], last_s[active] = here, value
-        reach = 0.9 * value.abs() * prior.band * (points - camera).norm(dim=1)
+        reach = 0.9 * value.abs() * priors[0].band * (points - camera).norm(dim=1)
         t[active] = here + reach.clamp(0.5 * grid.cell_m, 2 * grid.cell_m)
         active = active[~met]
     without = (depth == 0) & (spare > 0)

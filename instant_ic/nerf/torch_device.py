@@ -19,7 +19,9 @@ from .field import (
     Rays,
     Scene,
     adam_step_size,
+    depth_trust,
     level_rates,
+    ray_sources,
     sample_weights,
 )
 from .reference import TorchField, TorchGrid, TorchPrior
@@ -27,22 +29,27 @@ from .reference import TorchField, TorchGrid, TorchPrior
 RAYS_AT_ONCE = 1 << 18
 
 
-def torch_prior(scene: Scene, device: str) -> TorchPrior:
-    """A scene's prior as tensors."""
-    prior = scene.prior
+def torch_priors(scene: Scene, device: str) -> list[TorchPrior]:
+    """A scene's keyframes as tensors, newest first."""
 
     def tensor(array: Any, kind: torch.dtype = torch.float32) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(device=device, dtype=kind)
 
-    return TorchPrior(
-        rgb=tensor(prior.rgb),
-        inverse_depth=tensor(prior.inverse_depth),
-        known=tensor(prior.known, torch.bool),
-        torn=tensor(prior.torn, torch.bool),
-        map_from_camera=tensor(prior.map_from_camera),
-        camera_from_map=tensor(np.linalg.inv(prior.map_from_camera)),
-        band=prior.band,
-    )
+    return [
+        TorchPrior(
+            rgb=tensor(prior.rgb),
+            inverse_depth=tensor(prior.inverse_depth),
+            known=tensor(prior.known, torch.bool),
+            torn=tensor(prior.torn, torch.bool),
+            usable=tensor(prior.usable, torch.bool),
+            trust=tensor(depth_trust(prior)),
+            map_from_camera=tensor(prior.map_from_camera),
+            camera_from_map=tensor(np.linalg.inv(prior.map_from_camera)),
+            band=prior.band,
+            gain=tensor(gain),
+        )
+        for prior, gain in zip(scene.priors, scene.exposure, strict=True)
+    ]
 
 
 class TorchDevice:
@@ -61,7 +68,7 @@ class TorchDevice:
         arrays = (parameters.table, *parameters.network())
         tensors = [torch.from_numpy(a.copy()).to(self._device).requires_grad_() for a in arrays]
         levels = parameters.table.shape[0]
-        lattice = [torch.zeros(n, device=self._device) for n in (levels, 3, 4)]  # until a scene comes
+        lattice = [torch.zeros(n, device=self._device) for n in ((levels,), (3,), (1, 4))]  # until a scene comes
         self._field = TorchField(*tensors, *lattice)
         self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in tensors]
         self._steps = 0
@@ -70,20 +77,23 @@ class TorchDevice:
         grid, lattice = scene.occupancy, scene.lattice
         arrays = (grid.distance, grid.origin, lattice.cells_per_m, lattice.origin, scene.focus)
         # All that needs memory comes first: where there is none, the old scene stays whole.
-        prior = torch_prior(scene, self._device)
+        priors = torch_priors(scene, self._device)
         distance, corner, cells_per_m, origin, focus = (torch.from_numpy(a).to(self._device) for a in arrays)
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
-        self._prior, self._grid, self._moments = prior, TorchGrid(distance, corner, grid.cell_m), moments
+        self._priors, self._grid, self._moments = priors, TorchGrid(distance, corner, grid.cell_m), moments
         self._field.cells_per_m, self._field.origin, self._field.focus = cells_per_m, origin, focus
         self._steps = 0
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
         drawn = torch.from_numpy(uniform).to(self._device)
-        points, target = reference.sample_rays(drawn, self._train.ray_columns, self._train.ray_rows, self._prior)
-        output = reference.query(self._field, points)
-        colour, distance = reference.loss(output, target, self._colour_weight, self._distance_weight)
-        grads = torch.autograd.grad(colour + distance, self._field.parameters())
+        columns, rows = self._train.ray_columns, self._train.ray_rows
         self._steps += 1
+        sources = torch.from_numpy(ray_sources(len(self._priors), columns * rows // 64, self._steps)).to(self._device)
+        points, target, weight = reference.sample_rays(drawn, columns, rows, self._priors, sources)
+        output = reference.query(self._field, points)
+        weights = self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1]
+        colour, distance = reference.loss(output, target, *weights)
+        grads = torch.autograd.grad(colour + distance, self._field.parameters())
         with torch.no_grad():
             for index, (value, grad) in enumerate(zip(self._field.parameters(), grads, strict=True)):
                 lr = table_lr if index == 0 else network_lr
@@ -92,14 +102,15 @@ class TorchDevice:
                     step_size = step_size * self._level_rates
                 # A network's row is an entry like the table's: without a gradient it is left alone.
                 reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
-        colour_error = float(colour.detach()) / (1 + self._train.band_colour_weight)
-        return colour_error, float(distance.detach()) / self._train.distance_weight
+        share = weight.mean(dim=0).clamp(min=1e-3)
+        colour_error = float(colour.detach() / share[0]) / (1 + self._train.band_colour_weight)
+        return colour_error, float(distance.detach() / share[1]) / self._train.distance_weight
 
-    def freeze(self) -> tuple[TorchField, TorchPrior, TorchGrid]:
+    def freeze(self) -> tuple[TorchField, list[TorchPrior], TorchGrid]:
         field = self._field
         table, w1, b1, w2, b2 = (p.detach().clone() for p in field.parameters())
         copy = TorchField(table, w1, b1, w2, b2, field.cells_per_m, field.origin, field.focus)
-        return copy, self._prior, self._grid
+        return copy, self._priors, self._grid
 
     @torch.no_grad()
     def draw(
@@ -107,9 +118,9 @@ class TorchDevice:
         rays: Rays,
         panorama_share: float,
         depth_share: float,
-        frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None,
+        frozen: tuple[TorchField, list[TorchPrior], TorchGrid] | None = None,
     ) -> tuple[Floats, Floats, Floats]:
-        drawn = frozen or (self._field, self._prior, self._grid)
+        drawn = frozen or (self._field, self._priors, self._grid)
         origin = torch.from_numpy(rays.origin).to(self._device)
         directions = torch.from_numpy(rays.directions).to(self._device)
         shares = panorama_share, depth_share
@@ -120,20 +131,20 @@ class TorchDevice:
     @staticmethod
     def _draw(
         field: TorchField,
-        prior: TorchPrior,
+        priors: list[TorchPrior],
         grid: TorchGrid,
         origin: Tensor,
         directions: Tensor,
         shares: tuple[float, float],
     ) -> tuple[Tensor, Tensor, Tensor]:
-        depth, confidence = reference.trace(field, grid, prior, shares[1], origin, directions)
+        depth, confidence = reference.trace(field, grid, priors, shares[1], origin, directions)
         met = torch.nonzero(depth)[:, 0]
         colour = torch.zeros_like(directions)
         points = origin + depth[met, None] * directions[met]
         colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
-        reference.mix_panorama(prior, origin, directions, depth, confidence, shares[0], colour)
+        reference.mix_panorama(priors, origin, directions, depth, confidence, shares[0], colour)
         return colour, depth, confidence
 
-    def parameters(self, frozen: tuple[TorchField, TorchPrior, TorchGrid] | None = None) -> FieldParameters:
+    def parameters(self, frozen: tuple[TorchField, list[TorchPrior], TorchGrid] | None = None) -> FieldParameters:
         field = self._field if frozen is None else frozen[0]
         return FieldParameters(*(p.detach().cpu().numpy().copy() for p in field.parameters()))

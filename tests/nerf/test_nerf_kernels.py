@@ -17,16 +17,18 @@ from instant_ic.nerf import (
     reference,
 )
 from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.field import FieldParameters, Lattice, Scene
+from instant_ic.nerf.field import FieldParameters, Lattice, Scene, StackedPriors, ray_sources
 from instant_ic.nerf.numba_device import NumbaDevice
-from instant_ic.nerf.occupancy import build_occupancy
+from instant_ic.nerf.occupancy import build_occupancy, surface_points
 from instant_ic.nerf.prior import prepare
 from instant_ic.nerf.reference import TorchField
-from instant_ic.nerf.torch_device import TorchDevice, torch_prior
+from instant_ic.nerf.torch_device import TorchDevice, torch_priors
 from instant_ic.nerf.view import perspective_rays
 
 F = np.float32
-FOCUS = np.array([0.3, 0.2, -0.5, 0.01], F)  # pixels of 1 cm a metre: levels of 1 cm and less fade away
+FOCUS = np.array(
+    [[0.3, 0.2, -0.5, 0.01], [2.0, 1.0, 0.5, 0.02]], F
+)  # pixels of 1 cm a metre: levels of 1 cm and less fade away
 
 
 def random_field(levels, features, hidden=16, log2_table=10, seed=3):
@@ -68,7 +70,7 @@ def test_encoding_by_hand():
     table[0, 0], table[0, 1] = 1.0, 10.0
     x = np.zeros((4, kernels.BLOCK), F)
     kernels.encode_block(
-        table, np.array([1.0], F), np.zeros(3, F), np.zeros(4, F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x
+        table, np.array([1.0], F), np.zeros(3, F), np.zeros((1, 4), F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x
     )
     # A pixel of 0 rad leaves all levels whole. 0.75·0.5·1 + 0.25·0.5·10 + 0.75·0.5·10 + 0.25·0.5·1 = 5.5
     assert x[:, 0] == pytest.approx([5.5] * 4)
@@ -133,33 +135,122 @@ def scene():
     depth = picture.depth_m.copy()
     depth[60:64, 40:60] = 0  # a patch without depth
     prior = prepare(picture.rgb, depth, pose, 0.02, GeometryConfig(), 2048)
-    return Scene(prior, Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
+    return Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
 
 
-def test_sampled_rays_agree_with_the_reference(scene):
-    prior = scene.prior
-    uniform = np.random.default_rng(2).random((64 * 32, 3), F)
-    points, target = np.zeros((2 * 64 * 32, 3), F), np.zeros((2 * 64 * 32, 4), F)
-    pose = prior.map_from_camera.astype(F)
+@pytest.fixture(scope="module")
+def two_keyframes():
+    """A scene of two keyframes: the older one is darker, half of its picture is masked, its depth is unsure there."""
+    config = GeometryConfig()
+    newest = pose_matrix(0.3, -0.1, 0.05, 0.02, -0.03, 0.7)
+    older = pose_matrix(-1.0, 0.8, 0.0, 0.0, 0.02, -2.0)
+    pictures = [box_room.panorama(pose, 64) for pose in (newest, older)]
+    sigma = np.full(pictures[1].depth_m.shape, 0.04, F)
+    sigma[:20] = 0.08
+    priors = [
+        prepare(pictures[0].rgb, pictures[0].depth_m, newest, 0.02, config, 2048),
+        prepare((pictures[1].rgb * 0.8).astype(np.uint8), pictures[1].depth_m, older, sigma, config, 2048),
+    ]
+    priors[1].usable[:, :64] = 0
+    gains = np.array([[1, 1, 1], [1.25, 1.25, 1.2]], F)
+    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), build_occupancy(priors[0], config), gains)
+
+
+def sampled(scene, uniform, columns, rows, sources):
+    stack, count = StackedPriors.of(scene), 2 * columns * rows
+    points, target, weight = np.zeros((count, 3), F), np.zeros((count, 4), F), np.zeros((count, 2), F)
     march.sample_rays(
-        uniform, 64, 32, prior.rgb, prior.inverse_depth, prior.torn, pose, F(prior.band), points, target
+        uniform, columns, rows, sources, stack.rgb, stack.inverse_depth, stack.torn, stack.usable, stack.trust,
+        stack.map_from_camera, stack.gains, stack.band, points, target, weight,
     )  # fmt: skip
-    expected = reference.sample_rays(torch.from_numpy(uniform), 64, 32, torch_prior(scene, "cpu"))
+    return points, target, weight
+
+
+@pytest.mark.parametrize("name", ["scene", "two_keyframes"])
+def test_sampled_rays_agree_with_the_reference(name, request):
+    scene = request.getfixturevalue(name)
+    uniform = np.random.default_rng(2).random((64 * 32, 3), F)
+    sources = ray_sources(len(scene.priors), 32, 3)
+    ours = sampled(scene, uniform, 64, 32, sources)
+    priors = torch_priors(scene, "cpu")
+    expected = reference.sample_rays(torch.from_numpy(uniform), 64, 32, priors, torch.from_numpy(sources))
     # At an edge a rounding decides which side is nearest: a few points in thousands may differ.
-    same = np.isclose(points, expected[0].numpy(), atol=1e-3).all(axis=1)
+    same = np.isclose(ours[0], expected[0].numpy(), atol=1e-3).all(axis=1)
     assert same.mean() > 0.998
-    np.testing.assert_allclose(target[same], expected[1].numpy()[same], atol=2e-3)
+    np.testing.assert_allclose(ours[1][same], expected[1].numpy()[same], atol=2e-3)
+    assert (ours[2] == expected[2].numpy()).mean() > 0.998
+
+
+def test_rays_of_several_keyframes(two_keyframes):
+    # Points of both keyframes lie on the same walls; colours of the darker one are brought to the newest's exposure;
+    # where it is masked nothing counts, where its depth is unsure it counts a quarter: (0.04 / 0.08)².
+    uniform = np.random.default_rng(2).random((64 * 32, 3), F)
+    older = np.ones(32, np.int32)
+    points, target, weight = sampled(two_keyframes, uniform, 64, 32, older)
+    surface = points.reshape(-1, 2, 64, 3)[:, 0].reshape(-1, 3)
+    gap = np.minimum(np.abs(surface - box_room.ROOM_LOW), np.abs(surface - box_room.ROOM_HIGH)).min(axis=1)
+    assert np.quantile(gap, 0.8) < 0.02
+    assert set(np.unique(weight[:, 0])) == {0, 1}
+    assert weight[:, 0].mean() == pytest.approx(0.5, abs=0.02)
+    assert np.unique(weight[weight[:, 0] > 0, 1]) == pytest.approx([0.25, 1.0])
+    colour = target.reshape(-1, 2, 64, 4)[:, 0, :, :3].reshape(-1, 3)
+    direction = np.sin((np.arange(64) + 0.5) * math.pi / 64)
+    picture = box_room.panorama(two_keyframes.priors[1].map_from_camera, 64).rgb / 255 - 0.5
+    even = (picture.mean(axis=1) * direction[:, None]).sum(axis=0) / direction.sum()
+    assert colour.mean(axis=0) == pytest.approx(even, abs=0.02)
+
+
+def test_half_of_the_rays_are_the_newests():
+    counts = np.zeros((20, 3))
+    for step in range(1, 21):
+        sources = ray_sources(3, 64, step)
+        counts[step - 1] = np.bincount(sources, minlength=3) / 64
+    assert counts.mean(axis=0) == pytest.approx([0.5, 0.25, 0.25], abs=0.01)
+    assert counts.min() > 0.1
+    # Each tile is looked at from each keyframe within few steps.
+    seen = np.stack([ray_sources(3, 64, step) for step in range(1, 21)])
+    assert all(set(seen[:, tile]) == {0, 1, 2} for tile in range(64))
+    assert not ray_sources(1, 64, 5).any()
+
+
+def test_a_scene_checks_its_keyframes(scene, two_keyframes):
+    lattice, grid = scene.lattice, scene.occupancy
+    with pytest.raises(ValueError, match="needs a keyframe"):
+        Scene((), lattice, grid)
+    with pytest.raises(ValueError, match="one size"):
+        Scene((scene.prior, two_keyframes.prior), lattice, grid)
+    with pytest.raises(ValueError, match=r"\(1, 3\)"):
+        Scene((scene.prior,), lattice, grid, np.ones((2, 3), F))
+
+
+def test_a_point_belongs_to_the_keyframe_that_sees_it(two_keyframes):
+    # On a surface of either keyframe the distance is 0 and it agrees; half way to it nothing does.
+    priors = torch_priors(two_keyframes, "cpu")
+    stack = StackedPriors.of(two_keyframes)
+    rng = np.random.default_rng(0)
+    for prior in two_keyframes.priors:
+        cloud = surface_points(prior, math.inf)
+        for share, on_surface in ((1.0, True), (0.5, False)):
+            camera = prior.map_from_camera[:3, 3].astype(F)
+            points = camera + F(share) * (cloud[rng.choice(len(cloud), 300)] - camera)
+            values = [
+                march.nearest_prior(
+                    *p, stack.inverse_depth, stack.torn, stack.known, stack.camera_from_map, stack.band, True
+                )
+                for p in points
+            ]
+            expected = reference.nearest_prior(priors, torch.from_numpy(points))
+            same = np.isclose([v for v, _ in values], expected[0].numpy(), rtol=0.02, atol=0.02)
+            assert same.mean() > 0.97
+            agrees = np.array([a for _, a in values])
+            assert (agrees == expected[1].numpy()).mean() > 0.97
+            assert (agrees[:] > 0).mean() > 0.97 if on_surface else (agrees > 0).mean() < 0.1
 
 
 def test_sampled_rays_lie_on_the_room_and_are_even_by_solid_angle(scene):
-    prior = scene.prior
-    columns, rows = 64, 32
-    uniform = np.random.default_rng(2).random((columns * rows, 3), F)
-    points, target = np.zeros((2 * columns * rows, 3), F), np.zeros((2 * columns * rows, 4), F)
-    pose = prior.map_from_camera.astype(F)
-    march.sample_rays(
-        uniform, columns, rows, prior.rgb, prior.inverse_depth, prior.torn, pose, F(prior.band), points, target
-    )  # fmt: skip
+    uniform = np.random.default_rng(2).random((64 * 32, 3), F)
+    points, _, _ = sampled(scene, uniform, 64, 32, np.zeros(32, np.int32))
+    pose = scene.prior.map_from_camera.astype(F)
     surface = points.reshape(-1, 2, 64, 3)[:, 0].reshape(-1, 3)
     # Each lies on a wall (one coordinate at a limit) or on the box inside.
     gap = np.minimum(np.abs(surface - box_room.ROOM_LOW), np.abs(surface - box_room.ROOM_HIGH)).min(axis=1)
@@ -183,8 +274,13 @@ def test_a_rays_direction_and_colour_by_hand():
     inverse, torn = np.full((32, 64), 0.5, F), np.zeros((32, 64), np.uint8)
     uniform = np.full((64, 3), 0.5, F)
     uniform[:, 2] = 0.75  # half way to the band's far end
-    points, target = np.zeros((128, 3), F), np.zeros((128, 4), F)
-    march.sample_rays(uniform, 8, 8, rgb, inverse, torn, np.eye(4, dtype=F), F(0.1), points, target)
+    points, target, weight = np.zeros((128, 3), F), np.zeros((128, 4), F), np.zeros((128, 2), F)
+    one = np.ones((1, 32, 64), F)
+    march.sample_rays(
+        uniform, 8, 8, np.zeros(1, np.int32), rgb[None], inverse[None], torn[None], one.astype(np.uint8), one / 4,
+        np.eye(4, dtype=F)[None], np.ones((1, 3), F), np.array([0.1], F), points, target, weight,
+    )  # fmt: skip
+    assert weight == pytest.approx(np.tile([1, 0.25], (128, 1)))
     flat = math.sqrt(1 - 0.875**2)
     direction = [flat * math.cos(math.radians(157.5)), flat * math.sin(math.radians(157.5)), 0.875]
     assert points[0] == pytest.approx([2 * d for d in direction], abs=1e-5)
@@ -193,9 +289,13 @@ def test_a_rays_direction_and_colour_by_hand():
     assert target[64] == pytest.approx([0.5, 51 / 255 - 0.5, -0.5, -0.5], abs=1e-6)  # behind the surface: negative
 
 
-@pytest.mark.parametrize(("share", "depth_share"), [(0.0, 0.0), (0.6, 0.5), (1.0, 1.0)])
-def test_rendering_agrees_with_the_reference(scene, share, depth_share):
+@pytest.mark.parametrize(
+    ("name", "share", "depth_share"),
+    [("scene", 0.0, 0.0), ("scene", 0.6, 0.5), ("scene", 1.0, 1.0), ("two_keyframes", 0.6, 0.5)],
+)
+def test_rendering_agrees_with_the_reference(name, share, depth_share, request):
     # A field that has learnt the room a little, drawn by both from aside.
+    scene = request.getfixturevalue(name)
     field_config, train = FieldConfig(log2_table=13), TrainConfig(ray_columns=64, ray_rows=32)
     device = NumbaDevice(field_config, train)
     device.set_scene(scene)
@@ -223,12 +323,13 @@ def test_rendering_agrees_with_the_reference(scene, share, depth_share):
     assert np.quantile(relative, 0.95) < 0.03
 
 
-def test_training_steps_agree_with_the_reference(scene):
+@pytest.mark.parametrize("name", ["scene", "two_keyframes"])
+def test_training_steps_agree_with_the_reference(name, request):
     field_config, train = FieldConfig(levels=4, log2_table=12), TrainConfig(ray_columns=32, ray_rows=16)
     devices = NumbaDevice(field_config, train), TorchDevice(field_config, train, "cpu")
     rng = np.random.default_rng(6)
     for device in devices:
-        device.set_scene(scene)
+        device.set_scene(request.getfixturevalue(name))
     for _ in range(10):
         uniform = rng.random((32 * 16, 3), F)
         ours, theirs = (device.step(uniform, 0.02, 0.005) for device in devices)
@@ -240,7 +341,7 @@ def test_the_march_by_hand():
     # 2 m round the camera, the band 5 %.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
     prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
-    scene = Scene(prior, Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
+    scene = Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)
     for distance in (-1.0, 1.0):
