@@ -144,8 +144,16 @@ class VirtualSpaceConfig:
     """Everything about the virtual space but the bus."""
 
     source: str = "field"
-    """What pictures show: ``field`` (the panorama warped by its depth until the field is better), or ``warp``: the
-    warped panorama alone; nothing is trained."""
+    """What pictures show: ``field`` (the panorama warped by its depth until the field is better), ``warp``: the
+    warped panorama alone, or ``mesh``: a place scanned beforehand (``make_space``); with both nothing is trained."""
+    mesh: str = ""
+    """File of the scanned place (GLB, glTF, PLY or OBJ), with ``source: mesh``."""
+    mesh_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Where the mesh lies in the map (map_from_mesh): x, y, z in metres, yaw in degrees, counter-clockwise."""
+    mesh_max_triangles: PositiveInt = 5_000_000
+    """Meshes with more triangles are refused; one takes 104 bytes, beside the ray caster's tree."""
+    mesh_fit_colours: bool = True
+    """Whether the mesh's colours are multiplied, a factor a colour, to look like the newest keyframe's."""
     device: str = "auto"
     """``auto`` (CUDA where torch finds it, else numba on the CPU), ``cpu``, ``cuda``, or ``torch-cpu`` (slow)."""
     panorama_width: int = 2048
@@ -162,5 +170,8 @@ class VirtualSpaceConfig:
         check_ranges(self)
         devices = ("auto", "cpu", "cuda", "torch-cpu")
         _require(self.device in devices, "device", self.device, "one of " + ", ".join(devices))
-        _require(self.source in ("field", "warp"), "source", self.source, "field or warp")
+        _require(self.source in ("field", "warp", "mesh"), "source", self.source, "field, warp or mesh")
+        _require(self.source != "mesh" or bool(self.mesh), "mesh", self.mesh, "a file with source: mesh")
+        pose = len(self.mesh_pose) == 4 and all(math.isfinite(value) for value in self.mesh_pose)
+        _require(pose, "mesh_pose", self.mesh_pose, "x, y, z in metres and yaw in degrees")
         _require(64 <= self.panorama_width <= 8192, "panorama_width", self.panorama_width, "from 64 to 8192")
