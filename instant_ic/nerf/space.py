@@ -114,6 +114,8 @@ class VirtualSpace:
 
     def __init__(self, config: VirtualSpaceConfig | None = None) -> None:
         self.config = config or VirtualSpaceConfig()
+        if self.config.source == "mesh":
+            raise ValueError("source is mesh: nothing is learnt there; use make_space, which draws the mesh")
         self._device = make_device(self.config)
         self._warning = ""
         self._scene: Scene | None = None
