@@ -298,12 +298,7 @@ class Recorder:
         for waiting in self.snapshots:
             if waiting.state == "waiting":  # one that is about to be written will have this too
                 return waiting
-        name = f"{datetime.now():%Y%m%d_%H%M%S}" + (f"_{_slug(reason)}" if _slug(reason) else "")
-        path, number = self.path / name, 1
-        while path.exists():
-            number += 1
-            path = self.path / f"{name}_{number}"
-        found = Snapshot(path, due_s=time.monotonic() + after_s)
+        found = Snapshot(dated(self.path, reason), due_s=time.monotonic() + after_s)
         self.snapshots.append(found)
         self.tick()
         return found
@@ -540,6 +535,12 @@ class Recorder:
                 self._stop(FAILED, str(error))
 
 
-def _slug(text: str) -> str:
-    """Text as part of a file name."""
-    return "".join(c if c.isalnum() else "_" for c in text.strip())[:40].strip("_")
+def dated(folder: Path, words: str, prefix: str = "") -> Path:
+    """A path in ``folder`` that is free, named by date, time and what of ``words`` a file name can hold."""
+    slug = "".join(c if c.isalnum() else "_" for c in words.strip())[:40].strip("_")
+    name = f"{prefix}{datetime.now():%Y%m%d_%H%M%S}" + (f"_{slug}" if slug else "")
+    path, number = folder / name, 1
+    while path.exists():
+        number += 1
+        path = folder / f"{name}_{number}"
+    return path

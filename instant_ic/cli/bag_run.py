@@ -151,13 +151,15 @@ def snapshot(args: argparse.Namespace) -> int:
 def control(args: argparse.Namespace) -> int:
     """Steers a running recorder or player."""
     arguments = argument_of(args.command, args.value)
-    kinds = ("bag_player",) if arguments else ("bag_recorder",) if args.command == "split" else _STEERED
+    kinds = (
+        ("bag_player",) if arguments else ("bag_recorder",) if args.command in ("split", "record", "stop") else _STEERED
+    )
     node = _node(kinds, args.node)
     result = _call(NodeControl(run_dir(), node.name), args.command, **arguments)
     if args.command == "status":
         print(json.dumps({"node": node.name, **result}, indent=2))
     else:
-        print(f"{node.name}: {args.command}")
+        print(f"{node.name}: {args.command}" + (f" {result['path']}" if args.command in ("record", "stop") else ""))
     return 0
 
 

@@ -1,19 +1,22 @@
-"""Records topics into a rosbag2 folder (MCAP), byte for byte, losses counted; or keeps the last seconds at hand."""
+"""Records topics into a rosbag2 folder (MCAP), byte for byte; or keeps the last seconds, and records when asked."""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, Recorder, RecordOptions, TakeMessage
+from instant_ic.bag.on_demand import OnDemand
+from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, Recorder, RecordOptions, Subscribe, TakeMessage
 from instant_ic.bus import ERROR, OK, RECORD, WARN, Node, NodeError, main, registry
+from instant_ic.bus.node import Subscription
 from instant_ic.bus.transport import Received, Stats
 from instant_ic.msg import Bool, ControlState
 from instant_ic.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Range, check_ranges
@@ -38,6 +41,7 @@ class BagRecorderConfig:
         min_free_mb: stop recording while the disk has less free space, MB.
         start_paused: record only once it is told to resume.
         snapshot: write nothing until asked (``ic bag snapshot``, emergency stop); keep the last seconds in memory.
+            Records into a bag of its own between the commands ``record`` and ``stop`` (the page's button).
         snapshot_seconds: how many.
         snapshot_after_s: how much of what follows the moment goes into the snapshot too, s.
         snapshot_on_estop: write one at each emergency stop.
@@ -91,6 +95,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     name = "bag_recorder"
     live_parameters = ("duration_s", "snapshot_after_s", "snapshot_on_estop")
     recorder: Recorder | None = None
+    on_demand: OnDemand | None = None
     _next_look_s = 0.0
     _seen: tuple[tuple[str, int], ...] = ()
 
@@ -98,10 +103,9 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         """Makes the bag and starts looking for topics."""
         if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
-        choice = TopicChoice(self.config.topics, self.config.exclude)
-        sim_now_ns = self.clock.now_ns if self.use_sim_time else None
+        self._choice = TopicChoice(self.config.topics, self.config.exclude)
         try:
-            self.recorder = Recorder(self.config.folder(), choice, self._listen, sim_now_ns, self.config.options())
+            self.recorder = self._recorder(self.config.folder(), self._listen, self.config.options())
         except BagError as error:
             raise NodeError(str(error)) from None
         if self.config.start_paused:
@@ -112,13 +116,16 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         if self.config.snapshot:
             self.subscribe("/operator/estop", Bool, lambda m: self._on_stop("operator", bool(m.data)))
             self.subscribe("/ic/state", ControlState, lambda m: self._on_stop("arbiter", bool(m.estop)))
+            self.on_demand = OnDemand(self.recorder.path, self._begin)
         self.commands = {
             "pause": self.recorder.pause,
             "resume": self.recorder.resume,
             "toggle": self._toggle,
             "split": self.recorder.split,
             "snapshot": self._snapshot,
-            "status": self.recorder.status,
+            "record": self._record,
+            "stop": self._end,
+            "status": self._status,
         }
         self._began_s = time.monotonic()
         self._discover()
@@ -135,11 +142,31 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             if self.config.duration_s and time.monotonic() >= self._began_s + self.config.duration_s:
                 self.stop()
 
+    def _recorder(self, path: Path, listen: Subscribe, options: RecordOptions) -> Recorder:
+        return Recorder(path, self._choice, listen, self.clock.now_ns if self.use_sim_time else None, options)
+
     def _listen(self, topic: str, take: TakeMessage) -> Stats:
+        return self._take_in(topic, take).raw.stats
+
+    def _take_in(self, topic: str, take: TakeMessage) -> Subscription:
         def forward(message: Received) -> None:
             take(message.topic, message.type_name, message.payload, message.publish_ns, message.publisher)
 
-        return self.subscribe_received(topic, forward, RECORD).raw.stats
+        return self.subscribe_received(topic, forward, RECORD)
+
+    def _begin(self, path: Path) -> tuple[Recorder, Callable[[], None]]:
+        """A recorder with subscriptions of its own, which bring it the latched values; and what ends them."""
+        taken: list[Subscription] = []
+
+        def listen(topic: str, take: TakeMessage) -> Stats:
+            taken.append(self._take_in(topic, take))
+            return taken[-1].raw.stats
+
+        def drop() -> None:
+            for subscription in taken:
+                self.drop(subscription)
+
+        return self._recorder(path, listen, replace(self.config.options(), snapshot_s=0.0)), drop
 
     def _discover(self) -> None:
         assert self.recorder is not None and self.run_dir is not None
@@ -152,14 +179,41 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             if due:
                 self._next_look_s = time.monotonic() + 2.0
                 nodes = registry.list_nodes(self.run_dir) if self.config.parameters else []
-            self.recorder.discover(registry.list_topics(self.run_dir), nodes)
+            topics = registry.list_topics(self.run_dir)
+            self.recorder.discover(topics, nodes)
+            if self.on_demand is not None:
+                self.on_demand.discover(topics, nodes)
         self.recorder.tick()
+        if self.on_demand is not None:
+            self.on_demand.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
         assert self.recorder is not None
         made = self.recorder.snapshot(reason, self.config.snapshot_after_s)
         self.log.info("snapshot %s in %.1f s", made.path, max(0.0, made.due_s - time.monotonic()))
         return {"path": str(made.path)}
+
+    def _record(self, name: str = "") -> dict[str, Any]:
+        assert self.run_dir is not None
+        if self.on_demand is None:
+            raise NodeError("it records all the time: one with snapshot: true records when it is asked")
+        try:
+            path = self.on_demand.start(name)
+        except BagError as error:
+            raise NodeError(str(error)) from None
+        self.on_demand.discover(registry.list_topics(self.run_dir), registry.list_nodes(self.run_dir))
+        self.log.info("recording into %s", path)
+        return {"path": str(path)}
+
+    def _end(self) -> dict[str, Any]:
+        if self.on_demand is None:
+            raise NodeError("it records all the time, until it ends")
+        return {"path": str(self.on_demand.stop())}
+
+    def _status(self) -> dict[str, Any]:
+        assert self.recorder is not None
+        told = self.recorder.status()
+        return told if self.on_demand is None else told | {"recording": self.on_demand.status()}
 
     def _toggle(self) -> None:
         assert self.recorder is not None
@@ -183,7 +237,9 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             words += f", {told['bytes'] / 1e6:.1f} MB in {told['files']} files"
         else:
             words += f", the last {told['cached_s']:g} s at hand ({told['cached_bytes'] / 1e6:.0f} MB)"
-        if self.recorder.state in (FAILED, DISK_FULL):
+        if self.on_demand is not None and (trouble := self.on_demand.trouble()):
+            self.diagnose("bag", ERROR, trouble)
+        elif self.recorder.state in (FAILED, DISK_FULL):
             self.diagnose("bag", ERROR, self.recorder.error)
         elif self.recorder.told.overflow:
             self.diagnose("bag", ERROR, f"{words}; the disk is too slow, left out: {_numbers(told['overflow'])}")
@@ -201,6 +257,8 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             return
         self.spin_once()  # what is already in the queues belongs into the bag
         try:
+            if self.on_demand is not None:
+                self.on_demand.close()
             self.recorder.close()
         except BagError as error:
             self.log.error("%s", error)

@@ -137,12 +137,24 @@ def test_snapshots_on_demand_and_at_an_emergency_stop(talker: Talker, tmp_path: 
         assert done.returncode == 0 and "door_stuck" in done.stdout and "messages" in done.stdout, done.stderr
         talker.estop.publish(Bool(data=True))
         pressed_ns = time.time_ns()
+        begun = talker.ic("bag", "control", "record")
+        assert begun.returncode == 0 and str(folder / "rec_") in begun.stdout, begun.stderr
+        again = talker.ic("bag", "control", "record")
+        assert again.returncode == 1 and "is being recorded already" in again.stderr
+        wait_for(lambda: status(talker)["recording"]["messages"] > 20, "a recording beside it")
+        assert talker.ic("bag", "control", "stop").returncode == 0
+        wait_for(lambda: status(talker)["recording"]["state"] == "idle", "its end")
         wait_for(lambda: list(folder.glob("*_estop/metadata.yaml")), "the snapshot of the stop")
     finally:
         text = end(process)
         talker.estop.publish(Bool(data=False))
     assert process.returncode == 0, text
-    (asked,), (stopped,) = folder.glob("*_door_stuck"), folder.glob("*_estop")
+    (asked,), (stopped,), (recorded,) = folder.glob("*_door_stuck"), folder.glob("*_estop"), folder.glob("rec_*")
+    with BagReader(recorded) as reader:
+        topics = {t.topic: t for t in reader.topics}
+        assert topics["/operator/estop"].count == 1  # latched long before
+        values = [deserialize(m.payload, m.type_name).data for m in reader.messages({"/count"})]
+        assert len(values) >= 20 and values == [values[0] + i for i in range(len(values))]
     with BagReader(asked) as reader:
         topics = {t.topic: t for t in reader.topics}
         # The latched value of long before is in it.

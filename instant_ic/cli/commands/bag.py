@@ -8,7 +8,7 @@ from typing import Any
 from instant_ic.cli import completion
 from instant_ic.cli.errors import UserError
 
-COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "split", "status")
+COMMANDS = ("pause", "resume", "toggle", "step", "rate", "seek", "split", "record", "stop", "status")
 _VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 

@@ -1,0 +1,140 @@
+"""Recordings that are begun and ended on request, one at a time, in one folder."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+from instant_ic.bag.errors import BagError
+from instant_ic.bag.recorder import Recorder, dated
+from instant_ic.bus.registry import NodeInfo, TopicInfo
+
+IDLE, ENDING = "idle", "ending"
+log = logging.getLogger(__name__)
+
+
+class OnDemand:
+    """Begins and ends recordings; used from the node's thread.
+
+    Args:
+        folder: that the bags go into, each a folder of its own, ``rec_DATE_TIME_NAME``.
+        begin: makes the recorder of one bag, and gives what ends its subscriptions.
+    """
+
+    def __init__(self, folder: Path, begin: Callable[[Path], tuple[Recorder, Callable[[], None]]]) -> None:
+        self.folder = folder
+        self.error = ""
+        """Why the last recording could not be completed, in words; empty when it was."""
+        self._begin = begin
+        self._recorder: Recorder | None = None
+        self._drop: Callable[[], None] = lambda: None
+        self._began_s = 0.0
+        self._ended_s: float | None = None
+        self._last: dict[str, Any] = {}
+        self._closing: threading.Thread | None = None
+
+    def start(self, name: str = "") -> Path:
+        """Begins a bag; returns its folder.
+
+        Raises:
+            ValueError: one is being recorded, or the one before is not on the disk yet.
+            BagError: it cannot be made.
+        """
+        if self._recorder is not None:
+            raise ValueError(f"{self._recorder.path} is being {'completed' if self._closing else 'recorded'} already")
+        path = dated(self.folder, name, "rec_")
+        self._recorder, self._drop = self._begin(path)
+        self._began_s, self._ended_s, self.error = time.monotonic(), None, ""
+        return path
+
+    def stop(self) -> Path:
+        """Ends the bag; what waits for the disk is written by and by (``status`` tells).
+
+        Raises:
+            ValueError: nothing is being recorded.
+        """
+        if self._recorder is None or self._closing is not None:
+            raise ValueError("nothing is being recorded")
+        self._drop()
+        self._ended_s = time.monotonic()
+        self._closing = threading.Thread(target=self._close, args=(self._recorder,), name="bag closer", daemon=True)
+        self._closing.start()
+        return self._recorder.path
+
+    def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
+        """Takes in new topics; see :meth:`Recorder.discover`."""
+        if self._recorder is not None and self._closing is None:
+            self._recorder.discover(topics, nodes)
+
+    def tick(self) -> None:
+        """Called now and then, as :meth:`Recorder.tick`; sees when a bag is complete."""
+        if self._recorder is None:
+            return
+        if self._closing is None:
+            self._recorder.tick()
+        elif not self._closing.is_alive():
+            self._last = self._told(self._recorder)
+            self._recorder = self._closing = None
+
+    def trouble(self) -> str:
+        """Why the present bag is not written, or the last one not complete; empty when all is well."""
+        if self._recorder is None or self._closing is not None:
+            return self.error
+        told = self._recorder.status()
+        if told["overflow"]:
+            return f"{told['path']}: the disk is too slow, left out: {sum(told['overflow'].values())} messages"
+        return self._recorder.error
+
+    def status(self) -> dict[str, Any]:
+        """What becomes of the present bag, else of the last.
+
+        ``state`` (``idle``, ``ending`` or the recorder's), ``path``, ``seconds``, ``bytes``, ``messages``, ``error``;
+        ``free_bytes`` of the disk, None where it cannot be asked.
+        """
+        told = {"state": IDLE, **self._last} if self._recorder is None else self._told(self._recorder)
+        try:
+            told["free_bytes"] = shutil.disk_usage(self.folder).free
+        except OSError:
+            told["free_bytes"] = None
+        return told
+
+    def close(self) -> None:
+        """Completes the bag, and waits for it.
+
+        Raises:
+            BagError: the disk does not take it.
+        """
+        if self._recorder is not None and self._closing is None:
+            self._drop()
+            self._close(self._recorder)
+        elif self._closing is not None:
+            self._closing.join(30.0)
+        if self.error:
+            raise BagError(self.error)
+
+    def _close(self, recorder: Recorder) -> None:
+        try:
+            recorder.close()
+            if recorder.failed:
+                self.error = recorder.error or "not everything is in it"
+        except BagError as error:
+            self.error = str(error)
+        if self.error:
+            log.error("%s: %s", recorder.path, self.error)
+
+    def _told(self, recorder: Recorder) -> dict[str, Any]:
+        told = recorder.status()
+        ended = self._closing is not None and not self._closing.is_alive()
+        return {
+            "state": IDLE if ended else ENDING if self._closing is not None else told["state"],
+            "path": told["path"],
+            "seconds": round((self._ended_s or time.monotonic()) - self._began_s, 1),
+            "bytes": told["bytes"],
+            "messages": told["messages"],
+            "error": self.error or told["error"],
+        }
