@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -26,6 +27,7 @@ from instant_ic.msg import (
     Path,
     PoseStamped,
     RenderedView,
+    ShownPictures,
     TwistStamped,
     ViewRequest,
     VspaceStatus,
@@ -35,6 +37,7 @@ from instant_ic.msg import (
     pose_matrix,
     pose_message,
     stamp_ns,
+    to_time,
     twist_stamped,
     twist_values,
 )
@@ -56,6 +59,8 @@ class ConsoleConfig:
     state_rate_hz: Positive = 20.0
     map_rate_hz: Positive = 2.0
     dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0
+    ease_ms: Annotated[float, Range(0, 5000)] = 400.0
+    colour_release_s: Annotated[float, Range(0, 60)] = 6.0
     footprint_length_m: Positive = 0.6
     footprint_width_m: Positive = 0.5
     camera_height_m: float = 1.2
@@ -75,6 +80,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.command_out = self.publisher("/operator/cmd_vel", TwistStamped, qos=SENSOR)
         self.estop_out = self.publisher("/operator/estop", Bool, qos=LATCHED)
         self.request_out = self.publisher("/view/request", ViewRequest, qos=SENSOR)
+        self.shown_out = self.publisher("/view/shown", ShownPictures, qos=SENSOR)
         self.control = self.latest("/ic/state", ControlState, max_age_s=1.0, qos=LATCHED)
         self.vbot = self.latest("/vbot/odom", Odometry, max_age_s=0.5)
         self.trajectory = self.latest("/ic/trajectory", Path, max_age_s=0.5)
@@ -92,6 +98,9 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.views = ViewScheduler(config.view)
         self.mode = self.shown = "none"
         self._picture_ns: int | None = None
+        self._picture_stamp = 0
+        self._view: tuple[int, Any, float] | None = None  # when the newest came, its pose, its delay in seconds
+        self._asked = (0, 0)  # the last request: its number, when it went out
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
         self._diagnoses_seen: dict[str, tuple[int, str, float]] = {}
@@ -99,6 +108,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.tf  # noqa: B018 - subscribes to /tf now, not at the first picture
         page = {
             "dissolve_ms": config.dissolve_ms,
+            "ease_ms": config.ease_ms,
+            "colour_release_s": config.colour_release_s,
             "footprint": [config.footprint_length_m, config.footprint_width_m],
             "camera": [0.0, 0.0, config.camera_height_m],
         }
@@ -144,7 +155,8 @@ class ConsoleNode(Node[ConsoleConfig]):
     def on_panorama(self, message: CompressedImage) -> None:
         """Passes a panorama on as it came, with the camera's pose when it was taken."""
         self._picture_ns = self.clock.steady_ns()
-        stamp = stamp_ns(message)
+        self._picture_stamp = stamp = stamp_ns(message)
+        self.tell_shown()
         map_from_camera = self.lookup("map", "camera", stamp)
         self.server.send_frame(
             FrameKind.PANORAMA,
@@ -162,6 +174,10 @@ class ConsoleNode(Node[ConsoleConfig]):
             self.diagnose("view", ERROR, f"rendered view with a field of view of {message.fov_rad:.3g} rad: dropped")
             return
         self.views.answered(int(message.request_id))
+        came_ns = self.clock.steady_ns()
+        number, asked_ns = self._asked
+        self._view = came_ns, message.pose, (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
+        self.tell_shown()
         self.server.send_frame(
             FrameKind.VIEW,
             {
@@ -170,6 +186,7 @@ class ConsoleNode(Node[ConsoleConfig]):
                 "p": camera[:3, 3].tolist(),
                 "fov": float(message.fov_rad),
                 "confidence": _finite(message.confidence),
+                "mask": base64.b64encode(bytes(message.confidence_png)).decode("ascii"),
                 "render_ms": _finite(message.render_ms),
                 "request_id": int(message.request_id),
             },
@@ -190,14 +207,31 @@ class ConsoleNode(Node[ConsoleConfig]):
         # The look direction is relative to the robot's heading, so of the mount only the place counts.
         map_from_camera = map_from_base @ self.camera_place() @ look.rotation()
         shape = view_shape(look, self.config.view)
+        number = self.views.asked(steady_s)
+        self._asked = number, self.clock.steady_ns()
         self.request_out.publish(
             ViewRequest(
                 header=header("map", now),
-                id=self.views.asked(steady_s),
+                id=number,
                 pose=pose_message(map_from_camera),
                 fov_rad=shape.fov_rad,
                 width=shape.width,
                 height=shape.height,
+            )
+        )
+
+    def tell_shown(self) -> None:
+        """Tells the arbiter what there is to be shown, and how old it is."""
+        now_ns = self.clock.steady_ns()
+        came_ns, pose, delay_s = self._view or (0, pose_message(np.eye(4)), 0.0)
+        self.shown_out.publish(
+            ShownPictures(
+                header=header("map", self.clock.now_ns()),
+                picture_stamp=to_time(self._picture_stamp),
+                picture_age_s=math.inf if self._picture_ns is None else (now_ns - self._picture_ns) / 1e9,
+                view_pose=pose,
+                view_age_s=math.inf if self._view is None else (now_ns - came_ns) / 1e9,
+                view_delay_s=delay_s,
             )
         )
 
@@ -218,13 +252,17 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.mode = "none" if control is None else MODES.get(int(control.mode), "none")
         virtual = control is not None and int(control.shown) == ControlState.SHOWN_VIRTUAL
         self.shown = "none" if control is None else "virtual" if virtual else "real"
-        self.server.show(FrameKind.VIEW if virtual else FrameKind.PANORAMA)
+        if self.mode in ("entering", "returning"):  # the other picture is wanted at any moment
+            self.server.show(FrameKind.VIEW, FrameKind.PANORAMA)
+        else:
+            self.server.show(FrameKind.VIEW if virtual else FrameKind.PANORAMA)
         state: dict[str, Any] = {
             "at_ms": self.server.now_ms(),
             "mode": self.mode,
             "shown": self.shown,
             "robot": _planar(self.robot_pose()),
             "vbot": _planar(self.vbot_pose()) if self.with_vbot() else None,
+            "twist": [_finite(value) or 0.0 for value in self.shown_twist()],
         }
         if control is not None:
             state |= {
@@ -239,7 +277,14 @@ class ConsoleNode(Node[ConsoleConfig]):
                 "time_to_obstacle_s": _finite(control.time_to_obstacle_s),
             }
         self.server.publish("state", state)
+        self.tell_shown()
         self.request_view()
+
+    def shown_twist(self) -> tuple[float, float]:
+        """Velocity (m/s, rad/s) of the robot that is shown, as it is measured."""
+        if self.shown == "virtual" and self.vbot.message is not None:
+            return twist_values(self.vbot.message)
+        return (0.0, 0.0) if self.control.message is None else twist_values(self.control.message.robot_twist)
 
     def send_plan(self) -> None:
         """Tells the page trajectory, path and subgoal, all in the map's frame."""
