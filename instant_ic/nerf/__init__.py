@@ -8,6 +8,8 @@ from .config import (
     TrainConfig,
     VirtualSpaceConfig,
 )
+from .mesh_file import MeshError
+from .mesh_space import MeshSpace, Space, make_space
 from .prior import KeyframeError
 from .saved import SpaceFileError
 from .space import NotReadyError, State, Status, TrainStats, VirtualSpace
@@ -18,10 +20,13 @@ __all__ = [
     "FieldConfig",
     "GeometryConfig",
     "KeyframeError",
+    "MeshError",
+    "MeshSpace",
     "NotReadyError",
     "PanoramaWarp",
     "PictureConfig",
     "ReadinessConfig",
+    "Space",
     "SpaceFileError",
     "State",
     "Status",
@@ -30,4 +35,5 @@ __all__ = [
     "View",
     "VirtualSpace",
     "VirtualSpaceConfig",
+    "make_space",
 ]

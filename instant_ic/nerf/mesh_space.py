@@ -127,7 +127,7 @@ class MeshSpace:
         except ValueError as error:
             raise KeyframeError(str(error)) from error
         width = min(_PROBE_WIDTH, rgb.shape[1])
-        theirs = area_average(rgb, width // 2, width).astype(np.float32).reshape(-1, 3) / 255
+        theirs: Floats = area_average(rgb, width // 2, width).astype(np.float32).reshape(-1, 3) / np.float32(255)
         rays = equirect_rays(pose, width)
         colour, range_m, _ = self._draw(rays)
         ours = colour / self._gain
@@ -136,8 +136,8 @@ class MeshSpace:
             self._fit_colours(theirs[met], ours[met])
         weight = np.sqrt(np.clip(1 - rays.directions[:, 2] ** 2, 0, 1))  # a panorama's rows by solid angle
         if met.any():
-            error = np.mean((np.clip(ours[met] * self._gain, 0, 1) - theirs[met]) ** 2, axis=1)
-            self._mse = float(np.average(error, weights=weight[met]))
+            squared = np.mean((np.clip(ours[met] * self._gain, 0, 1) - theirs[met]) ** 2, axis=1)
+            self._mse = float(np.average(squared, weights=weight[met]))
         else:
             self._mse = math.nan
         self._variance = Texture.of(rgb).variance

@@ -16,6 +16,8 @@ def warm_up(config: VirtualSpaceConfig) -> None:
 
     About 8 s of CPU on the first run of an installation, below 1 s after it.
     """
+    if config.source == "mesh":  # draws its first picture as it is made
+        return
     small = dataclasses.replace(
         config,
         field=dataclasses.replace(config.field, log2_table=10),

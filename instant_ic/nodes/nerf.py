@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
 import sys
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import cv2
@@ -29,7 +31,7 @@ from instant_ic.msg import (
     pose_message,
     to_time,
 )
-from instant_ic.nerf import KeyframeError, State, Status, View, VirtualSpace, VirtualSpaceConfig
+from instant_ic.nerf import KeyframeError, Space, State, Status, View, VirtualSpaceConfig, make_space
 from instant_ic.nerf.warm_up import warm_up
 from instant_ic.ranges import Percent, Positive, PositiveInt, Range, check_ranges
 
@@ -99,13 +101,14 @@ class NerfNode(Node[NerfConfig]):
     )
 
     def setup(self) -> None:
-        self.space: VirtualSpace | None = None  # touched by the worker alone
+        self.space: Space | None = None  # touched by the worker alone
         self.keyframe: Any = None  # newest that the space has taken
         self.shown: Any = None  # the one that pictures show: the one before while the newest is learnt
         self.status: Status | None = None
         self.waiting_keyframe: Any = None
         self.waiting_request: Any = None
         self.job: Job | None = None
+        self.warned = False
         self.last_drew = False
         self.failure = ""
         self.keyframe_ns = self.ready_ns = 0
@@ -172,7 +175,7 @@ class NerfNode(Node[NerfConfig]):
 
     def draw(self, request: Any) -> None:
         pixels = int(request.width) * int(request.height)
-        if self.keyframe is None:
+        if self.state() == State.EMPTY:
             self.diagnose("view", WARN, "a view was asked for, but no keyframe has come yet")
         elif pixels > self.config.max_view_pixels:
             words = f"{request.width} x {request.height} asked for, max_view_pixels is {self.config.max_view_pixels}"
@@ -205,7 +208,7 @@ class NerfNode(Node[NerfConfig]):
             if not self.lockstep:
                 self.yield_to_others()
                 warm_up(self.config.space)
-            self.space = VirtualSpace(self.config.space)
+            self.space = make_space(self.config.space)
             return Outcome(job)
         assert self.space is not None
         if job.kind == "keyframe":
@@ -228,7 +231,7 @@ class NerfNode(Node[NerfConfig]):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self.config.train_nice)
 
     @staticmethod
-    def take_keyframe(space: VirtualSpace, keyframe: Any) -> None:
+    def take_keyframe(space: Space, keyframe: Any) -> None:
         if not keyframe.fit:
             raise KeyframeError(f"its depth is not fit: {keyframe.message or 'no reason given'}")
         data = np.asarray(keyframe.panorama.data, np.uint8)
@@ -248,8 +251,9 @@ class NerfNode(Node[NerfConfig]):
         self.job = None
         kind = outcome.job.kind
         self.status = outcome.status
-        if self.status is not None and self.status.warning:
-            self.diagnose("device", WARN, self.status.warning)
+        if self.status is not None and (self.status.warning or self.warned):
+            self.warned = bool(self.status.warning)
+            self.diagnose("device", WARN if self.warned else OK, self.status.warning or self.status.device)
         if outcome.error is not None:
             self.on_error(kind, outcome.error)
         elif kind == "keyframe":
@@ -274,7 +278,7 @@ class NerfNode(Node[NerfConfig]):
             self.publish_status()
         else:
             self.diagnose(kind, ERROR, words)
-        if type(error).__name__ != "OutOfMemoryError":  # that is no bug, and is told
+        if type(error).__name__ not in ("OutOfMemoryError", "DeviceError", "MeshError"):  # no bugs, and told
             self.fault(f"virtual space, {kind}", error)
 
     def on_keyframe_taken(self, outcome: Outcome) -> None:
@@ -298,14 +302,15 @@ class NerfNode(Node[NerfConfig]):
         # Wall time would make a replay differ from run to run.
         self.render_ms = 0.0 if self.lockstep else outcome.elapsed_ms
         self.drawn_ns.append(now)
-        self.expected_psnr_db, self.unseen_share = view.expected_psnr_db, view.unseen_share
+        expected = view.expected_psnr_db
+        self.expected_psnr_db, self.unseen_share = 0.0 if math.isnan(expected) else expected, view.unseen_share
         self.diagnose("view", OK, f"{request.width} x {request.height} in {self.render_ms:.0f} ms")
         image = compressed_image_message(outcome.jpeg, "map", now)
         self.view_out.publish(
             RenderedView(
                 header=header("map", now),
                 request_id=request.id,
-                keyframe_id=self.shown.id,
+                keyframe_id=0 if self.shown is None else self.shown.id,
                 pose=request.pose,
                 fov_rad=request.fov_rad,
                 width=request.width,
@@ -323,16 +328,20 @@ class NerfNode(Node[NerfConfig]):
     def state(self) -> State:
         if self.failure:
             return State.FAILED
-        return State.EMPTY if self.status is None or self.keyframe is None else self.status.state
+        if self.status is None or (self.keyframe is None and self.config.space.source != "mesh"):
+            return State.EMPTY
+        return self.status.state
 
     def words(self) -> str:
         if self.failure:
             return self.failure
         if self.status is None:
             return "warming up: kernels are being compiled"
+        space = self.config.space
+        if space.source == "mesh":
+            return f"the scanned place {Path(space.mesh).name}; nothing is trained (source: mesh)"
         if self.keyframe is None:
             return "waiting for the first keyframe"
-        space = self.config.space
         if space.source == "warp":
             return "the panorama warped by its depth; nothing is trained (source: warp)"
         if self.status.converged:
@@ -372,6 +381,8 @@ class NerfNode(Node[NerfConfig]):
             device="" if status is None else status.device,
             message=self.words(),
         )
+        if status is not None and self.config.space.source == "mesh":
+            message.ready_radius_m = status.ready_radius_m
         if status is not None and keyframe is not None:
             message.keyframe_id = keyframe.id
             message.keyframe_pose = keyframe.pose
