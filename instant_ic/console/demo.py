@@ -7,6 +7,7 @@ sketch of the method that lets the page be tried; the real thing is instant_ic.c
 from __future__ import annotations
 
 import argparse
+import base64
 import logging
 import math
 import threading
@@ -42,16 +43,23 @@ class DemoConfig:
 class Demo:
     """A backend with a robot of its own. ``start`` and ``stop`` run it beside a server."""
 
-    def __init__(self, server_config: ServerConfig, config: DemoConfig | None = None) -> None:
+    def __init__(
+        self,
+        server_config: ServerConfig,
+        config: DemoConfig | None = None,
+        page_values: dict[str, float] | None = None,
+    ) -> None:
         self.config = config or DemoConfig()
-        page = {"dissolve_ms": 250, "footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
-        self.server = ConsoleServer(self, server_config, page)
+        page = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
+        self.server = ConsoleServer(self, server_config, page | (page_values or {}))
         self.commands: list[tuple[float, float]] = []
         self.look = Look()
         self.estop = False
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
         self.pictures = True
+        self.tint = (1.0, 1.0, 1.0)  # of the rendered view, blue, green, red
+        self.keyframe: Pose | None = None  # where the virtual space was learnt: what could not be seen there is noise
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
@@ -63,6 +71,7 @@ class Demo:
         self._transitions = 0
         self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
+        self._noise = np.random.default_rng(0)
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self._drawn, self._drawn_from = b"", np.zeros((4, 4))  # the last panorama, and where the camera was
         self._stop = threading.Event()
@@ -188,6 +197,7 @@ class Demo:
             {
                 "at_ms": self.server.now_ms(),
                 "mode": self.mode,
+                "shown": "virtual" if self.mode == "virtual" else "real",
                 "reason": self.reason,
                 "estop": self.estop,
                 "blocked": False,
@@ -196,6 +206,7 @@ class Demo:
                 "vbot": self.vbot.round(4).tolist() if self.mode == "virtual" else None,
                 "command": [v, w],
                 "applied": [v, w],
+                "twist": [v, w],
             },
         )
         self.server.show(FrameKind.VIEW if self.mode == "virtual" else FrameKind.PANORAMA)
@@ -224,13 +235,21 @@ class Demo:
         shape = view_shape(look, self.config.view)
         camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
         directions = _turned(perspective_directions(shape.width, shape.height, shape.fov_rad), camera)
-        picture = demo_world.shade(_position(camera), directions)
+        picture, mask = demo_world.shade(_position(camera), directions), b""
+        if self.keyframe is not None:
+            seen = demo_world.seen(_position(_camera(self.keyframe)), _position(camera), directions)
+            picture = np.where(seen[..., None] > 0, picture, self._noise.integers(0, 256, picture.shape)).astype(
+                np.uint8
+            )
+            mask = _mask(seen)
+        picture = np.clip(picture * np.array(self.tint), 0, 255).astype(np.uint8)
         header = {
             "captured_ms": captured_ms,
             "q": quaternion_from_matrix(camera).tolist(),
             "p": camera[:3, 3].tolist(),
             "fov": shape.fov_rad,
             "confidence": 0.9,
+            "mask": base64.b64encode(mask).decode("ascii"),
             "render_ms": 20.0,
             "request_id": request_id,
         }
@@ -259,6 +278,17 @@ def _jpeg(picture: NDArray[np.uint8]) -> bytes:
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     if not ok:
         raise ValueError(f"JPEG encoder refused a picture of shape {picture.shape}")
+    return bytes(data.tobytes())
+
+
+def _mask(seen: NDArray[np.float32]) -> bytes:
+    import cv2
+
+    height, width = seen.shape
+    small = cv2.resize(seen, (64, max(1, round(64 * height / width))), interpolation=cv2.INTER_AREA)
+    ok, data = cv2.imencode(".png", np.rint(255 * small).astype(np.uint8))
+    if not ok:
+        raise ValueError(f"PNG encoder refused a mask of shape {small.shape}")
     return bytes(data.tobytes())
 
 

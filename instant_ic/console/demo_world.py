@@ -38,6 +38,25 @@ def shade(origin: tuple[float, float, float], directions: Array) -> NDArray[np.u
     eye = np.asarray(origin, np.float32)
     shape = directions.shape[:-1]
     rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
+    nearest, axis, material = _cast(eye, rays)
+    points = eye + rays * nearest[:, None]
+    colour = _colours(points, axis, material)
+    fog = np.exp(-nearest / 22)[:, None]
+    return np.clip(255 * colour * fog, 0, 255).astype(np.uint8).reshape(*shape, 3)
+
+
+def seen(keyframe: tuple[float, float, float], origin: tuple[float, float, float], directions: Array) -> Array:
+    """1 where what stands along ``directions`` (..., 3) from ``origin`` can be seen from ``keyframe`` too, else 0."""
+    eye, other = np.asarray(origin, np.float32), np.asarray(keyframe, np.float32)
+    rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
+    way = eye + rays * _cast(eye, rays)[0][:, None] - other
+    distance = np.linalg.norm(way, axis=1)
+    reached = _cast(other, way / distance[:, None])[0] > distance - 0.02
+    return reached.astype(np.float32).reshape(directions.shape[:-1])
+
+
+def _cast(eye: Array, rays: Array) -> tuple[Array, NDArray[np.int8], NDArray[np.int8]]:
+    """Distance, axis of the face and material of what unit ``rays`` (N, 3) meet first."""
     inverse = 1.0 / np.where(np.abs(rays) < 1e-6, np.float32(1e-6), rays)
     nearest = np.full(len(rays), np.inf, np.float32)
     axis = np.zeros(len(rays), np.int8)
@@ -53,10 +72,7 @@ def shade(origin: tuple[float, float, float], directions: Array) -> NDArray[np.u
             distance, face = near.max(axis=1), near.argmax(axis=1)
             hit = (distance < far.min(axis=1)) & (distance > 0) & (distance < nearest)
         nearest[hit], axis[hit], material[hit] = distance[hit], face[hit], box.material
-    points = eye + rays * nearest[:, None]
-    colour = _colours(points, axis, material)
-    fog = np.exp(-nearest / 22)[:, None]
-    return np.clip(255 * colour * fog, 0, 255).astype(np.uint8).reshape(*shape, 3)
+    return nearest, axis, material
 
 
 def _colours(points: Array, axis: NDArray[np.int8], material: NDArray[np.int8]) -> Array:

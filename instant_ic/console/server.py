@@ -105,7 +105,7 @@ class ConsoleServer:
         self._next_number = 1
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}
-        self._foreground = FrameKind.PANORAMA
+        self._foreground = frozenset({FrameKind.PANORAMA})
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._gate_wake = asyncio.Event()
@@ -167,9 +167,9 @@ class ConsoleServer:
         """Sends a picture or map to every client; only the newest of a kind waits."""
         self._call(self._send_frame, kind, PendingFrame(header, payload))
 
-    def show(self, kind: FrameKind) -> None:
-        """Says which of PANORAMA and VIEW the page shows; the other is sent rarely."""
-        self._call(self._show, kind)
+    def show(self, *kinds: FrameKind) -> None:
+        """Says which of PANORAMA and VIEW the page shows, or soon will; what is not named is sent rarely."""
+        self._call(self._show, frozenset(kinds))
 
     def _call(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is None:
@@ -505,12 +505,12 @@ class ConsoleServer:
         for session in self._sessions.values():
             session.put_frame(kind, frame)
 
-    def _show(self, kind: FrameKind) -> None:
-        if kind is self._foreground:
+    def _show(self, kinds: frozenset[FrameKind]) -> None:
+        if kinds == self._foreground:
             return
-        self._foreground = kind
+        self._foreground = kinds
         for session in self._sessions.values():
-            session.set_foreground(kind, 1.0 / self.config.background_picture_hz)
+            session.set_foreground(kinds, 1.0 / self.config.background_picture_hz)
 
 
 def _sign_in_page(text: str, status: int) -> web.Response:

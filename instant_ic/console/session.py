@@ -43,7 +43,7 @@ class Session:
         self._sent_frames: dict[FrameKind, int] = dict.fromkeys(FrameKind, 0)
         self._unacknowledged: dict[FrameKind, int] = {}
         self._last_sent: dict[FrameKind, float] = {}
-        self._foreground = FrameKind.PANORAMA
+        self._foreground: frozenset[FrameKind] = frozenset({FrameKind.PANORAMA})
         self._background_period_s = 0.0
         self._wake = asyncio.Event()
 
@@ -62,9 +62,9 @@ class Session:
         self._frames[kind] = frame
         self._wake.set()
 
-    def set_foreground(self, kind: FrameKind, background_period_s: float) -> None:
-        """Pictures of the other kind go out once in ``background_period_s`` only."""
-        self._foreground = kind
+    def set_foreground(self, kinds: frozenset[FrameKind], background_period_s: float) -> None:
+        """Pictures of another kind go out once in ``background_period_s`` only."""
+        self._foreground = kinds
         self._background_period_s = background_period_s
         self._wake.set()
 
@@ -101,6 +101,6 @@ class Session:
         return None
 
     def _held_back(self, kind: FrameKind, now: float) -> bool:
-        if kind is self._foreground or kind not in (FrameKind.PANORAMA, FrameKind.VIEW):
+        if kind in self._foreground or kind not in (FrameKind.PANORAMA, FrameKind.VIEW):
             return False
         return now - self._last_sent.get(kind, float("-inf")) < self._background_period_s

@@ -50,8 +50,8 @@ class FakeServer:
     def send_frame(self, kind, header, payload):
         self.frames.append((kind, header, payload))
 
-    def show(self, kind):
-        self.shown = kind
+    def show(self, *kinds):
+        self.shown = kinds
 
     def stop(self):
         pass
@@ -172,7 +172,7 @@ def test_state_tells_mode_poses_and_reason(setup):
     assert state["robot"] == pytest.approx([1, 2, math.pi / 2], abs=1e-3)
     assert state["vbot"] is None
     assert state["time_to_obstacle_s"] is None  # inf is no JSON
-    assert server.shown is FrameKind.PANORAMA
+    assert server.shown == (FrameKind.PANORAMA,)
 
 
 def test_silent_arbiter_is_no_mode(setup):
@@ -197,7 +197,7 @@ def test_virtual_mode_asks_for_the_view_from_the_vbot_where_the_operator_looks(s
     np.testing.assert_allclose(map_from_camera[:3, 3], [3, 2, 1.5], atol=1e-6)  # mount of /tf_static
     np.testing.assert_allclose(map_from_camera[:3, 0], [1, 0, 0], atol=1e-6)  # north, then 90° right: east
     assert request.fov_rad >= 1.2 * 1.15 - 1e-6
-    assert server.shown is FrameKind.VIEW
+    assert server.shown == (FrameKind.VIEW,)
     assert server.texts["state"]["vbot"] == pytest.approx([3, 2, math.pi / 2], abs=1e-3)
 
 

@@ -9,7 +9,7 @@ import { COSTMAP, Link, MAP } from "./link.js";
 import { Look } from "./look.js";
 import { radians, transpose } from "./math.js";
 import { MiniMap } from "./minimap.js";
-import { Pictures } from "./pictures.js";
+import { Pictures, shows } from "./pictures.js";
 import { GlViewer } from "./viewer.js";
 
 const LOOK_MS = 100; // look direction sent at most this often
@@ -31,7 +31,7 @@ hud.mark("quality", viewer.slow ? "plain" : "full");
 const pictures = new Pictures(viewer, link);
 const minimap = new MiniMap(byId("map-canvas"));
 
-let page = { footprint: [0.6, 0.5], camera: [0, 0, 1.2], dissolve_ms: 250 };
+let page = { footprint: [0.6, 0.5], camera: [0, 0, 1.2], dissolve_ms: 250, ease_ms: 400, colour_release_s: 6 };
 let state = null, session = { driver: "none", clients: 0, estop: false };
 let plan = { trajectory: [], path: [], subgoal: null };
 let everConnected = false;
@@ -73,6 +73,8 @@ link.addEventListener("message", ({ detail: message }) => {
       mayDrive = message.may_drive;
       document.body.dataset.mayDrive = mayDrive;
       pictures.dissolveMs = reducedMotion.matches ? 0 : page.dissolve_ms;
+      pictures.motion.easeMs = reducedMotion.matches ? 0 : page.ease_ms;
+      pictures.colourReleaseMs = 1000 * page.colour_release_s;
       drive.limits = { linear: message.max_linear, angular: message.max_angular };
       break;
     case "state":
@@ -242,9 +244,8 @@ function sendLook(tanHalf, now) {
 }
 
 function cameraPosition() {
-  const pose = (state?.shown ?? state?.mode) === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
-  if (!pose) return null;
-  const [x, y, yaw] = pose, [cx, cy, cz] = page.camera;
+  if (!pictures.motion.pose) return null;
+  const [x, y, yaw] = pictures.motion.pose, [cx, cy, cz] = page.camera;
   return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
 }
 
@@ -284,6 +285,9 @@ function drawPicture(scene) {
   lastPicture = key;
   pictures.changed = false;
   viewer.draw(scene);
+  // For whoever measures: which picture was drawn, and from where.
+  const { motion, view, panorama } = pictures, shown = shows(state);
+  dispatchEvent(new CustomEvent("drawn", { detail: { shown, pose: motion.pose, blend: scene.blend, view, panorama } }));
 }
 
 function drawOverlay(scene, tanHalf) {

@@ -1,7 +1,11 @@
 // The feedback picture without WebGL: a crop of the panorama (cylinder in place of a plane, so lines bend
 // a little), and the rendered view moved and scaled. Aims right in the middle of the picture.
 
+import { plain } from "./colour.js";
 import { rotate } from "./math.js";
+import { cells, SAMPLE, SAMPLE_FINE } from "./viewer.js";
+
+const SOFT_PIXELS = 16; // of the view, to one of its blurred copy
 
 export class FlatViewer {
   constructor(canvas) {
@@ -10,35 +14,54 @@ export class FlatViewer {
     this.name = "canvas";
     this.slow = true;
     this.lost = false;
-    this._panorama = null;
+    this._panorama = null; // {bitmap, mask, finished, colour}
     this._view = null;
   }
 
   setPanorama(bitmap) {
-    this._panorama?.close();
-    this._panorama = bitmap;
+    this._panorama = renewed(this._panorama, bitmap, null);
   }
 
-  setView(bitmap) {
-    this._view?.close();
-    this._view = bitmap;
+  /** `mask`: small grey picture of where the view is sure; null: everywhere. */
+  setView(bitmap, mask = null) {
+    this._view = renewed(this._view, bitmap, mask);
   }
 
   draw(scene) {
-    const context = this.context;
+    const { width, height } = this.canvas;
+    this._draw(this.context, width, height, scene, scene.blend);
+  }
+
+  /** See GlViewer.sample; here the weights are 0 outside of the view, else 1. */
+  sample(scene) {
+    this._sampled ??= new OffscreenCanvas(SAMPLE[0] * SAMPLE_FINE, SAMPLE[1] * SAMPLE_FINE);
+    const { width, height } = this._sampled;
+    const context = this._sampled.getContext("2d", { willReadFrequently: true });
+    const raw = { ...scene, panoramaColour: plain, viewColour: plain };
+    const read = (draw) => {
+      context.clearRect(0, 0, width, height);
+      draw();
+      return cells(context.getImageData(0, 0, width, height).data);
+    };
+    const panorama = read(() => this._draw(context, width, height, raw, 0));
+    const view = read(() => this._drawView(context, width, height, raw));
+    return { 1: panorama.colours, 2: view.colours, weights: view.alpha.map((alpha) => (alpha > 0.99 ? 1 : 0)) };
+  }
+
+  _draw(context, width, height, scene, blend) {
     context.globalAlpha = 1;
     context.fillStyle = "#090b0e";
-    context.fillRect(0, 0, this.canvas.width, this.canvas.height);
-    if (this._panorama) this._drawPanorama(scene);
-    if (this._view && scene.blend > 0) {
-      context.globalAlpha = scene.blend;
-      this._drawView(scene);
+    context.fillRect(0, 0, width, height);
+    if (this._panorama) this._drawPanorama(context, width, height, scene);
+    if (this._view && blend > 0) {
+      context.globalAlpha = blend;
+      this._drawView(context, width, height, scene);
       context.globalAlpha = 1;
     }
   }
 
-  _drawPanorama(scene) {
-    const { width, height } = this.canvas, image = this._panorama;
+  _drawPanorama(context, width, height, scene) {
+    const image = finished(this._panorama, scene.panoramaColour);
     const [x, y, z] = rotate(scene.panoramaFromLook, [1, 0, 0]);
     const centreU = 0.5 - Math.atan2(y, x) / (2 * Math.PI);
     const centreV = 0.5 - Math.asin(z) / Math.PI;
@@ -48,11 +71,10 @@ export class FlatViewer {
     const turn = width / spanU, sheet = height / spanV;
     const top = height / 2 - centreV * sheet;
     for (const shift of [-1, 0, 1])
-      this.context.drawImage(image, width / 2 - (centreU + shift) * turn, top, turn, sheet);
+      context.drawImage(image, width / 2 - (centreU + shift) * turn, top, turn, sheet);
   }
 
-  _drawView(scene) {
-    const { width, height } = this.canvas;
+  _drawView(context, width, height, scene) {
     // Where the rendered view's axis stands in the look frame (viewFromLook's first row).
     const axis = scene.viewFromLook.slice(0, 3);
     if (axis[0] <= 0.1) return;
@@ -60,6 +82,58 @@ export class FlatViewer {
     const viewHeight = (height * scene.viewTanHalf[1]) / scene.tanHalf[1];
     const x = width / 2 - ((axis[1] / axis[0]) * width) / 2 / scene.tanHalf[0];
     const y = height / 2 - ((axis[2] / axis[0]) * height) / 2 / scene.tanHalf[1];
-    this.context.drawImage(this._view, x - viewWidth / 2, y - viewHeight / 2, viewWidth, viewHeight);
+    context.drawImage(finished(this._view, scene.viewColour), x - viewWidth / 2, y - viewHeight / 2, viewWidth, viewHeight);
+  }
+}
+
+function renewed(old, bitmap, mask) {
+  old?.bitmap.close();
+  old?.mask?.close();
+  return { bitmap, mask, finished: null, colour: plain };
+}
+
+/** The picture in its colour, soft where the mask tells that nobody has seen; made once a picture and colour. */
+function finished(picture, colour) {
+  if (!picture.mask && colour === plain) return picture.bitmap;
+  if (picture.finished && sameColour(picture.colour, colour)) return picture.finished;
+  const { width, height } = picture.bitmap;
+  const canvas = new OffscreenCanvas(width, height);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.imageSmoothingQuality = "high";
+  const pixels = (image) => {
+    context.drawImage(image, 0, 0, width, height);
+    return context.getImageData(0, 0, width, height);
+  };
+  const image = pixels(picture.bitmap), data = image.data;
+  if (picture.mask) soften(data, pixels(blurred(picture.bitmap)).data, pixels(picture.mask).data);
+  for (let i = 0; i < data.length; i += 4)
+    for (let channel = 0; channel < 3; channel++)
+      data[i + channel] = data[i + channel] * colour.gain[channel] + 255 * colour.offset[channel]; // clamped by its type
+  context.putImageData(image, 0, 0);
+  picture.finished = canvas;
+  picture.colour = colour;
+  return canvas;
+}
+
+const sameColour = (a, b) =>
+  a.gain.every((gain, i) => Math.abs(gain - b.gain[i]) < 0.004) &&
+  a.offset.every((offset, i) => Math.abs(offset - b.offset[i]) < 0.002);
+
+function blurred(bitmap) {
+  const small = new OffscreenCanvas(Math.ceil(bitmap.width / SOFT_PIXELS), Math.ceil(bitmap.height / SOFT_PIXELS));
+  const context = small.getContext("2d");
+  context.imageSmoothingQuality = "high";
+  context.drawImage(bitmap, 0, 0, small.width, small.height);
+  return small;
+}
+
+/** Mixes the blurred, paler picture in where the mask is dark. */
+function soften(data, soft, mask) {
+  for (let i = 0; i < data.length; i += 4) {
+    const seen = mask[i] / 255;
+    if (seen > 0.996) continue;
+    const grey = 0.3 * soft[i] + 0.59 * soft[i + 1] + 0.11 * soft[i + 2];
+    for (let channel = 0; channel < 3; channel++)
+      data[i + channel] = seen * data[i + channel] + (1 - seen) * (soft[i + channel] + grey) / 2;
   }
 }

@@ -22,7 +22,10 @@ export class Pictures {
     this.changed = true;
     this.motion = new Motion();
     this._virtual = false;
-    this._since = 0; // when the shown robot last changed, by the server's clock
+    // Since when pictures of each kind have been made where the shown robot is; by the server's clock.
+    this._since = { [PANORAMA]: 0, [VIEW]: 0 };
+    this._nearVbot = false;
+    this._changedAt = 0;
     this._toward = 0;
     this._colours = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
     this._colouredAt = 0;
@@ -115,10 +118,14 @@ export class Pictures {
   /** Goes on with the dissolve; true when one starts from a picture that was shown alone. */
   _step(state, elapsedMs) {
     const virtual = shows(state) === "virtual";
-    if (virtual !== this._virtual) {
-      this._virtual = virtual;
-      this._since = state?.at_ms ?? 0;
-    }
+    const at = state?.at_ms ?? 0;
+    if (!virtual && this._virtual) this._since[PANORAMA] = this._changedAt = at;
+    if (virtual && !this._virtual) this._changedAt = at;
+    this._virtual = virtual;
+    // While the virtual space is entered, views are made at the v-bot's pose already.
+    const nearVbot = virtual || state?.mode === "entering";
+    if (nearVbot && !this._nearVbot) this._since[VIEW] = at;
+    this._nearVbot = nearVbot;
     // A stop shows the real view, however old; so does the loss of the controller.
     const waits = virtual || state?.mode === "real";
     const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
@@ -137,7 +144,7 @@ export class Pictures {
   _fits(kind) {
     const header = kind === VIEW ? this.view : this.panorama;
     if (!header) return kind === PANORAMA;
-    return header.captured_ms >= this._since || this.link.serverNow() - this._since > WAIT_MS[kind];
+    return header.captured_ms >= this._since[kind] || this.link.serverNow() - this._changedAt > WAIT_MS[kind];
   }
 
   /** Gives the picture that comes the colours of the one that goes, as both show the same place. */
@@ -158,7 +165,7 @@ export class Pictures {
 
   /** Follows the shown robot between the state messages. */
   _follow(state, elapsedMs, now) {
-    const robot = shows(state);
+    const robot = shows(state) === "virtual" ? "virtual" : "real";
     const pose = robot === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
     const age = state ? (this.link.serverNow() ?? state.at_ms) - state.at_ms : 0;
     this.motion.follow(robot, pose, state?.twist ?? [0, 0], age, elapsedMs, now);

@@ -12,15 +12,20 @@ const FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 screen;
 out vec4 colour;
-uniform sampler2D panorama, view;
+uniform sampler2D panorama, view, mask;
 uniform bool hasPanorama;
 uniform mat3 panoramaFromLook, viewFromLook;
 uniform vec2 tanHalf;      // of the shown field of view
 uniform vec2 viewTanHalf;  // of the rendered view
 uniform vec2 viewSize;     // pixels
 uniform float blend;       // 0 camera, 1 virtual space
+uniform bool hasMask;
+uniform int only;          // 0 the picture; for samples: 1 the panorama, 2 the view with its confidence as alpha
+uniform vec3 panoramaGain, panoramaOffset, viewGain, viewOffset;
 const float PI = 3.14159265358979;
 const vec3 NIGHT = vec3(0.035, 0.043, 0.055);
+const vec3 GREY = vec3(0.30, 0.59, 0.11);
+const float SOFT_LEVEL = 4.0; // of the view's pyramid, for what nobody has seen
 
 vec3 fromPanorama(vec3 direction) {
   if (!hasPanorama) return NIGHT;
@@ -31,7 +36,8 @@ vec3 fromPanorama(vec3 direction) {
 }
 
 // Cubic B-spline by four bilinear look-ups: a small view enlarged stays soft, without squares.
-vec3 smoothView(vec2 uv) {
+vec3 smoothView(vec2 uv, float level) {
+  vec2 viewSize = max(floor(viewSize / exp2(level)), 1.0);
   vec2 p = uv * viewSize - 0.5;
   vec2 i = floor(p), f = p - i;
   vec2 f2 = f * f, f3 = f2 * f;
@@ -42,31 +48,55 @@ vec3 smoothView(vec2 uv) {
   vec2 low = w0 + w1, high = w2 + w3;
   vec2 a = (i - 0.5 + w1 / low) / viewSize, b = (i + 1.5 + w3 / high) / viewSize;
   return mix(
-    mix(texture(view, vec2(a.x, a.y)), texture(view, vec2(b.x, a.y)), high.x),
-    mix(texture(view, vec2(a.x, b.y)), texture(view, vec2(b.x, b.y)), high.x), high.y).rgb;
+    mix(textureLod(view, vec2(a.x, a.y), level), textureLod(view, vec2(b.x, a.y), level), high.x),
+    mix(textureLod(view, vec2(a.x, b.y), level), textureLod(view, vec2(b.x, b.y), level), high.x), high.y).rgb;
+}
+
+// What was seen is sharp; the rest is guessed from around it, so it is shown blurred and paler.
+vec3 fromView(vec2 uv) {
+  float seen = hasMask ? smoothstep(0.0, 1.0, texture(mask, uv).r) : 1.0;
+  vec3 result = seen > 0.004 ? smoothView(uv, 0.0) : vec3(0.0);
+  if (seen < 0.996) {
+    vec3 soft = smoothView(uv, SOFT_LEVEL);
+    result = mix(mix(soft, vec3(dot(soft, GREY)), 0.5), result, seen);
+  }
+  return result;
 }
 
 void main() {
   vec3 direction = normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y));
-  vec3 real = fromPanorama(direction);
+  vec3 real = only == 2 ? NIGHT : fromPanorama(direction);
+  if (only == 1) {
+    colour = vec4(real, 1.0);
+    return;
+  }
+  real = real * panoramaGain + panoramaOffset;
   vec3 result = real;
   if (blend > 0.0) {
     // Beyond the rendered view's edge the camera's picture goes on, dim and grey.
-    vec3 around = mix(NIGHT, vec3(dot(real, vec3(0.30, 0.59, 0.11))), 0.35);
+    vec3 around = mix(NIGHT, vec3(dot(real, GREY)), 0.35);
     vec3 d = viewFromLook * direction;
     vec3 rendered = around;
     if (d.x > 0.0) {
       vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf);
       vec2 edge = smoothstep(1.0, 0.94, abs(at));
       vec2 uv = vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y);
-      rendered = mix(around, smoothView(uv), edge.x * edge.y);
+      float inside = edge.x * edge.y;
+      if (only == 2) {
+        colour = vec4(smoothView(uv, 0.0), inside * (hasMask ? texture(mask, uv).r : 1.0));
+        return;
+      }
+      rendered = mix(around, fromView(uv) * viewGain + viewOffset, inside);
     }
     result = mix(real, rendered, blend);
   }
-  colour = vec4(result, 1.0);
+  colour = vec4(result, only == 2 ? 0.0 : 1.0);
 }`;
 
-/** Throws when WebGL 2 is missing. Pictures are {bitmap, rotation, tanHalf}. */
+/** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
+export const SAMPLE = [40, 24], SAMPLE_FINE = 4;
+
+/** Throws when WebGL 2 is missing. */
 export class GlViewer {
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
@@ -81,14 +111,24 @@ export class GlViewer {
     this.lost = false;
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
     this._program = link(gl, VERTEX, FRAGMENT);
-    this._at = (name) => gl.getUniformLocation(this._program, name);
+    const places = new Map();
+    this._at = (name) => {
+      if (!places.has(name)) places.set(name, gl.getUniformLocation(this._program, name));
+      return places.get(name);
+    };
     this._panorama = this._texture(0, gl.REPEAT);
     this._view = this._texture(1, gl.CLAMP_TO_EDGE);
+    this._mask = this._texture(2, gl.CLAMP_TO_EDGE);
+    gl.activeTexture(gl.TEXTURE1);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_NEAREST);
+    gl.generateMipmap(gl.TEXTURE_2D);
     this._hasPanorama = false;
+    this._hasMask = false;
     this._viewSize = [1, 1];
     gl.useProgram(this._program);
     gl.uniform1i(this._at("panorama"), 0);
     gl.uniform1i(this._at("view"), 1);
+    gl.uniform1i(this._at("mask"), 2);
   }
 
   setPanorama(bitmap) {
@@ -96,15 +136,48 @@ export class GlViewer {
     this._hasPanorama = true;
   }
 
-  setView(bitmap) {
+  /** `mask`: small grey picture of where the view is sure; null: everywhere. */
+  setView(bitmap, mask = null) {
     this._upload(1, this._view, bitmap);
     this._viewSize = [bitmap.width, bitmap.height];
+    this.gl.generateMipmap(this.gl.TEXTURE_2D); // to blur it where nobody has seen
+    this._hasMask = mask !== null;
+    if (mask) this._upload(2, this._mask, mask);
   }
 
-  /** `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend. */
+  /** `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend, panoramaColour, viewColour. */
   draw(scene) {
+    this._draw(scene, this.canvas.width, this.canvas.height, 0);
+  }
+
+  /**
+   * Panorama and view as they came, small and in the same projection: {1: panorama, 2: view} with 3 values a cell,
+   * 0..1, and `weights`, 0 where the view shows nothing that was seen.
+   */
+  sample(scene) {
+    const gl = this.gl, width = SAMPLE[0] * SAMPLE_FINE, height = SAMPLE[1] * SAMPLE_FINE;
+    this._sampled ??= this._target(width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this._sampled);
+    const pixels = new Uint8Array(4 * width * height);
+    const read = (only) => {
+      this._draw({ ...scene, blend: 1 }, width, height, only);
+      gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+      return cells(pixels);
+    };
+    const panorama = read(1), view = read(2);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    return { 1: panorama.colours, 2: view.colours, weights: view.alpha };
+  }
+
+  _draw(scene, width, height, only) {
     const gl = this.gl;
-    gl.viewport(0, 0, this.canvas.width, this.canvas.height);
+    gl.viewport(0, 0, width, height);
+    gl.uniform1i(this._at("only"), only);
+    gl.uniform1i(this._at("hasMask"), this._hasMask ? 1 : 0);
+    gl.uniform3fv(this._at("panoramaGain"), scene.panoramaColour.gain);
+    gl.uniform3fv(this._at("panoramaOffset"), scene.panoramaColour.offset);
+    gl.uniform3fv(this._at("viewGain"), scene.viewColour.gain);
+    gl.uniform3fv(this._at("viewOffset"), scene.viewColour.offset);
     gl.uniform1i(this._at("hasPanorama"), this._hasPanorama ? 1 : 0);
     // transpose = true: our matrices are row-major.
     gl.uniformMatrix3fv(this._at("panoramaFromLook"), true, scene.panoramaFromLook);
@@ -114,6 +187,15 @@ export class GlViewer {
     gl.uniform2fv(this._at("viewSize"), this._viewSize);
     gl.uniform1f(this._at("blend"), scene.blend);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  _target(width, height) {
+    const gl = this.gl, buffer = gl.createFramebuffer(), pixels = gl.createRenderbuffer();
+    gl.bindRenderbuffer(gl.RENDERBUFFER, pixels);
+    gl.renderbufferStorage(gl.RENDERBUFFER, gl.RGBA8, width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, pixels);
+    return buffer;
   }
 
   _texture(unit, wrap) {
@@ -134,6 +216,18 @@ export class GlViewer {
     gl.bindTexture(gl.TEXTURE_2D, texture);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, gl.RGB, gl.UNSIGNED_BYTE, bitmap);
   }
+}
+
+/** Means over the cells of RGBA pixels: {colours: 3 a cell, alpha: 1 a cell}, 0..1. */
+export function cells(pixels) {
+  const [columns, rows] = SAMPLE, fine = SAMPLE_FINE, share = 1 / (255 * fine * fine);
+  const colours = new Array(3 * columns * rows).fill(0), alpha = new Array(columns * rows).fill(0);
+  for (let i = 0; i < pixels.length / 4; i++) {
+    const cell = Math.floor(i / (columns * fine) / fine) * columns + Math.floor((i % (columns * fine)) / fine);
+    for (let channel = 0; channel < 3; channel++) colours[3 * cell + channel] += pixels[4 * i + channel] * share;
+    alpha[cell] += pixels[4 * i + 3] * share;
+  }
+  return { colours, alpha };
 }
 
 function link(gl, vertexSource, fragmentSource) {

@@ -1,0 +1,100 @@
+// Colours of one picture made like another's: a gain and an offset a channel, fitted where both show the same place.
+
+import { clamp } from "./math.js";
+
+export const plain = { gain: [1, 1, 1], offset: [0, 0, 0] };
+
+const ROUNDS = 6; // of fitting with less weight to what does not fit
+const OUTLIER = 1.5; // median deviations
+const LEAST_WEIGHT = 0.05; // of the cells; with less in common nothing is matched
+const STIFFNESS = 0.02; // a flat picture tells gain and offset apart badly: then it is the gain
+const MOST_GAIN = 1.8, MOST_OFFSET = 0.2;
+
+/**
+ * The colour {gain, offset} with which `from` looks most like `to`.
+ * `from`, `to`: 3 values a cell, 0..1; `weights`: one a cell, 0..1. Cells that differ by more than colour
+ * (something moved, an edge is not quite in place) count little.
+ */
+export function fitColour(from, to, weights) {
+  const total = weights.reduce((sum, weight) => sum + weight, 0);
+  if (total < LEAST_WEIGHT * weights.length) return plain;
+  const result = { gain: [], offset: [] };
+  for (let channel = 0; channel < 3; channel++) {
+    const x = pick(from, channel), y = pick(to, channel);
+    let [gain, offset] = line(x, y, weights), heard = weights;
+    for (let round = 0; round < ROUNDS; round++) {
+      const misfit = x.map((value, i) => Math.abs(y[i] - gain * value - offset));
+      const scale = Math.max(OUTLIER * median(misfit.filter((_, i) => weights[i] > 0)), 1 / 255);
+      heard = weights.map((weight, i) => (weight * scale) / Math.max(scale, misfit[i]) / Math.max(1, (misfit[i] / scale) ** 2));
+      [gain, offset] = line(x, y, heard);
+    }
+    result.gain.push(gain);
+    result.offset.push(offset);
+  }
+  return result;
+}
+
+function pick(values, channel) {
+  const one = new Array(values.length / 3);
+  for (let i = 0; i < one.length; i++) one[i] = values[3 * i + channel];
+  return one;
+}
+
+/** Weighted least squares of y = gain x + offset, the offset held towards 0. */
+function line(x, y, weights) {
+  let n = 0, sx = 0, sy = 0, sxx = 0, sxy = 0;
+  for (let i = 0; i < x.length; i++) {
+    n += weights[i];
+    sx += weights[i] * x[i];
+    sy += weights[i] * y[i];
+    sxx += weights[i] * x[i] * x[i];
+    sxy += weights[i] * x[i] * y[i];
+  }
+  if (sxx < 1e-9) return [1, 0];
+  const m = n * (1 + STIFFNESS);
+  const determinant = sxx * m - sx * sx;
+  const offset = clamp((sxx * sy - sx * sxy) / determinant, -MOST_OFFSET, MOST_OFFSET);
+  return [clamp((sxy - offset * sx) / sxx, 1 / MOST_GAIN, MOST_GAIN), offset];
+}
+
+function median(values) {
+  const sorted = values.toSorted((a, b) => a - b);
+  return sorted[sorted.length >> 1] ?? 0;
+}
+
+/** A share of `colour`: 0 none, 1 all of it. */
+export function part(colour, share) {
+  return {
+    gain: colour.gain.map((gain) => 1 + (gain - 1) * share),
+    offset: colour.offset.map((offset) => offset * share),
+  };
+}
+
+/** `values` (3 a cell) in that colour. */
+export function coloured(values, { gain, offset }) {
+  return values.map((value, i) => clamp(value * gain[i % 3] + offset[i % 3], 0, 1));
+}
+
+/** A colour that is let go slowly: all of it at first, nothing after `releaseMs`. */
+export class Releasing {
+  constructor() {
+    this._colour = plain;
+    this._since = 0;
+    this.releaseMs = 6000;
+  }
+
+  set(colour, now) {
+    this._colour = colour;
+    this._since = now;
+  }
+
+  get active() {
+    return this._colour !== plain;
+  }
+
+  at(now) {
+    const t = this.releaseMs > 0 ? (now - this._since) / this.releaseMs : 1;
+    if (t >= 1) this._colour = plain;
+    return this._colour === plain ? plain : part(this._colour, 1 - t * t * (3 - 2 * t));
+  }
+}
