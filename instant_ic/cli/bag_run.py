@@ -133,7 +133,7 @@ def play(args: argparse.Namespace) -> int:
 
 def snapshot(args: argparse.Namespace) -> int:
     """Has a recorder write the last seconds; waits until they are on the disk."""
-    node = _node(("bag_recorder",), args.node)
+    node = _node(("bag_recorder",), args.node, keeps_snapshots=True)
     recorder = NodeControl(run_dir(), node.name)
     path = _call(recorder, "snapshot", reason=args.reason)["path"]
     deadline_s = time.monotonic() + args.timeout
@@ -151,15 +151,14 @@ def snapshot(args: argparse.Namespace) -> int:
 def control(args: argparse.Namespace) -> int:
     """Steers a running recorder or player."""
     arguments = argument_of(args.command, args.value)
-    kinds = (
-        ("bag_player",) if arguments else ("bag_recorder",) if args.command in ("split", "record", "stop") else _STEERED
-    )
-    node = _node(kinds, args.node)
+    on_request = args.command in ("record", "stop")
+    kinds = ("bag_player",) if arguments else ("bag_recorder",) if on_request or args.command == "split" else _STEERED
+    node = _node(kinds, args.node, keeps_snapshots=on_request)
     result = _call(NodeControl(run_dir(), node.name), args.command, **arguments)
     if args.command == "status":
         print(json.dumps({"node": node.name, **result}, indent=2))
     else:
-        print(f"{node.name}: {args.command}" + (f" {result['path']}" if args.command in ("record", "stop") else ""))
+        print(f"{node.name}: {args.command}" + (f" {result['path']}" if on_request else ""))
     return 0
 
 
@@ -176,9 +175,13 @@ def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
             raise UserError(str(error)) from None
 
 
-def _node(kinds: tuple[str, ...], name: str) -> NodeInfo:
+def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -> NodeInfo:
+    """The node that is meant; of several recorders the one that can do it."""
     running = [node for node in list_nodes(run_dir()) if node.module.rsplit(".", 1)[-1] in kinds]
     chosen = [node for node in running if not name or node.name == name]
+    if len(chosen) > 1:
+        able = [node for node in chosen if bool(node.params.get("snapshot")) is keeps_snapshots]
+        chosen = able or chosen
     if len(chosen) == 1:
         return chosen[0]
     what = " or ".join(kinds)

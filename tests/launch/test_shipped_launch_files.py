@@ -23,7 +23,7 @@ EVERYTHING = {
 }
 PERCEPTION = {"grid_slam", "depth_estimator", "depth_scaler"}
 ROBOT = {"theta_camera", "vlp16_driver", "crawler_base", "grid_slam", "virtual_robot", "navigator", "arbiter"}
-STATION = {"depth_estimator", "depth_scaler", "nerf", "console"}
+STATION = {"depth_estimator", "depth_scaler", "nerf", "console", "operator_recorder"}
 
 
 def nodes(name: str, **arguments: str) -> dict[str, str]:
@@ -55,12 +55,20 @@ def test_which_nodes_run() -> None:
     assert set(nodes("station")) == STATION
     assert set(nodes("full")) == ROBOT | STATION
     assert set(nodes("sim")) == ROBOT | STATION | {"simulator"}
-    without = {"console", "nerf"}
+    assert set(nodes("full", recorder="false")) == (ROBOT | STATION) - {"operator_recorder"}
+    without = {"console", "nerf", "operator_recorder"}
     assert set(nodes("sim", headless="true", vspace="false")) == (ROBOT | STATION | {"simulator"}) - without
     assert set(nodes("sim", snapshots="snaps")) == ROBOT | STATION | {"simulator", "snapshot_recorder"}
     assert set(nodes("sim", record="drive")) == ROBOT | STATION | {"simulator", "bag_recorder"}
     assert set(nodes("replay")) == PERCEPTION | {"bag_player"}
     assert set(nodes("replay", nerf="true", record="again")) == PERCEPTION | {"bag_player", "bag_recorder", "nerf"}
+
+
+def test_the_pages_recorder_keeps_the_last_minute_and_writes_where_it_is_told() -> None:
+    assert " path:=" not in nodes("full")["operator_recorder"]
+    assert "path:=drives" in nodes("full", recordings="drives")["operator_recorder"]
+    file = yaml.safe_load(paths.shipped_file("config", "console.yaml").read_text())["operator_recorder"]
+    assert file["ros__parameters"]["snapshot"] is True and file["ros__parameters"]["snapshot_seconds"] == 60.0
 
 
 def test_simulated_devices_and_drivers_meet() -> None:
@@ -90,6 +98,15 @@ def test_lidar_alone_starts_no_network() -> None:
         assert " source:=" not in with_network["depth_scaler"] and " source:=lidar" in without["depth_scaler"]
         assert " source:=network" in nodes(name, depth_source="network")["depth_scaler"]
     assert "depth_estimator" not in nodes("replay", depth_source="lidar")["bag_player"]
+
+
+def test_a_scanned_place_as_the_virtual_space() -> None:
+    given = {"vspace_source": "mesh", "vspace_mesh": "/scans/my house.glb", "vspace_mesh_pose": "-4.7,2,0,90"}
+    for name in ("station", "full", "sim"):
+        assert "space." not in nodes(name)["nerf"]
+        command = nodes(name, **given)["nerf"]
+        assert "space.source:=mesh" in command and "space.mesh:=/scans/my house.glb" in command
+        assert check_parameters(read_launch_file(find_launch_file(name), given).nodes) == []
 
 
 def test_robot_leaves_to_the_configuration_what_is_not_given() -> None:
