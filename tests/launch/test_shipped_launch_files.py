@@ -66,7 +66,7 @@ def test_which_nodes_run() -> None:
 
 def test_the_pages_recorder_keeps_the_last_minute_and_writes_where_it_is_told() -> None:
     assert " path:=" not in nodes("full")["operator_recorder"]
-    assert "path:=drives" in nodes("full", recordings="drives")["operator_recorder"]
+    assert "/drives" in nodes("full", recordings="drives")["operator_recorder"]
     file = yaml.safe_load(paths.shipped_file("config", "console.yaml").read_text())["operator_recorder"]
     assert file["ros__parameters"]["snapshot"] is True and file["ros__parameters"]["snapshot_seconds"] == 60.0
 
