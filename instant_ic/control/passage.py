@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..ranges import NotNegative, NotNegativeInt, check_ranges
-from .costmap import UNKNOWN, Costmap
+from .costmap import Costmap
 from .planner import HybridPlanner
 from .prediction import Prediction
-from .subgoal import extend_ahead
+from .subgoal import behind_obstacle, extend_ahead
 from .walls import WallMap
 
 
@@ -54,11 +54,7 @@ def find_passage(
     hit = prediction.poses[prediction.hit_index]
     heading = hit if forward else hit + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, config.max_pass_m, costmap.resolution)
-    costs = costmap.cost_at(ahead[:, :2])
-    free = (costs <= config.max_cost) | (costs == UNKNOWN)
-    # What is free before the obstacle has begun is not behind it.
-    inside = np.flatnonzero(~free)
-    free[: inside[0] if inside.size else 0] = False
+    free = behind_obstacle(costmap, ahead, config.max_cost)
     exit_index = int(np.flatnonzero(free)[0]) if free.any() else len(ahead)
     if walls is not None:
         at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < config.wall_clearance_m)

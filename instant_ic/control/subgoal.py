@@ -46,6 +46,27 @@ def extend_ahead(pose: NDArray[np.float64], length_m: float, step_m: float) -> N
     return np.concatenate([ahead, np.full((len(ahead), 1), pose[2])], axis=1)
 
 
+_UNSEEN_DEPTH_M = 0.6
+"""What is not seen behind a thing's near side may be the thing itself, to this depth."""
+
+
+def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64], max_cost: int) -> NDArray[np.bool_]:
+    """Which of the poses (N, 3) straight ahead, a cell apart, are places behind the first thing on the line.
+
+    What is free before the thing has begun is not behind it. Where nothing is taken every free place counts.
+    """
+    costs = costmap.cost_at(ahead[:, :2])
+    unseen = (costs == UNKNOWN) & costmap.contains(ahead[:, :2])
+    taken = (costs > max_cost) & ~unseen
+    if not taken.any():
+        return ~taken
+    index = np.arange(len(ahead))
+    behind_m = (index - np.maximum.accumulate(np.where(taken, index, -1))) * costmap.resolution
+    free: NDArray[np.bool_] = ~taken & (~unseen | (behind_m >= _UNSEEN_DEPTH_M))
+    free[: int(np.argmax(taken))] = False
+    return free
+
+
 def _free(costmap: Costmap, points: NDArray[np.float64], config: SubgoalConfig) -> NDArray[np.bool_]:
     """Which points (..., 2) may be the subgoal."""
     costs = costmap.cost_at(points)
@@ -104,10 +125,7 @@ def _straight_on(
     """First free pose (3,) behind the obstacle that ``pose`` runs into; None when a wall comes first."""
     heading = pose if forward else pose + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, config.extend_m, costmap.resolution)
-    free = _free(costmap, ahead[:, :2], config)
-    taken = np.flatnonzero(~free)
-    free[: taken[0] if taken.size else 0] = False
-    index = np.flatnonzero(free)
+    index = np.flatnonzero(behind_obstacle(costmap, ahead, config.max_cost))
     if index.size == 0:
         return None
     first = int(index[0])
