@@ -38,13 +38,13 @@ FOV = math.pi / 2
 @njit(nogil=True, fastmath=True)
 def _encode_all(table, table_grad, touched, cells_per_m, focus, points, backward):  # type: ignore[no-untyped-def]
     x = np.ones((table.shape[0] * table.shape[2], kernels.BLOCK), np.float32)
+    levels = table.shape[0] if backward else 1
+    entries, weights = np.empty((levels, 8, kernels.BLOCK), np.uint32), np.empty((levels, 8, kernels.BLOCK), np.float32)
     origin = np.zeros(3, np.float32)
     for start in range(0, points.shape[0], kernels.BLOCK):
-        kernels.encode_block(table, cells_per_m, origin, focus, points, start, kernels.BLOCK, x)
+        kernels.encode_block(table, cells_per_m, origin, focus, points, start, kernels.BLOCK, entries, weights, x)
         if backward:
-            kernels.encode_backward_block(
-                table_grad, touched, cells_per_m, origin, focus, points, start, kernels.BLOCK, x
-            )
+            kernels.encode_backward_block(table_grad, touched, entries, weights, kernels.BLOCK, x)
 
 
 def cpu_seconds(call: Callable[[], Any], repeats: int) -> float:
@@ -65,7 +65,7 @@ def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[st
     cells = np.geomspace(2, 80, levels).astype(np.float32)
     place = np.arange(samples)
     points = np.stack([np.full(samples, 2.0), place % 256 * 0.02, place // 256 * 0.02], axis=1).astype(np.float32)
-    focus = np.zeros(4, np.float32)
+    focus = np.zeros((1, 4), np.float32)
     result = {}
     for name, backward in (("forward", False), ("forward_backward", True)):
         _encode_all(table, grad, touched, cells, focus, points, backward)

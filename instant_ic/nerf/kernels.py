@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .vectors import adam2, adam4, gather2, gather4, scatter2, scatter4
+
 BLOCK = 64
 _P1 = 2654435761
 _P2 = 805459861
@@ -38,96 +40,92 @@ def pixel_block(points, start, count, focus, pixel):  # type: ignore[no-untyped-
 
 
 @njit(**_OPTIONS)
-def corners(points, index, origin, scale, mask):  # type: ignore[no-untyped-def]
-    """Table entries of the eight corners of a point's cell, and their trilinear weights."""
-    px = (points[index, 0] - origin[0]) * scale
-    py = (points[index, 1] - origin[1]) * scale
-    pz = (points[index, 2] - origin[2]) * scale
-    flx, fly, flz = math.floor(px), math.floor(py), math.floor(pz)
-    fx, fy, fz = px - np.float32(flx), py - np.float32(fly), pz - np.float32(flz)
-    x0, y0, z0 = np.int64(flx), np.int64(fly) * _P1, np.int64(flz) * _P2
-    x1, y1, z1 = x0 + 1, y0 + _P1, z0 + _P2
-    gx, gy, gz = np.float32(1) - fx, np.float32(1) - fy, np.float32(1) - fz
-    w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
+def cells_block(points, start, count, origin, scale, size, pixel, entries, weights):  # type: ignore[no-untyped-def]
+    """Where a block's points lie in one level: table entries of their cells' corners, and trilinear weights.
+
+    A level counts whole while its cells are wider than the keyframe's pixel there, not at all from half of it.
+
+    Args:
+        size: entries of a level, a power of two; pixel: (BLOCK,), of ``pixel_block``.
+        entries: out, (8, BLOCK) uint32; weights: out, (8, BLOCK) float32.
+    """
+    one = np.float32(1)
+    p1, p2, mask = np.uint32(_P1), np.uint32(_P2), np.uint32(size - 1)
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    for i in range(count):
+        share = min(max(np.float32(2) - pixel[i] * scale, np.float32(0)), one)
+        px = (points[start + i, 0] - ox) * scale
+        py = (points[start + i, 1] - oy) * scale
+        pz = (points[start + i, 2] - oz) * scale
+        flx, fly, flz = np.floor(px), np.floor(py), np.floor(pz)
+        x0 = np.uint32(np.int32(flx))
+        y0, z0 = np.uint32(np.uint32(np.int32(fly)) * p1), np.uint32(np.uint32(np.int32(flz)) * p2)
+        x1, y1, z1 = np.uint32(x0 + np.uint32(1)), np.uint32(y0 + p1), np.uint32(z0 + p2)
+        entries[0, i], entries[1, i] = (x0 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z0) & mask
+        entries[2, i], entries[3, i] = (x0 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z0) & mask
+        entries[4, i], entries[5, i] = (x0 ^ y0 ^ z1) & mask, (x1 ^ y0 ^ z1) & mask
+        entries[6, i], entries[7, i] = (x0 ^ y1 ^ z1) & mask, (x1 ^ y1 ^ z1) & mask
+        fx, fy, fz = px - flx, py - fly, pz - flz
+        gx, gy, gz = one - fx, one - fy, share * (one - fz)
+        fz *= share
+        w00, w10, w01, w11 = gy * gz, fy * gz, gy * fz, fy * fz
+        weights[0, i], weights[1, i], weights[2, i], weights[3, i] = gx * w00, fx * w00, gx * w10, fx * w10
+        weights[4, i], weights[5, i], weights[6, i], weights[7, i] = gx * w01, fx * w01, gx * w11, fx * w11
+
+
+@njit(**_OPTIONS)
+def of_point(corners, i):  # type: ignore[no-untyped-def]
+    """Eight corners' values (8, BLOCK) of one point, as a tuple."""
     return (
-        ((x0 ^ y0 ^ z0) & mask, (x1 ^ y0 ^ z0) & mask, (x0 ^ y1 ^ z0) & mask, (x1 ^ y1 ^ z0) & mask,
-         (x0 ^ y0 ^ z1) & mask, (x1 ^ y0 ^ z1) & mask, (x0 ^ y1 ^ z1) & mask, (x1 ^ y1 ^ z1) & mask),
-        (gx * w00, fx * w00, gx * w10, fx * w10, gx * w01, fx * w01, gx * w11, fx * w11),
+        corners[0, i], corners[1, i], corners[2, i], corners[3, i],
+        corners[4, i], corners[5, i], corners[6, i], corners[7, i],
     )  # fmt: skip
 
 
 @njit(**_OPTIONS)
-def encode_block(table, cells_per_m, origin, focus, points, start, count, x):  # type: ignore[no-untyped-def]
+def encode_block(  # type: ignore[no-untyped-def]
+    table, cells_per_m, origin, focus, points, start, count, entries, weights, x
+):
     """Trilinear features of ``points[start:start + count]`` into ``x`` (levels·features, BLOCK).
 
-    A level counts whole while its cells are wider than the keyframe's pixel there, not at all from half of it.
+    ``entries``, ``weights``: out, (levels, 8, BLOCK) for ``encode_backward_block``, of ``cells_block``; with (1, 8,
+    BLOCK), where no gradient is wanted, one level is written over the other.
     """
     levels, size, features = table.shape
-    mask = size - 1
     pixel = np.empty(BLOCK, np.float32)
     pixel_block(points, start, count, focus, pixel)
     for level in range(levels):
-        scale = cells_per_m[level]
-        row = level * features
-        for i in range(count):
-            share = min(max(np.float32(2) - pixel[i] * scale, np.float32(0)), np.float32(1))
-            if share == 0:
-                for f in range(features):
-                    x[row + f, i] = 0
-                continue
-            (i0, i1, i2, i3, i4, i5, i6, i7), (w0, w1, w2, w3, w4, w5, w6, w7) = corners(
-                points, start + i, origin, scale, mask
-            )
-            for f in range(features):
-                x[row + f, i] = share * (
-                    w0 * table[level, i0, f]
-                    + w1 * table[level, i1, f]
-                    + w2 * table[level, i2, f]
-                    + w3 * table[level, i3, f]
-                    + w4 * table[level, i4, f]
-                    + w5 * table[level, i5, f]
-                    + w6 * table[level, i6, f]
-                    + w7 * table[level, i7, f]
-                )
+        kept = min(level, entries.shape[0] - 1)
+        at, by, values = entries[kept], weights[kept], table[level]
+        cells_block(points, start, count, origin, cells_per_m[level], size, pixel, at, by)
+        rows = x[level * features : (level + 1) * features]
+        if features == 4:
+            for i in range(count):
+                rows[0, i], rows[1, i], rows[2, i], rows[3, i] = gather4(values, of_point(at, i), of_point(by, i))
+        else:
+            for i in range(count):
+                rows[0, i], rows[1, i] = gather2(values, of_point(at, i), of_point(by, i))
 
 
 @njit(**_OPTIONS)
-def encode_backward_block(  # type: ignore[no-untyped-def]
-    table_grad, touched, cells_per_m, origin, focus, points, start, count, dx
-):
-    """Adds the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``."""
-    levels, size, features = table_grad.shape
-    mask = size - 1
-    pixel = np.empty(BLOCK, np.float32)
-    pixel_block(points, start, count, focus, pixel)
+def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # type: ignore[no-untyped-def]
+    """Adds the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``.
+
+    ``entries``, ``weights``: of ``encode_block``.
+    """
+    levels, _, features = table_grad.shape
     for level in range(levels):
-        scale = cells_per_m[level]
-        row = level * features
-        for i in range(count):
-            share = min(max(np.float32(2) - pixel[i] * scale, np.float32(0)), np.float32(1))
-            if share == 0:
-                continue
-            (i0, i1, i2, i3, i4, i5, i6, i7), (w0, w1, w2, w3, w4, w5, w6, w7) = corners(
-                points, start + i, origin, scale, mask
-            )
-            for f in range(features):
-                d = share * dx[row + f, i]
-                table_grad[level, i0, f] += w0 * d
-                table_grad[level, i1, f] += w1 * d
-                table_grad[level, i2, f] += w2 * d
-                table_grad[level, i3, f] += w3 * d
-                table_grad[level, i4, f] += w4 * d
-                table_grad[level, i5, f] += w5 * d
-                table_grad[level, i6, f] += w6 * d
-                table_grad[level, i7, f] += w7 * d
-            touched[level, i0] = 1
-            touched[level, i1] = 1
-            touched[level, i2] = 1
-            touched[level, i3] = 1
-            touched[level, i4] = 1
-            touched[level, i5] = 1
-            touched[level, i6] = 1
-            touched[level, i7] = 1
+        at, by, grad, marks = entries[level], weights[level], table_grad[level], touched[level]
+        d = dx[level * features : (level + 1) * features]
+        if features == 4:
+            for i in range(count):
+                scatter4(grad, of_point(at, i), of_point(by, i), (d[0, i], d[1, i], d[2, i], d[3, i]))
+        else:
+            for i in range(count):
+                scatter2(grad, of_point(at, i), of_point(by, i), (d[0, i], d[1, i]))
+        for corner in range(8):
+            for i in range(count):
+                marks[at[corner, i]] = 1
 
 
 @njit(**_OPTIONS)
@@ -155,7 +153,7 @@ def relu_block(y):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
-    """Gradients of ``layer_block``: adds to ``gw`` and ``gb``, writes ``dx`` (k, BLOCK)."""
+    """Gradients of ``layer_block``: adds to ``gw`` and ``gb``, writes ``dx`` (k, BLOCK); k and m multiples of 4."""
     for k in range(w.shape[1]):
         out = dx[k]
         for i in range(BLOCK):
@@ -171,12 +169,18 @@ def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
         for i in range(BLOCK):
             total += row[i]
         gb[j] += total
-        for k in range(w.shape[1]):
-            column = x[k]
-            dot = np.float32(0)
+        for k in range(0, w.shape[1], 4):
+            c0, c1, c2, c3 = x[k], x[k + 1], x[k + 2], x[k + 3]
+            d0, d1, d2, d3 = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             for i in range(BLOCK):
-                dot += row[i] * column[i]
-            gw[j, k] += dot
+                d0 += row[i] * c0[i]
+                d1 += row[i] * c1[i]
+                d2 += row[i] * c2[i]
+                d3 += row[i] * c3[i]
+            gw[j, k] += d0
+            gw[j, k + 1] += d1
+            gw[j, k + 2] += d2
+            gw[j, k + 3] += d3
 
 
 @njit(**_OPTIONS)
@@ -185,9 +189,10 @@ def query(table, w1, b1, w2, b2, cells_per_m, origin, focus, points, out):  # ty
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
     h = np.zeros((w1.shape[0], BLOCK), np.float32)
     y = np.zeros((4, BLOCK), np.float32)
+    entries, weights = np.empty((1, 8, BLOCK), np.uint32), np.empty((1, 8, BLOCK), np.float32)
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
-        encode_block(table, cells_per_m, origin, focus, points, start, count, x)
+        encode_block(table, cells_per_m, origin, focus, points, start, count, entries, weights, x)
         layer_block(w1, b1, x, h)
         relu_block(h)
         layer_block(w2, b2, h, y)
@@ -217,10 +222,12 @@ def gradient(  # type: ignore[no-untyped-def]
     dy = np.zeros((4, BLOCK), np.float32)
     dh = np.zeros((w1.shape[0], BLOCK), np.float32)
     dx = np.zeros((w1.shape[1], BLOCK), np.float32)
+    levels = table.shape[0]
+    entries, weights = np.empty((levels, 8, BLOCK), np.uint32), np.empty((levels, 8, BLOCK), np.float32)
     colour_error, distance_error = 0.0, 0.0
     for start in range(0, points.shape[0], BLOCK):
         count = min(BLOCK, points.shape[0] - start)
-        encode_block(table, cells_per_m, origin, focus, points, start, count, x)
+        encode_block(table, cells_per_m, origin, focus, points, start, count, entries, weights, x)
         layer_block(w1, b1, x, h)
         relu_block(h)
         layer_block(w2, b2, h, y)
@@ -241,7 +248,7 @@ def gradient(  # type: ignore[no-untyped-def]
                 if h[j, i] <= 0:
                     dh[j, i] = 0
         layer_backward_block(w1, x, dh, g1, gb1, dx)
-        encode_backward_block(table_grad, touched, cells_per_m, origin, focus, points, start, count, dx)
+        encode_backward_block(table_grad, touched, entries, weights, count, dx)
     return colour_error, distance_error
 
 
@@ -255,17 +262,13 @@ def adam_touched(  # type: ignore[no-untyped-def]
     the bias correction of the step, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
     """
     levels, size, features = table.shape
-    keep1, keep2 = np.float32(1) - beta1, np.float32(1) - beta2
     for level in range(levels):
-        step = step_size[level]
+        step, marks = step_size[level], touched[level]
+        rows, grad, mean, square = table[level], table_grad[level], m[level], v[level]
         for entry in range(size):
-            if touched[level, entry]:
-                touched[level, entry] = 0
-                for f in range(features):
-                    g = table_grad[level, entry, f]
-                    table_grad[level, entry, f] = 0
-                    mean = beta1 * m[level, entry, f] + keep1 * g
-                    square = beta2 * v[level, entry, f] + keep2 * g * g
-                    m[level, entry, f] = mean
-                    v[level, entry, f] = square
-                    table[level, entry, f] -= step * mean / (math.sqrt(square) + epsilon)
+            if marks[entry]:
+                marks[entry] = 0
+                if features == 4:
+                    adam4(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)
+                else:
+                    adam2(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)

@@ -264,6 +264,7 @@ def trace(  # type: ignore[no-untyped-def]
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
     h = np.zeros((w1.shape[0], BLOCK), np.float32)
     s = np.zeros((1, BLOCK), np.float32)
+    entries, weights = np.empty((1, 8, BLOCK), np.uint32), np.empty((1, 8, BLOCK), np.float32)
     head, bias = w2[3:4], b2[3:4]
     size = 0
     for n in range(count):
@@ -295,7 +296,7 @@ def trace(  # type: ignore[no-untyped-def]
                     n = active[start + i]
                     for c in range(3):
                         points[i, c] = origin[c] + t[n] * directions[pixels[n], c]
-                encode_block(table, cells_per_m, lattice_origin, focus, points, 0, block, x)
+                encode_block(table, cells_per_m, lattice_origin, focus, points, 0, block, entries, weights, x)
                 layer_block(w1, b1, x, h)
                 relu_block(h)
                 layer_block(head, bias, h, s)

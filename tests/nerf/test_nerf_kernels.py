@@ -69,9 +69,9 @@ def test_encoding_by_hand():
     table = np.zeros((1, 16, 4), F)
     table[0, 0], table[0, 1] = 1.0, 10.0
     x = np.zeros((4, kernels.BLOCK), F)
-    kernels.encode_block(
-        table, np.array([1.0], F), np.zeros(3, F), np.zeros((1, 4), F), np.array([[0.25, 0.5, 0.0]], F), 0, 1, x
-    )
+    entries, weights = np.zeros((1, 8, kernels.BLOCK), np.uint32), np.zeros((1, 8, kernels.BLOCK), F)
+    point, origin, focus = np.array([[0.25, 0.5, 0.0]], F), np.zeros(3, F), np.zeros((1, 4), F)
+    kernels.encode_block(table, np.array([1.0], F), origin, focus, point, 0, 1, entries, weights, x)
     # A pixel of 0 rad leaves all levels whole. 0.75·0.5·1 + 0.25·0.5·10 + 0.75·0.5·10 + 0.25·0.5·1 = 5.5
     assert x[:, 0] == pytest.approx([5.5] * 4)
 
@@ -135,7 +135,7 @@ def scene():
     depth = picture.depth_m.copy()
     depth[60:64, 40:60] = 0  # a patch without depth
     prior = prepare(picture.rgb, depth, pose, 0.02, GeometryConfig(), 2048)
-    return Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
+    return Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
 
 
 @pytest.fixture(scope="module")
@@ -153,7 +153,7 @@ def two_keyframes():
     ]
     priors[1].usable[:, :64] = 0
     gains = np.array([[1, 1, 1], [1.25, 1.25, 1.2]], F)
-    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), build_occupancy(priors[0], config), gains)
+    return Scene(tuple(priors), Lattice.for_prior(priors[0], FieldConfig()), build_occupancy(priors, config), gains)
 
 
 def sampled(scene, uniform, columns, rows, sources):
@@ -341,7 +341,7 @@ def test_the_march_by_hand():
     # 2 m round the camera, the band 5 %.
     rgb = np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8)
     prior = prepare(rgb, np.full((32, 64), 2.0, F), np.eye(4), 0.0, GeometryConfig(band_min=0.05), 2048)
-    scene = Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy(prior, GeometryConfig()))
+    scene = Scene((prior,), Lattice.for_prior(prior, FieldConfig()), build_occupancy((prior,), GeometryConfig()))
     config = FieldConfig(levels=2, log2_table=10, hidden=4)
     rays = perspective_rays(np.eye(4), 32, 16, 1.0)
     for distance in (-1.0, 1.0):

@@ -1,0 +1,105 @@
+"""A table entry as one machine vector: what the compiler does not find by itself (numba intrinsics in LLVM's words).
+
+``gather2``, ``gather4`` (rows, entries, weights) → tuple of 2 or 4 float32:
+    ``Σ weights[c] · rows[entries[c]]`` over the eight corners of a cell.
+``scatter2``, ``scatter4`` (rows, entries, weights, upstream):
+    ``rows[entries[c]] += weights[c] · upstream``, corner by corner.
+
+``adam2``, ``adam4`` (rows, grad, m, v, entry, step, beta1, beta2, epsilon):
+    one step of Adam on ``rows[entry]`` and its moments, all of ``rows``' shape; clears ``grad[entry]``.
+
+``rows`` (size, features) float32, C-contiguous, with as many features as the function's name says; ``entries`` and
+``weights`` are tuples of eight uint32 and eight float32; ``upstream`` one of 2 or 4 float32. Nothing is checked.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core.cgutils import get_or_insert_function
+from numba.extending import intrinsic
+
+_CORNERS = 8
+_FAST = ("fast",)
+_LONG, _INT, _FLOAT = ir.IntType(64), ir.IntType(32), ir.FloatType()
+
+
+def _functions(features: int) -> tuple[Any, Any, Any]:
+    vector = ir.VectorType(_FLOAT, features)
+
+    def row(context: Any, builder: Any, kind: Any, rows: Any, entry: Any) -> Any:
+        """Pointer to a table's row."""
+        first = builder.mul(builder.zext(entry, _LONG), _LONG(features))
+        data = context.make_array(kind)(context, builder, rows).data
+        return builder.bitcast(builder.gep(data, [first]), vector.as_pointer())
+
+    def filled(builder: Any, scalars: list[Any]) -> Any:
+        value = ir.Constant(vector, ir.Undefined)
+        for place, scalar in enumerate(scalars):
+            value = builder.insert_element(value, scalar, _INT(place))
+        return value
+
+    def weighted(builder: Any, weights: Any, corner: int, value: Any) -> Any:
+        weight = filled(builder, [builder.extract_value(weights, corner)] * features)
+        return builder.fmul(value, weight, flags=_FAST)
+
+    @intrinsic
+    def gather(_typing: Any, rows: Any, entries: Any, weights: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            total = ir.Constant(vector, [0.0] * features)
+            for corner in range(_CORNERS):
+                place = row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], corner))
+                value = weighted(builder, args[2], corner, builder.load(place, align=4))
+                total = builder.fadd(total, value, flags=_FAST)
+            parts = [builder.extract_element(total, _INT(place)) for place in range(features)]
+            return context.make_tuple(builder, signature.return_type, parts)
+
+        return types.UniTuple(types.float32, features)(rows, entries, weights), code
+
+    @intrinsic
+    def scatter(_typing: Any, rows: Any, entries: Any, weights: Any, upstream: Any) -> Any:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            value = filled(builder, [builder.extract_value(args[3], place) for place in range(features)])
+            for corner in range(_CORNERS):
+                place = row(context, builder, signature.args[0], args[0], builder.extract_value(args[1], corner))
+                added = weighted(builder, args[2], corner, value)
+                builder.store(builder.fadd(builder.load(place, align=4), added, flags=_FAST), place, align=4)
+            return context.get_dummy_value()
+
+        return types.void(rows, entries, weights, upstream), code
+
+    @intrinsic
+    def adam(
+        _typing: Any, rows: Any, grad: Any, m: Any, v: Any, entry: Any, step: Any, beta1: Any, beta2: Any, epsilon: Any
+    ) -> Any:
+        def code(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            places = [row(context, builder, signature.args[n], args[n], args[4]) for n in range(4)]
+            value, slope, mean, square = (builder.load(place, align=4) for place in places)
+            step, beta1, beta2, epsilon = (filled(builder, [scalar] * features) for scalar in args[5:])
+
+            def mixed(kept: Any, new: Any, share: Any) -> Any:
+                """``new + share · (kept − new)``."""
+                return builder.fadd(
+                    new, builder.fmul(share, builder.fsub(kept, new, flags=_FAST), flags=_FAST), flags=_FAST
+                )
+
+            mean = mixed(mean, slope, beta1)
+            square = mixed(square, builder.fmul(slope, slope, flags=_FAST), beta2)
+            name, kind = f"llvm.sqrt.v{features}f32", ir.FunctionType(vector, [vector])
+            root = builder.call(get_or_insert_function(builder.module, kind, name), [square])
+            ratio = builder.fdiv(mean, builder.fadd(root, epsilon, flags=_FAST), flags=_FAST)
+            value = builder.fsub(value, builder.fmul(step, ratio, flags=_FAST), flags=_FAST)
+            zero = ir.Constant(vector, [0.0] * features)
+            for place, stored in zip(places, (value, zero, mean, square), strict=True):
+                builder.store(stored, place, align=4)
+            return context.get_dummy_value()
+
+        return types.void(rows, grad, m, v, types.uint32, step, beta1, beta2, epsilon), code
+
+    return gather, scatter, adam
+
+
+gather2, scatter2, adam2 = _functions(2)
+gather4, scatter4, adam4 = _functions(4)
