@@ -43,6 +43,10 @@ class ControlError(RuntimeError):
     """The node does not run, does not answer, or refuses the request."""
 
 
+class NodeMissingError(ControlError):
+    """The node does not run."""
+
+
 class NodeBusyError(ControlError):
     """The node's own thread is in a long callback; nothing was changed."""
 
@@ -295,7 +299,7 @@ class NodeControl:
                     f"(ic node list shows its pid)"
                 ) from None
             except (FileNotFoundError, ConnectionRefusedError):
-                raise ControlError(self._not_there()) from None
+                raise NodeMissingError(self._not_there()) from None
             except OSError as error:
                 raise ControlError(f"node {self.node}: {path}: {error}") from error
         if line is None:

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.console import demo_world
-from instant_ic.console.gridimage import GridImage, grid_image
+from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
+from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer, ServerConfig
 from instant_ic.console.view import Look, ViewConfig, ViewScheduler, view_shape
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
@@ -38,6 +39,36 @@ class DemoConfig:
     panorama_width: int = 640
     panorama_hz: float = 5.0
     view: ViewConfig = field(default_factory=ViewConfig)
+
+
+class DemoRecorder:
+    """Says what a recorder would say, and writes nothing."""
+
+    def __init__(self) -> None:
+        self.missing = False
+        self.state, self.error = "idle", ""
+        self.snapshots: list[dict[str, str]] = []
+        self._began_s = 0.0
+
+    def ask(self, command: str, **arguments: Any) -> Any:
+        """See :class:`instant_ic.console.recording.Ask`."""
+        if self.missing:
+            raise RecorderError("no recorder runs: launch the station with recorder:=true")
+        path = f"recordings/rec_{time.strftime('%Y%m%d_%H%M%S')}"
+        if command == "record":
+            self.state, self._began_s = "recording", time.monotonic()
+        elif command == "stop":
+            self.state = "idle"
+        elif command == "snapshot":
+            self.snapshots.append({"path": f"{path}_operator", "state": "done", "words": "demo: nothing is written"})
+        seconds = time.monotonic() - self._began_s if self.state != "idle" else 0.0
+        recording = {"state": self.state, "path": path, "seconds": round(seconds, 1), "bytes": int(2e6 * seconds)}
+        return {
+            "path": path,
+            "cached_s": 60.0,
+            "snapshots": self.snapshots,
+            "recording": recording | {"error": self.error, "free_bytes": 50_000_000_000},
+        }
 
 
 class Demo:
@@ -74,6 +105,8 @@ class Demo:
         self._noise = np.random.default_rng(0)
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
         self._drawn, self._drawn_from = b"", np.zeros((4, 4))  # the last panorama, and where the camera was
+        self.recorder = DemoRecorder()
+        self._desk = RecordingDesk(self.recorder.ask, lambda told: self.server.publish("recording", told), 0.2)
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=run, name=f"console-demo-{run.__name__}", daemon=True)
@@ -93,9 +126,26 @@ class Demo:
         """See Backend."""
         self.look = look
 
+    def on_record(self, on: bool) -> None:
+        """See Backend."""
+        self._desk.record(on)
+
+    def on_snapshot(self) -> None:
+        """See Backend."""
+        self._desk.snapshot()
+
+    def on_bookmark(self, name: str) -> None:
+        """See Backend."""
+        self._desk.bookmark(name)
+
+    def export_map(self) -> dict[str, bytes]:
+        """See Backend."""
+        return {"map.png": grey_png(demo_world.occupancy()[0].view(np.uint8)), "map.yaml": b"image: map.png\n"}
+
     def start(self) -> None:
         """Starts the server and the robot."""
         self.server.start()
+        self._desk.start()
         grid, origin = demo_world.occupancy()
         for kind, cells in ((FrameKind.MAP, grid), (FrameKind.COSTMAP, demo_world.inflate(grid, 0.05))):
             image = grid_image(cells, 0.05, origin)
@@ -107,6 +157,7 @@ class Demo:
     def stop(self) -> None:
         """Ends both."""
         self._stop.set()
+        self._desk.stop()
         for thread in self._threads:
             if thread.is_alive():
                 thread.join(timeout=5.0)

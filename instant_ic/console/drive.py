@@ -6,8 +6,11 @@ Times are seconds of one monotonic clock, given by the caller, so that tests nee
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
+
+RATE_COMMANDS = 200  # of which the rate is counted
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ class DriveGate:
         self.counts: dict[Verdict, int] = dict.fromkeys(Verdict, 0)
         self.watchdog_trips = 0
         self.last_age_s: float | None = None
+        self._accepted: deque[float] = deque(maxlen=RATE_COMMANDS)
         self._driver_seen = -math.inf
         self._driver_beat = -math.inf
         self._sequence: dict[int, int] = {}
@@ -127,6 +131,7 @@ class DriveGate:
         self._sequence[client] = sequence
         self._driver_seen = self._driver_beat = now
         self.last_age_s = age_s
+        self._accepted.append(now)
         limits = self.config
         command = (
             _clamp(linear, limits.max_linear_mps),
@@ -148,6 +153,10 @@ class DriveGate:
         if abs(age_s) > self.config.max_command_age_s:
             return Verdict.OLD
         return Verdict.STOPPED if self.estop else Verdict.ACCEPTED
+
+    def rate_hz(self, now: float) -> float:
+        """Commands accepted a second, over the last second; 0 while none come."""
+        return float(sum(now - at <= 1.0 for at in self._accepted))
 
     def stop(self, now: float) -> None:
         """Command zero from now on."""

@@ -38,8 +38,6 @@ def grid_image(
     Returns:
         None when nothing is known.
     """
-    import cv2
-
     known_rows = np.flatnonzero((grid >= 0).any(axis=1))
     known_columns = np.flatnonzero((grid >= 0).any(axis=0))
     if len(known_rows) == 0:
@@ -50,9 +48,6 @@ def grid_image(
         column_0, column_1 = max(known_columns[0] - 2, 0), min(known_columns[-1] + 3, column_1)
     cells = grid[row_0:row_1, column_0:column_1]
     grey = np.ascontiguousarray(np.where(cells < 0, UNKNOWN, cells).astype(np.uint8)[::-1])
-    ok, png = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])
-    if not ok:
-        raise ValueError(f"PNG encoder refused a grid of {grey.shape[1]}x{grey.shape[0]} cells")
     header = {
         "resolution": float(resolution),
         "width": int(grey.shape[1]),
@@ -60,5 +55,15 @@ def grid_image(
         "x": float(origin_xy[0] + column_0 * resolution),
         "y": float(origin_xy[1] + row_0 * resolution),
     }
-    data = png.tobytes()
+    data = grey_png(grey)
     return GridImage(header, data, zlib.crc32(data, zlib.crc32(repr(header).encode())))
+
+
+def grey_png(grey: NDArray[np.uint8]) -> bytes:
+    """PNG of a picture (H, W)."""
+    import cv2
+
+    ok, png = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    if not ok:
+        raise ValueError(f"PNG encoder refused a picture of {grey.shape[1]}x{grey.shape[0]} pixels")
+    return bytes(png.tobytes())

@@ -112,6 +112,24 @@ def whole(message: dict[str, Any], key: str) -> int:
     return value
 
 
+def words(message: dict[str, Any], key: str, max_length: int) -> str:
+    """Text ``message[key]`` of 1 to ``max_length`` printable characters; ProtocolError otherwise."""
+    value = message.get(key)
+    if not isinstance(value, str) or not 1 <= len(value.strip()) <= max_length or not value.isprintable():
+        raise ProtocolError(
+            f"{message['type']}.{key} must be 1 to {max_length} printable characters (got {value!r:.80})"
+        )
+    return value.strip()
+
+
+def flag(message: dict[str, Any], key: str, default: bool | None = None) -> bool:
+    """Truth value ``message[key]``; ProtocolError otherwise, or where it is missing and has no default."""
+    value = message.get(key, default)
+    if not isinstance(value, bool):
+        raise ProtocolError(f"{message['type']}.{key} must be true or false (got {value!r:.40})")
+    return value
+
+
 def _as_float(value: int | float) -> float:
     try:
         return float(value)

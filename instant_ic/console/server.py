@@ -9,13 +9,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import html
+import io
 import ipaddress
 import json
 import logging
 import threading
 import time
+import zipfile
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 from urllib.parse import quote, urlsplit
@@ -24,7 +27,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, tls_context
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
-from instant_ic.console.protocol import FrameKind, ProtocolError, number, parse_text, whole
+from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, whole, words
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 
@@ -33,6 +36,7 @@ from ..ranges import Positive, PositiveInt, Range, check_ranges
 STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096
 MAX_BAD_MESSAGES = 20
+MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
 START_TIMEOUT_S = 10.0
 SECURITY_HEADERS = {
@@ -61,6 +65,18 @@ class Backend(Protocol):
 
     def on_look(self, look: Look) -> None:
         """Look direction and field of view of the driver."""
+
+    def on_record(self, on: bool) -> None:
+        """Recording asked for, or to be ended."""
+
+    def on_snapshot(self) -> None:
+        """The last minute is to be kept."""
+
+    def on_bookmark(self, name: str) -> None:
+        """The present moment gets a name."""
+
+    def export_map(self) -> dict[str, bytes]:
+        """Files of the map, name → content; empty while there is none. Called on a thread of its own; may take time."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +209,8 @@ class ConsoleServer:
         app = web.Application(middlewares=[self._guard])
         app.router.add_get("/", self._index)
         app.router.add_get("/health", self._health)
+        app.router.add_get("/export/panorama.jpg", self._export_panorama)
+        app.router.add_get("/export/map.zip", self._export_map)
         app.router.add_post("/sign-in", self._sign_in)
         app.router.add_post("/sign-out", self._sign_out)
         app.router.add_get("/ws", self._websocket)
@@ -302,6 +320,18 @@ class ConsoleServer:
             }
         )
 
+    async def _export_panorama(self, request: web.Request) -> web.StreamResponse:
+        frame = self._frames.get(FrameKind.PANORAMA)
+        if frame is None:
+            raise web.HTTPNotFound(text="no picture has come from the camera yet\n")
+        return _download(frame.payload, "panorama", "jpg", "image/jpeg")
+
+    async def _export_map(self, request: web.Request) -> web.StreamResponse:
+        files = await asyncio.to_thread(self.backend.export_map)
+        if not files:
+            raise web.HTTPNotFound(text="there is no map yet\n")
+        return _download(zip_of(files), "map", "zip", "application/zip")
+
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         if not origin_allowed(request.headers.get("Origin"), request.headers.get("Host", "")):
             logger.warning("refused a WebSocket from origin %r", request.headers.get("Origin"))
@@ -380,14 +410,14 @@ class ConsoleServer:
             "estop": self._on_estop,
             "estop_release": self._on_estop_release,
             "look": self._on_look,
+            "record": self._on_record,
+            "snapshot": self._on_snapshot,
+            "bookmark": self._on_bookmark,
             "ack": self._on_ack,
         }.get(kind)
         if handler is None:
             raise ProtocolError(f"unknown message type {kind!r:.40}")
-        away = message.get("away", False)
-        if not isinstance(away, bool):
-            raise ProtocolError(f"{kind}.away must be true or false (got {away!r:.40})")
-        if self.gate.touch(session.number, now, away=away):
+        if self.gate.touch(session.number, now, away=flag(message, "away", False)):
             self._emit_due()
         handler(session, message, now)
 
@@ -399,6 +429,7 @@ class ConsoleServer:
                 "client_ms": number(message, "client_ms"),
                 "server_ms": self.now_ms(),
                 "command_age_ms": None if age_s is None else max(age_s, 0.0) * 1000.0,
+                "command_hz": self.gate.rate_hz(now),
             }
         )
 
@@ -412,11 +443,8 @@ class ConsoleServer:
         self._emit_due()
 
     def _on_lease(self, session: Session, message: dict[str, Any], now: float) -> None:
-        take = message.get("take", False)
-        if not isinstance(take, bool):
-            raise ProtocolError(f"lease.take must be true or false (got {take!r:.40})")
-        if not session.may_drive:
-            session.reply({"type": "refused", "reason": "watch_only", "text": "this sign-in may watch only"})
+        take = flag(message, "take", False)
+        if not self._may_drive(session):
             return
         self.gate.request(session.number, now, take=take)
         self._emit_due()
@@ -452,6 +480,27 @@ class ConsoleServer:
         # The renderer has one camera: it looks where the driver looks, or the only one who watches.
         if self.gate.driver in (session.number, None):
             self.backend.on_look(look)
+
+    @staticmethod
+    def _may_drive(session: Session) -> bool:
+        """Whether this sign-in may do more than watch and stop; tells it where it may not."""
+        if not session.may_drive:
+            session.reply({"type": "refused", "reason": "watch_only", "text": "this sign-in may watch only"})
+        return session.may_drive
+
+    def _on_record(self, session: Session, message: dict[str, Any], now: float) -> None:
+        on = flag(message, "on")
+        if self._may_drive(session):
+            self.backend.on_record(on)
+
+    def _on_snapshot(self, session: Session, message: dict[str, Any], now: float) -> None:
+        if self._may_drive(session):
+            self.backend.on_snapshot()
+
+    def _on_bookmark(self, session: Session, message: dict[str, Any], now: float) -> None:
+        name = words(message, "name", MAX_BOOKMARK)
+        if self._may_drive(session):
+            self.backend.on_bookmark(name)
 
     def _on_ack(self, session: Session, message: dict[str, Any], now: float) -> None:
         try:
@@ -511,6 +560,21 @@ class ConsoleServer:
         self._foreground = kinds
         for session in self._sessions.values():
             session.set_foreground(kinds, 1.0 / self.config.background_picture_hz)
+
+
+def zip_of(files: dict[str, bytes]) -> bytes:
+    """A ZIP archive of ``files``, name → content."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return packed.getvalue()
+
+
+def _download(content: bytes, stem: str, ending: str, content_type: str) -> web.Response:
+    name = f"{stem}_{datetime.now():%Y%m%d_%H%M%S}.{ending}"
+    headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
+    return web.Response(body=content, content_type=content_type, headers=headers)
 
 
 def _sign_in_page(text: str, status: int) -> web.Response:

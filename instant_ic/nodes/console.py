@@ -10,8 +10,10 @@ from typing import Annotated, Any
 import numpy as np
 
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
+from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look, ServerConfig, ViewConfig, ViewScheduler
-from instant_ic.console.gridimage import grid_image
+from instant_ic.console.gridimage import grey_png, grid_image
+from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.view import view_shape
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, quaternion_from_matrix, transform_points
 from instant_ic.geometry.transforms import TransformError
@@ -28,6 +30,7 @@ from instant_ic.msg import (
     PoseStamped,
     RenderedView,
     ShownPictures,
+    String,
     TwistStamped,
     ViewRequest,
     VspaceStatus,
@@ -46,6 +49,7 @@ from instant_ic.ranges import Positive, Range, check_ranges
 MODES = {0: "real", 1: "virtual", 2: "stopped", 3: "entering", 4: "returning"}
 VSPACE_STATES = {0: "empty", 1: "training", 2: "ready", 3: "failed"}
 HEARTBEAT_TIMEOUT_S = 3.0
+RECORDER_TIMEOUT_S = 3.0
 PICTURE_TIMEOUT_S = 2.0
 MAX_FAULTS = 4
 
@@ -64,6 +68,7 @@ class ConsoleConfig:
     footprint_length_m: Positive = 0.6
     footprint_width_m: Positive = 0.5
     camera_height_m: float = 1.2
+    recorder: str = "operator_recorder"
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -79,6 +84,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         config = self.config
         self.command_out = self.publisher("/operator/cmd_vel", TwistStamped, qos=SENSOR)
         self.estop_out = self.publisher("/operator/estop", Bool, qos=LATCHED)
+        self.bookmark_out = self.publisher("/operator/bookmark", String, qos=RELIABLE)
         self.request_out = self.publisher("/view/request", ViewRequest, qos=SENSOR)
         self.shown_out = self.publisher("/view/shown", ShownPictures, qos=SENSOR)
         self.control = self.latest("/ic/state", ControlState, max_age_s=1.0, qos=LATCHED)
@@ -113,10 +119,13 @@ class ConsoleNode(Node[ConsoleConfig]):
             "footprint": [config.footprint_length_m, config.footprint_width_m],
             "camera": [0.0, 0.0, config.camera_height_m],
         }
+        self._map: OccupancyGrid | None = None
+        self.recording = RecordingDesk(self.ask_recorder, lambda told: self.server.publish("recording", told))
         try:
             self.server = ConsoleServer(self, config.server, page)
             if not self.lockstep:
                 self.server.start()
+                self.recording.start()
         except ConsoleError as error:
             raise NodeError(str(error)) from error
         if not self.lockstep:
@@ -134,7 +143,8 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def teardown(self) -> None:
         if hasattr(self, "server"):
-            self.server.stop()
+            self.server.stop()  # first: it stops the robot
+            self.recording.stop()
 
     # ---- from the operator, on the server's thread ----------------------------------------------
 
@@ -149,6 +159,42 @@ class ConsoleNode(Node[ConsoleConfig]):
     def on_look(self, look: Look) -> None:
         """Takes the look direction for the next view."""
         self.look = look
+
+    def on_record(self, on: bool) -> None:
+        """Has the recorder begin or end a recording."""
+        self.recording.record(on)
+
+    def on_snapshot(self) -> None:
+        """Has the recorder keep the last minute."""
+        self.recording.snapshot()
+
+    def on_bookmark(self, name: str) -> None:
+        """Gives the present moment a name, on a topic, so that it is in every recording and snapshot."""
+        self.bookmark_out.publish(String(data=name))
+        self.recording.bookmark(name)
+
+    def ask_recorder(self, command: str, **arguments: Any) -> Any:
+        """Has the recorder do something; on the desk's thread. Raises RecorderError with words for the operator."""
+        name = self.config.recorder
+        if self.run_dir is None:
+            raise RecorderError("no recorder can be asked here")
+        try:
+            return NodeControl(self.run_dir, name, RECORDER_TIMEOUT_S).call(command, **arguments)
+        except NodeMissingError:
+            raise RecorderError(f"no recorder runs: launch the station with recorder:=true (node {name})") from None
+        except ControlError as error:
+            raise RecorderError(f"recorder: {error}") from None
+
+    def export_map(self) -> dict[str, bytes]:
+        """The newest map as map_server reads it; on a thread of the server."""
+        from instant_ic.slam.map_files import ros_map  # brings numba along
+
+        message = self._map
+        if message is None or message.info.width * message.info.height == 0:
+            return {}
+        grid, resolution, origin = grid_array(message)
+        picture, text = ros_map(grid, round(resolution, 6), origin, "map.png")  # the message has it as float32
+        return {"map.png": grey_png(picture), "map.yaml": text.encode()}
 
     # ---- pictures -------------------------------------------------------------------------------
 
@@ -354,6 +400,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_map(self, message: OccupancyGrid) -> None:
         """Keeps the newest map."""
+        self._map = message
         self._grids[FrameKind.MAP] = message
 
     def on_costmap(self, message: OccupancyGrid) -> None:

@@ -33,28 +33,46 @@ def graph_file(stem: Path) -> Path:
     return stem.with_name(stem.name + ".graph.npz")
 
 
+def ros_map(
+    values: NDArray[np.int8], resolution: float, origin: Sequence[float], image: str
+) -> tuple[NDArray[np.uint8], str]:
+    """Picture (H, W), largest y on top, and YAML text of a map, as map_server reads them.
+
+    Args:
+        values: cells (H, W), lowest y first; 0..100, -1 unknown.
+        resolution: metres a cell.
+        origin: lower left corner (x, y), m.
+        image: file name of the picture, for the text.
+
+    Raises:
+        MapError: an empty map.
+    """
+    if values.size == 0:
+        raise MapError("the map is empty: nothing to save")
+    picture = np.full(values.shape, 205, dtype=np.uint8)
+    picture[values >= round(100 * OCCUPIED_THRESH)] = 0
+    picture[(values >= 0) & (values <= round(100 * FREE_THRESH))] = 254
+    text = (
+        f"image: {image}\nmode: trinary\nresolution: {resolution:.9g}\n"
+        f"origin: [{origin[0]:.9g}, {origin[1]:.9g}, 0]\nnegate: 0\n"
+        f"occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {WRITTEN_FREE_THRESH}\n"
+    )
+    return np.ascontiguousarray(picture[::-1]), text
+
+
 def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
     """Write ``stem.pgm`` and ``stem.yaml``; returns them.
 
     Raises:
         MapError: an empty map, or a folder that cannot be written.
     """
-    values = grid.values
-    if values.size == 0:
-        raise MapError("the map is empty: nothing to save")
-    picture = np.full(values.shape, 205, dtype=np.uint8)
-    picture[values >= round(100 * OCCUPIED_THRESH)] = 0
-    picture[(values >= 0) & (values <= round(100 * FREE_THRESH))] = 254
-    height, width = values.shape
     image, text = stem.with_name(stem.name + ".pgm"), stem.with_name(stem.name + ".yaml")
+    picture, words = ros_map(grid.values, grid.resolution, grid.origin, image.name)
+    height, width = picture.shape
     try:
         stem.parent.mkdir(parents=True, exist_ok=True)
-        image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture[::-1].tobytes())
-        text.write_text(
-            f"image: {image.name}\nmode: trinary\nresolution: {grid.resolution:.9g}\n"
-            f"origin: [{grid.origin[0]:.9g}, {grid.origin[1]:.9g}, 0]\nnegate: 0\n"
-            f"occupied_thresh: {OCCUPIED_THRESH}\nfree_thresh: {WRITTEN_FREE_THRESH}\n"
-        )
+        image.write_bytes(f"P5\n{width} {height}\n255\n".encode() + picture.tobytes())
+        text.write_text(words)
     except OSError as error:
         raise MapError(f"the map cannot be written: {error}") from None
     return [text, image]

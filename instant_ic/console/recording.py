@@ -1,0 +1,151 @@
+"""The page's record, snapshot and bookmark buttons: asks a recorder, and tells the page what has become of it."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from pathlib import PurePath
+from typing import Any, Protocol
+
+MAX_BOOKMARKS = 50
+MAX_SNAPSHOTS = 5
+_END_S = 5.0
+logger = logging.getLogger("instant_ic.console")
+
+
+class RecorderError(RuntimeError):
+    """The recorder did not do what it was asked; says why, in words for the operator."""
+
+
+class Ask(Protocol):
+    """Has the recorder do one of its commands (``record``, ``stop``, ``snapshot``, ``status``) and gives its answer."""
+
+    def __call__(self, command: str, **arguments: Any) -> Any:
+        """Waits for the answer; raises RecorderError where there is none or it is a refusal."""
+
+
+class RecordingDesk:
+    """Asks the recorder from a thread of its own: an answer may take seconds, and the page must not wait.
+
+    Args:
+        ask: see :class:`Ask`.
+        tell: gets the page's ``recording`` message, each ``poll_s`` and at once after something was done.
+        poll_s: how often the recorder is asked how it is, s.
+    """
+
+    def __init__(self, ask: Ask, tell: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
+        self._ask = ask
+        self._tell = tell
+        self._poll_s = poll_s
+        self._wishes: queue.Queue[Callable[[], str] | None] = queue.Queue(maxsize=20)
+        self._bookmarks: deque[dict[str, Any]] = deque(maxlen=MAX_BOOKMARKS)
+        self._recording: Mapping[str, Any] = {}
+        self._notice: dict[str, Any] = {"number": 0, "text": "", "level": "ok"}
+        self._thread = threading.Thread(target=self._run, name="recording desk", daemon=True)
+
+    def start(self) -> None:
+        """Begins to ask."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends; what was asked for and is not done yet is left."""
+        if self._thread.is_alive():
+            self._wish(None)
+            self._thread.join(_END_S)
+
+    # ---- any thread ----------------------------------------------------------------------------------
+
+    def record(self, on: bool) -> None:
+        """Begins a recording, or ends it."""
+        self._wish(self._begin if on else self._end)
+
+    def snapshot(self) -> None:
+        """Has the last minute written."""
+        self._wish(self._snap)
+
+    def bookmark(self, name: str) -> None:
+        """Notes a bookmark that has been published, for the list."""
+        seconds = self._recording.get("seconds") if self._recording.get("state") == "recording" else None
+        path = self._recording.get("path", "") if seconds is not None else ""
+        at = f"{datetime.now():%H:%M:%S}"
+        self._bookmarks.append({"name": name, "at": at, "seconds": seconds, "recording": _name(path)})
+        self._wish(lambda: f"Marked: {name}" + ("" if path else " (nothing is being recorded)"))
+
+    def _wish(self, wish: Callable[[], str] | None) -> None:
+        try:
+            self._wishes.put_nowait(wish)
+        except queue.Full:
+            logger.warning("recorder: %d wishes wait already, this one is left out", self._wishes.maxsize)
+
+    # ---- the desk's thread ---------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        due = 0.0
+        while True:
+            try:
+                wish = self._wishes.get(timeout=max(due - time.monotonic(), 0.0))
+            except queue.Empty:
+                due = time.monotonic() + self._poll_s
+                self._tell(self._told())
+                continue
+            if wish is None:
+                return
+            self._do(wish)
+            due = 0.0
+
+    def _do(self, wish: Callable[[], str]) -> None:
+        try:
+            text, level = wish(), "ok"
+        except RecorderError as error:
+            text, level = str(error), "error"
+            logger.warning("%s", error)
+        self._notice = {"number": self._notice["number"] + 1, "text": text, "level": level}
+
+    def _begin(self) -> str:
+        return f"Recording into {_name(self._ask('record')['path'])}"
+
+    def _end(self) -> str:
+        return f"Recorded: {_name(self._ask('stop')['path'])}"
+
+    def _snap(self) -> str:
+        return f"The last minute is being kept: {_name(self._ask('snapshot', reason='operator')['path'])}"
+
+    def _told(self) -> dict[str, Any]:
+        told: dict[str, Any] = {"notice": self._notice, "bookmarks": list(self._bookmarks)}
+        try:
+            status = self._ask("status")
+        except RecorderError as error:
+            self._recording = {}
+            return told | {"recorder": "missing", "text": str(error), "state": "none"}
+        recording = status.get("recording")
+        if recording is None:
+            text = (
+                f"the recorder writes {_name(status.get('path', ''))} all the time: there is nothing to begin or to end"
+            )
+            return told | {"recorder": "missing", "text": text, "state": "none"}
+        self._recording = recording
+        found = [
+            {"name": _name(made.get("path", "")), "state": made.get("state", ""), "words": made.get("words", "")}
+            for made in status.get("snapshots", [])[-MAX_SNAPSHOTS:]
+        ]
+        return told | {
+            "recorder": "ok",
+            "text": recording.get("error", "") or status.get("error", ""),
+            "state": recording.get("state", "idle"),
+            "name": _name(recording.get("path", "")),
+            "path": recording.get("path", ""),
+            "seconds": recording.get("seconds", 0.0),
+            "bytes": recording.get("bytes", 0),
+            "free_bytes": recording.get("free_bytes"),
+            "cached_s": status.get("cached_s", 0.0),
+            "snapshots": found,
+        }
+
+
+def _name(path: str) -> str:
+    return PurePath(path).name

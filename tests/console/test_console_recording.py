@@ -1,0 +1,281 @@
+"""Record, snapshot, bookmark and export: what the recorder is asked, and what the page is told when it cannot."""
+
+import asyncio
+import io
+import queue
+import threading
+import time
+import zipfile
+
+import aiohttp
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from instant_ic.bus.control import ControlServer
+from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console.access import AccessConfig
+from instant_ic.console.recording import MAX_BOOKMARKS, RecorderError, RecordingDesk
+from instant_ic.msg import grid_message
+from instant_ic.nodes.console import ConsoleConfig, ConsoleNode
+
+WAIT_S = 20.0
+
+
+class FakeRecorder:
+    def __init__(self):
+        self.asked, self.state, self.error, self.refusal = [], "idle", "", ""
+
+    def ask(self, command, **arguments):
+        if self.refusal:
+            raise RecorderError(self.refusal)
+        if command == "status":
+            recording = {
+                "state": self.state, "path": "/d/rec_1", "seconds": 12.5, "bytes": 3_000_000, "messages": 9,
+                "error": self.error, "free_bytes": 10**9,
+            }  # fmt: skip
+            made = [{"path": f"/d/s{n}", "state": "done", "words": "9 messages"} for n in range(7)]
+            return {"path": "/d", "error": "", "cached_s": 60.0, "snapshots": made, "recording": recording}
+        self.asked.append((command, arguments))
+        if command == "record":
+            self.state = "recording"
+        return {"path": "/d/rec_1"}
+
+
+@pytest.fixture
+def desk():
+    """A desk, its recorder, and a wait for what it tells the page."""
+    recorder, told = FakeRecorder(), queue.Queue()
+    made = RecordingDesk(recorder.ask, told.put, poll_s=0.02)
+    made.start()
+
+    def wait_for(condition):
+        deadline = time.monotonic() + WAIT_S
+        while not condition(message := told.get(timeout=WAIT_S)):
+            assert time.monotonic() < deadline, message
+        return message
+
+    yield made, recorder, wait_for
+    made.stop()
+    assert not made._thread.is_alive()
+
+
+def test_a_recording_is_begun_told_and_ended(desk):
+    made, recorder, wait_for = desk
+    assert wait_for(lambda m: m["state"] == "idle")["recorder"] == "ok"
+    made.record(True)
+    told = wait_for(lambda m: m["state"] == "recording")
+    assert (told["name"], told["seconds"], told["bytes"], told["free_bytes"]) == ("rec_1", 12.5, 3_000_000, 10**9)
+    assert told["notice"] == {"number": 1, "text": "Recording into rec_1", "level": "ok"}
+    made.record(False)
+    made.snapshot()
+    told = wait_for(lambda m: m["notice"]["number"] == 3)
+    assert recorder.asked == [("record", {}), ("stop", {}), ("snapshot", {"reason": "operator"})]
+    assert told["notice"]["text"] == "The last minute is being kept: rec_1"
+    assert [made["name"] for made in told["snapshots"]] == ["s2", "s3", "s4", "s5", "s6"]  # the newest five
+
+
+def test_a_missing_recorder_and_a_refusal_are_told_in_words_and_the_next_wish_counts(desk):
+    made, recorder, wait_for = desk
+    recorder.refusal = "no recorder runs: launch the station with recorder:=true"
+    made.record(True)
+    told = wait_for(lambda m: m["notice"]["number"] == 1)
+    assert told["notice"] == {"number": 1, "text": recorder.refusal, "level": "error"}
+    assert (told["recorder"], told["state"], told["text"]) == ("missing", "none", recorder.refusal)
+    recorder.refusal = ""
+    made.record(True)
+    assert wait_for(lambda m: m["notice"]["number"] == 2)["notice"]["level"] == "ok"
+
+
+def test_a_full_disk_is_told(desk):
+    _, recorder, wait_for = desk
+    recorder.state, recorder.error = "disk full", "only 90 MB are free where /d is"
+    assert wait_for(lambda m: m["state"] == "disk full")["text"] == "only 90 MB are free where /d is"
+
+
+def test_bookmarks_are_listed_with_their_place_in_the_recording(desk):
+    made, recorder, wait_for = desk
+    made.bookmark("before")
+    told = wait_for(lambda m: m["bookmarks"])
+    assert told["bookmarks"][0]["seconds"] is None and "nothing is being recorded" in told["notice"]["text"]
+    recorder.state = "recording"
+    wait_for(lambda m: m["state"] == "recording")
+    for n in range(MAX_BOOKMARKS):
+        made.bookmark(f"door {n}")
+    told = wait_for(lambda m: m["bookmarks"][-1]["name"] == f"door {MAX_BOOKMARKS - 1}")
+    assert len(told["bookmarks"]) == MAX_BOOKMARKS and told["bookmarks"][0]["name"] == "door 0"
+    assert (told["bookmarks"][-1]["seconds"], told["bookmarks"][-1]["recording"]) == (12.5, "rec_1")
+
+
+def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
+    told = []
+    made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, told.append)
+    told.append(made._told())
+    assert told[0]["recorder"] == "missing" and "drive all the time" in told[0]["text"]
+
+
+# ---- the node --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def node():
+    with LockstepBus(1_000_000_000) as bus:
+        yield bus, bus.add(ConsoleNode, ConsoleConfig())
+
+
+def test_a_bookmark_goes_to_the_bus_so_that_every_bag_has_it(node):
+    bus, console = node
+    console.on_bookmark("door stuck")
+    assert bus.last("/operator/bookmark").data == "door stuck"
+
+
+def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypatch):
+    _, console = node
+    with pytest.raises(RecorderError, match="no recorder can be asked here"):
+        console.ask_recorder("status")
+    monkeypatch.setattr(ConsoleNode, "run_dir", tmp_path)
+    (tmp_path / "nodes").mkdir()
+    with pytest.raises(RecorderError, match=r"no recorder runs: .* recorder:=true \(node operator_recorder\)"):
+        console.ask_recorder("status")
+
+    class Recorder:
+        def __init__(self):
+            self.node_name, self.starting = "operator_recorder", False
+            self.commands = {"status": lambda: {"path": "/d"}, "stop": lambda: int("nothing is being recorded")}
+
+        def call_soon(self, function):
+            threading.Thread(target=function).start()
+
+    server = ControlServer(Recorder(), tmp_path / "nodes" / "operator_recorder.sock")
+    try:
+        assert console.ask_recorder("status") == {"path": "/d"}
+        with pytest.raises(RecorderError, match=r"recorder: stop: .*nothing is being recorded"):
+            console.ask_recorder("stop")
+    finally:
+        server.close()
+
+
+def test_the_map_is_exported_as_map_server_reads_it(node, tmp_path):
+    from instant_ic.slam.map_files import load_grid
+
+    bus, console = node
+    assert console.export_map() == {}
+    grid = np.array([[0, 100, -1], [0, 0, 100]], np.int8)  # row 0: lowest y
+    bus.publish("/map", grid_message(grid, 0.05, (1.0, -2.0), "map", bus.clock.now_ns()), latched=True)
+    files = console.export_map()
+    picture = cv2.imdecode(np.frombuffer(files["map.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+    assert picture.tolist() == [[254, 254, 0], [254, 0, 205]]  # largest y on top
+    text = yaml.safe_load(files["map.yaml"])
+    assert (text["image"], text["resolution"], text["origin"]) == ("map.png", 0.05, [1.0, -2.0, 0])
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    assert load_grid(tmp_path / "map.yaml").values.tolist() == grid.tolist()
+
+
+# ---- the server ------------------------------------------------------------------------------------
+
+
+class Backend:
+    def __init__(self):
+        self.done, self.map = [], {}
+        self._news = threading.Condition()
+
+    def on_drive(self, linear, angular):
+        pass
+
+    def on_estop(self, stop):
+        self._add(("estop", stop))
+
+    def on_look(self, look):
+        pass
+
+    def on_record(self, on):
+        self._add(("record", on))
+
+    def on_snapshot(self):
+        self._add(("snapshot",))
+
+    def on_bookmark(self, name):
+        self._add(("bookmark", name))
+
+    def export_map(self):
+        return self.map
+
+    def _add(self, what):
+        with self._news:
+            self.done.append(what)
+            self._news.notify_all()
+
+    def wait(self, count):
+        with self._news:
+            assert self._news.wait_for(lambda: len(self.done) >= count, WAIT_S), self.done
+
+
+@pytest.fixture
+def served(tmp_path):
+    tokens = {}
+    for role in ("token_file", "watch_token_file"):
+        tokens[role] = tmp_path / role
+        tokens[role].write_text(f"{role}-0123456789")
+        tokens[role].chmod(0o600)
+    backend = Backend()
+    access = AccessConfig(**{role: str(path) for role, path in tokens.items()})
+    server = ConsoleServer(backend, ServerConfig(port=0, access=access))
+    server.start()
+    yield server, backend
+    server.stop()
+
+
+def test_drivers_record_and_watchers_may_not_but_both_export(served):
+    server, backend = served
+
+    async def scenario():
+        async with (
+            ConsoleClient(server.url, token="token_file-0123456789") as driver,
+            ConsoleClient(server.url, token="watch_token_file-0123456789") as watcher,
+        ):
+            for message in ({"type": "record", "on": True}, {"type": "snapshot"}, {"type": "bookmark", "name": "x"}):
+                await watcher.send(message)
+            await watcher.wait_for(lambda c: c.refused == ["watch_only"] * 3, WAIT_S)
+            assert backend.done == []
+            await driver.send({"type": "record", "on": True})
+            await driver.send({"type": "snapshot"})
+            await driver.send({"type": "bookmark", "name": " door stuck "})
+            await driver.send({"type": "record", "on": False})
+            await asyncio.to_thread(backend.wait, 4)
+            assert backend.done == [("record", True), ("snapshot",), ("bookmark", "door stuck"), ("record", False)]
+            for bad in ({"type": "record"}, {"type": "record", "on": 1}, {"type": "bookmark"}):
+                await driver.send(bad)
+            for name in ("", "  ", "x" * 61, "a\nb", 7):
+                await driver.send({"type": "bookmark", "name": name})
+            await driver.wait_for(lambda c: len(c.errors) == 8, WAIT_S)
+        header = {"Authorization": "Bearer watch_token_file-0123456789"}
+        async with aiohttp.ClientSession(headers=header) as http:
+            for path in ("panorama.jpg", "map.zip"):
+                async with http.get(f"{server.url}export/{path}") as answer:
+                    assert answer.status == 404  # nothing there yet
+            server.send_frame(FrameKind.PANORAMA, {}, b"JPEG")
+            backend.map = {"map.png": b"PNG", "map.yaml": b"image: map.png\n"}
+            async with http.get(f"{server.url}export/panorama.jpg") as answer:
+                assert await answer.read() == b"JPEG" and answer.content_type == "image/jpeg"
+                assert answer.headers["Content-Disposition"].startswith('attachment; filename="panorama_')
+            async with http.get(f"{server.url}export/map.zip") as answer:
+                with zipfile.ZipFile(io.BytesIO(await answer.read())) as archive:
+                    assert {name: archive.read(name) for name in archive.namelist()} == backend.map
+        async with aiohttp.ClientSession() as http, http.get(f"{server.url}export/map.zip") as answer:
+            assert answer.status == 401
+
+    asyncio.run(scenario())
+
+
+def test_rate_of_the_drivers_commands_is_told():
+    from instant_ic.console.drive import DriveConfig, DriveGate
+
+    gate = DriveGate(DriveConfig())
+    gate.request(1, 0.0)
+    for n in range(40):  # 20 Hz for two seconds
+        gate.receive(1, n, 0.0, 0.1, 0.0, n * 0.05)
+    assert gate.rate_hz(1.96) == 20.0
+    assert gate.rate_hz(3.0) == 0.0
