@@ -74,10 +74,10 @@ class SharedControl(Arbiter):
 
     def _done(self, inputs: ArbiterInputs, pose: FloatArray, costmap: Costmap, command: tuple[float, float]) -> bool:
         assert self.goal is not None
-        if float(np.linalg.norm(pose[:2] - self.goal[:2])) < ARRIVED_M:
-            return True
         if abs(wrap_angle(float(pose[2] - self.goal[2]))) > ALIGNED_RAD:
             return False
+        if float(np.linalg.norm(pose[:2] - self.goal[:2])) < ARRIVED_M:
+            return True
         switch = self.config.switch
         ahead = self.predictor.predict(
             pose, inputs.robot_velocity, command, costmap, switch.return_margin_m, switch.return_side_m

@@ -349,7 +349,8 @@ class SimulatedStack:
         simulation.step(STEP_S)
         now_ns = START_NS + round(simulation.time_s * 1e9)
         self.bus.advance_to(now_ns)
-        packets = simulation.scan_packets()
+        # Just after the driver's cut (180°: 0.05 s into each revolution), so that no scan is late for it.
+        packets = simulation.scan_packets() if self._steps % 6 == 3 else []
         if packets:
             scan = VelodyneScan(
                 header=header("velodyne", now_ns),

@@ -1,0 +1,269 @@
+"""``ic evaluate teleop``: an operator drives through corridors with obstacles that he does not look at.
+
+The whole stack runs in simulated time (``teleop_stack``), by illusory control, by a robot that stops at obstacles, and
+by shared control that goes round by itself. Figures are those of ``teleop_figures``.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..control.arbiter import Mode
+from ..control.warmup import warm_up
+from ..geometry.poses import pose_matrix
+from . import teleop_figures as figures
+from .teleop_figures import Drive, Switch
+from .teleop_operator import Operator, Sight, make_operator, read_commands
+from .teleop_stack import CAMERA_HEIGHT_M, DEPTHS, METHODS, STEP_S, Shown, SimulatedStack, StackConfig
+from .teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+AT_GOAL_M = 0.35
+READY_S = 10.0
+"""Most that the machine may take to be ready for the first command."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of one evaluation.
+
+    Attributes:
+        episodes, seed: which drives; the same seed gives the same drives.
+        world: ``corridors`` (random ones), or a world of the simulator.
+        methods: of ``METHODS``.
+        depth: of ``DEPTHS``.
+        log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
+        pictures: whether the pictures on either side of a switch are drawn and compared.
+    """
+
+    episodes: int = 50
+    seed: int = 0
+    world: str = RANDOM_CORRIDORS
+    methods: tuple[str, ...] = METHODS
+    depth: str = "fused"
+    log: Path | None = None
+    pictures: bool = True
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
+        for key, given, allowed in (("methods", self.methods, METHODS), ("depth", (self.depth,), DEPTHS)):
+            unknown = [name for name in given if name not in allowed]
+            if unknown or not given:
+                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
+
+
+class _Episode:
+    """One drive in the making."""
+
+    def __init__(self, settings: Settings, course: Course, index: int, method: str) -> None:
+        seed = 1000 * settings.seed + index
+        config = StackConfig(method=method, depth=settings.depth, seed=seed)
+        self.settings, self.course = settings, course
+        self.drive = Drive(index, method, way_m=course.way_m)
+        log = read_commands(settings.log) if settings.log is not None else None
+        self.recorded = log is not None
+        self.operator: Operator = make_operator(course.goals, lambda: floor_plan(course.world), log)
+        per_obstacle = 20.0 * len(course.obstacles)
+        self.limit_s = READY_S + (log[-1, 0] + 20.0 if log is not None else 20.0 + 4.0 * course.way_m + per_obstacle)
+        self.stack = SimulatedStack(course.world, config)
+        self.began_s: float | None = None
+        self.ended_s: float | None = None
+        self.contacts = 0
+
+    def run(self, on_step: Callable[[SimulatedStack], None] | None = None) -> Drive:
+        """Drives until the goal, the operator's giving up, or the time limit.
+
+        Raises:
+            RuntimeError: the machine never got ready.
+        """
+        drive, stack, began = self.drive, self.stack, time.process_time()
+        with stack:
+            while stack.time_s < self.limit_s and not self._over():
+                stack.step(self._operate)
+                if on_step is not None:
+                    on_step(stack)
+                if self.began_s is None and stack.time_s > READY_S:
+                    reason = stack.state.reason if stack.state is not None else "the arbiter says nothing"
+                    raise RuntimeError(f"the simulated robot was not ready within {READY_S:g} s: {reason}")
+            drive.cpu_s = time.process_time() - began
+            end_s = self.ended_s or stack.time_s
+            drive.seconds = end_s - (self.began_s or 0.0)
+            drive.contacts = stack.simulation.robot.contacts
+            drive.completed = self.ended_s is not None
+            drive.gave_up = self.operator.gave_up
+            drive.detours = getattr(self.operator, "detours", 0)
+            drive.reason = "" if drive.completed else str(stack.state.reason)
+            centres = np.array([(one.x, one.y) for one in self.course.obstacles]).reshape(-1, 2)
+            figures.judge(drive, stack.log, centres)
+            drive.switches = [self._with_pictures(switch) for switch in drive.switches]
+        return drive
+
+    def _operate(self) -> tuple[float, float]:
+        stack = self.stack
+        state = stack.state
+        if state is None or (self.began_s is None and int(state.mode) != Mode.REAL):
+            return 0.0, 0.0
+        if self.began_s is None:
+            self.began_s = stack.time_s
+        twist = stack.simulation.robot.twist
+        sight = Sight(
+            stack.time_s,
+            stack.shown_pose,
+            stack.page.virtual,
+            int(state.mode) == Mode.STOPPED,
+            (float(twist[0]), float(twist[2])),
+            stack.robot,
+        )
+        command = self.operator.command(sight)
+        if self.ended_s is None and self._there():
+            self.ended_s = stack.time_s
+        return command
+
+    def _there(self) -> bool:
+        """The operator is done, the r-bot is where he wanted it, and it is shown again."""
+        if not self.operator.done or self.stack.page.virtual:
+            return False
+        if self.recorded:
+            return True
+        return float(np.linalg.norm(self.stack.robot[:2] - self.course.goals[-1])) < AT_GOAL_M
+
+    def _over(self) -> bool:
+        return self.operator.gave_up or (self.ended_s is not None and self.stack.time_s > self.ended_s + 0.5)
+
+    # -- the pictures at a switch
+
+    def _with_pictures(self, switch: Switch) -> Switch:
+        found = figures.pictures_at(self.stack.log.pictures, switch)
+        if found is None:
+            return switch
+        error = figures.picture_error_m(*found, self.stack.log)
+        psnr = self._psnr_db(*found) if self.settings.pictures else None
+        return replace(switch, picture_error_m=error, psnr_db=psnr)
+
+    def _psnr_db(self, before: Shown, after: Shown) -> float:
+        from .pictures import psnr_db
+
+        view, photo = (before, after) if before.virtual else (after, before)
+        rgb = decode(view.jpeg)
+        return psnr_db(rgb, self.photograph(photo, rgb.shape[1], rgb.shape[0], view.fov_rad))
+
+    def photograph(self, shown: Shown, width: int, height: int, fov_rad: float) -> NDArray[np.uint8]:
+        """The camera's picture as the page shows it: from where it was taken, turned to the heading."""
+        return self.stack.simulation.renderer.render_perspective(
+            pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading), width, height, fov_rad
+        ).rgb
+
+
+def decode(jpeg: bytes) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a JPEG.
+
+    Raises:
+        ValueError: it is none.
+    """
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    if picture is None:
+        raise ValueError(f"a rendered view of {len(jpeg)} bytes cannot be decoded")
+    return np.asarray(picture[..., ::-1])
+
+
+def run_episode(settings: Settings, index: int, on_step: Callable[[SimulatedStack], None] | None = None) -> list[Drive]:
+    """One course driven by each method in turn; the same for the same settings and index, times apart."""
+    logging.getLogger("instant_ic").setLevel(logging.ERROR)
+    course = make_course(settings.world, settings.seed, index)
+    return [_Episode(settings, course, index, method).run(on_step) for method in settings.methods]
+
+
+def prepare() -> None:
+    """Compiles the kernels that the nodes compile at their start elsewhere, so that no episode counts that time."""
+    logging.getLogger("instant_ic").setLevel(logging.ERROR)
+    warm_up()
+
+
+def evaluate(
+    settings: Settings,
+    jobs: int = 1,
+    on_episode: Callable[[list[Drive]], None] | None = None,
+    timeout_s: float = 7200.0,
+) -> list[Drive]:
+    """Drives all episodes, ``jobs`` at a time, each in a process of its own where more than one.
+
+    Raises:
+        ValueError: nothing to do, no such world, no such log.
+        TimeoutError: they took longer than ``timeout_s``.
+        RuntimeError: a process died, or a robot never got ready.
+    """
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures.process import BrokenProcessPool
+
+    if jobs < 1:
+        raise ValueError(f"jobs must be at least 1 (got {jobs})")
+    if settings.log is not None:
+        read_commands(settings.log)  # before anything is started
+    done: list[Drive] = []
+    tell = on_episode or (lambda drives: None)
+    if jobs == 1:
+        prepare()
+        for index in range(settings.episodes):
+            drives = run_episode(settings, index)
+            done += drives
+            tell(drives)
+        return done
+    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare)
+    try:
+        futures = [pool.submit(run_episode, settings, index) for index in range(settings.episodes)]
+        for future in as_completed(futures, timeout=timeout_s):
+            drives = future.result()
+            done += drives
+            tell(drives)
+    except BrokenProcessPool as error:
+        raise RuntimeError("a process that drove an episode died (out of memory?); try --jobs 1") from error
+    except TimeoutError as error:
+        raise TimeoutError(f"the episodes took longer than {timeout_s:.0f} s; {len(done)} drives are done") from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    return sorted(done, key=lambda drive: (drive.index, METHODS.index(drive.method)))
+
+
+def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
+    """Figures by method, the targets, and each drive without its tracks, as JSON takes it."""
+    by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
+    stop = by_method.get("stop")
+    methods = {name: figures.summary(of, stop if name != "stop" else None) for name, of in by_method.items() if of}
+    rows = []
+    for drive in drives:
+        row = {key: value for key, value in asdict(drive).items() if key != "tracks"}
+        rows.append(_finite(row))
+    return {
+        "seed": settings.seed,
+        "world": settings.world,
+        "operator": "scripted" if settings.log is None else "recorded",
+        "depth": settings.depth,
+        "methods": _finite(methods),
+        "targets": figures.targets(methods["ic"]) if "ic" in methods else {},
+        "each": rows,
+    }
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+__all__ = ["STEP_S", "Settings", "evaluate", "report", "run_episode"]
