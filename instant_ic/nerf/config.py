@@ -29,9 +29,13 @@ class FieldConfig:
     """Cells of the coarsest level across the scene."""
     hidden: Annotated[int, Range(4, 64)] = 32
     """Width of the hidden layer; a multiple of 4."""
+    geometry: str = "distance"
+    """What the field says of surfaces: ``distance``, a signed one (one colour query a pixel), or ``density``, the
+    paper's way (colours composited over samples round the depth)."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        _require(self.geometry in ("distance", "density"), "geometry", self.geometry, "distance or density")
         _require(self.features in (2, 4), "features", self.features, "2 or 4")
         _require(self.hidden % 4 == 0, "hidden", self.hidden, "a multiple of 4")
         inputs = self.levels * self.features
@@ -58,6 +62,12 @@ class TrainConfig:
     """Weight of the signed-distance error against the colour error."""
     band_colour_weight: Share = 0.3
     """Weight of the colour error of samples beside the surface against those on it."""
+    depth_weight: Share = 0.1
+    """With ``density``: weight of the squared error of a ray's depth, in bands and by its uncertainty."""
+    opacity_weight: Share = 0.01
+    """With ``density``: weight of what of the light passes through a surface, squared."""
+    distortion_weight: Share = 0.01
+    """With ``density``: weight of how far a ray's density is spread (distortion loss of mip-NeRF 360)."""
     seed: int = 1
 
     def __post_init__(self) -> None:
@@ -82,6 +92,11 @@ class GeometryConfig:
     """Depths beyond are set to it."""
     min_known_share: _UpToOne = 0.5
     """A keyframe whose depth is known in less of the picture is refused."""
+    body_below_deg: Annotated[float, Range(-90, 0)] = -90.0
+    """Below this elevation the panorama shows the robot itself, which is left out; -90: nowhere."""
+    sky_share: Share = 0.05
+    """Regions of unknown depth above the horizon that are as large a share of the sphere are sky: endlessly far. 1: no
+    sky, they are filled from around."""
     cell_m: _UpToOne = 0.04
     """Smallest cell of the occupancy grid, metres; larger where max_cells would be passed."""
     max_cells: Annotated[int, Range(10_000, 2**27)] = 6_000_000
@@ -121,6 +136,8 @@ class PictureConfig:
     field_from_db: float = 40.0
     """The field alone from this PSNR on; at or under ``panorama_until_db`` the panorama is never used."""
 
+    refresh_pictures: Annotated[int, Range(1, 60)] = 6
+    """Over so many pictures what is shown passes to a new keyframe; 1: at once."""
     least_depth_share: Share = 0.5
     """Of the keyframe's depth in where surfaces lie, at least; otherwise the panorama's share counts here too."""
 
@@ -174,4 +191,6 @@ class VirtualSpaceConfig:
         _require(self.source != "mesh" or bool(self.mesh), "mesh", self.mesh, "a file with source: mesh")
         pose = len(self.mesh_pose) == 4 and all(math.isfinite(value) for value in self.mesh_pose)
         _require(pose, "mesh_pose", self.mesh_pose, "x, y, z in metres and yaw in degrees")
+        for key in ("ray_columns", "ray_rows") if self.field.geometry == "density" else ():
+            _require(getattr(self.train, key) % 16 == 0, key, getattr(self.train, key), "a multiple of 16 with density")
         _require(64 <= self.panorama_width <= 8192, "panorama_width", self.panorama_width, "from 64 to 8192")

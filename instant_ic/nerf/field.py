@@ -16,6 +16,10 @@ from .prior import PanoramaPrior
 Floats = NDArray[np.float32]
 BETA1, BETA2, EPSILON = 0.9, 0.99, 3e-7
 """Adam's constants, as in instant-ngp."""
+VOLUME_SAMPLES = 8
+"""Of a ray where geometry is a density, evenly through the band."""
+RAW_LIMITS = -10.0, 6.0
+"""Of the logarithm of the density: outside it has no gradient."""
 
 
 @dataclass(frozen=True)
@@ -273,6 +277,11 @@ def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
     colour = np.where(on_surface, 1.0, config.band_colour_weight) / (3 * rays)
     distance = np.full(2 * rays, config.distance_weight / (2 * rays))
     return colour.astype(np.float32), distance.astype(np.float32)
+
+
+def volume_rays(config: TrainConfig) -> tuple[int, int]:
+    """Columns and rows of a batch's rays where geometry is a density: as many field queries as with a distance."""
+    return config.ray_columns // 2, config.ray_rows // 2
 
 
 def level_rates(config: TrainConfig, levels: int) -> Floats:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from . import kernels, march
+from . import kernels, march, volume
 from .config import FieldConfig, TrainConfig
 from .field import (
     BETA1,
@@ -21,6 +21,7 @@ from .field import (
     level_rates,
     ray_sources,
     sample_weights,
+    volume_rays,
 )
 
 FIRST_STRIDE = 4
@@ -48,6 +49,8 @@ class NumbaDevice:
     def __init__(self, field: FieldConfig, train: TrainConfig) -> None:
         self.first_stride = FIRST_STRIDE
         self._train = train
+        self._density = field.geometry == "density"
+        self._losses = np.array([train.depth_weight, train.opacity_weight, train.distortion_weight], np.float32)
         self._rays = train.ray_columns * train.ray_rows
         self._points = np.zeros((2 * self._rays, 3), np.float32)
         self._target = np.zeros((2 * self._rays, 4), np.float32)
@@ -75,19 +78,32 @@ class NumbaDevice:
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
         drawn, lattice, p = self._drawn, self._drawn.scene.lattice, self._p
-        priors, weight, columns, rows = drawn.priors, self._weight, self._train.ray_columns, self._train.ray_rows
+        priors = drawn.priors
+        columns, rows = volume_rays(self._train) if self._density else (self._train.ray_columns, self._train.ray_rows)
+        weight = self._weight[: 2 * columns * rows]
         self._steps += 1
+        sources = ray_sources(len(priors.band), columns * rows // 64, self._steps)
         march.sample_rays(
-            uniform, columns, rows, ray_sources(len(priors.band), self._rays // 64, self._steps),
+            uniform, columns, rows, sources,
             priors.rgb, priors.inverse_depth, priors.torn, priors.usable, priors.trust,
             priors.map_from_camera, priors.gains, priors.band, self._points, self._target, weight,
         )  # fmt: skip
-        g1, gb1, g2, gb2 = self._network_grads
-        colour, distance = kernels.gradient(
-            p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, self._points, self._target,
-            self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1],
-            self._table_grad, self._touched, g1, gb1, g2, gb2,
-        )  # fmt: skip
+        place = lattice.cells_per_m, lattice.origin, drawn.focus
+        grads = self._table_grad, self._touched, *self._network_grads
+        share = np.maximum(weight.mean(axis=0), np.float32(1e-3)).tolist()
+        if self._density:
+            colour, distance = volume.volume_gradient(
+                p.table, *p.network(), *place, self._points, self._target, weight,
+                uniform[: columns * rows, 2].copy(), sources, drawn.focus[:, :3].copy(), priors.band,
+                self._losses, *grads,
+            )  # fmt: skip
+        else:
+            colour, distance = kernels.gradient(
+                p.table, *p.network(), *place, self._points, self._target,
+                self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1], *grads,
+            )  # fmt: skip
+            colour /= 1 + self._train.band_colour_weight
+            distance /= self._train.distance_weight
         betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
         step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, self._steps))
         kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_sizes, *betas)
@@ -97,9 +113,7 @@ class NumbaDevice:
             v += (1 - betas[1]) * (grad * grad - v)
             value -= step_size * m / (np.sqrt(v) + betas[2])
             grad[...] = 0
-        drawn_share = max(float(weight[:, 0].mean()), 1e-3)
-        colour_error = colour / ((1 + self._train.band_colour_weight) * drawn_share)
-        return colour_error, distance / (self._train.distance_weight * max(float(weight[:, 1].mean()), 1e-3))
+        return colour / share[0], distance / share[1]
 
     def freeze(self) -> DrawnField:
         return replace(self._drawn, parameters=self.parameters())
@@ -109,16 +123,23 @@ class NumbaDevice:
     ) -> tuple[Floats, Floats, Floats]:
         height, width = rays.shape
         drawn = frozen or self._drawn
-        axial_depth, confidence = self._trace(drawn, rays, depth_share)
+        # A density is composited round the keyframes' own depth.
+        axial_depth, confidence = self._trace(drawn, rays, 1.0 if self._density else depth_share)
         depth = axial_depth / rays.axial
-        colour = np.zeros((height * width, 3), np.float32)
-        if panorama_share < 1:
+        guide, colour = depth, np.zeros((height * width, 3), np.float32)
+        if panorama_share < 1 and self._density:
+            p, lattice, depth = drawn.parameters, drawn.scene.lattice, guide.copy()
+            volume.composite(
+                p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, drawn.priors.band[0],
+                np.float32(depth_share), rays.origin, rays.directions, depth, colour,
+            )  # fmt: skip
+        elif panorama_share < 1:
             self._query(drawn, rays, depth, colour)
         if panorama_share > 0:
             priors = drawn.priors
             march.mix_panorama(
                 priors.rgb, priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.gains,
-                priors.band, rays.origin, rays.directions, depth, confidence, np.float32(panorama_share), colour,
+                priors.band, rays.origin, rays.directions, guide, confidence, np.float32(panorama_share), colour,
             )  # fmt: skip
         return colour, depth, confidence
 

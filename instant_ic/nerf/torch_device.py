@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import reference
+from . import reference, volume_reference
 from .config import FieldConfig, TrainConfig
 from .field import (
     BETA1,
@@ -23,6 +23,7 @@ from .field import (
     level_rates,
     ray_sources,
     sample_weights,
+    volume_rays,
 )
 from .reference import TorchField, TorchGrid, TorchPrior
 
@@ -57,6 +58,7 @@ class TorchDevice:
 
     def __init__(self, field: FieldConfig, train: TrainConfig, device: str) -> None:
         self._train = train
+        self._density = field.geometry == "density"
         self._device = device
         self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
         weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
@@ -86,14 +88,9 @@ class TorchDevice:
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
         drawn = torch.from_numpy(uniform).to(self._device)
-        columns, rows = self._train.ray_columns, self._train.ray_rows
         self._steps += 1
-        sources = torch.from_numpy(ray_sources(len(self._priors), columns * rows // 64, self._steps)).to(self._device)
-        points, target, weight = reference.sample_rays(drawn, columns, rows, self._priors, sources)
-        output = reference.query(self._field, points)
-        weights = self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1]
-        colour, distance = reference.loss(output, target, *weights)
-        grads = torch.autograd.grad(colour + distance, self._field.parameters())
+        error, colour, distance = self._density_loss(drawn) if self._density else self._distance_loss(drawn)
+        grads = torch.autograd.grad(error, self._field.parameters())
         with torch.no_grad():
             for index, (value, grad) in enumerate(zip(self._field.parameters(), grads, strict=True)):
                 lr = table_lr if index == 0 else network_lr
@@ -102,9 +99,39 @@ class TorchDevice:
                     step_size = step_size * self._level_rates
                 # A network's row is an entry like the table's: without a gradient it is left alone.
                 reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
+        return float(colour.detach()), float(distance.detach())
+
+    def _rays(self, uniform: Tensor, columns: int, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Points, targets and weights of a batch, and the keyframe of each tile."""
+        sources = torch.from_numpy(ray_sources(len(self._priors), columns * rows // 64, self._steps)).to(self._device)
+        return *reference.sample_rays(uniform, columns, rows, self._priors, sources), sources
+
+    def _distance_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What training minimises, and ``step``'s two errors."""
+        points, target, weight, _ = self._rays(uniform, self._train.ray_columns, self._train.ray_rows)
+        output = reference.query(self._field, points)
+        weights = self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1]
+        colour, distance = reference.loss(output, target, *weights)
         share = weight.mean(dim=0).clamp(min=1e-3)
-        colour_error = float(colour.detach() / share[0]) / (1 + self._train.band_colour_weight)
-        return colour_error, float(distance.detach() / share[1]) / self._train.distance_weight
+        errors = colour / share[0] / (1 + self._train.band_colour_weight), distance / share[1]
+        return colour + distance, errors[0], errors[1] / self._train.distance_weight
+
+    def _density_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As ``_distance_loss``."""
+        columns, rows = volume_rays(self._train)
+        points, target, weight, sources = self._rays(uniform[: columns * rows], columns, rows)
+        surface, colours, weight = (a.view(-1, 2, 64, a.shape[1])[:, 0].flatten(0, 1) for a in (points, target, weight))
+        number = sources.long().repeat_interleave(64)
+        cameras = torch.stack([prior.map_from_camera[:3, 3] for prior in self._priors])[number]
+        band = torch.tensor([prior.band for prior in self._priors], device=self._device)[number]
+        jitter = uniform[: columns * rows, 2]
+        samples, offset, span = volume_reference.band_samples(cameras, surface, jitter, band, self._priors[0])
+        output = reference.query(self._field, samples.reshape(-1, 3)).reshape(*offset.shape, 4)
+        losses = volume_reference.volume_loss(output, offset, span, colours[:, :3], weight)
+        weights = 1.0, self._train.depth_weight, self._train.opacity_weight, self._train.distortion_weight
+        share = weight.mean(dim=0).clamp(min=1e-3)
+        error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
+        return error, losses[0] / share[0], losses[1] / share[1]
 
     def freeze(self) -> tuple[TorchField, list[TorchPrior], TorchGrid]:
         field = self._field
@@ -124,7 +151,8 @@ class TorchDevice:
         origin = torch.from_numpy(rays.origin).to(self._device)
         directions = torch.from_numpy(rays.directions).to(self._device)
         shares = panorama_share, depth_share
-        parts = [self._draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
+        draw = self._draw_density if self._density else self._draw
+        parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
@@ -143,6 +171,20 @@ class TorchDevice:
         points = origin + depth[met, None] * directions[met]
         colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
         reference.mix_panorama(priors, origin, directions, depth, confidence, shares[0], colour)
+        return colour, depth, confidence
+
+    @staticmethod
+    def _draw_density(
+        field: TorchField,
+        priors: list[TorchPrior],
+        grid: TorchGrid,
+        origin: Tensor,
+        directions: Tensor,
+        shares: tuple[float, float],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        guide, confidence = reference.trace(field, grid, priors, 1.0, origin, directions)
+        colour, depth = volume_reference.composite(field, priors[0], shares[1], origin, directions, guide)
+        reference.mix_panorama(priors, origin, directions, guide, confidence, shares[0], colour)
         return colour, depth, confidence
 
     def parameters(self, frozen: tuple[TorchField, list[TorchPrior], TorchGrid] | None = None) -> FieldParameters:
