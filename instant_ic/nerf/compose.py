@@ -1,4 +1,4 @@
-"""One picture of several keyframes: what each draws of a view, put together.
+"""One picture of several keyframes: what each draws of a view, put together; what has moved; one exposure.
 
 Colours of surfaces that several keyframes have seen are blended as in unstructured lumigraph rendering (Buehler et al.,
 2001): by the angle between the view's ray and the keyframe's, and by the keyframe's distance.
@@ -16,19 +16,23 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import equirect_directions, equirect_pixels
 
 from .field import Floats, Rays
-from .prior import PanoramaPrior
+from .prior import ROOM, PanoramaPrior
 
 SAME_SURFACE = 0.06
 """Depths within this share of each other are one surface."""
 SAME_PLACE = 0.15
 """Surfaces within this share of the nearest are one that the keyframes' depths disagree about: the best seen counts."""
-_SHARPNESS = 6.0
-_LEAST_PENALTY = 0.05
-_ASIDE_RAD = 0.02  # less is the keyframe's own view, whose edges are right
-_EDGE = 0.25  # less confidence at an edge
+SHARPNESS = 6.0
+LEAST_PENALTY = 0.05
+ASIDE_RAD = 0.02
+"""Less is the keyframe's own view, whose edges are right."""
+EDGE = 0.25
+"""Less confidence at an edge."""
+_VOTE_ROWS = 256  # of the pixels that are asked whether they have moved
 _STEP_ROWS = 128  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
 _MAX_GAIN = 2.5
+_MAX_SPREAD = 0.35  # of the logarithms of the ratios: more is no common factor
 
 
 @dataclass(frozen=True)
@@ -48,104 +52,122 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     """Colours (P, 3), depth (P,) and confidence (P,) of the layers together, newest first.
 
     Of surfaces at different depths the nearest counts, of those that depths only disagree about the one that is seen
-    most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two
-    surfaces mix, only where no keyframe has a plain one. What a newer keyframe has looked through is left out of the
-    older: it has moved away since.
+    most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two surfaces mix, only where
+    no keyframe has a plain one. What nobody has seen is as the newest has it. Needs numba.
     """
-    depth = np.stack([layer.depth for layer in layers])
-    confidence = np.stack([layer.confidence for layer in layers])
-    rank = confidence.copy()
-    for number, layer in enumerate(layers):
-        at = np.flatnonzero(confidence[number])
-        points = rays.origin + depth[number, at, None] * rays.directions[at]
-        # From the keyframe's own place its edges are as it saw them.
-        aside = _angle(layer.prior, points, rays.directions[at]) > _ASIDE_RAD
-        rank[number, at] -= _EDGE * (aside & _at_edge(layer.prior, points))
-        for newer in layers[:number]:
-            rank[number, at[looked_through(newer.prior, points, layer.prior)]] = 0
-    best = rank.max(axis=0)
-    candidate = (rank > 0) & (rank == best)
-    met = best > 0
-    nearest = np.where(candidate, depth, np.inf).min(axis=0)
-    candidate &= depth <= nearest * np.float32(1 + SAME_PLACE)
-    points = rays.origin + nearest[met, None] * rays.directions[met]
-    penalty = np.full(depth.shape, np.inf, np.float32)
-    for number, layer in enumerate(layers):
-        angle = _angle(layer.prior, points, rays.directions[met])
-        away = np.linalg.norm(points - layer.prior.map_from_camera[:3, 3].astype(np.float32), axis=1)
-        penalty[number, met] = _LEAST_PENALTY + angle + np.maximum(0, away / nearest[met] - 1)
-    penalty[~candidate] = np.inf
-    surface = np.take_along_axis(depth, penalty.argmin(axis=0)[None], axis=0)[0]
-    candidate &= np.abs(depth - surface) <= surface * np.float32(SAME_SURFACE)
-    weight = np.where(candidate, penalty, np.inf) ** -_SHARPNESS
-    weight[0, ~met] = 1  # nobody has seen it: as the newest has it
-    weight /= weight.sum(axis=0)
-    colour = sum(w[:, None] * layer.gain * layer.colour for w, layer in zip(weight, layers, strict=True))
-    shown = np.where(candidate, confidence, 0).max(axis=0)
-    return np.asarray(colour, np.float32), (weight * depth).sum(axis=0), shown
+    from .compose_kernels import blend
+
+    poses = np.array([layer.prior.map_from_camera for layer in layers])
+    colour = np.empty_like(layers[0].colour)
+    depth, confidence = np.empty_like(layers[0].depth), np.empty_like(layers[0].confidence)
+    blend(
+        *(np.stack([getattr(layer, key) for layer in layers]) for key in ("colour", "depth", "confidence", "gain")),
+        np.stack([layer.prior.torn for layer in layers]), np.linalg.inv(poses).astype(np.float32),
+        np.ascontiguousarray(poses[:, :3, 3], np.float32), rays.origin, rays.directions,
+        *(np.float32(value) for value in (EDGE, ASIDE_RAD, SAME_PLACE, SAME_SURFACE, LEAST_PENALTY, SHARPNESS)),
+        colour, depth, confidence,
+    )  # fmt: skip
+    return colour, depth, confidence
 
 
-def _angle(prior: PanoramaPrior, points: Floats, directions: Floats) -> Floats:
-    """Radians between a view's rays (N, 3) to points (N, 3) and the keyframe's."""
-    seen = points - prior.map_from_camera[:3, 3].astype(np.float32)
-    cosine = np.einsum("ij,ij->i", seen, directions) / np.maximum(np.linalg.norm(seen, axis=1), 1e-6)
-    return np.asarray(np.arccos(np.clip(cosine, -1, 1)), np.float32)
+def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
+    """What of each keyframe (newest first, all of one size) is not there any more or never stood still, (h, w) each.
 
-
-def looked_through(prior: PanoramaPrior, points: Floats, theirs: PanoramaPrior) -> NDArray[np.bool_]:
-    """Whether a keyframe has seen farther than points (N, 3) of the map frame in their directions: nothing is there.
-
-    ``theirs``: the keyframe that the points are of; the depth errors of both leave room.
+    Each keyframe that knows says whether there is a surface at a pixel's place or whether it has looked through it; the
+    majority counts, and where there is none the newest: of two keyframes the newer wins. Single pixels, which are
+    errors of the depth, are left in. Needs numba.
     """
-    row, column, distance = _seen_from(prior, points)
-    height, width = prior.inverse_depth.shape
-    least = np.full(len(points), np.inf, np.float32)
-    for v in (row, np.minimum(row + 1, height - 1)):  # at an edge the nearest of the neighbours counts
-        for u in (column % width, (column + 1) % width):
-            least = np.minimum(least, np.where(prior.known[v, u] == 1, 1 / prior.inverse_depth[v, u], 0))
-    room = max(0.15, 3 * math.hypot(_sigma(prior), _sigma(theirs)))
-    return distance * np.float32(1 + room) < least
+    from .compose_kernels import outvoted
+
+    height, width = priors[0].inverse_depth.shape
+    step = max(1, height // _VOTE_ROWS)
+    inverse = np.stack([prior.inverse_depth for prior in priors])
+    sure = np.stack([(prior.known == 1) & (prior.content == ROOM) for prior in priors]).astype(np.uint8)
+    poses = np.array([prior.map_from_camera for prior in priors])
+    matrices = poses.astype(np.float32), np.linalg.inv(poses).astype(np.float32)
+    found = []
+    for own, prior in enumerate(priors):
+        room = np.array([disagreement(prior, other) for other in priors], np.float32)
+        out = np.zeros((height, width), np.uint8)
+        outvoted(equirect_directions(width, height), inverse, sure, *matrices, room, own, step, out)
+        found.append(_opened(out > 0, step))
+    return found
 
 
-def _at_edge(prior: PanoramaPrior, points: Floats) -> NDArray[np.bool_]:
-    row, column, _ = _seen_from(prior, points)
-    return prior.torn[row, column % prior.torn.shape[1]] > 0
+def _opened(mask: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
+    """Less of what is thinner than three cells of ``step`` pixels; what stays gets a rim of two, as edges are soft."""
+    if not mask.any():
+        return mask
+    for grow, times in ((False, step), (True, 3 * step)):
+        for _ in range(times):
+            for axis in (0, 1):  # columns wrap; so do the rows, where the poles' few pixels do not matter
+                before, after = np.roll(mask, 1, axis), np.roll(mask, -1, axis)
+                mask = mask | before | after if grow else mask & before & after
+    return mask
 
 
-def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats:
-    """Factors (3,) that bring an older keyframe's colours to the newest's: medians over places that both have seen.
+def disagreement(first: PanoramaPrior, second: PanoramaPrior) -> float:
+    """Share of a distance by which the depths of two keyframes may differ and still be of one surface."""
+    return max(0.15, 3 * math.hypot(first.relative_sigma, second.relative_sigma))
 
-    1 where too few places are seen by both.
+
+def exposure_gains(priors: Sequence[PanoramaPrior]) -> Floats:
+    """Factors that bring each keyframe's colours to the newest's (the first), (K, 3).
+
+    A keyframe that has too little in common with the newest is fitted to those between them.
+    """
+    gains = [np.ones(3, np.float32)]
+    for number, older in enumerate(priors[1:], 1):
+        fits = (
+            fit * gain
+            for newer, gain in zip(priors[:number], gains, strict=True)
+            if (fit := exposure_gain(newer, older)) is not None
+        )
+        gains.append(np.clip(next(fits, np.ones(3, np.float32)), 1 / _MAX_GAIN, _MAX_GAIN).astype(np.float32))
+    return np.stack(gains)
+
+
+def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
+    """Factors (3,) that bring an older keyframe's colours to the newest's, from places that both have seen.
+
+    The middle of the shortest interval that holds half of the ratios, a colour (the shorth): what has changed between
+    the two, such as a lamp or a shadow, does not move it as long as it is less than half.
+
+    Returns:
+        None where too few places are seen by both, or where their ratios have no common factor.
     """
     height, width = older.inverse_depth.shape
     step = max(1, height // _STEP_ROWS)
-    known = older.known[::step, ::step] == 1
+    known = ((older.known == 1) & (older.content == ROOM))[::step, ::step]
     depth = 1 / older.inverse_depth[::step, ::step][known]
     directions = equirect_directions(width, height)[::step, ::step][known]
-    points = depth[:, None] * (directions @ older.map_from_camera[:3, :3].T.astype(np.float32))
+    # Not by matmul: BLAS would start threads for it, which wait for each other longer than they compute.
+    points = depth[:, None] * np.einsum("ij,kj->ik", directions, older.map_from_camera[:3, :3].astype(np.float32))
     points += older.map_from_camera[:3, 3].astype(np.float32)
-    row, column, distance = _seen_from(newest, points)
-    column %= newest.inverse_depth.shape[1]
-    same = np.abs(newest.inverse_depth[row, column] * distance - 1) < SAME_SURFACE
-    same &= (newest.known[row, column] == 1) & (newest.torn[row, column] == 0)
-    theirs = _colours(older, directions)[same]
-    turn = newest.map_from_camera[:3, :3].astype(np.float32)
-    ours = _colours(newest, (points - newest.map_from_camera[:3, 3].astype(np.float32)) @ turn)[same]
+    local = points - newest.map_from_camera[:3, 3].astype(np.float32)
+    local = np.einsum("ij,jk->ik", local, newest.map_from_camera[:3, :3].astype(np.float32))
+    row, column = _upper_left(newest, local)
+    same = np.abs(newest.inverse_depth[row, column] * np.linalg.norm(local, axis=1) - 1) < SAME_SURFACE
+    same &= (newest.known[row, column] == 1) & (newest.torn[row, column] == 0) & (newest.content[row, column] == ROOM)
+    theirs, ours = _colours(older, directions[same]), _colours(newest, local[same])
     usable = np.all((theirs > 12) & (theirs < 243) & (ours > 12) & (ours < 243), axis=1)
     if np.count_nonzero(usable) < _MIN_SAMPLES:
-        return np.ones(3, np.float32)
-    gain = np.median(ours[usable] / theirs[usable], axis=0)
-    return np.clip(gain, 1 / _MAX_GAIN, _MAX_GAIN).astype(np.float32)
+        return None
+    ratios = np.sort(np.log(ours[usable] / theirs[usable]), axis=0)
+    half = len(ratios) // 2
+    widths = ratios[half:] - ratios[: len(ratios) - half]
+    first = widths.argmin(axis=0)
+    if widths.min(axis=0).max() > _MAX_SPREAD:
+        return None
+    ends = np.take_along_axis(ratios, np.stack([first, first + half]), axis=0)
+    return np.exp(ends.mean(axis=0)).astype(np.float32)
 
 
-def _seen_from(prior: PanoramaPrior, points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats]:
-    """Upper left pixels (row, column; the column may be −1) of points of the map frame, and their distances."""
-    local = points - prior.map_from_camera[:3, 3].astype(np.float32)
-    local = local @ prior.map_from_camera[:3, :3].astype(np.float32)
+def _upper_left(prior: PanoramaPrior, local: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pixels (row, column) of a keyframe's depth up and left of points (N, 3) of its camera's frame."""
     height, width = prior.inverse_depth.shape
     u, v = equirect_pixels(local, width, height)
-    row = np.clip(np.floor(v), 0, height - 1).astype(np.intp)
-    return row, np.floor(u).astype(np.intp), np.linalg.norm(local, axis=1).astype(np.float32)
+    return np.clip(np.floor(v), 0, height - 1).astype(np.intp), np.floor(u).astype(np.intp) % width
 
 
 def _colours(prior: PanoramaPrior, directions: Floats) -> Floats:
@@ -154,7 +176,3 @@ def _colours(prior: PanoramaPrior, directions: Floats) -> Floats:
     u, v = equirect_pixels(directions, width, height)
     row = np.clip(np.rint(v), 0, height - 1).astype(np.intp)
     return prior.rgb[row, np.rint(u).astype(np.intp) % width].astype(np.float32)
-
-
-def _sigma(prior: PanoramaPrior) -> float:
-    return float(np.median(prior.relative_sigma))

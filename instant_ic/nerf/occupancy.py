@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from instant_ic.geometry.projections import equirect_directions
 
 from .config import GeometryConfig
-from .prior import PanoramaPrior
+from .prior import ROOM, PanoramaPrior
 
 MAX_DISTANCE = 100
 MARGIN_CELLS = 2
@@ -45,17 +46,19 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     16 × 16 parts. Along a quad the inverse depth is linear. An infinite ``cell_m`` gives the pixels' own points.
     """
     height, width = prior.inverse_depth.shape
-    directions = equirect_directions(width, height) @ prior.map_from_camera[:3, :3].T.astype(np.float32)
+    directions = equirect_directions(width, height)
+    directions = np.einsum("vuj,ij->vui", directions, prior.map_from_camera[:3, :3].astype(np.float32))
     inverse = prior.inverse_depth
     points = directions / inverse[..., None]
-    clouds = [points.reshape(-1, 3)]
+    room = prior.content == ROOM
+    clouds = [points[room] if room.any() else points.reshape(-1, 3)]
     if math.isinf(cell_m):
         return clouds[0] + prior.map_from_camera[:3, 3].astype(np.float32)
     down = np.linalg.norm(points[1:] - points[:-1], axis=2)
     across = np.linalg.norm(np.roll(points, -1, 1) - points, axis=2)[:-1]
     parts = np.ceil(np.maximum(down, across) / cell_m)
     parts = 2 ** np.ceil(np.log2(np.clip(parts, 1, _MAX_PARTS))).astype(np.intp)
-    parts[prior.torn[:-1] > 0] = 1
+    parts[(prior.torn[:-1] > 0) | ~room[:-1]] = 1
     for count in np.unique(parts):
         if count == 1:
             continue
@@ -73,18 +76,18 @@ def surface_points(prior: PanoramaPrior, cell_m: float) -> NDArray[np.float32]:
     return np.asarray(cloud, np.float32)
 
 
-def build_occupancy(prior: PanoramaPrior, config: GeometryConfig) -> Occupancy:
-    """Occupancy grid of a keyframe; ``MARGIN_CELLS`` are added round each surface."""
-    corners = surface_points(prior, math.inf)
+def build_occupancy(priors: Sequence[PanoramaPrior], config: GeometryConfig) -> Occupancy:
+    """Occupancy grid of keyframes' surfaces together; ``MARGIN_CELLS`` are added round each surface."""
+    corners = np.concatenate([surface_points(prior, math.inf) for prior in priors])
     low, high = corners.min(axis=0), corners.max(axis=0)  # parts of quads lie between their corners
     volume = float(np.prod((high - low).astype(np.float64) + 8 * config.cell_m))
     cell = max(config.cell_m, (volume / config.max_cells) ** (1 / 3))
     origin = low - np.float32(4 * cell)
     shape = tuple(int(n) for n in np.ceil((high - origin) / cell).astype(int) + 4)
-    cloud = surface_points(prior, cell)
-    index = ((cloud - origin) * np.float32(1 / cell)).astype(np.intp)
     distance = np.full(shape, MAX_DISTANCE, np.uint8)
-    distance.reshape(-1)[np.ravel_multi_index(tuple(index.T), shape)] = 0
+    for prior in priors:
+        index = ((surface_points(prior, cell) - origin) * np.float32(1 / cell)).astype(np.intp)
+        distance.reshape(-1)[np.ravel_multi_index(tuple(index.T), shape)] = 0
     _spread(distance)
     # A margin for surfaces between the samples, for steps, and for the field's own small differences from the prior.
     distance -= np.minimum(distance, np.uint8(MARGIN_CELLS))

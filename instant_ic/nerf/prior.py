@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,11 @@ from .config import GeometryConfig
 
 MOST_SIGMA = 0.5
 """Depth that is more uncertain than this, relative to it, is as good as filled in: views of it are less confident."""
+
+
+ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
+"""What a pixel shows: a part of the place; the robot itself; the sky, endlessly far; what has moved away."""
+_SKY_RISE = 0.17  # sine of the elevation that unknown regions must lie above, on the mean, to be the sky
 
 
 class KeyframeError(ValueError):
@@ -30,7 +35,8 @@ class PanoramaPrior:
         relative_sigma: standard deviation of the depth, relative to it: median over the picture.
         band: half width, relative to the depth, of the band in which the signed distance is learnt.
         sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
-        usable: 1 where training may draw rays, (h, w) uint8.
+        usable: 1 where training may draw rays, (h, w) uint8: where ``content`` is ``ROOM``.
+        content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
     """
 
     rgb: NDArray[np.uint8]
@@ -42,6 +48,16 @@ class PanoramaPrior:
     band: float
     sigma: NDArray[np.float32]
     usable: NDArray[np.uint8]
+    content: NDArray[np.uint8]
+
+    def without(self, moved: NDArray[np.bool_]) -> PanoramaPrior:
+        """The keyframe with what has ``moved`` (h, w) left out, and nothing else that was left out for that before."""
+        content = np.where(self.content == MOVED, ROOM, self.content)
+        content[moved & (content == ROOM)] = MOVED
+        return self if np.array_equal(content, self.content) else self._with(content.astype(np.uint8))
+
+    def _with(self, content: NDArray[np.uint8]) -> PanoramaPrior:
+        return replace(self, content=content, usable=(content == ROOM).astype(np.uint8))
 
     @property
     def median_depth_m(self) -> float:
@@ -57,6 +73,7 @@ def prepare(
     relative_sigma: float | NDArray[np.floating],
     config: GeometryConfig,
     panorama_width: int,
+    robot: NDArray[np.bool_] | None = None,
 ) -> PanoramaPrior:
     """Checks a keyframe and makes its prior.
 
@@ -68,31 +85,37 @@ def prepare(
             the depth, not finite where it is unknown.
         config: geometry parameters.
         panorama_width: a wider panorama is area-averaged to this width.
+        robot: picture (H, 2 H) of any size: true where the panorama shows the robot itself or its stand, besides what
+            lies below ``config.body_below_deg``.
 
     Raises:
         KeyframeError: wrong shape or type, values that are not finite, too little depth, a pose that is none.
     """
     _check_panorama(rgb)
     _check_pose(map_from_camera)
-    depth = _checked_depth(depth_m, config)
+    depth, content = _checked_depth(depth_m, config, robot)
     sigma, each = _checked_sigma(relative_sigma, depth_m, depth)
     if rgb.shape[1] > panorama_width:
-        rgb = area_average(rgb, panorama_width // 2, panorama_width)
-    known = depth > 0
+        rgb = _shrunk(rgb, panorama_width // 2, panorama_width)
+    sky = content == SKY
+    known: NDArray[np.bool_] = depth > 0
     with np.errstate(divide="ignore"):
         inverse = np.where(known, 1.0 / np.clip(depth, config.min_depth_m, config.max_depth_m), 0.0)
-    inverse = fill_holes(inverse.astype(np.float32), known)
+    inverse = fill_holes(inverse.astype(np.float32), known & ~sky)
+    inverse[sky] = 1 / config.max_depth_m
+    known |= sky
     band = float(np.clip(config.band_sigmas * sigma, config.band_min, config.band_max))
     return PanoramaPrior(
         rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile anew
         inverse_depth=np.ascontiguousarray(inverse),
-        known=(known & (each <= MOST_SIGMA)).astype(np.uint8),
+        known=(known & ((each <= MOST_SIGMA) | sky) & (content != ROBOT)).astype(np.uint8),
         torn=torn_quads(inverse, config.torn_ratio),
         map_from_camera=np.array(map_from_camera, np.float64),
         relative_sigma=sigma,
         band=band,
         sigma=np.where(known, np.minimum(each, np.float32(MOST_SIGMA)), np.float32(MOST_SIGMA)),
-        usable=np.ones(depth.shape, np.uint8),
+        usable=(content == ROOM).astype(np.uint8),
+        content=content,
     )
 
 
@@ -115,7 +138,10 @@ def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
         raise KeyframeError("pose has no rotation matrix in it")
 
 
-def _checked_depth(depth_m: NDArray[np.floating], config: GeometryConfig) -> NDArray[np.float32]:
+def _checked_depth(
+    depth_m: NDArray[np.floating], config: GeometryConfig, robot: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth (h, w) and content (h, w)."""
     if depth_m.ndim != 2 or depth_m.shape[1] != 2 * depth_m.shape[0] or depth_m.shape[1] < 32:
         raise KeyframeError(f"depth must be (H, 2 H), 32 columns or more (got {depth_m.shape})")
     bad = int(np.count_nonzero(~np.isfinite(depth_m)))
@@ -128,10 +154,69 @@ def _checked_depth(depth_m: NDArray[np.floating], config: GeometryConfig) -> NDA
     depth = np.ascontiguousarray(depth_m[::step, ::step], np.float32)
     if depth.shape[1] != 2 * depth.shape[0]:
         depth = depth[: depth.shape[1] // 2, : 2 * depth.shape[0]]
-    share = float(np.count_nonzero(depth)) / depth.size
+    content = np.full(depth.shape, ROOM, np.uint8)
+    content[sky_region(depth == 0, config.sky_share)] = SKY
+    content[robot_region(depth.shape[0], config.body_below_deg, robot)] = ROBOT
+    share = float(np.count_nonzero(depth)) / max(1, int(np.count_nonzero(content != SKY)))
     if share < config.min_known_share:
         raise KeyframeError(f"depth is known in {share:.0%} of the picture, {config.min_known_share:.0%} are needed")
-    return depth
+    return depth, content
+
+
+def robot_region(height: int, below_deg: float, robot: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Where a panorama of ``height`` rows shows the robot itself, (h, 2 h).
+
+    Raises:
+        KeyframeError: the mask ``robot`` is no panorama.
+    """
+    elevation = 90 - (np.arange(height) + 0.5) * (180 / height)
+    region = np.repeat((elevation < below_deg)[:, None], 2 * height, axis=1)
+    if robot is None:
+        return region
+    if robot.ndim != 2 or robot.shape[1] != 2 * robot.shape[0] or robot.shape[0] < 1:
+        raise KeyframeError(f"the robot's mask must be twice as wide as high (got {robot.shape})")
+    rows = ((np.arange(height) + 0.5) * (robot.shape[0] / height)).astype(int)
+    columns = ((np.arange(2 * height) + 0.5) * (robot.shape[1] / (2 * height))).astype(int)
+    return np.asarray(region | (robot[rows][:, columns] > 0))
+
+
+def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.bool_]:
+    """Regions of unknown depth that are the sky, (h, w): as large as ``least_share`` of the sphere, and high up.
+
+    Unknown places in a room are small; where they are not, ``least_share`` 1 has them filled from around instead.
+    """
+    height, width = unknown.shape
+    area = np.cos(np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)) * (np.pi / (2 * height * width))
+    sky = np.zeros(unknown.shape, bool)
+    if least_share >= 1 or float(unknown.sum(axis=1) @ area) < least_share:
+        return sky
+    try:
+        from scipy.ndimage import find_objects, label
+    except ImportError:  # then it is filled from around
+        return sky
+    labels, count = label(unknown)
+    for row in range(height):  # a region may go on over the seam
+        first, last = labels[row, 0], labels[row, -1]
+        if first and last and first != last:
+            labels[labels == last] = first
+    rise = np.sin(np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height))
+    for number, place in enumerate(find_objects(labels, count), 1):
+        if place is None:
+            continue
+        part = labels[place] == number
+        share = part.sum(axis=1) * area[place[0]]
+        if share.sum() >= least_share and share @ rise[place[0]] > _SKY_RISE * share.sum():
+            sky[place] |= part
+    return sky
+
+
+def _shrunk(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """``area_average``; OpenCV's where it is installed: a tenth of the time where the ratio is no whole number."""
+    try:
+        import cv2
+    except ImportError:
+        return area_average(rgb, height, width)
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _checked_sigma(

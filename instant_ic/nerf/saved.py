@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import VirtualSpaceConfig
-from .field import FieldParameters, Lattice
+from .field import FieldParameters, Floats, Lattice
 from .prior import PanoramaPrior
 
-FORMAT, VERSION = "instant_ic virtual space", 1
+FORMAT, VERSION = "instant_ic virtual space", 2
 FILE_NAME = "space.npz"
 """Of the file where a folder is named."""
 
@@ -36,28 +36,19 @@ class Progress:
     refresh: bool
     ready_iterations: int
     train_seconds: float
-
-
-@dataclass(frozen=True)
-class SavedKeyframe:
-    """One keyframe and the field that has learnt it."""
-
-    prior: PanoramaPrior
-    lattice: Lattice
-    parameters: FieldParameters
-    progress: Progress
+    ready: bool
 
 
 @dataclass(frozen=True)
 class SavedSpace:
-    """What a file holds. ``keyframes``: newest first."""
+    """What a file holds: the keyframes (newest first), their gains (K, 3), and the field that has learnt them."""
 
     config: VirtualSpaceConfig
-    keyframes: tuple[SavedKeyframe, ...]
-
-
-_GROUPS = {"prior": PanoramaPrior, "lattice": Lattice, "parameters": FieldParameters}
-"""The parts of a keyframe that are arrays."""
+    priors: tuple[PanoramaPrior, ...]
+    gains: Floats
+    lattice: Lattice
+    parameters: FieldParameters
+    progress: Progress
 
 
 def space_file(path: str | Path) -> Path:
@@ -77,14 +68,14 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
         "format": FORMAT,
         "version": VERSION,
         "config": dataclasses.asdict(saved.config),
-        "keyframes": [dataclasses.asdict(keyframe.progress) for keyframe in saved.keyframes],
+        "keyframes": len(saved.priors),
+        "progress": dataclasses.asdict(saved.progress),
     }
-    arrays = {"head": np.frombuffer(json.dumps(head).encode(), np.uint8)}
-    for number, keyframe in enumerate(saved.keyframes):
-        for group, kind in _GROUPS.items():
-            for field in dataclasses.fields(kind):
-                value = getattr(getattr(keyframe, group), field.name)
-                arrays[f"{number}.{group}.{field.name}"] = np.asarray(value)
+    arrays: dict[str, NDArray[Any]] = {"head": np.frombuffer(json.dumps(head).encode(), np.uint8), "gains": saved.gains}
+    groups: dict[str, Any] = {f"prior.{number}": prior for number, prior in enumerate(saved.priors)}
+    for group, part in (groups | {"lattice": saved.lattice, "parameters": saved.parameters}).items():
+        for field in dataclasses.fields(part):
+            arrays[f"{group}.{field.name}"] = np.asarray(getattr(part, field.name))
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
@@ -124,16 +115,19 @@ def read(path: str | Path) -> SavedSpace:
             raise SpaceFileError(f"{file}: not a saved virtual space (format {head['format']!r})")
         if head["version"] > VERSION:
             raise SpaceFileError(f"{file}: version {head['version']}, this program reads up to {VERSION}: update it")
-        keyframes = [
-            SavedKeyframe(
-                **{group: _group(kind, f"{number}.{group}", arrays) for group, kind in _GROUPS.items()},
-                progress=_built(Progress, progress),
-            )
-            for number, progress in enumerate(head["keyframes"])
-        ]
-        if not keyframes:
+        if head["version"] < VERSION:
+            raise SpaceFileError(f"{file}: version {head['version']}, of an older program: train it again")
+        priors = tuple(_group(PanoramaPrior, f"prior.{number}", arrays) for number in range(head["keyframes"]))
+        if not priors:
             raise SpaceFileError(f"{file}: holds no keyframe")
-        return SavedSpace(_built(VirtualSpaceConfig, head["config"]), tuple(keyframes))
+        return SavedSpace(
+            _built(VirtualSpaceConfig, head["config"]),
+            priors,
+            arrays["gains"],
+            _group(Lattice, "lattice", arrays),
+            _group(FieldParameters, "parameters", arrays),
+            _built(Progress, head["progress"]),
+        )
     except SpaceFileError:
         raise
     except (KeyError, TypeError, ValueError) as error:
@@ -155,7 +149,9 @@ def _group(kind: type[Any], group: str, arrays: dict[str, NDArray[Any]]) -> Any:
     return kind(**{name: value.item() if value.ndim == 0 else value for name, value in values.items()})
 
 
-def _built(kind: type[Any], values: dict[str, Any]) -> Any:
+def _built(kind: Any, value: Any) -> Any:
     """A configuration from nested dictionaries; a key that it does not know is an error."""
-    hints = get_type_hints(kind)
-    return kind(**{k: _built(hints[k], v) if dataclasses.is_dataclass(hints.get(k)) else v for k, v in values.items()})
+    if dataclasses.is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return kind(**{key: _built(hints.get(key), part) for key, part in value.items()})  # type: ignore[operator]
+    return tuple(value) if isinstance(value, list) else value  # JSON knows no tuples

@@ -6,28 +6,30 @@ import dataclasses
 import enum
 import functools
 import importlib.util
+import itertools
 import math
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, sample_equirect
 
-from .compose import Layer, compose, exposure_gain
+from .compose import Layer, compose, exposure_gains, moved
 from .config import VirtualSpaceConfig
 from .field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
 from .readiness import Texture, error_terms, expected_psnr_db
-from .saved import Progress, SavedKeyframe, SavedSpace, read, write
+from .saved import Progress, SavedSpace, read, write
+from .store import Keyframe, KeyframeSet, KeyframeStore, ready
 from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
-from .warp import PanoramaWarp, dissolve
+from .warp import dissolve
 
 T = TypeVar("T")
 _PROBE = (64, 36)  # pixels of the picture that readiness is judged by
@@ -60,8 +62,7 @@ class TrainStats:
 class Status:
     """What the space can show now; fields as in VspaceStatus.msg.
 
-    Training figures are of the newest keyframe. While ``refreshing``, pictures show the keyframe before it, and
-    ``ready_radius_m`` counts from that one.
+    Training figures are since the newest keyframe. ``refreshing``: the field has not learnt that one yet.
     """
 
     state: State
@@ -90,20 +91,29 @@ class DeviceError(RuntimeError):
 
 
 @dataclass(frozen=True)
-class _Learnt:
-    """The space of one keyframe: its scene, a frozen copy of its field (None: the one that is being trained)."""
+class Prepared:
+    """What the field is to learn, and the keyframes that it is of."""
 
     scene: Scene
-    frozen: Any
-    progress: Progress
+    keyframes: KeyframeSet
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """A view (P, …) as it was drawn; ``guessed``: what nobody has seen, drawn from the background."""
+
+    colour: Floats
+    depth: Floats
+    confidence: Floats
+    guessed: NDArray[np.bool_]
 
 
 class VirtualSpace:
-    """A hash-grid radiance field that is trained from the newest keyframe and drawn between training steps.
+    """The newest keyframes: shown at once by warping, and one hash-grid field that learns from all of them.
 
-    A space that is fit to show stays so: a new keyframe is learnt behind it, and takes over once it is fit itself.
-    One thread at a time. The same calls with the same seed give the same bits on the CPU, as long as training is asked
-    for by iterations and not by time.
+    A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
+    time, but for ``prepare`` and ``scene_of``, which another may call meanwhile. The same calls with the same seed give the
+    same bits on the CPU, as long as training is asked for by iterations and not by time.
 
     Example:
         >>> space = VirtualSpace(VirtualSpaceConfig())                        # doctest: +SKIP
@@ -112,57 +122,63 @@ class VirtualSpace:
         >>> space.render(map_from_camera, 320, 180, fov_rad=1.57).rgb
     """
 
-    def __init__(self, config: VirtualSpaceConfig | None = None) -> None:
+    def __init__(self, config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> None:
+        """Makes an empty space.
+
+        Args:
+            config: parameters.
+            robot: picture (H, 2 H): true where panoramas show the robot itself or its stand, besides what
+                ``config.geometry.body_below_deg`` says.
+
+        Raises:
+            ValueError: parameters that do not fit; DeviceError: a device that is not there.
+        """
         self.config = config or VirtualSpaceConfig()
         if self.config.source == "mesh":
             raise ValueError("source is mesh: nothing is learnt there; use make_space, which draws the mesh")
+        self._robot = robot
         self._device = make_device(self.config)
         self._warning = ""
-        self._scene: Scene | None = None
-        self._kept: list[_Learnt] = []  # keyframes before the newest that were fit, newest first
-        self._warps: list[PanoramaWarp] = []
-        self._texture: tuple[PanoramaPrior, Texture] | None = None
         self._can_warp = importlib.util.find_spec("numba") is not None
-        self._gains: list[Floats] = [np.ones(3, np.float32)]  # of the keyframes that pictures show
+        # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
+        self._store = KeyframeStore(self.config.keyframes + 2)
+        self._shown: KeyframeSet | None = None
+        self._before: KeyframeSet | None = None  # what pictures showed before, until these have taken over
+        self._pictures = 0  # drawn since then
+        self._scene: Scene | None = None  # what the field learns
+        self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
+        self._texture: tuple[PanoramaPrior, Texture] | None = None
+        self._ready = False
+        self._colour_error = math.nan
         self._rng = np.random.default_rng(self.config.train.seed)
         self._reset_run(refresh=False)
 
     def _reset_run(self, refresh: bool) -> None:
         self._schedule = Schedule(self.config.train, refresh)
-        self._psnr_db = math.nan
-        self._colour_error = math.nan
+        if not refresh:
+            self._colour_error = math.nan
         self._history: deque[float] = deque(maxlen=self.config.readiness.plateau_iterations + 1)
         self._ready_iterations = 0
         self._train_seconds = 0.0
 
     @property
     def keyframe(self) -> PanoramaPrior | None:
-        """The keyframe that pictures show."""
-        shown = self._shown
-        return shown[0].scene.prior if shown else None
+        """The newest keyframe that pictures show."""
+        return None if self._shown is None else self._shown.keyframes[0].prior
+
+    @property
+    def keyframes(self) -> tuple[PanoramaPrior, ...]:
+        """All keyframes that pictures show, newest first."""
+        return () if self._shown is None else self._shown.priors
+
+    @property
+    def _psnr_db(self) -> float:
+        return -10 * math.log10(max(self._colour_error, 1e-10))  # NaN stays NaN
 
     @property
     def _done(self) -> bool:
         """Nothing is left to train."""
         return self._schedule.finished or self.config.source == "warp"
-
-    @property
-    def _refreshing(self) -> bool:
-        """The newest keyframe is not fit yet, and pictures show those before it."""
-        return bool(self._kept) and not self._ready_iterations
-
-    @property
-    def _shown(self) -> list[_Learnt]:
-        """What pictures show, newest first."""
-        if self._scene is None:
-            return []
-        return self._kept if self._refreshing else [_Learnt(self._scene, None, self._progress), *self._kept]
-
-    def _keep(self, count: int) -> None:
-        """Lets go of all but so many of the keyframes before the newest; the others get the newest's exposure."""
-        del self._kept[count:]
-        newest, *older = (learnt.scene.prior for learnt in self._shown)
-        self._gains = [np.ones(3, np.float32), *(exposure_gain(newest, prior) for prior in older)]
 
     def set_keyframe(
         self,
@@ -171,42 +187,109 @@ class VirtualSpace:
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> None:
-        """Learns a new keyframe; the field goes on from its present weights where it can.
-
-        Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), if they were fit: pictures
-        show them together, in the newest's exposure. A keyframe that was not fit is replaced.
+        """Takes a new keyframe in: ``prepare``, ``scene_of``, ``learn`` and ``show``, one after another.
 
         Args: as ``prior.prepare``.
 
         Raises:
             KeyframeError: the keyframe is no good; the old space stays as it was.
         """
+        prepared = self.prepare(rgb, depth_m, map_from_camera, relative_sigma)
+        self.learn(self.scene_of(prepared))
+        self.show(prepared)
+
+    def prepare(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float | NDArray[np.floating],
+    ) -> KeyframeSet:
+        """Makes a new keyframe ready to be shown, with those before it that are kept; changes nothing that is shown.
+
+        Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), in the new one's exposure and
+        without what has moved; none where its pictures have another size. May run in a thread of its own beside all
+        other calls; one keyframe at a time, and each must be shown before the next.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good.
+        """
         config = self.config
-        prior = prepare(rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width)
-        occupancy = build_occupancy(prior, config.geometry)
-        lattice = Lattice.for_prior(prior, config.field)
-        if self._scene is not None and self._ready_iterations:
-            frozen = self._on_device(lambda device: device.freeze())
-            self._kept.insert(0, _Learnt(self._scene, frozen, self._progress))
-        refresh = self._scene is not None and self._scene.lattice.suits(lattice)
-        if refresh:
-            assert self._scene is not None
-            lattice = self._scene.lattice
-        elif self._scene is not None:
-            self._device.load(FieldParameters.random(config.field, config.train.seed))
-        scene = Scene((prior,), lattice, occupancy)
-        try:
+        prior = prepare(
+            rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width, self._robot
+        )
+        newest = self._store.put(prior, self._can_warp)
+        older = () if self._shown is None else self._shown.keyframes[: config.keyframes - 1]
+        same = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
+        older = tuple(one for one in older if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == same)
+        return self._together((newest, *older))
+
+    def _together(self, keyframes: tuple[Keyframe, ...]) -> KeyframeSet:
+        """Keyframes in one exposure, without what has moved."""
+        if len(keyframes) == 1:
+            alone = keyframes[0].prior.without(np.zeros_like(keyframes[0].prior.content, bool))
+            return KeyframeSet((_renewed(keyframes[0], alone),), np.ones((1, 3), np.float32))
+        if self._can_warp:
+            gone = moved([keyframe.prior for keyframe in keyframes])
+            keyframes = tuple(_renewed(one, one.prior.without(mask)) for one, mask in zip(keyframes, gone, strict=True))
+        return KeyframeSet(keyframes, exposure_gains([keyframe.prior for keyframe in keyframes]))
+
+    def show(self, prepared: KeyframeSet, dissolve: bool = False) -> None:
+        """Pictures show these keyframes from now on.
+
+        ``dissolve``: what was shown before passes into them over the next ``picture.refresh_pictures`` pictures.
+        """
+        self._before, self._pictures = self._shown if dissolve else None, 0
+        self._shown = prepared
+        if self.config.source == "warp":
+            self._ready, self._ready_iterations = True, 1  # a warp is ready at once
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Frees what is neither shown nor learnt any more."""
+        if self._pictures >= self.config.picture.refresh_pictures - 1:
+            self._before = None
+        shown = [one.keyframes for one in (self._shown, self._before) if one is not None]
+        self._store.keep(itertools.chain(*shown, self._held))
+
+    def scene_of(self, prepared: KeyframeSet) -> Prepared:
+        """What the field needs to learn keyframes; in any thread, as ``prepare``, and before the next keyframe's."""
+        priors, config = prepared.priors, self.config
+        lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
+        if scene is not None and scene.lattice.suits(lattice):
+            lattice = scene.lattice
+        return Prepared(Scene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains), prepared)
+
+    def learn(self, prepared: Prepared) -> None:
+        """The field learns these keyframes from now on, from what it has learnt before.
+
+        Where the scale has changed by more than a factor of 2 it starts anew. A failing device leaves the old space.
+        """
+        scene, old = prepared.scene, self._scene
+        refresh = old is not None and scene.lattice is old.lattice
+        if refresh or old is None:
             self._on_device(lambda device: device.set_scene(scene))
-        except Exception:
-            if not refresh:  # the old parameters are gone
-                self._scene, self._kept = None, []
-                self._reset_run(refresh=False)
-            raise
-        self._scene = scene
+        else:
+            self._start_anew(scene, old)
+        self._scene, self._held = scene, prepared.keyframes.keyframes
+        self._ready = self._ready and (refresh or self.config.picture.panorama_share(math.nan) == 1)
         self._reset_run(refresh)
-        if config.source == "warp":
-            self._ready_iterations = 1  # a warp is ready at once
-        self._keep(config.keyframes - 1 if self._ready_iterations else config.keyframes)
+
+    def _start_anew(self, scene: Scene, old: Scene) -> None:
+        learnt = self._device.parameters()
+
+        def start(device: Device) -> None:
+            device.load(FieldParameters.random(self.config.field, self.config.train.seed))
+            device.set_scene(scene)
+
+        try:
+            self._on_device(start)
+        except Exception:
+            self._device.load(learnt)
+            self._device.set_scene(old)
+            raise
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
         """Trains until the time is spent, the iterations are done or the schedule has ended, at least one iteration.
@@ -236,27 +319,25 @@ class VirtualSpace:
     def _note(self, colour_error: float) -> None:
         first = math.isnan(self._colour_error)
         self._colour_error = colour_error if first else 0.9 * self._colour_error + 0.1 * colour_error
-        self._psnr_db = -10 * math.log10(max(self._colour_error, 1e-10))
         self._history.append(self._psnr_db)
         rule = self.config.readiness
         full = len(self._history) == rule.plateau_iterations + 1
         plateau = full and self._history[-1] - self._history[0] < rule.plateau_db
         good = self._psnr_db >= rule.psnr_db and self._schedule.iteration >= 5
         if not self._ready_iterations and (good or plateau or self._schedule.finished):
-            self._ready_iterations = self._schedule.iteration
-            self._keep(self.config.keyframes - 1)
+            self._ready_iterations, self._ready = self._schedule.iteration, True
 
     @property
     def status(self) -> Status:
         """What the space can show now."""
         iterations = self._schedule.iteration
-        if self._scene is None:
+        if self._shown is None:
             state = State.EMPTY
         else:
-            state = State.READY if self._ready_iterations or self._kept else State.TRAINING
+            state = State.READY if self._ready else State.TRAINING
         return Status(
             state=state,
-            refreshing=self._refreshing,
+            refreshing=self._ready and not self._ready_iterations,
             psnr_db=self._psnr_db,
             iterations=iterations,
             train_seconds=self._train_seconds,
@@ -320,11 +401,11 @@ class VirtualSpace:
 
         From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
         """
-        if self._scene is None:
+        if self._shown is None:
             return -math.inf
         rays = perspective_rays(checked_pose(map_from_camera), *_PROBE, fov_rad)
-        _, depth, confidence = self._draw_shown(rays, warps=True)
-        return self._judge(rays, depth, confidence)
+        picture = self._drawn(rays, self._shown, True, {})
+        return self._judge(rays, picture.depth, picture.confidence)
 
     def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
         """Expected PSNR of a view as it was drawn, (P,) each; a few thousand pixels tell it."""
@@ -332,59 +413,85 @@ class VirtualSpace:
         height, width = rays.shape
         chosen = np.arange(height * width).reshape(height, width)[step // 2 :: step, step // 2 :: step].reshape(-1)
         some = Rays(rays.origin, rays.directions[chosen], rays.axial[chosen], (len(chosen), 1))
-        shown = self._shown
-        priors = [one.scene.prior for one in shown]
+        priors = self.keyframes
         if self._texture is None or self._texture[0] is not priors[0]:
             self._texture = priors[0], Texture.of(priors[0].rgb)
         terms = error_terms(priors, self._texture[1], some, depth[chosen], confidence[chosen])
-        return expected_psnr_db(terms, shown[0].progress.psnr_db, self._panorama_share(shown[0]))
+        return expected_psnr_db(terms, self._psnr_db, self._panorama_share)
 
     def _view(self, rays: Rays, projection: str) -> View:
-        if self._scene is None:
+        if self._shown is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
         height, width = rays.shape
-        colour, depth, confidence = self._draw_shown(rays, warps=projection != "equirect")
-        expected = self._judge(rays, depth, confidence)
-        depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
-        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
+        warps = projection != "equirect"
+        layers: dict[int, tuple[Floats, Floats, Floats]] = {}  # a keyframe of both sets is drawn once
+        picture = self._drawn(rays, self._shown, warps, layers)
+        image = self._filled(picture, rays, projection)
+        if self._before is not None:
+            old = self._filled(self._drawn(rays, self._before, warps, layers), rays, projection)
+            share = np.float32((self._pictures + 1) / self.config.picture.refresh_pictures)
+            image = share * image + (1 - share) * old
+            self._pictures += 1
+            self._let_go()
+        expected = self._judge(rays, picture.depth, picture.confidence)
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        return View(rgb, depth, confidence, projection, expected)
+        shape = height, width
+        return View(rgb, picture.depth.reshape(shape), picture.confidence.reshape(shape), projection, expected)
 
-    def _draw_shown(self, rays: Rays, warps: bool) -> tuple[Floats, Floats, Floats]:
-        """Colour, depth and confidence of a view's rays by all that pictures show."""
+    @staticmethod
+    def _filled(picture: _Picture, rays: Rays, projection: str) -> Floats:
+        """The picture (H, W, 3) with what nobody knows, nor guesses, continued from around it."""
+        shape = rays.shape
+        seen = ((picture.confidence > 0) | picture.guessed).reshape(shape).astype(np.float32)
+        image = picture.colour.reshape(*shape, 3)
+        return continue_unseen(image, picture.depth.reshape(shape), seen, wraps=projection == "equirect")
 
-        def draw(device: Device) -> tuple[Floats, Floats, Floats]:
-            drawn = [self._draw(device, rays, shown, warps) for shown in self._shown]
-            if len(drawn) == 1:
-                return drawn[0]
-            parts = zip(self._shown, self._gains, drawn, strict=True)
-            return compose([Layer(shown.scene.prior, gain, *part) for shown, gain, part in parts], rays)
+    def _drawn(
+        self, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, tuple[Floats, Floats, Floats]]
+    ) -> _Picture:
+        """A view by keyframes: their panoramas warped, then the field as it becomes better.
 
-        return self._on_device(draw)
+        ``layers``: in and out, keyframes that have been drawn for this view.
+        """
+        share, depth_share = self._panorama_share, self.config.picture.depth_share(self._psnr_db)
+        warps = warps and self._can_warp
+        if share == 1 and warps:
+            picture = self._warped(rays, shown, layers)
+        else:
+            if self._scene is None:
+                self.learn(self.scene_of(shown))
+            field = self._on_device(lambda device: device.draw(rays, 0.0 if warps else share, depth_share))
+            warped = self._warped(rays, shown, layers) if share > 0 and warps else None
+            picture = field if warped is None else dissolve(warped, field, share)
+        colour, depth, confidence = picture
+        guessed = np.zeros(len(depth), bool)
+        if warps:
+            for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
+                wanted = (confidence == 0) & ~guessed
+                if keyframe.background is None or not wanted.any():
+                    break
+                guessed |= keyframe.background.draw(rays, gain, wanted, picture)
+        return _Picture(colour, depth, confidence, guessed)
 
-    def _draw(self, device: Device, rays: Rays, shown: _Learnt, warps: bool) -> tuple[Floats, Floats, Floats]:
-        """A keyframe's part of a view: its panorama warped, then the field as it becomes better."""
-        share, depth_share = self._panorama_share(shown), self.config.picture.depth_share(shown.progress.psnr_db)
-        if share == 0 or not (warps and self._can_warp):
-            return device.draw(rays, share, depth_share, shown.frozen)
-        warped = self._warp(shown.scene.prior).draw(rays)
-        if share == 1:
-            return warped
-        colour, depth, confidence = device.draw(rays, 0.0, depth_share, shown.frozen)
-        return dissolve(warped, (colour, depth, confidence), share)
+    @staticmethod
+    def _warped(
+        rays: Rays, shown: KeyframeSet, layers: dict[int, tuple[Floats, Floats, Floats]]
+    ) -> tuple[Floats, Floats, Floats]:
+        """The keyframes' panoramas warped by their depth, put together."""
+        drawn = []
+        for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
+            assert keyframe.warp is not None
+            if id(keyframe.warp) not in layers:
+                layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
+            drawn.append(Layer(keyframe.prior, gain, *layers[id(keyframe.warp)]))
+        if len(drawn) > 1:
+            return compose(drawn, rays)
+        colour, depth, confidence = layers[id(shown.keyframes[0].warp)]
+        return colour.copy(), depth.copy(), confidence.copy()
 
-    def _panorama_share(self, shown: _Learnt) -> float:
-        return 1.0 if self.config.source == "warp" else self.config.picture.panorama_share(shown.progress.psnr_db)
-
-    def _warp(self, prior: PanoramaPrior) -> PanoramaWarp:
-        """The keyframe as a warp; made at its first picture, kept as long as pictures show it."""
-        shown = [learnt.scene.prior for learnt in self._shown]
-        self._warps = [warp for warp in self._warps if any(warp.prior is one for one in shown)]
-        for warp in self._warps:
-            if warp.prior is prior:
-                return warp
-        self._warps.append(PanoramaWarp.of_prior(prior))
-        return self._warps[-1]
+    @property
+    def _panorama_share(self) -> float:
+        return 1.0 if self.config.source == "warp" else self.config.picture.panorama_share(self._psnr_db)
 
     def _on_device(self, call: Callable[[Device], T]) -> T:
         """Calls; a GPU without memory is left for the CPU where ``device`` is ``auto``, with what is learnt."""
@@ -397,8 +504,6 @@ class VirtualSpace:
         parameters = self._device.parameters()
         self._device = make_device(dataclasses.replace(self.config, device="cpu"))
         self._device.load(parameters)
-        self._kept = []  # their copies lie on the device that is left
-        self._gains = self._gains[:1]
         if self._scene is not None:
             self._device.set_scene(self._scene)
         return call(self._device)
@@ -411,7 +516,8 @@ class VirtualSpace:
     def _progress(self) -> Progress:
         schedule = self._schedule
         return Progress(
-            self._psnr_db, schedule.iteration, schedule.refresh, self._ready_iterations, self._train_seconds
+            *(self._psnr_db, schedule.iteration, schedule.refresh),
+            *(self._ready_iterations, self._train_seconds, self._ready),
         )
 
     def save(self, path: str | Path) -> Path:
@@ -423,13 +529,18 @@ class VirtualSpace:
             NotReadyError: no keyframe yet.
             OSError: the file cannot be written; an older one stays as it was.
         """
-        if self._scene is None:
+        if self._shown is None:
             raise NotReadyError("no keyframe yet: there is nothing to save")
-        learnt = [
-            SavedKeyframe(shown.scene.prior, shown.scene.lattice, self._device.parameters(shown.frozen), shown.progress)
-            for shown in self._shown
-        ]
-        return write(path, SavedSpace(self.config, tuple(learnt)))
+        if self._scene is None:
+            self.learn(self.scene_of(self._shown))
+        assert self._scene is not None
+        return write(
+            path,
+            SavedSpace(
+                self.config, self._shown.priors, self._shown.gains, self._scene.lattice, self.parameters(),
+                self._progress,
+            ),
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
@@ -444,27 +555,26 @@ class VirtualSpace:
         """
         saved = read(path)
         space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
-        scenes = [
-            Scene((one.prior,), one.lattice, build_occupancy(one.prior, saved.config.geometry))
-            for one in saved.keyframes
-        ]
-        newest = saved.keyframes[0]
-        kept: list[_Learnt] = []
-        for one, scene in reversed(list(zip(saved.keyframes, scenes, strict=True))):
-            space._device.load(one.parameters)
-            space._device.set_scene(scene)
-            if one is not newest:
-                kept.insert(0, _Learnt(scene, space._device.freeze(), one.progress))
-        progress = newest.progress
+        shown = KeyframeSet(tuple(space._store.put(prior, space._can_warp) for prior in saved.priors), saved.gains)
+        occupancy = build_occupancy(saved.priors, saved.config.geometry)
+        space._device.load(saved.parameters)
+        space.learn(Prepared(Scene(shown.priors, saved.lattice, occupancy, saved.gains), shown))
+        space.show(shown)
+        progress = saved.progress
         space._schedule = Schedule(saved.config.train, progress.refresh, progress.iteration)
-        space._psnr_db, space._train_seconds = progress.psnr_db, progress.train_seconds
         space._colour_error = 10 ** (-progress.psnr_db / 10)
-        space._ready_iterations = progress.ready_iterations
-        space._scene, space._kept = scenes[0], kept
-        space._keep(len(kept))
+        space._train_seconds, space._ready_iterations = progress.train_seconds, progress.ready_iterations
+        space._ready = progress.ready
         # Rays that were not drawn before, the same at each loading.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space
+
+
+def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
+    """The keyframe with another prior of the same panorama."""
+    if prior is keyframe.prior:
+        return keyframe
+    return ready(keyframe.place, prior, None if keyframe.warp is None else keyframe.warp.pyramid)
 
 
 def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:

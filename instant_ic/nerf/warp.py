@@ -6,6 +6,7 @@ its full resolution, averaged over each pixel's footprint; what opens is continu
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from .config import GeometryConfig
 from .field import Floats, Rays
-from .prior import PanoramaPrior, prepare, torn_quads
+from .prior import ROOM, PanoramaPrior, prepare, torn_quads
 from .view import View, check_size, checked_pose, continue_unseen, perspective_rays
 
 TORN_RATIO = 0.05
@@ -38,15 +39,18 @@ class Pyramid:
     sizes: NDArray[np.int64]
 
     @classmethod
-    def of(cls, rgb: NDArray[np.uint8]) -> Pyramid:
-        """Of a panorama (H, 2 H, 3); levels as long as both sides can be halved, down to 8 rows."""
+    def of(cls, rgb: NDArray[np.uint8], texels: NDArray[np.uint8] | None = None) -> Pyramid:
+        """Of a panorama (H, 2 H, 3); levels as long as both sides can be halved, down to 8 rows.
+
+        ``texels``: where they go, if there is a place for them already.
+        """
         levels = [rgb]
         while levels[-1].shape[0] >= 16 and levels[-1].shape[0] % 2 == 0:
             rows = levels[-1][::2].astype(np.uint16) + levels[-1][1::2]
             levels.append(((rows[:, ::2] + rows[:, 1::2] + 2) >> 2).astype(np.uint8))
         sizes = np.array([level.shape[:2] for level in levels], np.int64)
         start = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int64)
-        return cls(np.concatenate([level.reshape(-1, 3) for level in levels]), start, sizes)
+        return cls(np.concatenate([level.reshape(-1, 3) for level in levels], out=texels), start, sizes)
 
     def look_up(
         self, camera_from_map: Floats, rays: Rays, depth: Floats, wanted: Floats, share: float, colour: Floats
@@ -102,15 +106,15 @@ class PanoramaWarp:
         self._take(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), panorama_width))
 
     @classmethod
-    def of_prior(cls, prior: PanoramaPrior) -> PanoramaWarp:
-        """Of a keyframe that has been made ready already."""
+    def of_prior(cls, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> PanoramaWarp:
+        """Of a keyframe that has been made ready already, and its pyramid where that is there too."""
         warp = cls.__new__(cls)
-        warp._take(prior)
+        warp._take(prior, pyramid)
         return warp
 
-    def _take(self, prior: PanoramaPrior) -> None:
+    def _take(self, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> None:
         self.prior = prior
-        self.pyramid = Pyramid.of(prior.rgb)
+        self.pyramid = pyramid or Pyramid.of(prior.rgb)
         self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)
         height, width = prior.inverse_depth.shape
         # A row more above and below closes the mesh at the poles.
@@ -120,7 +124,16 @@ class PanoramaWarp:
         none = np.zeros((1, width), np.uint8)
         # The last row's own quads reach down to the pole, where nothing is torn.
         torn = torn_quads(prior.inverse_depth, TORN_RATIO)
-        self._torn = np.concatenate([none, torn[:-1], none, none])
+        gone = prior.content != ROOM
+        if gone.any():  # quads at its rim are drawn by their corners, of which it has none
+            right = np.roll(gone, -1, 1)
+            torn[:-1] |= (gone | right)[:-1] | (gone | right)[1:]
+            torn[-1] = 0
+            self._known[1:-1][gone] = 2
+            self._known[[0, -1]] = self._known[[1, -2]]
+            none = (self._known[[0]] == 2).astype(np.uint8)
+        below = (self._known[[-1]] == 2).astype(np.uint8)
+        self._torn = np.concatenate([none, torn[:-1], below, below])
         self._halves = _half_step_directions(width, height)
         self._directions = np.ascontiguousarray(self._halves[::2, ::2])
         self._vertices = np.empty((height + 2, width, 3), np.float32)
@@ -148,7 +161,7 @@ class PanoramaWarp:
         """
         from . import warp_kernels
 
-        map_from_view, half = _pinhole(rays)
+        map_from_view, half = pinhole(rays)
         view_from_camera = (np.linalg.inv(map_from_view) @ self.prior.map_from_camera).astype(np.float32)
         nearness = np.zeros(rays.shape, np.float32)
         marks = np.zeros(rays.shape, np.uint8)
@@ -184,7 +197,7 @@ def dissolve(
     return colour, np.where(first, warped[1], field[1]), np.where(first, warped[2], field[2])
 
 
-def _pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
+def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
     """Pose (4, 4) of a perspective view, and the tangent of half its horizontal field of view, from its rays."""
     height, width = rays.shape
     flat = (rays.directions / rays.axial[:, None]).reshape(height, width, 3)[:: height - 1, :: width - 1]
@@ -198,6 +211,7 @@ def _pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
     return pose, np.float32(0.5 * np.linalg.norm(left) * width / (width - 1))
 
 
+@functools.lru_cache(maxsize=2)  # a keyframe is as large as the one before
 def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:
     """Unit directions at every half pixel of a panorama with a row more above and below, (2 height + 3, 2 width, 3).
 

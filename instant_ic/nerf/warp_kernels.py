@@ -95,7 +95,7 @@ def draw_mesh(  # type: ignore[no-untyped-def]
 
     Args:
         vertices, outside: of ``place_vertices``; inverse, torn, known: of the ``PanoramaPrior``, with a row more above
-            and below for the poles.
+            and below for the poles; known 2: nothing is drawn there.
         corners: unit vectors half a pixel up and left of each pixel, (h + 1, w, 3).
         nearness: in and out, (H, W): inverse of the depth along the view's axis, 0 where nothing is.
         marks: in and out, (H, W) uint8: ``EMPTY``, ``FILLED``, ``KNOWN`` or ``BEHIND``.
@@ -120,6 +120,8 @@ def draw_mesh(  # type: ignore[no-untyped-def]
                 continue
             for corner in range(4):
                 row, column = v + corner // 2, right if corner % 2 else u
+                if known[row, column] > 1:
+                    continue
                 # The quarter between the pixel's own direction and the middle of the quad.
                 depth = np.float32(1) / inverse[row, column]
                 tangled, common = False, 31

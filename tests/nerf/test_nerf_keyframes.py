@@ -16,9 +16,10 @@ from instant_ic.nerf import (
     VirtualSpaceConfig,
     box_room,
 )
-from instant_ic.nerf.compose import Layer, compose, exposure_gain, looked_through
+from instant_ic.nerf import compose as composing
+from instant_ic.nerf.compose import Layer, compose, exposure_gain, exposure_gains, moved
 from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.prior import prepare
+from instant_ic.nerf.prior import MOVED, prepare
 from instant_ic.nerf.view import perspective_rays
 
 CONFIG = VirtualSpaceConfig(
@@ -65,16 +66,39 @@ def test_the_newest_so_many_are_kept(keyframes):
     space = VirtualSpace(dataclasses.replace(CONFIG, keyframes=keyframes))
     poses = [pose_matrix(x=x) for x in (-1.0, -0.5, 0.0, 0.5)]
     learn(space, *poses)
-    shown = [one.scene.prior.map_from_camera[0, 3] for one in space._shown]
-    assert shown == [0.5, 0.0, -0.5][:keyframes]
-    # A keyframe that is not fit yet is not among them, and replaces none that is.
+    assert [prior.map_from_camera[0, 3] for prior in space.keyframes] == [0.5, 0.0, -0.5][:keyframes]
+    assert len(space._scene.priors) == len(space.keyframes)  # one field learns from all of them
+    # A new one is shown from the first moment, and what was fit to show stays so.
     picture = box_room.panorama(FIRST, 96)
     space.set_keyframe(picture.rgb, picture.depth_m, FIRST, 0.02)
-    status = space.status
-    assert (status.state, status.refreshing) == (State.READY, True)
-    shown = [one.scene.prior.map_from_camera[0, 3] for one in space._shown]
-    assert shown == [0.5, 0.0, -0.5][:keyframes]
-    assert space.render(VIEW, 32, 32, 1.0).confidence.mean() > 0.5
+    assert (space.status.state, space.status.refreshing) == (State.READY, True)
+    assert [prior.map_from_camera[0, 3] for prior in space.keyframes] == [-1.5, 0.5, 0.0][:keyframes]
+    space.train()
+    assert not space.status.refreshing
+
+
+def test_nothing_large_is_allocated_for_a_keyframe_after_the_first():
+    space = VirtualSpace(dataclasses.replace(CONFIG, keyframes=2))
+    seen = set()
+    for number in range(9):
+        learn(space, pose_matrix(x=-1.0 + 0.2 * number))
+        space.render(VIEW, 32, 32, 1.0)
+        seen.add(space.keyframe.rgb.__array_interface__["data"][0])
+        # What is shown is what was taken, although others have lain in its place before.
+        assert np.array_equal(space.keyframe.rgb, box_room.panorama(space.keyframe.map_from_camera, 96).rgb)
+    assert len(seen) <= 4  # two shown, one that is left, one that is made ready
+    assert len(space._store._arrays) == 4
+
+
+def test_keyframes_of_another_size_replace_all():
+    space = learn(VirtualSpace(CONFIG), FIRST, SECOND)
+    picture = box_room.panorama(VIEW, 64)
+    space.set_keyframe(picture.rgb, picture.depth_m, VIEW, 0.02)
+    assert len(space.keyframes) == 1
+    view = space.render(VIEW, 64, 48, 1.2)
+    assert psnr_db(view.rgb, box_room.perspective(VIEW, 64, 48, 1.2).rgb) > 22
+    learn(space, FIRST)
+    assert len(space.keyframes) == 1
 
 
 def test_a_saved_space_has_all_its_keyframes(tmp_path):
@@ -84,31 +108,83 @@ def test_a_saved_space_has_all_its_keyframes(tmp_path):
     before, after = space.render(VIEW, 64, 48, 1.5), loaded.render(VIEW, 64, 48, 1.5)
     assert np.array_equal(before.rgb, after.rgb)
     assert np.array_equal(before.depth_m, after.depth_m)
-    assert len(loaded._shown) == 2
+    assert len(loaded.keyframes) == 2
 
 
 def test_exposure_is_fitted_where_both_have_seen():
     newest, older = prior_of(FIRST), prior_of(SECOND, gain=(0.8, 0.7, 0.6))
     assert exposure_gain(newest, older) == pytest.approx([1 / 0.8, 1 / 0.7, 1 / 0.6], rel=0.02)
     black = dataclasses.replace(older, rgb=older.rgb // 100)
-    assert exposure_gain(newest, black).tolist() == [1, 1, 1]  # nothing to fit on
+    assert exposure_gain(newest, black) is None  # nothing to fit on
+    assert exposure_gains([newest, black]).tolist() == [[1, 1, 1], [1, 1, 1]]
     # A picture of both has the newest's exposure throughout: as if the other had been taken with it.
     uneven = learn(VirtualSpace(CONFIG), SECOND, FIRST, gains=(0.6, 1.0)).render(VIEW, 96, 64, 1.5)
     even = learn(VirtualSpace(CONFIG), SECOND, FIRST).render(VIEW, 96, 64, 1.5)
     assert psnr_db(uneven.rgb, even.rgb) > 28
 
 
-def test_what_the_newest_has_looked_through_by_hand():
-    # The newest stands in a sphere of 4 m. Points at 2 m in its free space are gone, on it and behind it they are not.
-    sphere = prepare(
+def test_a_lamp_in_a_part_of_the_room_is_no_exposure():
+    # A third of the older panorama is twice as bright: the median of all ratios would be drawn aside by it.
+    newest, older = prior_of(FIRST), prior_of(pose_matrix(x=-1.0, y=0.3), gain=0.8)
+    rgb = older.rgb.copy()
+    rgb[:, 20:62] = np.clip(2.0 * rgb[:, 20:62].astype(float), 0, 255)
+    fitted = exposure_gain(newest, dataclasses.replace(older, rgb=rgb))
+    assert fitted == pytest.approx([1.25] * 3, rel=0.03)
+
+
+def test_an_exposure_is_fitted_through_the_keyframes_between():
+    # The oldest has nothing in common with the newest, whose depth is unknown; the middle one has.
+    newest, middle, oldest = prior_of(FIRST), prior_of(SECOND, gain=0.8), prior_of(SECOND, gain=0.5)
+    blind = dataclasses.replace(newest, known=np.zeros_like(newest.known))
+    assert exposure_gains([blind, middle, oldest])[2] == pytest.approx([1.6] * 3, rel=0.03)  # 0.8 / 0.5
+
+
+def sphere(radius_m, x, content=0):
+    return prepare(
         np.random.default_rng(0).integers(0, 255, (32, 64, 3)).astype(np.uint8),
-        np.full((32, 64), 4.0, np.float32), pose_matrix(x=1.0), 0.02, GeometryConfig(), 2048,
+        np.full((32, 64), radius_m, np.float32), pose_matrix(x=x), 0.02, GeometryConfig(), 2048,
     )  # fmt: skip
-    points = np.array([[3, 0, 0], [5, 0, 0], [7, 0, 0], [1, -3.6, 0], [-2.9, 0, 0]], np.float32)
-    # Distances from (1, 0, 0): 2, 4, 6, 3.6 (within 15 % of 4: may be an error of the depth), 3.9 across the seam.
-    assert looked_through(sphere, points, sphere).tolist() == [True, False, False, False, False]
-    unknown = dataclasses.replace(sphere, known=np.zeros_like(sphere.known))
-    assert not looked_through(unknown, points, sphere).any()
+
+
+def with_person(prior, depth_m=1.5):
+    """The same with somebody in the middle of the picture, 16 × 16 pixels."""
+    inverse = prior.inverse_depth.copy()
+    inverse[8:24, 24:40] = 1 / depth_m
+    return dataclasses.replace(prior, inverse_depth=inverse)
+
+
+def test_what_has_moved_by_majority():
+    empty, busy = sphere(4.0, 0.0), with_person(sphere(4.0, 0.0))
+    inside = np.s_[9:23, 25:39]
+
+    def gone(*priors):
+        masks = moved(priors)
+        return [bool(mask[inside].all()) for mask in masks], [int(mask.sum()) for mask in masks]
+
+    # Two: the newer wins. It sees nobody, so the older's person is gone; it sees somebody, and the wall that the older
+    # saw behind is hidden from it: nothing is gone.
+    assert gone(empty, busy)[0] == [False, True]
+    assert gone(busy, empty)[1] == [0, 0]
+    # Three: who is seen by one only has moved, be it the newest; who is seen by two stands there.
+    for order in range(3):
+        three = [empty] * 3
+        three[order] = busy
+        assert gone(*three)[0] == [number == order for number in range(3)]
+        assert gone(*three)[1][(order + 1) % 3] == 0
+    assert gone(empty, busy, busy)[0] == [False, False, False]
+    # Errors of the depth within three sigmas are no movement, nor is what the others do not know.
+    assert gone(empty, with_person(empty, 3.7), empty)[1] == [0, 0, 0]
+    blind = dataclasses.replace(empty, known=np.zeros_like(empty.known))
+    assert gone(blind, busy, blind)[1] == [0, 0, 0]
+
+
+def test_a_keyframe_leaves_out_what_has_moved_and_takes_it_in_again():
+    prior, mask = sphere(4.0, 0.0), np.zeros((32, 64), bool)
+    mask[4, 5] = True
+    left = prior.without(mask)
+    assert (left.content[4, 5], left.usable[4, 5], left.content.sum()) == (MOVED, 0, MOVED)
+    assert left.without(~mask & False).usable.all()
+    assert prior.without(mask & False) is prior
 
 
 def test_a_thing_that_has_moved_away_is_left_out():
@@ -133,8 +209,9 @@ def test_a_thing_that_has_moved_away_is_left_out():
 
     assert pixels_on_the_box() > 100
     space.set_keyframe(picture.rgb, depth, pose, 0.02)
-    space.train()
     assert pixels_on_the_box() < 5
+    assert (space.keyframes[1].content == MOVED).sum() > 100
+    assert not space._scene.priors[1].usable.all()  # nor does the field learn from it
 
 
 def layer(prior, depth, confidence, colour, gain=1.0):
@@ -164,3 +241,54 @@ def test_the_keyframe_that_is_nearer_to_a_surface_has_more_say():
     # Surface at 8 m, seen from 10.5 and from 6: penalties 0.05 + 10.5/8 − 1 = 0.3625 and 0.05, to the power of −6.
     colour, _, _ = compose(layers, rays)
     assert colour[0, 0] == pytest.approx(1 / (1 + (0.05 / 0.3625) ** 6), abs=1e-3)
+
+
+def composed_plainly(layers, rays):
+    """The rules of ``compose`` in plain numpy."""
+    depth, confidence = (np.stack([getattr(one, key) for one in layers]) for key in ("depth", "confidence"))
+
+    def angle(prior, points, directions):
+        seen = points - prior.map_from_camera[:3, 3]
+        cosine = np.einsum("ij,ij->i", seen, directions) / np.linalg.norm(seen, axis=1)
+        return np.arccos(np.clip(cosine, -1, 1))
+
+    rank = confidence.copy()
+    for number, one in enumerate(layers):
+        at = np.flatnonzero(confidence[number])
+        points = rays.origin + depth[number, at, None] * rays.directions[at]
+        local = (points - one.prior.map_from_camera[:3, 3]) @ one.prior.map_from_camera[:3, :3]
+        u, v = composing.equirect_pixels(local, *one.prior.torn.shape[::-1])
+        row = np.clip(np.floor(v), 0, one.prior.torn.shape[0] - 1).astype(int)
+        torn = one.prior.torn[row, np.floor(u).astype(int) % one.prior.torn.shape[1]] > 0
+        rank[number, at] -= composing.EDGE * (torn & (angle(one.prior, points, rays.directions[at]) > 0.02))
+    met = rank.max(axis=0) > 0
+    candidate = (rank > 0) & (rank == rank.max(axis=0))
+    nearest = np.where(candidate, depth, np.inf).min(axis=0)
+    candidate &= depth <= nearest * (1 + composing.SAME_PLACE)
+    penalty = np.full(depth.shape, np.inf)
+    points = rays.origin + nearest[met, None] * rays.directions[met]
+    for number, one in enumerate(layers):
+        away = np.linalg.norm(points - one.prior.map_from_camera[:3, 3], axis=1)
+        aside = angle(one.prior, points, rays.directions[met])
+        penalty[number, met] = composing.LEAST_PENALTY + aside + np.maximum(0, away / nearest[met] - 1)
+    penalty[~candidate] = np.inf
+    surface = np.take_along_axis(depth, penalty.argmin(axis=0)[None], axis=0)[0]
+    candidate &= np.abs(depth - surface) <= surface * composing.SAME_SURFACE
+    weight = np.where(candidate, penalty, np.inf) ** -composing.SHARPNESS
+    weight[0, ~met] = 1
+    weight /= weight.sum(axis=0)
+    colour = sum(w[:, None] * one.gain * one.colour for w, one in zip(weight, layers, strict=True))
+    return colour, (weight * depth).sum(axis=0), np.where(candidate, confidence, 0).max(axis=0)
+
+
+def test_the_kernel_composes_as_plain_numpy_does():
+    from instant_ic.nerf import PanoramaWarp
+
+    rays = perspective_rays(VIEW, 48, 32, 1.5)
+    layers = []
+    for pose, gain in ((FIRST, 1.0), (SECOND, 0.8), (pose_matrix(x=0.4, y=-0.5), 1.2)):
+        prior = prior_of(pose)
+        layers.append(Layer(prior, np.full(3, gain, np.float32), *PanoramaWarp.of_prior(prior).draw(rays)))
+    for fast, plain in zip(compose(layers, rays), composed_plainly(layers, rays), strict=True):
+        off = np.abs(fast - plain).reshape(len(rays.axial), -1).max(axis=1)
+        assert np.count_nonzero(off > 2e-3) <= 3  # a pixel on the border of two rules may fall to either side

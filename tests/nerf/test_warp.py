@@ -158,7 +158,8 @@ def test_a_space_shows_the_warp_from_the_first_moment(room, warp):
     space = VirtualSpace(SMALL)
     space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.02)
     first, truth = space.render(pose, 96, 54, FOV), box_room.perspective(pose, 96, 54, FOV)
-    assert np.array_equal(first.rgb, warp.render(pose, 96, 54, FOV).rgb)
+    seen = first.confidence > 0
+    assert np.array_equal(first.rgb[seen], warp.render(pose, 96, 54, FOV).rgb[seen])
     assert psnr_db(first.rgb, truth.rgb) > 24
     assert space.status.state == State.TRAINING
     space.train(iterations=1)
@@ -210,10 +211,10 @@ def test_a_dissolve_by_hand():
 
 
 def test_a_views_pose_follows_from_its_rays(warp):
-    from instant_ic.nerf.warp import _pinhole
+    from instant_ic.nerf.warp import pinhole
 
     pose = pose_matrix(1.0, 2.0, 0.3, 0.1, -0.2, 0.7)
-    found, half = _pinhole(perspective_rays(pose, 96, 54, 1.2))
+    found, half = pinhole(perspective_rays(pose, 96, 54, 1.2))
     assert found == pytest.approx(pose, abs=1e-5)
     assert half == pytest.approx(math.tan(0.6), rel=1e-5)
 

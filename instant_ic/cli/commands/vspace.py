@@ -381,13 +381,13 @@ def info_(args: argparse.Namespace) -> int:
     from instant_ic.nerf.saved import read, space_file
 
     saved = read(args.space)
-    field, progress = saved.config.field, saved.keyframes[0].progress
-    fit = "fit to show" if progress.ready_iterations else "not fit to show yet"
+    field, progress = saved.config.field, saved.progress
+    fit = "fit to show" if progress.ready else "not fit to show yet"
     print(f"{space_file(args.space)}: {progress.iteration} iterations in {progress.train_seconds:.1f} s, "
           f"{progress.psnr_db:.1f} dB; {fit}")  # fmt: skip
     print(f"field: {field.levels} levels x {field.features} features, 2^{field.log2_table} entries, "
           f"network {field.levels * field.features}-{field.hidden}-4")  # fmt: skip
-    for prior in (keyframe.prior for keyframe in saved.keyframes):
+    for prior in saved.priors:
         height, width = prior.rgb.shape[:2]
         x, y, z = prior.map_from_camera[:3, 3]
         print(f"keyframe: panorama {width} x {height} at ({x:.2f}, {y:.2f}, {z:.2f}) m, depth known in "

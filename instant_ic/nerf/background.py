@@ -1,0 +1,118 @@
+"""What lies behind a keyframe's surfaces, as far as it can be guessed: shown where nobody has seen anything.
+
+Behind each depth edge the farther surface is continued, in depth and in colour, once for each keyframe: it lies fixed
+in the map, so that pictures of a moving camera agree with each other. The place under the robot is a continuation of
+the ground round it. The sky is drawn here too, endlessly far.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.projections import equirect_directions
+
+from .field import Floats, Rays
+from .prior import ROBOT, ROOM, SKY, PanoramaPrior, area_average, fill_holes, torn_quads
+from .warp import pinhole
+
+REACH_RAD = 0.3
+"""So far behind an edge the background is continued, as seen from the keyframe."""
+_NEARER = 0.12  # a surface is in front of another where its inverse depth is greater by this share
+_SKY_M = 1e4
+_ROWS = 256  # of the pictures that the background is made in: it is smooth
+
+
+@dataclass(frozen=True)
+class Background:
+    """A keyframe's background as a mesh of some quads of a panorama.
+
+    Attributes:
+        inverse: inverse depth, (h, w) float32; rgb: (h, w, 3) uint8.
+        guessed: the upper left pixels (row, column) of the quads that are guesses, (N, 2) int32.
+        sky: of those that are sky.
+        map_from_camera: pose, (4, 4).
+    """
+
+    inverse: Floats
+    rgb: NDArray[np.uint8]
+    guessed: NDArray[np.int32]
+    sky: NDArray[np.int32]
+    map_from_camera: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, prior: PanoramaPrior) -> Background:
+        """The background of a keyframe. Needs numba."""
+        from .background_kernels import in_front
+
+        step = max(1, prior.inverse_depth.shape[0] // _ROWS)
+        inverse = np.ascontiguousarray(prior.inverse_depth[::step, ::step])
+        content = prior.content[::step, ::step]
+        height, width = inverse.shape
+        sky = content == SKY
+        inverse[sky] = 1 / _SKY_M
+        reach = max(1, round(REACH_RAD / (2 * math.pi / width)))
+        steps = np.zeros(inverse.shape, np.int32)
+        # Beyond the reach as much again of the near surface is no source of what is behind it.
+        in_front(inverse, torn_quads(inverse, _NEARER), 2 * reach, steps)
+        removed = (content != ROOM) & ~sky
+        hole = ((steps > 0) & (steps <= reach)) | removed
+        source = (steps == 0) & ~removed
+        if not source.any():
+            source = ~hole
+        weight = (1 / (inverse * inverse)).astype(np.float32)
+        keep = source | (content == ROBOT)  # the ground under the robot is known, or filled in already
+        filled = fill_holes(np.where(keep, inverse, 0).astype(np.float32), keep, weight)
+        rgb = area_average(prior.rgb, height, width) if prior.rgb.shape[:2] != inverse.shape else prior.rgb
+        colours = np.where(source[..., None], rgb, 0).astype(np.float32)
+        rgb = np.where(hole[..., None], np.rint(fill_holes(colours, source, weight)), rgb).astype(np.uint8)
+        inverse = np.where(hole, filled, inverse).astype(np.float32)
+        whole = torn_quads(inverse, _NEARER)[:-1] == 0
+        guessed = _any_corner(hole) & whole
+        return cls(
+            np.maximum(inverse, 1 / _SKY_M), rgb, _places(guessed), _places(_any_corner(sky) & ~guessed & whole),
+            prior.map_from_camera,
+        )  # fmt: skip
+
+    def draw(
+        self, rays: Rays, gain: Floats, wanted: NDArray[np.bool_], picture: tuple[Floats, Floats, Floats]
+    ) -> NDArray[np.bool_]:
+        """Draws what lies behind into a perspective picture.
+
+        Args:
+            rays: of the view; gain: (3,) factors of the colours.
+            wanted: (P,) where nothing has been seen.
+            picture: in and out: colour (P, 3), depth (P,), confidence (P,), which is 1 on the sky, else left 0.
+
+        Returns:
+            Where something was drawn, (P,).
+        """
+        from .background_kernels import draw_quads, paint
+
+        map_from_view, half = pinhole(rays)
+        view_from_camera = (np.linalg.inv(map_from_view) @ self.map_from_camera).astype(np.float32)
+        nearness, marks = np.zeros(rays.shape, np.float32), np.zeros(rays.shape, np.uint8)
+        height, width = self.inverse.shape
+        directions = equirect_directions(width, height)
+        for mark, quads in ((1, self.guessed), (2, self.sky)):
+            draw_quads(quads, mark, self.inverse, directions, view_from_camera, half, nearness, marks)
+        drawn = wanted & (nearness.reshape(-1) > 0)
+        colour, depth, confidence = picture
+        depth[drawn] = 1 / (rays.axial[drawn] * nearness.reshape(-1)[drawn])
+        camera_from_map = np.linalg.inv(self.map_from_camera).astype(np.float32)
+        paint(self.rgb, camera_from_map, gain, rays.origin, rays.directions, drawn, depth, colour)
+        confidence[drawn & (marks.reshape(-1) == 2)] = 1
+        return np.asarray(drawn)
+
+
+def _any_corner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Of each quad, (h − 1, w)."""
+    right = np.roll(mask, -1, 1)
+    return (mask | right)[:-1] | (mask | right)[1:]
+
+
+def _places(quads: NDArray[np.bool_]) -> NDArray[np.int32]:
+    return np.argwhere(quads).astype(np.int32)

@@ -1,0 +1,111 @@
+"""CPU kernels of the background behind a keyframe's surfaces (numba)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from .kernels import _OPTIONS
+from .march import along
+from .warp_kernels import NEAR_M, draw_triangle
+
+
+@njit(**_OPTIONS)
+def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
+    """How far pixels of nearer surfaces lie from a depth edge.
+
+    From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
+    two sides of that edge.
+
+    Args:
+        inverse, torn: of the ``PanoramaPrior``, (h, w).
+        reach: pixels at most.
+        steps: out, (h, w) int32: pixels from the edge, from 1; 0 where no edge is near, or on the far side.
+    """
+    height, width = inverse.shape
+    queue = np.empty(height * width, np.int64)
+    limit = np.zeros((height, width), np.float32)
+    size = 0
+    for v in range(height - 1):
+        for u in range(width):
+            if not torn[v, u]:
+                continue
+            right = (u + 1) % width
+            a, b, c, d = inverse[v, u], inverse[v, right], inverse[v + 1, u], inverse[v + 1, right]
+            middle = math.sqrt(min(min(a, b), min(c, d)) * max(max(a, b), max(c, d)))
+            for corner in range(4):
+                y, x = v + corner // 2, right if corner % 2 else u
+                if inverse[y, x] > middle and steps[y, x] == 0:
+                    steps[y, x], limit[y, x] = 1, middle
+                    queue[size] = y * width + x
+                    size += 1
+    first = 0
+    while first < size:
+        y, x = queue[first] // width, queue[first] % width
+        first += 1
+        if steps[y, x] >= reach:
+            continue
+        for way in range(4):
+            ny = y + (1 if way == 0 else -1 if way == 1 else 0)
+            nx = (x + (1 if way == 2 else -1 if way == 3 else 0)) % width
+            if 0 <= ny < height and steps[ny, nx] == 0 and inverse[ny, nx] > limit[y, x]:
+                steps[ny, nx], limit[ny, nx] = steps[y, x] + 1, limit[y, x]
+                queue[size] = ny * width + nx
+                size += 1
+
+
+@njit(**_OPTIONS)
+def draw_quads(  # type: ignore[no-untyped-def]
+    quads, mark, inverse, directions, view_from_camera, half, nearness, marks
+):
+    """Some quads of a panorama's mesh into a z-buffer.
+
+    Args:
+        quads: upper left pixels (row, column), (N, 2); mark: what ``marks`` gets.
+        inverse: (h, w); directions: of the pixels, (h, w, 3).
+        view_from_camera, half, nearness, marks: as in ``warp_kernels.draw_mesh``.
+    """
+    width = inverse.shape[1]
+    aspect = np.float32(nearness.shape[0]) / np.float32(nearness.shape[1])
+    origin = np.zeros(3, np.float32)
+    patch = np.zeros((4, 3), np.float32)
+    for n in range(quads.shape[0]):
+        tangled, common = False, 31
+        for corner in range(4):
+            v, u = quads[n, 0] + corner // 2, (quads[n, 1] + corner % 2) % width
+            x, y, z = along(view_from_camera, origin, directions[v, u], np.float32(1) / inverse[v, u])
+            patch[corner, 0], patch[corner, 1], patch[corner, 2] = x, y, z
+            tangled = tangled or x < NEAR_M
+            code = 1 if x < NEAR_M else 0
+            code |= 2 if y > half * x else 0
+            code |= 4 if y < -half * x else 0
+            code |= 8 if z > half * aspect * x else 0
+            code |= 16 if z < -half * aspect * x else 0
+            common &= code
+        if common == 0:
+            draw_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
+            draw_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
+
+
+@njit(**_OPTIONS)
+def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour):  # type: ignore[no-untyped-def]
+    """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,)."""
+    height, width = rgb.shape[:2]
+    one = np.float32(1)
+    for n in range(depth.shape[0]):
+        if not wanted[n]:
+            continue
+        x, y, z = along(camera_from_map, origin, directions[n], depth[n])
+        u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
+        v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
+        v = min(max(v, np.float32(0)), np.float32(height - 1))
+        u0, v0 = math.floor(u), math.floor(v)
+        fu, fv = u - np.float32(u0), v - np.float32(v0)
+        v1 = min(v0 + 1, height - 1)
+        left, right = u0 % width, (u0 + 1) % width
+        for c in range(3):
+            top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
+            bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
+            colour[n, c] = (top * (one - fv) + bottom * fv) * np.float32(1 / 255) * gain[c]
