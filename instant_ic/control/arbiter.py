@@ -1,7 +1,6 @@
 """Who is driven and what is sent: the state machine of illusory control (paper, III.A).
 
-The machine is data: ``TRANSITIONS`` (states, guards, actions), ``GUARDS`` (what each guard means) and ``SOURCES``
-(what must be fresh in which state). ``diagram.py`` prints them for the docs; ``Arbiter.step`` runs them.
+The machine is data (``states.py``); ``Arbiter.step`` runs it.
 """
 
 from __future__ import annotations
@@ -9,21 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntEnum
-from typing import Annotated, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.poses import wrap_angle
-from ..ranges import NotNegative, Positive, Range, check_ranges
+from ..ranges import NotNegative, Positive, check_ranges
 from .costmap import Costmap
 from .footprint import Footprint
+from .freshness import TimeoutConfig
 from .kinematics import MotionLimits, clip_twist
 from .passage import Passage, PassageConfig, find_passage
 from .planner import HybridPlanner, PlannerConfig
 from .prediction import Prediction, PredictionConfig, Predictor
 from .safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
+from .states import OPERATOR_LOST, SOURCES, TRANSITIONS, Mode, Source, VbotAction
 from .subgoal import Subgoal, SubgoalConfig, choose_subgoal
 from .walls import WallMap
 
@@ -32,125 +32,57 @@ Twist2 = tuple[float, float]
 
 
 PASSAGE_PERIOD_NS = 200_000_000
-
-
-class Mode(IntEnum):
-    """Values of ControlState.mode."""
-
-    REAL = 0
-    VIRTUAL = 1
-    STOPPED = 2
-
-
-@dataclass(frozen=True)
-class Transition:
-    """One arrow: from ``source`` to ``target`` when ``guard`` holds, doing ``action``."""
-
-    source: Mode
-    target: Mode
-    guard: str
-    action: str
-
-
-TRANSITIONS: tuple[Transition, ...] = (
-    Transition(Mode.REAL, Mode.STOPPED, "estop_pressed", "stop"),
-    Transition(Mode.REAL, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.REAL, Mode.VIRTUAL, "obstacle_and_ready", "place_vbot"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.VIRTUAL, Mode.STOPPED, "vspace_lost", "stop"),
-    Transition(Mode.VIRTUAL, Mode.REAL, "rejoined", "hand_back"),
-    Transition(Mode.STOPPED, Mode.REAL, "may_resume", "hand_back"),
-)
-"""In order: the first row of the present state whose guard holds is taken, at most one a step."""
-
-GUARDS: dict[str, str] = {
-    "estop_pressed": "the emergency stop is pressed",
-    "source_lost": "a source that this state needs has been silent for stop_after_s",
-    "vspace_lost": "the virtual space has failed, or its node is silent",
-    "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready here, and there is a way "
-    "round for the r-bot",
-    "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, and the operator's command is safe for "
-    "the r-bot over a longer and wider way than the one that switches in",
-    "may_resume": "the emergency stop is released, every source is fresh for recover_s, the operator's command is zero "
-    "(silence counts as zero), and the operator's link is back where its loss was the reason",
-}
-
-ACTIONS: dict[str, str] = {
-    "stop": "command zero; the r-bot is shown",
-    "place_vbot": "the v-bot starts at the r-bot's pose; it is driven and shown",
-    "hand_back": "the r-bot is driven and shown",
-}
-
-
-@dataclass(frozen=True)
-class Source:
-    """An input that must be fresh: beyond its time-out the command is zero; beyond ``stop_after_s``, STOPPED."""
-
-    key: str
-    name: str
-    modes: tuple[Mode, ...]
-    words: str = ""
-    """What the operator is told of its loss; empty: "no NAME for SECONDS"."""
-    optional: bool = False
-    """Needed only once it has come: a robot without 3D points drives by its flat scan."""
-
-
-OPERATOR_LOST = "the operator's link is lost, the robot waits"
-
-SOURCES: tuple[Source, ...] = (
-    Source("scan", "LiDAR scan", (Mode.REAL, Mode.VIRTUAL)),
-    Source("points", "3D points", (Mode.REAL, Mode.VIRTUAL), optional=True),
-    Source("odometry", "wheel odometry", (Mode.REAL, Mode.VIRTUAL)),
-    Source("pose", "SLAM pose", (Mode.REAL, Mode.VIRTUAL)),
-    Source("camera", "camera picture", (Mode.REAL,)),
-    Source("vbot", "v-bot", (Mode.VIRTUAL,)),
-    Source("nav", "path follower", (Mode.VIRTUAL,)),
-    # In REAL its silence is a zero command and no more; in VIRTUAL the r-bot would go on to the v-bot by itself.
-    Source("command", "operator's link", (Mode.VIRTUAL,), OPERATOR_LOST),
-)
-
-
-_Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
-"""Longer than this is no time-out: a robot must not drive on what it saw or was told so long ago."""
-
-
-@dataclass(frozen=True)
-class TimeoutConfig:
-    """Age in seconds beyond which a source is stale and the command is zero."""
-
-    scan: _Timeout = 0.3
-    points: _Timeout = 0.5
-    odometry: _Timeout = 0.3
-    pose: _Timeout = 1.0
-    camera: _Timeout = 1.0
-    vbot: _Timeout = 0.3
-    nav: _Timeout = 0.3
-    command: _Timeout = 0.3
-    vspace: _Timeout = 2.0
-    stop_after_s: _Timeout = 1.5
-    recover_s: _Timeout = 0.5
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
+_STANDS_M_S, _STANDS_RAD_S = 0.03, 0.1
+"""Slower than this a robot counts as standing."""
+_SLOW_NS = 800_000_000
+"""Longer than it takes to reach full speed."""
 
 
 @dataclass(frozen=True)
 class SwitchConfig:
-    """Thresholds of the change between real and virtual."""
+    """Thresholds of the change between real and virtual.
+
+    Attributes:
+        position_m: m between the two robots below which they agree.
+        yaw_deg: degrees, likewise.
+        return_dwell_s: s that they must agree before the return begins.
+        picture_position_m: m between the places of view and camera picture at a switch; what jumps is no more.
+        picture_yaw_deg: degrees, likewise.
+        enter_timeout_s: s that a fitting view is waited for, while the r-bot slows to a stand.
+        return_timeout_s: s after which the return ends although view and picture do not meet: they come too rarely.
+        min_virtual_s: s; shortest stay in the virtual space.
+        min_real_s: s after a return, or an entry given up, before the next entry.
+        return_margin_m: m that the way must be free beyond the horizon that switches in.
+        return_side_m: m that it must be wider than the robot on each side.
+        neutral_return_s: s of hands off after which the real view comes back before an obstacle too.
+        lead_back_after_s: s of hands off after which the v-bot is led back to an r-bot that cannot come; 0: never.
+        stop_margin_m: m kept to an obstacle when no switch is possible.
+        min_switch_speed_m_s: m/s; slower than this forward the robot is turning.
+        min_expected_psnr_db: dB that the view where the robot stands must be expected to have; 0: not looked at.
+        ready_hold_s: s; a virtual space that learns its next keyframe still counts as ready with the last one.
+        require_camera: false: drive without pictures (tests, replays).
+        require_view: false: nobody shows the virtual space; it is neither waited for nor missed.
+    """
 
     position_m: Positive = 0.15
     yaw_deg: Positive = 10.0
     return_dwell_s: NotNegative = 0.5
+    picture_position_m: Positive = 0.02
+    picture_yaw_deg: Positive = 0.5
+    enter_timeout_s: Positive = 2.0
+    return_timeout_s: Positive = 3.0
     min_virtual_s: NotNegative = 1.0
     min_real_s: NotNegative = 1.0
     return_margin_m: Positive = 0.5
     return_side_m: Positive = 0.12
     neutral_return_s: NotNegative = 5.0
+    lead_back_after_s: NotNegative = 6.0
     stop_margin_m: NotNegative = 0.15
     min_switch_speed_m_s: NotNegative = 0.03
+    min_expected_psnr_db: NotNegative = 12.0
     ready_hold_s: NotNegative = 2.0
     require_camera: bool = True
+    require_view: bool = True
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -182,6 +114,8 @@ class Vspace:
     """(2,) of the newest keyframe in the map frame."""
     ready_radius_m: float = 0.0
     message: str = ""
+    expected_psnr_db: float = 0.0
+    """Of the view asked for last; 0 or NaN while unknown."""
 
 
 @dataclass(frozen=True)
@@ -202,8 +136,18 @@ class ArbiterInputs:
     """(3,) of the v-bot in the map frame."""
     vbot_velocity: Twist2 = (0.0, 0.0)
     nav_command: Twist2 = (0.0, 0.0)
+    shown_pose: NDArray[np.float64] | None = None
+    """(3,) of the r-bot when the camera picture now shown was taken, but its heading of now, to which the page turns
+    each picture; None: ``robot_pose``."""
+    picture_position: NDArray[np.float64] | None = None
+    """(2,) of the camera in the map frame when it took the newest picture that the operator has."""
+    view_position: NDArray[np.float64] | None = None
+    """(2,) of the camera in the map frame for the newest rendered view that the operator has."""
     ages: dict[str, float] = field(default_factory=dict)
-    """Seconds since the last of: scan, odometry, pose, camera, vbot, nav, command, vspace; points once they came."""
+    """Seconds since the last of: scan, odometry, pose, camera, view, vbot, nav, command, vspace; points and
+    estop_input once they came."""
+    usual: dict[str, float] = field(default_factory=dict)
+    """How old a source usually is when its next message comes (``freshness.Rhythm``), s."""
 
     def age(self, key: str) -> float:
         """Age of a source; inf when it has never been seen."""
@@ -234,6 +178,9 @@ class Decision:
     estop: bool
     operator_command: Twist2
     """As it counts: zero when it is old."""
+    vbot_action: VbotAction
+    vbot_target: NDArray[np.float64]
+    """(3,) to which the v-bot goes; not for DRIVEN and HELD."""
 
 
 @dataclass
@@ -245,9 +192,16 @@ class _Situation:
     command: Twist2
     """The operator's, zero when stale."""
     prediction: Prediction | None
+    target: NDArray[np.float64]
+    """(3,) of the r-bot as it is, or will be, shown."""
     vbot_pose: NDArray[np.float64]
     gap_m: float
     yaw_gap_rad: float
+
+
+class _Driven(NamedTuple):
+    command: Twist2
+    at_ns: int
 
 
 class Arbiter:
@@ -261,8 +215,9 @@ class Arbiter:
         self._returned_ns: int | None = None  # of the last change from VIRTUAL to REAL
         self._fresh_since_ns: int | None = None
         self._agree_since_ns: int | None = None
-        self._driven: Twist2 = (0.0, 0.0)  # the last command that was not zero
-        self._driven_ns: int | None = None
+        self._driven: _Driven | None = None  # the last command that was not zero
+        self._leading_back = False
+        self._slow_since_ns: int | None = None  # the v-bot drives more slowly than it is told to
         self._stop_reason = "waiting for the sensors"
         self._await_operator = False  # STOPPED because the operator's link was lost
         self._ready: tuple[int, Vspace] | None = None  # when the v-space was ready last, and what it said then
@@ -274,12 +229,19 @@ class Arbiter:
             "source_lost": self._source_lost,
             "vspace_lost": self._vspace_lost,
             "obstacle_and_ready": self._obstacle_and_ready,
+            "entry_moot": self._entry_moot,
+            "view_fits": self._view_fits,
             "rejoined": self._rejoined,
+            "unsafe_again": self._unsafe_again,
+            "picture_fits": self._picture_fits,
             "may_resume": self._may_resume,
         }
         self._actions: dict[str, Callable[[_Situation, str], None]] = {
             "stop": self._stop,
+            "call_vbot": self._keep,
             "place_vbot": self._place_vbot,
+            "ease_vbot": self._keep,
+            "drive_vbot_on": self._place_vbot,
             "hand_back": self._hand_back,
         }
 
@@ -317,6 +279,10 @@ class Arbiter:
             subgoal=self._subgoal,
             estop=inputs.estop,
             operator_command=situation.command,
+            vbot_action=self._vbot_action(situation),
+            vbot_target=(
+                inputs.robot_pose if self._leading_back and inputs.robot_pose is not None else situation.target
+            ).copy(),
         )
 
     # -- what the step starts from
@@ -325,7 +291,7 @@ class Arbiter:
         fresh = inputs.age("command") <= self.config.timeouts.command
         command = clip_twist(*inputs.operator_command, self.config.limits) if fresh else (0.0, 0.0)
         if command != (0.0, 0.0):
-            self._driven, self._driven_ns = command, now_ns
+            self._driven = _Driven(command, now_ns)
         if inputs.vspace.ready:
             self._ready = (now_ns, inputs.vspace)
         if self._lacking(inputs, Mode.REAL, now_ns):
@@ -333,27 +299,52 @@ class Arbiter:
         elif self._fresh_since_ns is None:
             self._fresh_since_ns = now_ns
         robot = inputs.robot_pose
-        vbot = robot if robot is not None else np.zeros(3)
-        gap, yaw_gap, prediction = 0.0, 0.0, None
+        target = inputs.shown_pose if inputs.shown_pose is not None else robot if robot is not None else np.zeros(3)
+        vbot = self._vbot_pose(inputs, target, now_ns)
+        # While it is driven the v-bot is compared with the r-bot; while it is shown beside it, with its picture.
+        other = robot if self.mode == Mode.VIRTUAL and robot is not None else target
+        gap = float(np.linalg.norm(vbot[:2] - other[:2]))
+        yaw_gap = wrap_angle(float(vbot[2] - other[2]))
+        prediction = None
         if self.mode == Mode.VIRTUAL:
-            # What the v-bot said before the change was not yet from where it starts.
-            spoken = inputs.vbot_pose is not None and inputs.age("vbot") < self._seconds_in_mode(now_ns)
-            vbot = inputs.vbot_pose if spoken and inputs.vbot_pose is not None else self._vbot_start
-            if robot is not None:
-                gap = float(np.linalg.norm(vbot[:2] - robot[:2]))
-                yaw_gap = wrap_angle(float(vbot[2] - robot[2]))
             prediction = self.predictor.predict(vbot, inputs.vbot_velocity, command, inputs.costmap)
         elif robot is not None:
             prediction = self.predictor.predict(robot, inputs.robot_velocity, command, inputs.costmap)
-        situation = _Situation(inputs, now_ns, command, prediction, np.asarray(vbot), gap, yaw_gap)
+        situation = _Situation(inputs, now_ns, command, prediction, np.asarray(target), vbot, gap, yaw_gap)
         self._watch_agreement(situation)
+        self._leading_back = self._leads_back(situation)
+        slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * abs(command[0])
+        self._slow_since_ns = (self._slow_since_ns or now_ns) if slow else None
         self._subgoal = None
         if self.mode == Mode.VIRTUAL and prediction is not None and inputs.costmap is not None:
             forward = (command[0] or inputs.vbot_velocity[0]) >= 0.0
-            self._subgoal = choose_subgoal(
-                inputs.costmap, np.asarray(vbot), prediction, forward, inputs.walls, self.config.subgoal
-            )
+            self._subgoal = choose_subgoal(inputs.costmap, vbot, prediction, forward, inputs.walls, self.config.subgoal)
         return situation
+
+    def _vbot_pose(self, inputs: ArbiterInputs, target: NDArray[np.float64], now_ns: int) -> NDArray[np.float64]:
+        if self.mode in (Mode.REAL, Mode.STOPPED):
+            return np.asarray(target)
+        # What it said before the entry is not yet from where it starts.
+        if inputs.vbot_pose is None or (self.mode == Mode.ENTERING and not self._vbot_spoke(inputs, now_ns)):
+            return np.asarray(target if self.mode == Mode.ENTERING else self._vbot_start)
+        return np.asarray(inputs.vbot_pose)
+
+    def _vbot_spoke(self, inputs: ArbiterInputs, now_ns: int) -> bool:
+        return inputs.age("vbot") < self._seconds_in_mode(now_ns)
+
+    def _leads_back(self, situation: _Situation) -> bool:
+        """Whether the v-bot goes back to the r-bot by itself: nobody drives it, and the r-bot cannot come to it."""
+        after, idle_s = self.config.switch.lead_back_after_s, self._idle_s(situation)
+        if self.mode != Mode.VIRTUAL or situation.inputs.robot_pose is None or after == 0.0 or idle_s < after:
+            return False
+        if self._leading_back or idle_s >= 3.0 * after:
+            return True
+        linear, angular = situation.inputs.robot_velocity
+        return self._agree_since_ns is None and abs(linear) < _STANDS_M_S and abs(angular) < _STANDS_RAD_S
+
+    def _idle_s(self, situation: _Situation) -> float:
+        """Seconds of hands off."""
+        return (situation.now_ns - (self._since_ns or 0 if self._driven is None else self._driven.at_ns)) / 1e9
 
     def _watch_agreement(self, situation: _Situation) -> None:
         switch = self.config.switch
@@ -368,24 +359,27 @@ class Arbiter:
         elif self._agree_since_ns is None:
             self._agree_since_ns = situation.now_ns
 
-    def _timeout(self, key: str) -> float:
-        return float(getattr(self.config.timeouts, key))
-
     def _lacking(self, inputs: ArbiterInputs, mode: Mode, now_ns: int) -> list[tuple[Source, float]]:
         """Sources that ``mode`` needs and that are stale, with their ages."""
         lacking = []
         for source in SOURCES:
-            if mode not in source.modes or (source.key == "camera" and not self.config.switch.require_camera):
+            if mode not in source.modes or (source.optional and source.key not in inputs.ages):
                 continue
-            if source.optional and source.key not in inputs.ages:
+            if (source.key, False) in (
+                ("camera", self.config.switch.require_camera),
+                ("view", self.config.switch.require_view),
+            ):
                 continue
             age = inputs.age(source.key)
-            if source.modes == (Mode.VIRTUAL,):
-                # It speaks in this state only: its silence counts from the change.
+            if Mode.REAL not in source.modes:
+                # It need not have spoken before the change: its silence counts from there.
                 age = min(age, self._seconds_in_mode(now_ns))
-            if age > self._timeout(source.key):
+            if age > self._allowed_s(source, inputs):
                 lacking.append((source, age))
         return lacking
+
+    def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
+        return self.config.timeouts.allowed_s(source.key, inputs.usual.get(source.key) if source.steady else None)
 
     def _seconds_in_mode(self, now_ns: int) -> float:
         return (now_ns - (self._since_ns or now_ns)) / 1e9
@@ -399,7 +393,7 @@ class Arbiter:
             reason = self._guards[row.guard](situation)
             if reason:
                 self._actions[row.action](situation, reason)
-                if row.source == Mode.VIRTUAL and row.target == Mode.REAL:
+                if row.source in (Mode.ENTERING, Mode.RETURNING) and row.target == Mode.REAL:
                     self._returned_ns = situation.now_ns
                 self.mode = row.target
                 self.transitions += 1
@@ -416,7 +410,7 @@ class Arbiter:
     def _source_lost(self, situation: _Situation) -> str:
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
         after = self.config.timeouts.stop_after_s
-        lost = [(source, age) for source, age in lacking if age > max(after, self._timeout(source.key))]
+        lost = [(source, age) for source, age in lacking if age > max(after, self._allowed_s(source, situation.inputs))]
         return _no_data(lost) if lost else ""
 
     def _vspace_lost(self, situation: _Situation) -> str:
@@ -431,7 +425,7 @@ class Arbiter:
             return ""
         if self._why_not_virtual(situation):
             return ""
-        return f"obstacle in {prediction.time_to_obstacle_s:.1f} s: you drive the virtual robot"
+        return f"obstacle in {prediction.time_to_obstacle_s:.1f} s: the virtual space is about to be shown"
 
     def _why_not_virtual(self, situation: _Situation) -> str:
         """What keeps the machine from switching although an obstacle is ahead; "" when nothing does."""
@@ -447,6 +441,11 @@ class Arbiter:
         away = float(np.linalg.norm(vspace.position - inputs.robot_pose[:2]))
         if away > vspace.ready_radius_m:
             return f"the virtual space is fit to show {vspace.ready_radius_m:.1f} m round a place {away:.1f} m off"
+        if 0.0 < vspace.expected_psnr_db < switch.min_expected_psnr_db:  # NaN is unknown too
+            return (
+                f"the virtual space would show this place too badly ({vspace.expected_psnr_db:.0f} dB expected, "
+                f"{switch.min_expected_psnr_db:.0f} dB needed)"
+            )
         back = self._returned_ns
         if back is not None and situation.now_ns - back < switch.min_real_s * 1e9:
             return "just back from the virtual space"
@@ -477,6 +476,39 @@ class Arbiter:
             self._passage_found = (situation.now_ns, passage)
         return self._passage_found[1]
 
+    def _entry_moot(self, situation: _Situation) -> str:
+        inputs = situation.inputs
+        if inputs.age("vspace") > self.config.timeouts.vspace or not self._shown_vspace(situation).ready:
+            return "the virtual space is not ready any more"
+        if self._seconds_in_mode(situation.now_ns) > self.config.switch.enter_timeout_s:
+            return "no fitting picture of the virtual space has come"
+        return "you drive the robot" if self._safe_ahead(situation) else ""
+
+    def _view_fits(self, situation: _Situation) -> str:
+        if self._hold_reason(situation) or not self._vbot_spoke(situation.inputs, situation.now_ns):
+            return ""
+        return "you drive the virtual robot" if self._pictures_agree(situation) else ""
+
+    def _pictures_agree(self, situation: _Situation) -> bool:
+        """Whether view and camera picture show the same place, so that nothing jumps when one follows the other."""
+        inputs, switch = situation.inputs, self.config.switch
+        if inputs.robot_pose is None:
+            return False
+        if abs(situation.yaw_gap_rad) > math.radians(switch.picture_yaw_deg):
+            return False
+        if not (switch.require_view and switch.require_camera):
+            return True
+        if self._seconds_old(inputs, "view") or inputs.view_position is None or inputs.picture_position is None:
+            return False
+        apart = inputs.view_position[:2] - inputs.picture_position[:2]
+        return float(np.linalg.norm(apart)) <= switch.picture_position_m
+
+    def _seconds_old(self, inputs: ArbiterInputs, key: str) -> float:
+        """Seconds that a source is old beyond what it may be; 0 while it is fresh."""
+        source = next(source for source in SOURCES if source.key == key)
+        age, allowed_s = inputs.age(key), self._allowed_s(source, inputs)
+        return age if age > allowed_s else 0.0
+
     def _rejoined(self, situation: _Situation) -> str:
         now_ns, switch, inputs = situation.now_ns, self.config.switch, situation.inputs
         since = self._agree_since_ns
@@ -484,24 +516,51 @@ class Arbiter:
             return ""
         if self._seconds_in_mode(now_ns) < switch.min_virtual_s:
             return ""
-        if self._lacking(inputs, Mode.REAL, now_ns) or inputs.robot_pose is None or inputs.costmap is None:
+        if self._lacking(inputs, Mode.REAL, now_ns) or self._hold_reason(situation):
             return ""
+        return "you drive the robot" if self._safe_ahead(situation) else ""
+
+    def _safe_ahead(self, situation: _Situation) -> bool:
+        """Whether the r-bot may be driven by the operator's command.
+
+        No obstacle on the way that switches in, nor on a longer and wider one: what leads back and what leads in never
+        hold together.
+        """
+        inputs, switch = situation.inputs, self.config.switch
+        if inputs.robot_pose is None or inputs.costmap is None:
+            return False
         command = situation.command
-        if command == (0.0, 0.0):
+        if command == (0.0, 0.0) and self._driven is not None and self._idle_s(situation) < switch.neutral_return_s:
             # Hands off before the obstacle: what would be driven next is most likely what was driven last. Only
             # after a while is the real view given back.
-            idle_ns = now_ns - (self._driven_ns if self._driven_ns is not None else now_ns)
-            if idle_ns < switch.neutral_return_s * 1e9:
-                command = self._driven
-        ahead = self.predictor.predict(
-            inputs.robot_pose,
-            inputs.robot_velocity,
-            command,
-            inputs.costmap,
-            extra_m=switch.return_margin_m,
-            side_m=switch.return_side_m,
+            command = self._driven.command
+        return all(
+            self.predictor.predict(
+                inputs.robot_pose, inputs.robot_velocity, command, inputs.costmap, extra_m=extra_m, side_m=side_m
+            ).hit_index
+            is None
+            for extra_m, side_m in ((0.0, 0.0), (switch.return_margin_m, switch.return_side_m))
         )
-        return "you drive the robot" if ahead.hit_index is None else ""
+
+    def _unsafe_again(self, situation: _Situation) -> str:
+        if self._lacking(situation.inputs, Mode.REAL, situation.now_ns):
+            return "you drive the virtual robot"
+        prediction = situation.prediction
+        if situation.command == (0.0, 0.0) or prediction is None or prediction.hit_index is None:
+            return ""
+        return f"obstacle in {prediction.time_to_obstacle_s:.1f} s: you drive the virtual robot"
+
+    def _picture_fits(self, situation: _Situation) -> str:
+        if self._hold_reason(situation):
+            return ""
+        switch, words = self.config.switch, "you drive the robot"
+        waited = self._seconds_in_mode(situation.now_ns) / switch.return_timeout_s
+        if waited >= 2.0:
+            return words  # a pose that trembles by more than the thresholds; the page eases what is left
+        near = situation.gap_m <= switch.picture_position_m
+        if not near or abs(situation.yaw_gap_rad) > math.radians(switch.picture_yaw_deg):
+            return ""
+        return words if waited >= 1.0 or self._pictures_agree(situation) else ""
 
     def _may_resume(self, situation: _Situation) -> str:
         inputs = situation.inputs
@@ -525,11 +584,13 @@ class Arbiter:
         self._await_operator = OPERATOR_LOST in reason
 
     def _place_vbot(self, situation: _Situation, reason: str) -> None:
-        assert situation.inputs.robot_pose is not None
-        self._vbot_start = np.asarray(situation.inputs.robot_pose, dtype=np.float64).copy()
+        self._vbot_start = situation.vbot_pose.copy()
+
+    def _keep(self, situation: _Situation, reason: str) -> None:
+        """Nothing is to be done but what the new state does."""
 
     def _hand_back(self, situation: _Situation, reason: str) -> None:
-        self._driven, self._driven_ns = situation.command, situation.now_ns
+        self._driven = _Driven(situation.command, situation.now_ns)
 
     # -- the command of each state
 
@@ -541,16 +602,37 @@ class Arbiter:
         if hold:
             return (0.0, 0.0), False, hold
         if self.mode == Mode.VIRTUAL:
-            wanted = clip_twist(*situation.inputs.nav_command, self.config.limits)
-            if situation.inputs.age("nav") > self._timeout("nav"):
-                wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
-            sent = self._monitored(wanted, situation)
-            reason = "you drive the virtual robot" + self._far_from_keyframe(situation)
-            if self._subgoal is None:
-                return (0.0, 0.0), False, reason + "; no free place for the robot near it"
-            held = "" if sent.action == "free" else "; the robot slows down for something close"
-            return sent.command, False, reason + held
+            return self._virtual_command(situation)
         return self._real_command(situation)
+
+    def _virtual_command(self, situation: _Situation) -> tuple[Twist2, bool, str]:
+        inputs = situation.inputs
+        reason = "you drive the virtual robot" + self._far_from_keyframe(situation)
+        if self._leading_back:
+            return (0.0, 0.0), False, "nobody drives: the view is led back to the robot; drive to go on"
+        if self._subgoal is None:
+            return (0.0, 0.0), False, reason + "; no free place for the robot near it"
+        wanted = clip_twist(*inputs.nav_command, self.config.limits)
+        if inputs.age("nav") > self.config.timeouts.nav:
+            wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
+        sent = self._monitored(wanted, situation)
+        left_s = self.config.switch.lead_back_after_s - self._idle_s(situation)
+        if self._agree_since_ns is None and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
+            reason = f"the robot cannot come to where you stopped: in {left_s:.0f} s the view is led back to it"
+        elif sent.action != "free":
+            reason += "; the robot slows down for something close"
+        elif self._slow_since_ns is not None and situation.now_ns - self._slow_since_ns > _SLOW_NS:
+            reason += "; slowed: a wall is ahead, or the robot must catch up"
+        return sent.command, False, reason
+
+    def _vbot_action(self, situation: _Situation) -> VbotAction:
+        if self.mode == Mode.RETURNING:
+            return VbotAction.EASED
+        if self.mode != Mode.VIRTUAL:
+            return VbotAction.WITH_ROBOT
+        if any(source.key == "view" for source, _ in self._lacking(situation.inputs, self.mode, situation.now_ns)):
+            return VbotAction.HELD  # nobody sees where it goes
+        return VbotAction.LED_BACK if self._leading_back else VbotAction.DRIVEN
 
     def _far_from_keyframe(self, situation: _Situation) -> str:
         """Words for a v-bot that has left what the virtual space is fit to show; "" within."""
@@ -566,10 +648,17 @@ class Arbiter:
         command, prediction = situation.command, situation.prediction
         blocked, reason = False, "you drive the robot"
         if prediction is not None and prediction.hit_index is not None and command != (0.0, 0.0):
-            blocked = True
-            why = self._why_not_virtual(situation) or "obstacle ahead"
-            reason = f"blocked: obstacle in {prediction.distance_m:.1f} m; {why}"
             command = self._slowed(command, prediction.distance_m)
+            if self.mode == Mode.REAL:
+                blocked = True
+                why = self._why_not_virtual(situation) or "obstacle ahead"
+                reason = f"blocked: obstacle in {prediction.distance_m:.1f} m; {why}"
+        if self.mode == Mode.ENTERING:
+            reason = "obstacle ahead: the virtual space is about to be shown"
+            left = max(0.0, 1.0 - self._seconds_in_mode(situation.now_ns) / self.config.switch.enter_timeout_s)
+            command = (command[0] * left, command[1] * left)
+        elif self.mode == Mode.RETURNING:
+            reason = "you drive the robot; the real view is about to come back"
         sent = self._monitored(command, situation)
         if sent.action in ("approach", "stop") and not blocked:
             blocked = True

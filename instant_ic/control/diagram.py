@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .arbiter import ACTIONS, GUARDS, SOURCES, TRANSITIONS, TimeoutConfig
+from .freshness import TimeoutConfig
+from .states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS
 
 
 def state_diagram() -> str:
@@ -10,6 +11,13 @@ def state_diagram() -> str:
     lines = ["stateDiagram-v2", "    [*] --> STOPPED"]
     lines += [f"    {row.source.name} --> {row.target.name}: {row.guard} / {row.action}" for row in TRANSITIONS]
     return "\n".join(lines)
+
+
+def state_table() -> str:
+    """What each state means, as a Markdown table."""
+    rows = ["| State | Driven by the operator | Shown | Meanwhile |", "|---|---|---|---|"]
+    rows += [f"| {mode.name} | {state.driven} | {state.shown} | {state.other} |" for mode, state in STATES.items()]
+    return "\n".join(rows)
 
 
 def guard_table() -> str:
@@ -29,5 +37,7 @@ def source_table(timeouts: TimeoutConfig | None = None) -> str:
     for source in SOURCES:
         modes = ", ".join(mode.name for mode in source.modes)
         timeout = getattr(timeouts, source.key)
-        rows.append(f"| {source.name} | {modes} | {timeout:g} s | {max(timeout, timeouts.stop_after_s):g} s |")
+        zero = f"{timeout:g} s" + (", or its own rhythm" if source.steady else "") if timeout else "never, as shipped"
+        stop = f"{max(timeout, timeouts.stop_after_s):g} s" if timeout else "never, as shipped"
+        rows.append(f"| {source.name} | {modes} | {zero} | {stop} |")
     return "\n".join(rows)

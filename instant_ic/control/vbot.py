@@ -8,22 +8,38 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.poses import wrap_angle
 from ..ranges import NotNegative, Positive, check_ranges
 from .footprint import Footprint
 from .kinematics import MotionLimits, accelerate, clip_twist, move
 from .walls import WallMap
 
+_TRACK_M = 0.1
+
 
 @dataclass(frozen=True)
 class VbotConfig:
-    """How far the v-bot may draw ahead, and how near its outline comes to walls.
+    """How far the v-bot may draw ahead, how near its outline comes to walls, how gently it goes by itself.
 
-    The wall clearance leaves room for the r-bot at the same place, or the two could never meet there.
+    Attributes:
+        max_lead_m: m; it is never driven farther ahead of the r-bot.
+        slow_lead_m: m; from here on it is slowed.
+        wall_clearance_m: m between its outline and a wall: room for the r-bot at the same place.
+        ease_m_s: m/s, at most, by which it is drawn onto the r-bot at the return, beside the motion of both.
+        ease_deg_s: degrees/s, likewise.
+        ease_time_s: s in which the last of it goes.
+        lead_back_m_s: m/s, at most, by which a v-bot that nobody drives goes back to the r-bot.
+        lead_back_deg_s: degrees/s, likewise.
     """
 
     max_lead_m: Positive = 3.0
     slow_lead_m: NotNegative = 1.0
     wall_clearance_m: NotNegative = 0.12
+    ease_m_s: Positive = 0.12
+    ease_deg_s: Positive = 10.0
+    ease_time_s: Positive = 0.25
+    lead_back_m_s: Positive = 0.2
+    lead_back_deg_s: Positive = 20.0
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -42,12 +58,15 @@ class VirtualRobot:
         self.velocity: tuple[float, float] = (0.0, 0.0)
         self.slowed_by = ""
         """Why the last step was slower than commanded: ``lead``, ``wall`` or empty."""
+        self._led_m_s = 0.0
+        self._track: list[NDArray[np.float64]] = []  # where it was driven, ``_TRACK_M`` apart: the way back
 
     def place(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> None:
         """Puts the v-bot at ``pose`` (x, y, yaw), moving at ``velocity`` (m/s, rad/s)."""
         self.pose = np.asarray(pose, dtype=np.float64).copy()
         self.velocity = clip_twist(*velocity, self.limits)
         self.slowed_by = ""
+        self._track = []
 
     def step(
         self,
@@ -72,7 +91,37 @@ class VirtualRobot:
             self.velocity = (0.0, self.velocity[1])
             pose = move(self.pose, 0.0, self.velocity[1], dt_s)
         self.pose = pose
+        self._led_m_s = 0.0
+        if not self._track or _distance(pose, self._track[-1]) > _TRACK_M:
+            self._track.append(pose.copy())
         return pose
+
+    def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> NDArray[np.float64]:
+        """Moves by ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), and draws the rest onto ``target`` (3,)."""
+        config = self.config
+        moved = move(self.pose, *velocity, dt_s)
+        share = min(1.0, dt_s / config.ease_time_s)
+        self.pose = _towards(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
+        self.velocity = clip_twist(*velocity, self.limits)
+        self.slowed_by = ""
+        return self.pose
+
+    def lead_back(
+        self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None
+    ) -> NDArray[np.float64]:
+        """Goes back towards the r-bot by ``dt_s``: straight, or by the way it came where a wall lies between."""
+        config = self.config
+        while self._track and _distance(self.pose, self._track[-1]) < _TRACK_M:
+            self._track.pop()
+        straight = not self._track or walls is None or _in_sight(self.pose, robot_pose, walls)
+        goal = np.asarray(robot_pose, dtype=np.float64) if straight else self._track[-1]
+        self._led_m_s = min(config.lead_back_m_s, self._led_m_s + 0.25 * self.limits.max_linear_accel_m_s2 * dt_s)
+        share = min(1.0, dt_s / config.ease_time_s)
+        turn = math.radians(config.lead_back_deg_s) * dt_s
+        self.pose = _towards(self.pose, goal, share, self._led_m_s * dt_s, turn)
+        self.velocity = (0.0, 0.0)
+        self.slowed_by = ""
+        return self.pose
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
         """Share of the linear speed that is left: 1 up to ``slow_lead_m``, 0 at ``max_lead_m``.
@@ -91,6 +140,27 @@ class VirtualRobot:
         now = float(walls.distance(_placed(self._body, self.pose)).min())
         then = float(walls.distance(_placed(self._body, pose)).min())
         return then < self.config.wall_clearance_m and then < now
+
+
+def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(math.hypot(a[0] - b[0], a[1] - b[1]))
+
+
+def _towards(
+    pose: NDArray[np.float64], goal: NDArray[np.float64], share: float, most_m: float, most_rad: float
+) -> NDArray[np.float64]:
+    """``pose`` (3,) brought nearer to ``goal`` by a share of what lies between, at most so much."""
+    gap, turn = np.asarray(goal)[:2] - pose[:2], wrap_angle(float(goal[2] - pose[2]))
+    step = min(share, most_m / max(float(np.linalg.norm(gap)), 1e-9))
+    turn = max(-most_rad, min(most_rad, share * turn))
+    return np.array([*(pose[:2] + step * gap), wrap_angle(float(pose[2]) + turn)])
+
+
+def _in_sight(a: NDArray[np.float64], b: NDArray[np.float64], walls: WallMap) -> bool:
+    """Whether no wall lies between two places."""
+    steps = np.linspace(0.0, 1.0, max(2, math.ceil(_distance(a, b) / walls.static.resolution)))
+    between = np.asarray(a)[:2] + steps[:, None] * (np.asarray(b)[:2] - np.asarray(a)[:2])
+    return bool((walls.distance(between) > walls.static.resolution).all())
 
 
 def _placed(body: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,10 @@ from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.freshness import Rhythm
 from instant_ic.control.heights import SortedPoints, sort_points
+from instant_ic.control.kinematics import move
+from instant_ic.control.states import SOURCES
 from instant_ic.control.walls import WallFinder, WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import Matrix, matrix_from_pose2, pose2_from_matrix, relative2
@@ -28,6 +31,7 @@ from instant_ic.msg import (
     PointCloud2,
     PoseStamped,
     PoseWithCovarianceStamped,
+    ShownPictures,
     TwistStamped,
     VspaceStatus,
     cloud_array,
@@ -92,8 +96,15 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.taken: tuple[int, int] = (-1, -1)  # stamps of the scan and the points that the costmap holds
         self.costmap_sent_ns: int | None = None
         self.camera_ns: int | None = None
+        self.rhythms = {source.key: Rhythm() for source in SOURCES if source.steady}
+        self.page_rhythm = Rhythm()  # of the camera pictures at the operator's page
+        self.heard: dict[str, int] = {}  # stamp of the newest message of each source
+        self.page: tuple[int, int] = (-1, 0)  # newest camera picture there: its stamp, when it was told
+        self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: its request, when it was told
+        self.picture_delay_s: float | None = None  # from the camera to the operator
         self.estop = False
         self.stopped_by: tuple[str, int] = ("", 0)  # who asked last for the emergency stop, and when
+        self.button: tuple[bool, int] | None = None  # the robot's own emergency stop: pressed, when it was told
         self.ticks = 0
 
         self.cmd_vel = self.publisher("/cmd_vel", TwistStamped, qos=SENSOR)
@@ -111,9 +122,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.pose = self.latest("/pose", PoseWithCovarianceStamped, max_age_s=10.0)
         self.vbot = self.latest("/vbot/odom", Odometry, max_age_s=10.0)
         self.nav = self.latest("/nav/cmd_vel", TwistStamped, max_age_s=10.0)
+        self.shown = self.latest("/view/shown", ShownPictures, max_age_s=1.0)
+        self.subscribe("/view/shown", ShownPictures, self.on_shown, qos=SENSOR)
         self.vspace = self.latest("/vspace/status", VspaceStatus, max_age_s=60.0, qos=LATCHED)
         self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
+        self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
         # Only its age matters: the picture is never decoded here.
         self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
         _ = self.tf  # listens from now on
@@ -165,6 +179,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 received.publisher,
                 received.publish_ns if same else max(received.publish_ns, stopped_ns),
             )
+        elif self.button is not None and self.button[0]:
+            self.log.warning("emergency stop: the button on the robot is pressed; let it out, then release here")
         elif received.publish_ns >= stopped_ns:
             self.estop = False
         elif self.estop:
@@ -176,31 +192,114 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             )
         self.tick()  # not at the next timer: now
 
-    def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
-        self.camera_ns = self.clock.steady_ns()
+    def on_button(self, received: Received) -> None:
+        """The emergency stop button on the robot: pressed it stops; let out it ends nothing, that is the operator's."""
+        pressed = bool(deserialize(received.payload, received.type_name).data)
+        self.button = pressed, self.clock.steady_ns()
+        if pressed:
+            self.estop, self.stopped_by = True, ("button", max(received.publish_ns, self.stopped_by[1]))
+        self.tick()
 
-    def age(self, latest: Latest) -> float:
+    def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
+        now_ns = self.clock.steady_ns()
+        if self.camera_ns is not None:
+            self.rhythms["camera"].heard((now_ns - self.camera_ns) / 1e9)
+        self.camera_ns = now_ns
+
+    def age(self, key: str, latest: Latest) -> float:
         """Seconds since the newest message came, or since it was measured where that is longer."""
         message = latest.message
         if message is None:
             return math.inf
-        return max(latest.age_s, (self.clock.now_ns() - stamp_ns(message)) / 1e9)
+        now_ns, stamp = self.clock.now_ns(), stamp_ns(message)
+        if key in self.rhythms and self.heard.get(key) != stamp:
+            if key in self.heard:
+                self.rhythms[key].heard((now_ns - self.heard[key]) / 1e9 - latest.age_s)
+            self.heard[key] = stamp
+        return max(latest.age_s, (now_ns - stamp) / 1e9)
+
+    def on_shown(self, message: ShownPictures) -> None:
+        """Notes what new pictures the operator's page has."""
+        now_ns, stamp, view = self.clock.steady_ns(), stamp_ns(message.picture_stamp), int(message.view_id)
+        if stamp not in (0, self.page[0]):
+            if self.page[0] > 0:
+                self.page_rhythm.heard((now_ns - self.page[1]) / 1e9)
+            self.page = stamp, now_ns
+            self.picture_delay_s = min(max((self.clock.now_ns() - stamp) / 1e9, 0.0), 1.0)
+        if view != self.view[0]:
+            if self.arbiter.mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING):
+                self.rhythms["view"].heard((now_ns - self.view[1]) / 1e9)
+            else:
+                self.rhythms["view"] = Rhythm()  # in REAL views are asked for rarely
+            self.view = view, now_ns
 
     def ages(self) -> dict[str, float]:
-        camera = math.inf if self.camera_ns is None else (self.clock.steady_ns() - self.camera_ns) / 1e9
+        shown, steady_ns = self.shown.message, self.clock.steady_ns()
+        camera_s = math.inf if self.camera_ns is None else (steady_ns - self.camera_ns) / 1e9
+        view_s = math.inf
+        if shown is not None:  # where there is a page, what matters is what has come there
+            camera_s = max(camera_s, float(shown.picture_age_s) + self.shown.age_s)
+            view_s = float(shown.view_age_s) + self.shown.age_s
         ages = {
-            "scan": self.age(self.scan),
-            "odometry": self.age(self.odometry),
-            "pose": self.age(self.pose),
-            "camera": camera,
-            "vbot": self.age(self.vbot),
-            "nav": self.age(self.nav),
-            "command": self.age(self.operator),
+            "scan": self.age("scan", self.scan),
+            "odometry": self.age("odometry", self.odometry),
+            "pose": self.age("pose", self.pose),
+            "camera": camera_s,
+            "view": view_s,
+            "vbot": self.age("vbot", self.vbot),
+            "nav": self.age("nav", self.nav),
+            "command": self.age("command", self.operator),
             "vspace": self.vspace.age_s,
         }
         if self.points is not None and self.points_seen:
-            ages["points"] = math.inf if self.sweep_error else self.age(self.points)
+            ages["points"] = math.inf if self.sweep_error else self.age("points", self.points)
+        if self.button is not None and self.config.timeouts.estop_input > 0:
+            ages["estop_input"] = (steady_ns - self.button[1]) / 1e9
         return ages
+
+    def usual(self) -> dict[str, float]:
+        """How old each source usually gets, s."""
+        usual = {key: rhythm.usual_s for key, rhythm in self.rhythms.items()}
+        if self.shown.message is not None:
+            usual["camera"] = max(usual["camera"], self.page_rhythm.usual_s)
+        return usual
+
+    # -- what the operator sees
+
+    def shown_pose(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> NDArray[np.float64] | None:
+        """Where the r-bot (3,) was when the picture now shown was taken, but heading as it does now.
+
+        A view of this place will be shown when the next pictures have come, so it is taken as far ahead as a view
+        takes. None without a page.
+        """
+        shown = self.shown.message
+        if shown is None or self.picture_delay_s is None:
+            return None
+        now_ns = self.clock.now_ns()
+        newest_ns = self.tf.newest_ns("base_link") or now_ns
+        now = move(pose, *velocity, min(max((now_ns - newest_ns) / 1e9, 0.0), 0.1))
+        behind_s = self.picture_delay_s - min(float(shown.view_delay_s), 0.5)
+        if behind_s <= (now_ns - newest_ns) / 1e9:
+            place = move(now, *velocity, -behind_s)
+        else:
+            try:
+                place = pose2_from_matrix(
+                    self.tf.lookup("map", "odom") @ self.tf.lookup("odom", "base_link", now_ns - round(behind_s * 1e9))
+                )
+            except TransformError:
+                return None
+        return np.array([place[0], place[1], now[2]])
+
+    def picture_position(self) -> NDArray[np.float64] | None:
+        """Place (2,) of the camera in the map when it took the newest picture that the page has."""
+        for frame in ("camera", "base_link"):
+            try:
+                odom_from_camera = self.tf.lookup("odom", frame, self.page[0])
+                place: NDArray[np.float64] = (self.tf.lookup("map", "odom") @ odom_from_camera)[:2, 3]
+                return place
+            except TransformError:
+                continue
+        return None
 
     def robot_pose(self) -> NDArray[np.float64] | None:
         try:
@@ -332,25 +431,39 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if points is None:
             points, ages["scan"] = np.zeros((0, 2)), math.inf
         pose = self.robot_pose()
-        vbot, status = self.vbot.message, self.vspace.message
+        vbot, status, shown, velocity = (
+            self.vbot.message,
+            self.vspace.message,
+            self.shown.message,
+            _twist(self.odometry),
+        )
         inputs = ArbiterInputs(
             robot_pose=pose,
-            robot_velocity=_twist(self.odometry),
+            robot_velocity=velocity,
             operator_command=_twist(self.operator),
             estop=self.estop,
             scan_points=points,
             costmap=self.costmap,
             walls=self.walls,
             vspace=Vspace() if status is None else _vspace(status),
-            vbot_pose=None if vbot is None else pose2_from_matrix(pose_matrix(vbot)),
+            vbot_pose=None if vbot is None else self.carried_on(vbot),
             vbot_velocity=_twist(self.vbot),
             nav_command=_twist(self.nav),
+            shown_pose=None if pose is None else self.shown_pose(pose, velocity),
+            picture_position=None if shown is None else self.picture_position(),
+            view_position=None if shown is None else pose_matrix(shown.view_pose)[:2, 3],
             ages=ages,
+            usual=self.usual(),
         )
         # Steady time: a clock that is set back must not make what has fallen silent look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         self.cmd_vel.publish(twist_stamped(*decision.command, now_ns))
         self.tell(decision, inputs, now_ns)
+
+    def carried_on(self, odometry: Odometry) -> NDArray[np.float64]:
+        """Pose (3,) of the v-bot now: its message is up to a period old."""
+        age_s = (self.clock.now_ns() - stamp_ns(odometry)) / 1e9
+        return move(pose2_from_matrix(pose_matrix(odometry)), *twist_values(odometry), min(max(age_s, 0.0), 0.1))
 
     def tell(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:
         pose = inputs.robot_pose if inputs.robot_pose is not None else np.zeros(3)
@@ -370,9 +483,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 pose_gap_m=decision.pose_gap_m,
                 yaw_gap_rad=decision.yaw_gap_rad,
                 time_to_obstacle_s=decision.time_to_obstacle_s,
-                shown=ControlState.SHOWN_VIRTUAL if decision.mode == Mode.VIRTUAL else ControlState.SHOWN_REAL,
-                vbot_action=ControlState.VBOT_DRIVEN if decision.mode == Mode.VIRTUAL else ControlState.VBOT_WITH_ROBOT,
-                vbot_target=pose_message(matrix_from_pose2(pose)),
+                shown=ControlState.SHOWN_VIRTUAL if decision.mode.shows_vbot else ControlState.SHOWN_REAL,
+                vbot_action=int(decision.vbot_action),
+                vbot_target=pose_message(matrix_from_pose2(decision.vbot_target)),
                 robot_twist=twist_message(*inputs.robot_velocity),
             )
         )
@@ -401,6 +514,7 @@ def _vspace(status: VspaceStatus) -> Vspace:
         position=pose_matrix(status.keyframe_pose)[:2, 3],
         ready_radius_m=float(status.ready_radius_m),
         message=status.message,
+        expected_psnr_db=float(status.expected_psnr_db),
     )
 
 

@@ -105,7 +105,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.mode = self.shown = "none"
         self._picture_ns: int | None = None
         self._picture_stamp = 0
-        self._view: tuple[int, Any, float] | None = None  # when the newest came, its pose, its delay in seconds
+        self._view = (0, 0, pose_message(np.eye(4)), 0.0)  # newest: request, when it came, its pose, its delay in s
         self._asked = (0, 0)  # the last request: its number, when it went out
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
@@ -222,7 +222,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.views.answered(int(message.request_id))
         came_ns = self.clock.steady_ns()
         number, asked_ns = self._asked
-        self._view = came_ns, message.pose, (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
+        delay_s = (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
+        self._view = int(message.request_id), came_ns, message.pose, delay_s
         self.tell_shown()
         self.server.send_frame(
             FrameKind.VIEW,
@@ -269,14 +270,15 @@ class ConsoleNode(Node[ConsoleConfig]):
     def tell_shown(self) -> None:
         """Tells the arbiter what there is to be shown, and how old it is."""
         now_ns = self.clock.steady_ns()
-        came_ns, pose, delay_s = self._view or (0, pose_message(np.eye(4)), 0.0)
+        view_id, came_ns, pose, delay_s = self._view
         self.shown_out.publish(
             ShownPictures(
                 header=header("map", self.clock.now_ns()),
                 picture_stamp=to_time(self._picture_stamp),
                 picture_age_s=math.inf if self._picture_ns is None else (now_ns - self._picture_ns) / 1e9,
+                view_id=view_id,
                 view_pose=pose,
-                view_age_s=math.inf if self._view is None else (now_ns - came_ns) / 1e9,
+                view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
                 view_delay_s=delay_s,
             )
         )
@@ -481,6 +483,9 @@ def _vspace(status: VspaceStatus | None) -> dict[str, Any] | None:
     return {
         "state": VSPACE_STATES.get(int(status.state), "empty"),
         "psnr_db": _finite(status.psnr_db) or 0.0,
+        "expected_psnr_db": _finite(status.expected_psnr_db) or 0.0,
+        "unseen_share": _finite(status.unseen_share) or 0.0,
+        "radius_m": _finite(status.ready_radius_m) or 0.0,
         "train_seconds": _finite(status.train_seconds) or 0.0,
         "message": status.message,
     }

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
-from instant_ic.control.arbiter import Mode
 from instant_ic.control.costmap import StaticMap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.kinematics import MotionLimits, move
+from instant_ic.control.states import VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallFinder, WallMap
 from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
@@ -57,7 +57,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.walls: WallMap | None = None
         self.map: StaticMap | None = None
         self.map_is_new = False
-        self.transitions: int | None = None
+        self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
         self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
@@ -99,23 +99,36 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         if state is None:
             self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
             self.robot.place(self.robot.pose, (0.0, 0.0))
-            if self.transitions is None:
+            if self.action is None:
                 return  # nowhere yet
-        elif state.mode != Mode.VIRTUAL:
-            self.transitions = state.transitions
-            self.robot.place(pose2_from_matrix(pose_matrix(state.robot_pose)), twist_values(state.applied_command))
-            self.diagnose("state", OK, "with the r-bot")
         else:
-            if state.transitions != self.transitions:
-                self.transitions = state.transitions
-                # It goes on at the speed that the operator is driving at.
-                self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_start)), self.robot.velocity)
-            self.robot.step(self.operator(now_ns), pose2_from_matrix(pose_matrix(state.robot_pose)), dt_s, self.walls)
-            slowed = self.robot.slowed_by
-            self.diagnose("state", OK, f"driven, slowed by {slowed}" if slowed else "driven")
+            self.obey(state, dt_s)
         self.odom.publish(
             odometry_message(matrix_from_pose2(self.robot.pose), *self.robot.velocity, "map", "vbot_base_link", now_ns)
         )
+
+    def obey(self, state: ControlState, dt_s: float) -> None:
+        """Does what the arbiter says."""
+        action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
+        robot_pose = pose2_from_matrix(pose_matrix(state.robot_pose))
+        robot_twist = twist_values(state.robot_twist)
+        age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
+        # The arbiter's word is up to a period old, and the r-bot goes on.
+        target = move(pose2_from_matrix(pose_matrix(state.vbot_target)), *robot_twist, min(max(age_s, 0.0), 0.1))
+        if before is None and action != VbotAction.WITH_ROBOT:
+            self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_pose)), (0.0, 0.0))  # started anew
+        if action == VbotAction.WITH_ROBOT:
+            self.robot.place(target, robot_twist)
+        elif action == VbotAction.DRIVEN:
+            self.robot.step(self.operator(self.clock.now_ns()), robot_pose, dt_s, self.walls)
+        elif action == VbotAction.HELD:
+            self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls)
+        elif action == VbotAction.EASED:
+            self.robot.ease(target, robot_twist, dt_s)
+        else:
+            self.robot.lead_back(robot_pose, dt_s, self.walls)
+        slowed = f", slowed by {self.robot.slowed_by}" if self.robot.slowed_by else ""
+        self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 
     def operator(self, now_ns: int) -> tuple[float, float]:
         """The operator's command; zero when it is old, by arrival or by its stamp."""

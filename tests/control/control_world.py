@@ -18,6 +18,7 @@ from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.states import VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 
@@ -128,12 +129,18 @@ class Frame:
     command: tuple[float, float]
     speed: float
     state: str
+    picture: np.ndarray
+    view: np.ndarray | None
 
 
 class Loop:
-    """The whole control part against the world at 20 Hz: scan at 10 Hz, costmap at 5 Hz, SLAM is the truth."""
+    """The whole control part against the world at 20 Hz: scan at 10 Hz, costmap at 5 Hz, SLAM is the truth.
+
+    The operator sees camera pictures and rendered views at 10 Hz, each some steps old.
+    """
 
     dt = 0.05
+    camera_delay, view_delay, picture_period = 3, 2, 2  # steps
 
     def __init__(
         self,
@@ -156,12 +163,17 @@ class Loop:
         self.vspace = Vspace(ready=True, position=np.zeros(2), ready_radius_m=100.0)
         self.k = 0
         self.frames: list[Frame] = []
-        self.ages = dict.fromkeys(["scan", "odometry", "pose", "camera", "vbot", "nav", "command", "vspace"], 0.0)
+        self.ages = dict.fromkeys(
+            ["scan", "odometry", "pose", "camera", "view", "vbot", "nav", "command", "vspace"], 0.0
+        )
         self.estop = False
         self.decision: Decision | None = None
         self.nav: tuple[float, float] = (0.0, 0.0)
         self.nav_state = ""
         self.costmap = None
+        self.cameras: list[np.ndarray] = []  # pose of the r-bot, as known, at each step
+        self.views: list[np.ndarray] = []  # pose of the v-bot at each step
+        self.views_stop_at = math.inf  # s; no view comes any more
 
     def step(self, operator: tuple[float, float]) -> Frame:
         now_ns = round(self.k * self.dt * 1e9)
@@ -179,16 +191,10 @@ class Loop:
         points = np.column_stack([hits, np.zeros(len(hits))])
         base_from_scan = np.linalg.inv(matrix(robot)) @ matrix(self.scan_pose)
         in_base = points @ base_from_scan[:3, :3].T + base_from_scan[:3, 3]
-        last = self.decision
-        virtual = last is not None and last.mode == Mode.VIRTUAL
-        if virtual:
-            if last.changed:
-                self.vbot.place(last.vbot_start, last.command)
-            fresh = operator if self.ages["command"] <= 0.3 else (0.0, 0.0)
-            self.vbot.step(fresh, robot, self.dt, self.walls)
-        else:
-            self.vbot.place(robot, (self.base.v, self.base.w))
-            self.navigator.reset()
+        self.cameras.append(robot)
+        self.move_vbot(operator, robot)
+        self.views.append(self.vbot.pose.copy())
+        picture, view = self.pictures()
         inputs = ArbiterInputs(
             robot_pose=robot,
             robot_velocity=(self.base.v, self.base.w),
@@ -201,10 +207,15 @@ class Loop:
             vbot_pose=self.vbot.pose,
             vbot_velocity=self.vbot.velocity,
             nav_command=self.nav,
+            shown_pose=self.shown_pose(robot),
+            picture_position=picture[:2],
+            view_position=None if view is None else view[:2],
             ages=dict(self.ages),
         )
         self.decision = self.arbiter.step(inputs, now_ns)
         self.nav = (0.0, 0.0)
+        if self.decision.mode != Mode.VIRTUAL:
+            self.navigator.reset()
         if self.decision.mode == Mode.VIRTUAL and self.decision.subgoal is not None:
             subgoal = self.decision.subgoal
             velocity = self.vbot.velocity if subgoal.rule == "vbot" else (0.0, 0.0)
@@ -219,10 +230,39 @@ class Loop:
             self.decision.command,
             self.base.v,
             self.nav_state,
+            picture,
+            view,
         )
         self.frames.append(frame)
         self.k += 1
         return frame
+
+    def move_vbot(self, operator: tuple[float, float], robot: np.ndarray) -> None:
+        """What the node does by the arbiter's last word."""
+        said = self.decision
+        twist = (self.base.v, self.base.w)
+        if said is None or said.vbot_action == VbotAction.WITH_ROBOT:
+            self.vbot.place(self.shown_pose(robot), twist)
+        elif said.vbot_action == VbotAction.EASED:
+            self.vbot.ease(self.shown_pose(robot), twist, self.dt)
+        elif said.vbot_action == VbotAction.LED_BACK:
+            self.vbot.lead_back(robot, self.dt, self.walls)
+        else:
+            free = said.vbot_action == VbotAction.DRIVEN and self.ages["command"] <= 0.3
+            self.vbot.step(operator if free else (0.0, 0.0), robot, self.dt, self.walls)
+
+    def shown_pose(self, robot: np.ndarray) -> np.ndarray:
+        """Where the r-bot was when the picture was taken that a view asked for now should look like."""
+        place = self.cameras[max(0, self.k - self.camera_delay + self.view_delay)]
+        return np.array([place[0], place[1], robot[2]])
+
+    def pictures(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Poses of the newest camera picture and the newest view that the operator has."""
+        taken = max(0, self.k - self.camera_delay) // self.picture_period * self.picture_period
+        asked = max(0, self.k - self.view_delay) // self.picture_period * self.picture_period
+        if asked * self.dt > self.views_stop_at:
+            return self.cameras[taken], None
+        return self.cameras[taken], self.views[asked]
 
     def measured(self, truth: np.ndarray) -> np.ndarray:
         """What SLAM says: the truth, or with noise an error that wanders by centimetres."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,25 +11,17 @@ import pytest
 from control_world import Loop, World, corridor, draw_map, rectangle
 
 from instant_ic.control import diagram
-from instant_ic.control.arbiter import (
-    ACTIONS,
-    GUARDS,
-    SOURCES,
-    TRANSITIONS,
-    Arbiter,
-    ArbiterInputs,
-    Mode,
-    SwitchConfig,
-    TimeoutConfig,
-    Vspace,
-)
+from instant_ic.control.arbiter import Arbiter, ArbiterInputs, SwitchConfig, Vspace
 from instant_ic.control.costmap import LETHAL, Costmap
 from instant_ic.control.footprint import Footprint
+from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.prediction import PredictionConfig, Predictor
+from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, TRANSITIONS, Mode
 
 BOX = (2.5, -0.25, 3.0, 0.25)
 FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
+THROUGH = ["STOPPED", "REAL", "ENTERING", "VIRTUAL", "RETURNING", "REAL"]
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "control.md"
 
 
@@ -52,17 +45,18 @@ def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
 def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped: bool) -> None:
     made = loop(box, mapped)
     drive(made, 23.0, FORWARD)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    assert made.modes() == THROUGH
     virtual = [f for f in made.frames if f.decision.mode == Mode.VIRTUAL]
-    # The v-bot starts at the r-bot's pose and goes straight through; the r-bot goes round.
-    np.testing.assert_allclose(virtual[0].decision.vbot_start, virtual[0].robot)
+    # The v-bot starts where the r-bot was when the picture was taken and goes straight through; the r-bot goes round.
+    np.testing.assert_allclose(virtual[0].decision.vbot_start, virtual[0].robot, atol=0.05)
     inside = [f for f in virtual if box[0] < f.vbot[0] < box[2] and box[1] < f.vbot[1] < box[3]]
     assert len(inside) > 10
     assert max(abs(f.robot[1]) for f in virtual) > 0.4
-    # At the return the two agree, and the operator was obeyed all the way.
-    last = virtual[-1]
-    assert np.linalg.norm(last.vbot[:2] - last.robot[:2]) <= 0.15 + 0.03
-    assert abs(last.vbot[2] - last.robot[2]) <= math.radians(10.0)
+    # At both switches view and picture are of the same place; in between the operator was obeyed.
+    for before, after in pairwise(made.frames):
+        if before.decision.mode.shows_vbot != after.decision.mode.shows_vbot:
+            assert np.linalg.norm(after.view[:2] - after.picture[:2]) <= 0.02
+            assert abs(after.vbot[2] - after.robot[2]) <= math.radians(0.5)
     assert min(made.vbot.limits.max_linear_m_s, 0.4) == pytest.approx(made.frames[-1].command[0])
     moved = np.linalg.norm(np.diff([f.decision.vbot_pose[:2] for f in virtual], axis=0), axis=1)
     assert np.mean(moved[20:]) / 0.05 == pytest.approx(0.4, abs=0.02)
@@ -146,30 +140,30 @@ def test_tapping_forward_before_the_obstacle_does_not_flicker() -> None:
     for _ in range(40):
         drive(made, 0.3, FORWARD)
         drive(made, 0.5, NOTHING)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL"]
+    assert made.modes() == THROUGH[:4]
     drive(made, 20.0, FORWARD)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    assert made.modes() == THROUGH
 
 
 def test_stopping_inside_the_obstacle_the_robot_waits_and_goes_on() -> None:
     made = loop()
     drive(made, 7.0, FORWARD)
-    drive(made, 12.0, NOTHING)
+    drive(made, 5.5, NOTHING)
     assert BOX[0] < made.vbot.pose[0] < BOX[2]
     waiting = made.frames[-1]
     assert waiting.decision.mode == Mode.VIRTUAL
     assert waiting.speed == pytest.approx(0.0, abs=0.01)
     drive(made, 14.0, FORWARD)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    assert made.modes() == THROUGH
 
 
 def test_turning_away_before_the_obstacle_gives_the_real_view_back() -> None:
     made = loop()
-    drive(made, 4.2, FORWARD)
+    drive(made, 4.6, FORWARD)
     assert made.modes()[-1] == "VIRTUAL"
     drive(made, 3.0, (0.0, 0.8))
     drive(made, 12.0, NOTHING)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    assert made.modes() == THROUGH
 
 
 def test_emergency_stop_in_both_modes() -> None:
@@ -296,7 +290,7 @@ def test_readiness_is_held_over_the_change_of_a_keyframe(
 def test_a_vbot_beyond_what_the_space_can_show_is_told() -> None:
     made = loop()
     made.vspace = Vspace(ready=True, ready_radius_m=2.0)
-    drive(made, 4.0, FORWARD)
+    drive(made, 4.6, FORWARD)
     assert made.modes()[-1] == "VIRTUAL"
     assert made.vbot.pose[0] < 2.0
     assert "picture" not in made.frames[-1].decision.reason
@@ -350,7 +344,7 @@ def test_one_switch_each_way_with_noise(seed: int) -> None:
     made = Loop(world, draw_map(walls, (-2, -1.2, 14, 1.2)), noise=rng)
     made.start()
     drive(made, 26.0, FORWARD)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    assert made.modes() == THROUGH
 
 
 @pytest.mark.parametrize("edge_y", [0.18, 0.22, 0.26])
@@ -361,7 +355,7 @@ def test_box_that_the_path_only_grazes_makes_one_switch_each_way(edge_y: float) 
     made = Loop(world, draw_map(walls, (-2, -1.2, 14, 1.2)), noise=np.random.default_rng(4))
     made.start()
     drive(made, 26.0, FORWARD)
-    assert made.modes() == ["STOPPED", "REAL", "VIRTUAL", "REAL"]
+    assert made.modes() == THROUGH
 
 
 def test_way_back_must_be_wider_than_the_robot() -> None:
@@ -410,6 +404,8 @@ class TestTable:
             rows = [row for row in TRANSITIONS if row.source == mode]
             assert (rows[0].guard, rows[0].target) == ("estop_pressed", Mode.STOPPED)
 
-    @pytest.mark.parametrize("text", [diagram.state_diagram(), diagram.guard_table(), diagram.source_table()])
+    @pytest.mark.parametrize(
+        "text", [diagram.state_diagram(), diagram.state_table(), diagram.guard_table(), diagram.source_table()]
+    )
     def test_the_docs_show_the_table_as_it_is(self, text: str) -> None:
         assert text in DOCS.read_text(), "docs/control.md is old: print instant_ic.control.diagram into it"

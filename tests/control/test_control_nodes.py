@@ -21,6 +21,7 @@ from instant_ic.msg import (
     ControlState,
     PoseWithCovariance,
     PoseWithCovarianceStamped,
+    ShownPictures,
     TFMessage,
     VspaceStatus,
     cloud_message,
@@ -85,6 +86,10 @@ class Stack:
         """(N, 3) places over ground and height in the world, seen wherever the robot is; None: no 3D points."""
         self.k = 0
         self.contact = False
+        self.page = True
+        """Whether the operator has a page, with views of the v-bot two steps old; none comes with "views" in silent."""
+        self.picture_ns = self.view_ns = 0
+        self.views: list[tuple[int, object]] = []
 
     @property
     def now(self) -> int:
@@ -121,6 +126,8 @@ class Stack:
             self.send("/lidar/points", cloud_message(points, "velodyne", now))
         if self.k % 10 == 0:
             self.send("/vspace/status", self.status(now))
+        if self.page:
+            self.show(now)
         if command is not None:
             self.send("/operator/cmd_vel", twist_stamped(*command, now))
         self.bus.advance_to(now + STEP_NS)
@@ -129,9 +136,32 @@ class Stack:
         self.contact |= self.world.contact(self.base.pose)
         return self.bus.last("/ic/state")
 
+    def show(self, now: int) -> None:
+        """What the console tells of the pictures that the operator has."""
+        if self.k % 2 == 0 and "/camera/image/compressed" not in self.silent:
+            self.picture_ns = now
+        if self.bus.messages("/vbot/odom") and "views" not in self.silent:
+            self.views.append((now, self.bus.last("/vbot/odom").pose.pose))
+            self.view_ns = now
+        asked_ns, pose = self.views[max(0, len(self.views) - 3)] if self.views else (now, pose_message(np.eye(4)))
+        self.bus.publish(
+            "/view/shown",
+            ShownPictures(
+                header=header("map", now),
+                picture_stamp=to_time(self.picture_ns),
+                picture_age_s=(now - self.picture_ns) / 1e9,
+                view_id=len(self.views),
+                view_pose=pose,
+                view_age_s=(now - self.view_ns) / 1e9 if self.views else math.inf,
+                view_delay_s=(now - asked_ns) / 1e9,
+            ),
+        )
+
     def status(self, now: int) -> VspaceStatus:
         fields = {field.name: 0 for field in dataclasses.fields(VspaceStatus)}
-        fields |= dict.fromkeys(("ready_radius_m", "psnr_db", "train_seconds", "ready_seconds"), 0.0)
+        fields |= dict.fromkeys(
+            ("ready_radius_m", "psnr_db", "expected_psnr_db", "unseen_share", "train_seconds", "ready_seconds"), 0.0
+        )
         fields |= dict.fromkeys(("ms_per_iteration", "render_ms", "render_fps"), 0.0)
         fields.pop("__msgtype__", None)
         return VspaceStatus(
@@ -159,9 +189,10 @@ def modes(states: list[ControlState]) -> list[int]:
 def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
     stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
     states = stack.drive(1.5, None) + stack.drive(17.0, (0.4, 0.0))
-    assert modes(states) == [ControlState.STOPPED, ControlState.REAL, ControlState.VIRTUAL, ControlState.REAL]
+    said = ControlState
+    assert modes(states) == [said.STOPPED, said.REAL, said.ENTERING, said.VIRTUAL, said.RETURNING, said.REAL]
     assert not stack.contact
-    assert states[-1].transitions == 3
+    assert states[-1].transitions == 5
     # The v-bot went straight through the box, the r-bot round it.
     virtual = [s for s in states if s.mode == ControlState.VIRTUAL]
     vbot = np.array([pose2_from_matrix(pose_matrix(s.vbot_pose)) for s in virtual])

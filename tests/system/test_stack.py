@@ -66,8 +66,9 @@ def outcome(tmp_path_factory):
 
 
 def test_control_passes_to_the_virtual_robot_and_back_once(outcome):
-    modes = outcome.record.modes
-    assert modes[-3:] == [ControlState.REAL, ControlState.VIRTUAL, ControlState.REAL], outcome.record.reasons
+    modes, said = outcome.record.modes, ControlState
+    passage = [said.REAL, said.ENTERING, said.VIRTUAL, said.RETURNING, said.REAL]
+    assert modes[-5:] == passage, outcome.record.reasons
     # No flicker: each passage is the only one since the start or since a stop by a late sensor on a busy machine.
     stops_in_virtual = sum(pair == (ControlState.VIRTUAL, ControlState.STOPPED) for pair in pairwise(modes))
     assert Counter(modes)[ControlState.VIRTUAL] == 1 + stops_in_virtual, outcome.record.reasons

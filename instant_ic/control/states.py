@@ -1,0 +1,151 @@
+"""The state machine of illusory control as data (paper, III.A): states, guards, actions, sources.
+
+``diagram.py`` prints these tables for the docs; ``arbiter.py`` runs them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Mode(IntEnum):
+    """Values of ControlState.mode."""
+
+    REAL = 0
+    VIRTUAL = 1
+    STOPPED = 2
+    ENTERING = 3
+    RETURNING = 4
+
+    @property
+    def shows_vbot(self) -> bool:
+        """Whether the operator sees the virtual space."""
+        return self in (Mode.VIRTUAL, Mode.RETURNING)
+
+
+class VbotAction(IntEnum):
+    """Values of ControlState.vbot_action: what the v-bot does."""
+
+    WITH_ROBOT = 0
+    DRIVEN = 1
+    HELD = 2
+    EASED = 3
+    LED_BACK = 4
+
+
+@dataclass(frozen=True)
+class State:
+    """What a mode means: who obeys the operator, what he sees, what the other robot does."""
+
+    driven: str
+    shown: str
+    other: str
+
+
+STATES: dict[Mode, State] = {
+    Mode.REAL: State("r-bot", "camera", "the v-bot goes with the r-bot"),
+    Mode.ENTERING: State(
+        "r-bot, slowing to a stand by enter_timeout_s",
+        "camera",
+        "the v-bot stands where the r-bot was when the picture shown was taken; its first view is awaited",
+    ),
+    Mode.VIRTUAL: State("v-bot", "virtual space", "the r-bot follows to the subgoal"),
+    Mode.RETURNING: State("r-bot", "virtual space", "the v-bot moves as the r-bot and is eased onto it"),
+    Mode.STOPPED: State("nobody", "camera", "both stand"),
+}
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One arrow: from ``source`` to ``target`` when ``guard`` holds, doing ``action``."""
+
+    source: Mode
+    target: Mode
+    guard: str
+    action: str
+
+
+TRANSITIONS: tuple[Transition, ...] = (
+    Transition(Mode.REAL, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.REAL, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.REAL, Mode.ENTERING, "obstacle_and_ready", "call_vbot"),
+    Transition(Mode.ENTERING, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.ENTERING, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.ENTERING, Mode.REAL, "entry_moot", "hand_back"),
+    Transition(Mode.ENTERING, Mode.VIRTUAL, "view_fits", "place_vbot"),
+    Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.VIRTUAL, Mode.STOPPED, "vspace_lost", "stop"),
+    Transition(Mode.VIRTUAL, Mode.RETURNING, "rejoined", "ease_vbot"),
+    Transition(Mode.RETURNING, Mode.STOPPED, "estop_pressed", "stop"),
+    Transition(Mode.RETURNING, Mode.STOPPED, "source_lost", "stop"),
+    Transition(Mode.RETURNING, Mode.STOPPED, "vspace_lost", "stop"),
+    Transition(Mode.RETURNING, Mode.VIRTUAL, "unsafe_again", "drive_vbot_on"),
+    Transition(Mode.RETURNING, Mode.REAL, "picture_fits", "hand_back"),
+    Transition(Mode.STOPPED, Mode.REAL, "may_resume", "hand_back"),
+)
+"""In order: the first row of the present state whose guard holds is taken, at most one a step."""
+
+GUARDS: dict[str, str] = {
+    "estop_pressed": "the emergency stop is pressed",
+    "source_lost": "a source that this state needs has been silent for stop_after_s",
+    "vspace_lost": "the virtual space has failed, or its node is silent",
+    "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready here, and there is a way "
+    "round for the r-bot",
+    "entry_moot": "the virtual space is no longer ready, no fitting view has come within enter_timeout_s, or the "
+    "operator's command is safe for the r-bot over the way that `rejoined` looks at",
+    "view_fits": "the newest rendered view and the newest camera picture were taken within picture_position_m and "
+    "picture_yaw_deg of each other",
+    "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, and the operator's command is safe for "
+    "the r-bot over the way that switches in and over a longer and wider one",
+    "unsafe_again": "the operator's command leads the r-bot into an obstacle again, or the camera is silent",
+    "picture_fits": "the v-bot has been eased onto the r-bot, and view and picture agree as in `view_fits` (after "
+    "return_timeout_s the first is enough, after twice that it goes on with what is left)",
+    "may_resume": "the emergency stop is released, every source is fresh for recover_s, the operator's command is zero "
+    "(silence counts as zero), and the operator's link is back where its loss was the reason",
+}
+
+ACTIONS: dict[str, str] = {
+    "stop": "command zero; the r-bot is shown",
+    "call_vbot": "views of the v-bot's pose are asked for; the r-bot slows",
+    "place_vbot": "the v-bot is driven and shown, from where it is: the pose of the picture that was shown",
+    "ease_vbot": "the r-bot is driven, the v-bot is eased onto it and still shown",
+    "drive_vbot_on": "the v-bot is driven again, from where it is",
+    "hand_back": "the r-bot is driven and shown",
+}
+
+
+@dataclass(frozen=True)
+class Source:
+    """An input that must be fresh: beyond its time-out the command is zero; beyond ``stop_after_s``, STOPPED."""
+
+    key: str
+    name: str
+    modes: tuple[Mode, ...]
+    words: str = ""
+    """What the operator is told of its loss; empty: "no NAME for SECONDS"."""
+    optional: bool = False
+    """Needed only once it has come: a robot without 3D points drives by its flat scan."""
+    steady: bool = False
+    """It comes at a rate of its own: its time-out is longer where it usually comes rarer."""
+
+
+OPERATOR_LOST = "the operator's link is lost, the robot waits"
+
+_MOVING = (Mode.REAL, Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
+
+SOURCES: tuple[Source, ...] = (
+    Source("scan", "LiDAR scan", _MOVING, steady=True),
+    Source("points", "3D points", _MOVING, optional=True, steady=True),
+    Source("odometry", "wheel odometry", _MOVING, steady=True),
+    Source("pose", "SLAM pose", _MOVING, steady=True),
+    Source("camera", "camera picture", (Mode.REAL, Mode.ENTERING), steady=True),
+    Source("estop_input", "word from the emergency stop button", _MOVING, optional=True),
+    Source("view", "picture of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
+    Source("vbot", "v-bot", (Mode.VIRTUAL, Mode.RETURNING)),
+    Source("nav", "path follower", (Mode.VIRTUAL,)),
+    # Where the operator drives the r-bot, silence is a zero command and no more; in VIRTUAL the r-bot would go on to
+    # the v-bot by itself.
+    Source("command", "operator's link", (Mode.VIRTUAL,), OPERATOR_LOST),
+)
