@@ -100,14 +100,14 @@ def find_node_class(name: str) -> type[Node[Any]]:
 
 
 def shipped_parameter_files(name: str) -> list[Path]:
-    """Files of ``config/`` with a section for a node, in the order of their names, except the simulator's."""
+    """Files of ``config/`` with a section for a node, in the order of their names, except those of simulated robots."""
     try:
         folder = paths.share_dir("config")
     except FileNotFoundError:
         return []
     found = []
     for file in sorted(folder.glob("*.yaml")):
-        if file.name == "sim.yaml":
+        if file.name in ("sim.yaml", "fleet_sim.yaml"):  # the fleet's lowers rates, so that many robots fit in
             continue
         try:
             content = yaml.safe_load(file.read_text())
