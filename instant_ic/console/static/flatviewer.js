@@ -88,7 +88,6 @@ export class FlatViewer {
 
 function renewed(old, bitmap, mask) {
   old?.bitmap.close();
-  old?.mask?.close();
   return { bitmap, mask, finished: null, colour: plain };
 }
 

@@ -48,10 +48,7 @@ export class Pictures {
         this.viewer.setView(bitmap, mask);
         this.view = { ...frame.header, aspect: bitmap.width / bitmap.height };
       }
-      if (this.viewer.name === "webgl") {
-        bitmap.close();
-        mask?.close();
-      }
+      if (this.viewer.name === "webgl") bitmap.close();
       this.changed = true;
       const arrivals = this._arrivals[frame.kind];
       arrivals.push(performance.now());
@@ -177,8 +174,26 @@ export const shows = (state) => state?.shown ?? (state?.mode === "virtual" ? "vi
 
 const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none" });
 
-/** The mask of a view, base64 of a PNG; null where all of it was seen. */
-function decodedMask(text) {
+/**
+ * The mask of a view, base64 of a PNG; null where all of it was seen. It is much coarser than the view: a place
+ * counts as what the least seen place beside it is, so that none that was not seen shows at the edges.
+ */
+async function decodedMask(text) {
   if (!text) return null;
-  return decoded(new Blob([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], { type: "image/png" }));
+  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  const bitmap = await decoded(new Blob([bytes], { type: "image/png" }));
+  const { width, height } = bitmap, canvas = new OffscreenCanvas(width, height);
+  const context = canvas.getContext("2d", { willReadFrequently: true });
+  context.drawImage(bitmap, 0, 0);
+  bitmap.close();
+  const image = context.getImageData(0, 0, width, height), seen = image.data.filter((_, i) => i % 4 === 0);
+  for (let y = 0; y < height; y++)
+    for (let x = 0; x < width; x++) {
+      let least = 255;
+      for (let v = Math.max(y - 1, 0); v <= Math.min(y + 1, height - 1); v++)
+        for (let u = Math.max(x - 1, 0); u <= Math.min(x + 1, width - 1); u++) least = Math.min(least, seen[v * width + u]);
+      image.data.fill(least, 4 * (y * width + x), 4 * (y * width + x) + 3);
+    }
+  context.putImageData(image, 0, 0);
+  return canvas;
 }
