@@ -156,13 +156,13 @@ class _Episode:
 
         view, photo = (before, after) if before.virtual else (after, before)
         rgb = decode(view.jpeg)
-        return psnr_db(rgb, self.photograph(photo, rgb.shape[1], rgb.shape[0], view.fov_rad))
+        return psnr_db(rgb, photograph(self.stack, photo, rgb.shape[1], rgb.shape[0], view.fov_rad))
 
-    def photograph(self, shown: Shown, width: int, height: int, fov_rad: float) -> NDArray[np.uint8]:
-        """The camera's picture as the page shows it: from where it was taken, turned to the heading."""
-        return self.stack.simulation.renderer.render_perspective(
-            pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading), width, height, fov_rad
-        ).rgb
+
+def photograph(stack: SimulatedStack, shown: Shown, width: int, height: int, fov_rad: float) -> NDArray[np.uint8]:
+    """The camera's picture as the page shows it: from where it was taken, turned to the heading."""
+    pose = pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading)
+    return stack.simulation.renderer.render_perspective(pose, width, height, fov_rad).rgb
 
 
 def decode(jpeg: bytes) -> NDArray[np.uint8]:
@@ -179,11 +179,16 @@ def decode(jpeg: bytes) -> NDArray[np.uint8]:
     return np.asarray(picture[..., ::-1])
 
 
-def run_episode(settings: Settings, index: int, on_step: Callable[[SimulatedStack], None] | None = None) -> list[Drive]:
+def run_episode(
+    settings: Settings,
+    index: int,
+    on_step: Callable[[SimulatedStack], None] | None = None,
+    methods: tuple[str, ...] = (),
+) -> list[Drive]:
     """One course driven by each method in turn; the same for the same settings and index, times apart."""
     logging.getLogger("instant_ic").setLevel(logging.ERROR)
     course = make_course(settings.world, settings.seed, index)
-    return [_Episode(settings, course, index, method).run(on_step) for method in settings.methods]
+    return [_Episode(settings, course, index, method).run(on_step) for method in methods or settings.methods]
 
 
 def prepare() -> None:
@@ -266,4 +271,4 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-__all__ = ["STEP_S", "Settings", "evaluate", "report", "run_episode"]
+__all__ = ["STEP_S", "Drive", "Settings", "evaluate", "report", "run_episode"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -174,17 +175,15 @@ def find_switches(log: Log) -> list[Switch]:
 
 def count_flicker(switches: list[Switch]) -> int:
     """Switches taken back within ``FLICKER_S``."""
-    return sum(
-        after.time_s - before.time_s < FLICKER_S for before, after in zip(switches, switches[1:], strict=False)
-    )
+    return sum(after.time_s - before.time_s < FLICKER_S for before, after in pairwise(switches))
 
 
 def pictures_at(pictures: list[Shown], switch: Switch) -> tuple[Shown, Shown] | None:
     """Last picture before a switch, first after; None where one of them is missing."""
-    for before, after in zip(pictures, pictures[1:], strict=False):
-        if before.virtual != after.virtual and abs(after.time_s - switch.time_s) < 1.0:
-            if after.virtual == switch.to_virtual:
-                return before, after
+    for before, after in pairwise(pictures):
+        near = abs(after.time_s - switch.time_s) < 1.0
+        if near and before.virtual != after.virtual == switch.to_virtual:
+            return before, after
     return None
 
 

@@ -95,11 +95,11 @@ def _corridor(rng: np.random.Generator, name: str) -> Course | None:
     finish, height = random_finish(rng), float(rng.uniform(2.4, 3.2))
     width = float(rng.uniform(2.0, 2.6))
     bent = rng.random() < 0.4
-    length = float(rng.uniform(7.5, 9.5) if bent else rng.uniform(9.0, 13.0))
+    length = float(rng.uniform(7.0, 8.5) if bent else rng.uniform(8.0, 11.5))
     arm = building.add(Zone(-1.5, -width / 2, length, width / 2, height, finish))
     legs = [(np.zeros(2), np.array([length - 1.0, 0.0]))]
     if bent:
-        across, beyond = float(rng.uniform(2.0, 2.6)), float(rng.uniform(5.5, 8.0))
+        across, beyond = float(rng.uniform(2.0, 2.6)), float(rng.uniform(4.5, 6.5))
         low, high = (arm.y1, arm.y1 + beyond) if rng.random() < 0.5 else (arm.y0 - beyond, arm.y0)
         building.add(Zone(length - across, low, length, high, height, finish))
         turn = np.array([length - across / 2, 0.0])
