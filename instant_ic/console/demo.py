@@ -268,6 +268,7 @@ class Demo:
 
     def _tell_health(self) -> None:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
+        vspace |= {"expected_psnr_db": 25.6, "unseen_share": 0.03, "radius_m": 2.0}
         battery = {"voltage": 24.6, "percent": 81.0}
         self.server.publish("health", {"vspace": vspace, "battery": battery, "faults": self.faults})
 

@@ -1,6 +1,6 @@
 // The operator's page: joins link, drive, look, pictures, map and overlay.
 
-import { attachStick, Drive, isDriveKey } from "./drive.js";
+import { attachStick, Drive, isDriveKey, isTyping } from "./drive.js";
 import { Gamepads } from "./gamepad.js";
 import { FlatViewer } from "./flatviewer.js";
 import { drawCompass, drawGuide } from "./guide.js";
@@ -10,6 +10,8 @@ import { Look } from "./look.js";
 import { radians, transpose } from "./math.js";
 import { MiniMap } from "./minimap.js";
 import { Pictures, shows } from "./pictures.js";
+import { Recording } from "./record.js";
+import { saveFile, savePicture } from "./save.js";
 import { GlViewer } from "./viewer.js";
 
 const LOOK_MS = 100; // look direction sent at most this often
@@ -30,6 +32,7 @@ hud.mark("viewer", viewer.name);
 hud.mark("quality", viewer.slow ? "plain" : "full");
 const pictures = new Pictures(viewer, link);
 const minimap = new MiniMap(byId("map-canvas"));
+const recording = new Recording(link, drive);
 
 let page = { footprint: [0.6, 0.5], camera: [0, 0, 1.2], dissolve_ms: 250, ease_ms: 400, colour_release_s: 6 };
 let state = null, session = { driver: "none", clients: 0, estop: false };
@@ -70,7 +73,7 @@ link.addEventListener("message", ({ detail: message }) => {
   switch (message.type) {
     case "hello":
       page = { ...page, ...message.page };
-      mayDrive = message.may_drive;
+      mayDrive = recording.mayRecord = message.may_drive;
       document.body.dataset.mayDrive = mayDrive;
       pictures.dissolveMs = reducedMotion.matches ? 0 : page.dissolve_ms;
       pictures.motion.easeMs = reducedMotion.matches ? 0 : page.ease_ms;
@@ -79,11 +82,14 @@ link.addEventListener("message", ({ detail: message }) => {
       break;
     case "state":
       state = message;
-      hud.showMode(state);
+      hud.showMode(state, session.driver);
       showBanner();
       break;
     case "plan":
       plan = message;
+      break;
+    case "recording":
+      recording.take(message);
       break;
     case "health":
       hud.showHealth(message);
@@ -150,10 +156,23 @@ function fullScreen() {
   else document.documentElement.requestFullscreen().catch((error) => hud.toast(`No full screen: ${error.message}`));
 }
 
+function saveShownPicture() {
+  savePicture(picture, () => viewer.draw(pictures.scene(state, look, shownFov(), 0)));
+  lastPicture = "";
+}
+
+function help() {
+  if (byId("help").open) byId("help").close();
+  else byId("help").showModal();
+}
+
 const SHORTCUTS = {
   KeyM: enlargeMap,
+  KeyR: () => recording.toggle(),
+  KeyB: () => recording.mark(),
+  KeyP: saveShownPicture,
   KeyF: fullScreen,
-  KeyH: () => (byId("help").open ? byId("help").close() : byId("help").showModal()),
+  KeyH: help,
   Minus: () => setScale(+byId("scale").value - 10),
   Equal: () => setScale(+byId("scale").value + 10),
 };
@@ -161,6 +180,7 @@ SHORTCUTS.NumpadSubtract = SHORTCUTS.Minus;
 SHORTCUTS.NumpadAdd = SHORTCUTS.Equal;
 
 window.addEventListener("keydown", (event) => {
+  if (isTyping(event)) return; // a name is typed in a dialog; the robot is held as long as that is open
   if (event.code === "Space") {
     // Before any focused button gets it: the space bar always stops.
     event.preventDefault();
@@ -173,7 +193,7 @@ window.addEventListener("keydown", (event) => {
   if (isDriveKey(event)) askForTheLease();
 }, { capture: true });
 window.addEventListener("keyup", (event) => {
-  if (event.code === "Space") event.preventDefault();
+  if (event.code === "Space" && !isTyping(event)) event.preventDefault();
 }, { capture: true });
 
 byId("estop").addEventListener("pointerdown", stopNow);
@@ -190,7 +210,14 @@ byId("compass").addEventListener("click", () => look.centre());
 byId("map-size").addEventListener("click", enlargeMap);
 byId("map-canvas").addEventListener("click", enlargeMap);
 byId("fullscreen").addEventListener("click", fullScreen);
-byId("help-open").addEventListener("click", SHORTCUTS.KeyH);
+byId("help-open").addEventListener("click", help);
+byId("help-more").addEventListener("click", help);
+byId("save-picture").addEventListener("click", saveShownPicture);
+byId("save-panorama").addEventListener("click", () => saveFile("panorama.jpg"));
+byId("save-map").addEventListener("click", () => saveFile("map.zip"));
+for (const button of document.querySelectorAll("#more button")) {
+  button.addEventListener("click", () => byId("more").hidePopover());
+}
 byId("scale").addEventListener("input", (event) => setScale(+event.target.value));
 byId("scale").addEventListener("change", (event) => event.target.blur());
 hud.holdToConfirm(byId("release"), () => link.send({ type: "estop_release" }));
@@ -326,5 +353,5 @@ function drawMap(scene, tanHalf, now) {
 }
 
 setScale(70);
-hud.showMode(null);
+hud.showMode(null, session.driver);
 requestAnimationFrame(frame);

@@ -4,13 +4,20 @@ import { degrees } from "./math.js";
 import { PANORAMA, VIEW } from "./link.js";
 
 const MODES = {
-  real: ["REAL", "You drive the robot"],
+  real: ["REAL", "The robot obeys the operator"],
   virtual: ["VIRTUAL", "The robot follows you round the obstacle"],
   entering: ["ENTERING", "The virtual space is about to be shown"],
   returning: ["RETURNING", "The real view is about to come back"],
   stopped: ["STOPPED", "The robot is held"],
   none: ["WAITING", "No controller is running"],
 };
+// Said to whoever cannot see the mode; what lasts a moment only is not.
+const SAID = {
+  real: "Real view: you see through the robot's camera",
+  virtual: "Virtual view: you drive the virtual robot, the robot follows",
+  stopped: "Stopped: the robot is held",
+};
+const ANNOUNCE_MS = 400;
 const HOLD_MS = 800;
 const TOAST_MS = 2600;
 const byId = (id) => document.getElementById(id);
@@ -20,9 +27,11 @@ function write(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
-export function showMode(state) {
+export function showMode(state, driver) {
   const mode = state?.mode ?? "none";
-  const [name, usual] = MODES[mode] ?? MODES.none;
+  let [name, usual] = MODES[mode] ?? MODES.none;
+  if (mode === "real" && driver === "you") usual = "You drive the robot";
+  if (mode !== document.body.dataset.mode && mode in SAID) announce(SAID[mode]);
   document.body.dataset.mode = mode;
   write(byId("mode-name"), name);
   write(byId("mode-reason"), state?.reason || usual);
@@ -35,9 +44,11 @@ export function showLatency(link, pictures) {
     element.className = value === null ? "" : value > bad ? "bad" : value > warn ? "warn" : "";
   };
   const ms = (value) => (value < 9950 ? `${Math.round(value)} ms` : `${(value / 1000).toFixed(0)} s`);
-  put("link-ms", link.connected ? link.roundTripMs : null, ms, 80, 200);
+  put("link-ms", link.connected ? link.roundTripMs : null, (value) => ms(value) + (link.quality ? ` · ${link.quality}` : ""), 80, 200);
+  mark("linkQuality", link.quality ?? "none");
   put("picture-ms", link.connected ? pictures.ageMs() : null, ms, 400, 1000);
-  put("command-ms", link.connected ? link.commandAgeMs : null, ms, 80, 200);
+  const withRate = (value) => ms(value) + (link.commandHz ? ` · ${Math.round(link.commandHz)} /s` : "");
+  put("command-ms", link.connected ? link.commandAgeMs : null, withRate, 80, 200);
   const camera = pictures.rate(PANORAMA), view = pictures.rate(VIEW);
   write(byId("rates"), camera || view ? `${camera.toFixed(0)} · ${view.toFixed(0)} /s` : "–");
 }
@@ -46,7 +57,7 @@ export function showHealth(health) {
   const { vspace, battery, faults = [] } = health;
   byId("vspace-dot").dataset.state = vspace?.state ?? "empty";
   write(byId("vspace-text"), vspaceText(vspace));
-  write(byId("vspace-more"), vspace?.psnr_db > 0 ? ` · ${vspace.psnr_db.toFixed(1)} dB` : "");
+  write(byId("vspace-more"), vspace ? readiness(vspace) : "");
   byId("battery-row").hidden = !battery;
   if (battery) {
     const share = battery.percent === null ? "" : ` · ${Math.round(battery.percent)} %`;
@@ -59,11 +70,21 @@ export function showHealth(health) {
   list.replaceChildren(...faults.map(({ level, name, text }) => {
     const item = document.createElement("li");
     item.className = level;
+    item.title = text;
     const bold = document.createElement("b");
     bold.textContent = name;
     item.append(bold, ` ${text}`);
     return item;
   }));
+}
+
+/** How good the virtual space is: sharpness of what was learnt, of the view asked for, how much of it was seen, how far. */
+function readiness({ psnr_db, expected_psnr_db, unseen_share, radius_m }) {
+  const words = [];
+  if (expected_psnr_db > 0) words.push(`${expected_psnr_db.toFixed(0)} dB here`, `${Math.round(100 * (1 - unseen_share))} % seen`);
+  else if (psnr_db > 0) words.push(`${psnr_db.toFixed(1)} dB`);
+  if (radius_m > 0) words.push(`within ${radius_m.toFixed(1)} m`);
+  return words.map((word) => ` · ${word}`).join("");
 }
 
 function vspaceText(vspace) {
@@ -124,6 +145,13 @@ export function showBanner(connected, everConnected, estop, held, driver) {
 /** Sets a data attribute of the page, where styles and tests look; writes only what has changed. */
 export function mark(name, value) {
   if (document.body.dataset[name] !== value) document.body.dataset[name] = value;
+}
+
+let announceTimer = null;
+/** Has a screen reader say a text, if it still holds in a moment: what flickers is not said. */
+export function announce(text) {
+  clearTimeout(announceTimer);
+  announceTimer = setTimeout(() => write(byId("announce"), text), ANNOUNCE_MS);
 }
 
 let toastTimer = null;

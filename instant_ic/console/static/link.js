@@ -17,6 +17,8 @@ export class Link extends EventTarget {
     this.url = url;
     this.roundTripMs = null;
     this.commandAgeMs = null;
+    this.commandHz = 0; // drive commands that the server took in the last second
+    this.away = false; // the operator is at something else than the robot
     this.connected = false;
     this._offsetMs = null;
     this._samples = [];
@@ -30,6 +32,15 @@ export class Link extends EventTarget {
   /** The server's clock now, ms; null before the first answer. */
   serverNow() {
     return this._offsetMs === null ? null : performance.now() + this._offsetMs;
+  }
+
+  /** How good the link is: "good", "fair", "poor"; null while it is not known. By its round trips, the usual and the slow. */
+  get quality() {
+    if (!this.connected || this._samples.length < 5) return null;
+    const sorted = this._samples.slice(-30).map((sample) => sample.roundTrip).sort((a, b) => a - b);
+    const usual = sorted[sorted.length >> 1], slow = sorted[Math.floor(sorted.length * 0.9)];
+    if (usual <= 80 && slow <= 150) return "good";
+    return usual <= 200 && slow <= 400 ? "fair" : "poor";
   }
 
   send(message) {
@@ -107,7 +118,7 @@ export class Link extends EventTarget {
   }
 
   _ping() {
-    this.send({ type: "ping", client_ms: performance.now(), away: document.hidden });
+    this.send({ type: "ping", client_ms: performance.now(), away: document.hidden || this.away });
   }
 
   _receive(data) {
@@ -132,6 +143,7 @@ export class Link extends EventTarget {
     const recent = this._samples.slice(-20).map((s) => s.roundTrip).sort((a, b) => a - b);
     this.roundTripMs = recent[recent.length >> 1];
     this.commandAgeMs = message.command_age_ms;
+    this.commandHz = message.command_hz;
     if (!this.connected) {
       this.connected = true;
       this.dispatchEvent(new Event("open"));

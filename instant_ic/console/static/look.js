@@ -1,5 +1,6 @@
 // Where the operator looks, relative to the robot's heading: mouse or finger drag, wheel, keys.
 
+import { isTyping } from "./drive.js";
 import { clamp, radians, wrapAngle } from "./math.js";
 
 const MAX_PITCH = radians(80);
@@ -36,7 +37,7 @@ export class Look {
     }, { passive: false });
     element.addEventListener("dblclick", () => this.centre());
     window.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (event.ctrlKey || event.metaKey || event.altKey || isTyping(event)) return;
       if (event.code in KEYS) this._held.add(event.code);
       if (event.code === "KeyC") this.centre();
     });

@@ -1,0 +1,111 @@
+// Record button, snapshot of the last minute, bookmarks: wishes to the server, and what it says has become of them.
+
+import { announce, toast } from "./hud.js";
+
+const byId = (id) => document.getElementById(id);
+const BUSY = { ending: "Saving…", "disk full": "Disk full", failed: "Failed", paused: "Paused" };
+
+export class Recording {
+  /** `drive` is stopped, and the link says "away", while a bookmark's name is typed: the robot is held meanwhile. */
+  constructor(link, drive) {
+    this.link = link;
+    this.drive = drive;
+    this.mayRecord = true;
+    this._told = { recorder: "missing", state: "none", text: "No recorder has answered yet.", bookmarks: [], snapshots: [] };
+    this._notice = null;
+    byId("record").addEventListener("click", () => this.toggle());
+    byId("snapshot").addEventListener("click", () => this._wish({ type: "snapshot" }));
+    byId("mark").addEventListener("click", () => this.mark());
+    byId("marks-open").addEventListener("click", () => this._openMarks());
+    byId("marks").addEventListener("close", () => { link.away = false; });
+    byId("mark-form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.mark(byId("mark-name").value.trim());
+      byId("mark-name").value = "";
+    });
+  }
+
+  get running() {
+    return ["recording", "disk full", "paused"].includes(this._told.state);
+  }
+
+  toggle() {
+    if (this._told.recorder !== "ok" && this.mayRecord) toast(this._told.text);
+    else this._wish({ type: "record", on: !this.running });
+  }
+
+  /** Gives this moment a name; without one it gets a number. */
+  mark(name) {
+    this._wish({ type: "bookmark", name: name || `Mark ${this._told.bookmarks.length + 1}` });
+  }
+
+  /** Takes a "recording" message. */
+  take(message) {
+    this._told = { bookmarks: [], snapshots: [], ...message };
+    const { number, text } = message.notice;
+    if (this._notice !== null && number !== this._notice) toast(text);
+    this._notice = number;
+    this._showButton();
+    this._showLists();
+  }
+
+  _wish(message) {
+    if (!this.mayRecord) toast("This sign-in may watch and save pictures, not record.");
+    else if (!this.link.connected) toast("No link: nothing was recorded or marked.");
+    else this.link.send(message);
+  }
+
+  _openMarks() {
+    this.drive.stop("the bookmarks were opened");
+    this.link.away = true;
+    byId("marks").showModal();
+  }
+
+  _showButton() {
+    const { recorder, state, seconds, bytes, text } = this._told, button = byId("record");
+    const amount = `${clock(seconds ?? 0)} · ${megabytes(bytes ?? 0)}`;
+    const shown = state === "recording" ? amount : BUSY[state] ?? "Record";
+    const usable = recorder === "ok" && this.mayRecord;
+    if (document.body.dataset.recording !== state) announce(state === "recording" ? "Recording" : BUSY[state] ?? "");
+    document.body.dataset.recording = state;
+    write(byId("record-text"), shown);
+    button.setAttribute("aria-pressed", this.running);
+    button.setAttribute("aria-disabled", !usable);
+    button.setAttribute("aria-label", this.running ? `Stop recording (${shown})` : shown);
+    button.title = text || (this.running ? this._told.path : "Record all topics (R)");
+  }
+
+  _showLists() {
+    const { bookmarks, snapshots, free_bytes, cached_s } = this._told;
+    const marks = bookmarks.map(({ at, name, seconds, recording }) =>
+      `${at}  ${name}` + (recording ? `  (${clock(seconds)} in ${recording})` : ""));
+    list(byId("marks-list"), marks.reverse(), "None yet.");
+    list(byId("snapshots-list"), snapshots.map(({ name, state, words }) => `${name}: ${words || state}`).reverse(), "None yet.");
+    const room = free_bytes == null ? "" : ` · ${megabytes(free_bytes)} free on the disk`;
+    write(byId("record-more"), cached_s === undefined ? this._told.text : `The last ${Math.round(cached_s)} s are at hand${room}`);
+  }
+}
+
+function clock(seconds) {
+  const whole = Math.floor(seconds ?? 0), minutes = Math.floor(whole / 60);
+  return `${minutes}:${String(whole % 60).padStart(2, "0")}`;
+}
+
+function megabytes(bytes) {
+  return bytes < 1e9 ? `${Math.round(bytes / 1e6)} MB` : `${(bytes / 1e9).toFixed(1)} GB`;
+}
+
+function write(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+function list(element, lines, none) {
+  const key = lines.join("\n");
+  if (element.dataset.key === key) return;
+  element.dataset.key = key;
+  element.replaceChildren(...(lines.length ? lines : [none]).map((line) => {
+    const item = document.createElement("li");
+    item.textContent = line;
+    return item;
+  }));
+}

@@ -1,0 +1,45 @@
+// Saves the picture, the panorama and the map as files of the operator's machine.
+
+import { toast } from "./hud.js";
+
+/** The picture as it is shown, without the overlay, in the window's full resolution. `draw` draws it into the canvas. */
+export function savePicture(canvas, draw) {
+  const { width, height } = canvas;
+  canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
+  canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
+  draw(); // WebGL keeps no picture beyond the task in which it was drawn
+  canvas.toBlob((blob) => {
+    if (blob) hand(blob, `picture_${stamp()}.png`);
+    else toast("The browser could not make a file of the picture.");
+  }, "image/png");
+  canvas.width = width;
+  canvas.height = height;
+  draw();
+}
+
+/** A file of the server: `path` under /export/. */
+export async function saveFile(path) {
+  try {
+    const answer = await fetch(`/export/${path}`, { cache: "no-store" });
+    if (!answer.ok) return toast(`Nothing saved: ${(await answer.text()).trim()}`);
+    const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? path;
+    hand(await answer.blob(), name);
+  } catch (error) {
+    toast(`Nothing saved: ${error.message}`);
+  }
+}
+
+function hand(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  toast(`Saved: ${name}`);
+}
+
+function stamp() {
+  const now = new Date(), two = (value) => String(value).padStart(2, "0");
+  const day = `${now.getFullYear()}${two(now.getMonth() + 1)}${two(now.getDate())}`;
+  return `${day}_${two(now.getHours())}${two(now.getMinutes())}${two(now.getSeconds())}`;
+}
