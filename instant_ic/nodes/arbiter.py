@@ -114,6 +114,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.costmap_out = self.publisher("/costmap", OccupancyGrid, qos=SENSOR)
 
         self.operator = self.latest("/operator/cmd_vel", TwistStamped, max_age_s=10.0)
+        self.obeyed = (0.0, 0.0)  # the operator's command of the last step
+        self.early = False  # a step was made before its time since the last timer
+        self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
         self.scan = self.latest("/scan", LaserScan, max_age_s=10.0)
         self.points = (
             self.latest("/lidar/points", PointCloud2, max_age_s=10.0) if self.config.costmap.points.enabled else None
@@ -133,7 +136,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         _ = self.tf  # listens from now on
         self.timer(self.config.wall_period_s, self.update_walls)
         self.timer(1.0 / self.config.costmap.update_frequency, self.update_costmap)
-        self.timer(1.0 / self.config.rate_hz, self.tick)
+        self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: ArbiterNodeConfig) -> None:
         super().reconfigure(config)
@@ -198,6 +201,16 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.button = pressed, self.clock.steady_ns()
         if pressed:
             self.estop, self.stopped_by = True, ("button", max(received.publish_ns, self.stopped_by[1]))
+        self.tick()
+
+    def on_command(self, message: TwistStamped) -> None:
+        """Obeys a command that has changed at once: the next timer is half a period off."""
+        if not self.early and twist_values(message) != self.obeyed:
+            self.early = True
+            self.tick()
+
+    def on_timer(self) -> None:
+        self.early = False
         self.tick()
 
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
@@ -455,6 +468,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             ages=ages,
             usual=self.usual(),
         )
+        self.obeyed = inputs.operator_command
         # Steady time: a clock that is set back must not make what has fallen silent look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         self.cmd_vel.publish(twist_stamped(*decision.command, now_ns))

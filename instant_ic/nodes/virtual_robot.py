@@ -61,12 +61,15 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
         self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
+        self.obeyed = (0.0, 0.0)  # the operator's command of the last step
+        self.early = False  # a step was made before its time since the last timer
+        self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
             self.wall_worker = self.background(WallFinder(self.config.wall_min_length_m).find, self.on_walls)
             self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
             self.timer(self.config.wall_period_s, self.update_walls)
-        self.timer(1.0 / self.config.rate_hz, self.tick)
+        self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: VirtualRobotConfig) -> None:
         super().reconfigure(config)
@@ -89,6 +92,16 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def on_walls(self, walls: WallMap) -> None:
         self.walls = walls
+
+    def on_command(self, message: TwistStamped) -> None:
+        """Obeys a command that has changed at once: the next timer is half a period off."""
+        if self.action == VbotAction.DRIVEN and not self.early and twist_values(message) != self.obeyed:
+            self.early = True
+            self.tick()
+
+    def on_timer(self) -> None:
+        self.early = False
+        self.tick()
 
     def tick(self) -> None:
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
@@ -120,7 +133,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
-            self.robot.step(self.operator(self.clock.now_ns()), robot_pose, dt_s, self.walls)
+            self.obeyed = self.operator(self.clock.now_ns())
+            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls)
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls)
         elif action == VbotAction.EASED:
