@@ -61,15 +61,15 @@ class Space(Protocol):
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float: ...
 
 
-def make_space(config: VirtualSpaceConfig | None = None) -> Space:
-    """The space that ``config.source`` asks for.
+def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> Space:
+    """The space that ``config.source`` asks for; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
 
     Raises:
         MeshError: ``source`` is ``mesh``, and its file cannot be used.
         DeviceError: the device that was asked for is not there.
     """
     config = config or VirtualSpaceConfig()
-    return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config)
+    return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config, robot)
 
 
 class MeshSpace:

@@ -112,8 +112,8 @@ class VirtualSpace:
     """The newest keyframes: shown at once by warping, and one hash-grid field that learns from all of them.
 
     A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
-    time, but for ``prepare`` and ``scene_of``, which another may call meanwhile. The same calls with the same seed give the
-    same bits on the CPU, as long as training is asked for by iterations and not by time.
+    time, but for ``prepare`` and ``scene_of``, which another may call meanwhile. The same calls with the same seed give
+    the same bits on the CPU, as long as training is asked for by iterations and not by time.
 
     Example:
         >>> space = VirtualSpace(VirtualSpaceConfig())                        # doctest: +SKIP
@@ -297,8 +297,10 @@ class VirtualSpace:
         Raises:
             NotReadyError: no keyframe yet.
         """
-        if self._scene is None:
+        if self._shown is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
+        if self._scene is None:
+            self.learn(self.scene_of(self._shown))
         start = time.perf_counter()
         done, distance_error = 0, math.nan
         limit = self.config.train.iterations if iterations is None else iterations
@@ -344,7 +346,7 @@ class VirtualSpace:
             ready_iterations=self._ready_iterations if self.config.source == "field" else 0,
             ms_per_iteration=self._train_seconds * 1e3 / iterations if iterations else 0.0,
             ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
-            converged=self._scene is not None and self._done,
+            converged=self._shown is not None and self._done,
             device=self._device.name,
             warning=self._warning,
         )

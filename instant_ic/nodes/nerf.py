@@ -15,8 +15,9 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.depth.keyframes import decode_sigma
 from instant_ic.msg import (
     CompressedImage,
@@ -31,7 +32,8 @@ from instant_ic.msg import (
     pose_message,
     to_time,
 )
-from instant_ic.nerf import KeyframeError, Space, State, Status, View, VirtualSpaceConfig, make_space
+from instant_ic.nerf import KeyframeError, Space, State, Status, View, VirtualSpace, VirtualSpaceConfig, make_space
+from instant_ic.nerf.turns import Turns
 from instant_ic.nerf.warm_up import warm_up
 from instant_ic.ranges import Percent, Positive, PositiveInt, Range, check_ranges
 
@@ -41,27 +43,29 @@ class NerfConfig:
     """Parameters.
 
     Attributes:
-        train_slice_ms: training between two pictures, at least; a request waits about this long.
-        train_share: training's time between two pictures, against the last picture's, where that is more.
-        train_share_until_ready: the same before the space is fit to show: there is more need of training than pictures.
-        train_nice: of the thread that trains and draws: what steers the robot comes first on a busy machine; 0 to 19.
+        render_fps: pictures a second that are held where they are asked for; training gets the time that is left.
+        train_ms_per_frame: of training at a stretch, at most: a picture that is asked for waits no longer. While nobody
+            asks, training has all the time.
+        train_nice: of the threads that train, draw and prepare: what steers the robot comes first; 0 to 19.
         lockstep_iterations: iterations at each tick of ``lockstep_period_s`` in tests and replay.
         lockstep_period_s: see ``lockstep_iterations``.
         max_view_pixels: larger requests are refused.
         jpeg_quality: 1 to 100.
         status_period_s: of ``/vspace/status``.
+        robot_mask: picture, twice as wide as high, white where the panorama shows the robot itself or its stand (see
+            also ``space.geometry.body_below_deg``); none where empty.
         space: the virtual space itself.
     """
 
-    train_slice_ms: Positive = 30.0
-    train_share: Positive = 0.3
-    train_share_until_ready: Positive = 2.0
+    render_fps: Annotated[float, Range(0.5, 120)] = 10.0
+    train_ms_per_frame: Positive = 50.0
     train_nice: Annotated[int, Range(0, 19)] = 5
     lockstep_iterations: PositiveInt = 5
     lockstep_period_s: Positive = 0.1
     max_view_pixels: PositiveInt = 1280 * 720
     jpeg_quality: Percent = 85
     status_period_s: Positive = 0.5
+    robot_mask: str = ""
     space: VirtualSpaceConfig = dataclasses.field(default_factory=VirtualSpaceConfig)
 
     def __post_init__(self) -> None:
@@ -70,11 +74,14 @@ class NerfConfig:
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work for the worker: ``warm_up``, ``keyframe``, ``draw`` or ``train``."""
+    """One piece of work: ``keyframe`` and ``scene`` for the thread that prepares, ``warm_up``, ``show``, ``learn``,
+    ``draw`` and ``train`` for the one that draws. ``made``: by the job before it.
+    """
 
     kind: str
     message: Any = None
     budget_ms: float = 0.0
+    made: Any = None
 
 
 @dataclass(frozen=True)
@@ -85,41 +92,90 @@ class Outcome:
     status: Status | None = None
     view: View | None = None
     jpeg: bytes = b""
+    made: Any = None
     mask_png: bytes = b""
     elapsed_ms: float = 0.0
     refused: str = ""
     error: Exception | None = None
 
 
+NOTHING_SEEN = 0.98
+"""A picture of which more than this share has been seen by nobody shows nothing that is known."""
+
+
+def read_mask(path: str) -> NDArray[np.bool_] | None:
+    """The robot's mask, (H, 2 H), or None where there is none.
+
+    Raises:
+        NodeError: no picture, or no panorama.
+    """
+    if not path:
+        return None
+    picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise NodeError(f"robot_mask {path}: no such file, or no picture that can be decoded")
+    if picture.shape[1] != 2 * picture.shape[0]:
+        size = f"{picture.shape[1]} x {picture.shape[0]}"
+        raise NodeError(f"robot_mask {path}: must be twice as wide as high, as the panorama is (got {size})")
+    return np.asarray(picture > 127)
+
+
+def decode_keyframe(keyframe: Any) -> tuple[Any, Any, Any, Any]:
+    """Arguments of ``VirtualSpace.prepare``.
+
+    Raises:
+        KeyframeError: the keyframe is not fit, or cannot be decoded.
+    """
+    if not keyframe.fit:
+        raise KeyframeError(f"its depth is not fit: {keyframe.message or 'no reason given'}")
+    data = np.asarray(keyframe.panorama.data, np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    if picture is None:
+        raise KeyframeError(f"the panorama ({data.size} bytes) cannot be decoded")
+    rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    if keyframe.depth.encoding != "32FC1":
+        raise KeyframeError(f"depth must be 32FC1 (got {keyframe.depth.encoding!r})")
+    each = keyframe.sigma.data.size > 0
+    sigma = decode_sigma(image_array(keyframe.sigma)) if each else keyframe.relative_sigma
+    return rgb, image_array(keyframe.depth), pose_matrix(keyframe.pose), sigma
+
+
 class NerfNode(Node[NerfConfig]):
-    """Hands the worker one job at a time: a new keyframe first, then pictures and slices of training by turns."""
+    """One thread draws and trains by turns; another one prepares a new keyframe meanwhile, in two steps.
+
+    First what pictures need, which then show it; then what the field needs, which then learns it.
+    """
 
     name = "nerf"
     live_parameters = (
-        *("train_slice_ms", "train_share", "train_share_until_ready"),
+        *("render_fps", "train_ms_per_frame"),
         *("lockstep_iterations", "max_view_pixels", "jpeg_quality"),
     )
 
     def setup(self) -> None:
-        self.space: Space | None = None  # touched by the worker alone
-        self.keyframe: Any = None  # newest that the space has taken
-        self.shown: Any = None  # the one that pictures show: the one before while the newest is learnt
+        self.robot = read_mask(self.config.robot_mask)
+        self.space: Space | None = None  # touched by the two workers alone
+        self.keyframe: Any = None  # newest that pictures show
         self.status: Status | None = None
         self.waiting_keyframe: Any = None
         self.waiting_request: Any = None
-        self.job: Job | None = None
+        self.job: Job | None = None  # that the worker has in hand
+        self.todo: deque[Job] = deque()  # of the keyframe in preparation
+        self.preparing = False
+        self.learns = False  # the field has been given something to learn
         self.warned = False
-        self.last_drew = False
         self.failure = ""
         self.keyframe_ns = self.ready_ns = 0
-        self.shown_seconds = 0.0
+        self.ready_seconds = 0.0
         self.render_ms = 0.0
         self.expected_psnr_db = self.unseen_share = 0.0  # of the picture drawn last; 0 = unknown
         self.drawn_ns: deque[int] = deque(maxlen=20)
+        self.turns = Turns(self.config.render_fps, self.config.train_ms_per_frame)
         self.view_out = self.publisher("/vspace/view", RenderedView, qos=SENSOR)
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
         self.worker = self.background(self.work, self.on_outcome)
+        self.preparer = self.background(self.work, self.on_prepared)
         self.start_job(Job("warm_up"))
         self.subscribe("/keyframe", Keyframe, self.on_keyframe, qos=LATCHED)
         self.subscribe("/view/request", ViewRequest, self.on_request, qos=SENSOR)
@@ -129,7 +185,7 @@ class NerfNode(Node[NerfConfig]):
         self.publish_status()
 
     def on_keyframe(self, keyframe: Any) -> None:
-        self.waiting_keyframe = keyframe
+        self.waiting_keyframe = (keyframe, self.clock.now_ns())
         self.next_job()
 
     def on_request(self, request: Any) -> None:
@@ -139,28 +195,25 @@ class NerfNode(Node[NerfConfig]):
     # -- who is next ---------------------------------------------------------------------------------
 
     def next_job(self) -> None:
-        """Gives the idle worker its next job; idle it stays when there is nothing to train, draw or take in."""
+        """Gives idle threads their next jobs; idle they stay when there is nothing to take in, draw or train."""
+        if self.space is not None and self.waiting_keyframe is not None and not self.preparing:
+            waiting, self.waiting_keyframe = self.waiting_keyframe, None
+            self.preparing = True
+            self.preparer.submit(Job("keyframe", waiting))
         if self.job is not None or self.space is None:
             return
-        if self.waiting_keyframe is not None and self.takes_keyframe:
-            keyframe, self.waiting_keyframe = self.waiting_keyframe, None
-            self.start_job(Job("keyframe", keyframe))
-        elif self.waiting_request is not None and (self.lockstep or not (self.trains and self.last_drew)):
+        trains = self.trains and not self.lockstep
+        if self.todo:
+            self.start_job(self.todo.popleft())
+        elif self.turns.draws_next(self.waiting_request is not None, trains):
             request, self.waiting_request = self.waiting_request, None
             self.draw(request)
-        elif self.trains and not self.lockstep:
-            self.start_job(Job("train", budget_ms=self.slice_ms()))
-
-    @property
-    def takes_keyframe(self) -> bool:
-        """Each keyframe is learnt until it is fit to show, however fast they come; of those that wait, the newest."""
-        return self.keyframe is None or self.ready_ns > 0 or not self.trains
-
-    def slice_ms(self) -> float:
-        """On a busy machine a picture takes long: training must not starve beside it."""
-        share = self.config.train_share if self.state() == State.READY else self.config.train_share_until_ready
-        drew = self.render_ms if self.last_drew else 0.0
-        return max(self.config.train_slice_ms, share * drew)
+        elif trains:
+            self.turns.render_fps, self.turns.train_ms_per_frame = (
+                self.config.render_fps,
+                self.config.train_ms_per_frame,
+            )
+            self.start_job(Job("train", budget_ms=self.turns.budget_ms()))
 
     def train_in_lockstep(self) -> None:
         if self.job is None and self.trains:
@@ -170,8 +223,7 @@ class NerfNode(Node[NerfConfig]):
     def trains(self) -> bool:
         """Whether there is anything left to train."""
         status = self.status
-        empty = status is None or status.state == State.EMPTY
-        return not (empty or self.failure or (status is not None and status.converged))
+        return not (status is None or not self.learns or self.failure or status.converged)
 
     def draw(self, request: Any) -> None:
         pixels = int(request.width) * int(request.height)
@@ -187,10 +239,9 @@ class NerfNode(Node[NerfConfig]):
 
     def start_job(self, job: Job) -> None:
         self.job = job
-        self.last_drew = job.kind == "draw"
         self.worker.submit(job)
 
-    # -- the worker's thread -------------------------------------------------------------------------
+    # -- on the workers' threads -------------------------------------------------------------------------
 
     def work(self, job: Job) -> Outcome:
         start = time.perf_counter()
@@ -198,7 +249,7 @@ class NerfNode(Node[NerfConfig]):
             outcome = self.do(job)
         except Exception as error:  # noqa: BLE001 - told on the node's thread, which must learn that the worker is free
             # A keyframe or request that is no good is the sender's fault, anything else is ours.
-            refused = job.kind in ("keyframe", "draw") and isinstance(error, ValueError)
+            refused = job.kind in ("keyframe", "show", "draw") and isinstance(error, ValueError)
             outcome = Outcome(job, refused=str(error)) if refused else Outcome(job, error=error)
         status = None if self.space is None else self.space.status
         return dataclasses.replace(outcome, status=status, elapsed_ms=(time.perf_counter() - start) * 1e3)
@@ -208,18 +259,30 @@ class NerfNode(Node[NerfConfig]):
             if not self.lockstep:
                 self.yield_to_others()
                 warm_up(self.config.space)
-            self.space = make_space(self.config.space)
+            self.space = make_space(self.config.space, self.robot)
             return Outcome(job)
-        assert self.space is not None
+        space = self.space
+        assert space is not None
         if job.kind == "keyframe":
-            self.take_keyframe(self.space, job.message)
+            self.yield_to_others()
+            decoded = decode_keyframe(job.message[0])
+            return Outcome(job, made=space.prepare(*decoded) if isinstance(space, VirtualSpace) else decoded)
+        if job.kind == "scene":
+            assert isinstance(space, VirtualSpace)
+            return Outcome(job, made=space.scene_of(job.made))
+        if job.kind == "show" and isinstance(space, VirtualSpace):
+            space.show(job.made, dissolve=True)
+        elif job.kind == "show":
+            space.set_keyframe(*job.made)
+        elif job.kind == "learn" and isinstance(space, VirtualSpace):
+            space.learn(job.made)
         elif job.kind == "train" and self.lockstep:
-            self.space.train(iterations=self.config.lockstep_iterations)
+            space.train(iterations=self.config.lockstep_iterations)
         elif job.kind == "train":
-            self.space.train(budget_ms=job.budget_ms)
+            space.train(budget_ms=job.budget_ms)
         elif job.kind == "draw":
             request = job.message
-            view = self.space.render(pose_matrix(request.pose), request.width, request.height, request.fov_rad)
+            view = space.render(pose_matrix(request.pose), request.width, request.height, request.fov_rad)
             quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality]
             _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], quality)
             return Outcome(job, view=view, jpeg=jpeg.tobytes(), mask_png=view.mask_png())
@@ -230,22 +293,20 @@ class NerfNode(Node[NerfConfig]):
         if self.config.train_nice and sys.platform == "linux":
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self.config.train_nice)
 
-    @staticmethod
-    def take_keyframe(space: Space, keyframe: Any) -> None:
-        if not keyframe.fit:
-            raise KeyframeError(f"its depth is not fit: {keyframe.message or 'no reason given'}")
-        data = np.asarray(keyframe.panorama.data, np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-        if picture is None:
-            raise KeyframeError(f"the panorama ({data.size} bytes) cannot be decoded")
-        rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-        if keyframe.depth.encoding != "32FC1":
-            raise KeyframeError(f"depth must be 32FC1 (got {keyframe.depth.encoding!r})")
-        each = keyframe.sigma.data.size > 0
-        sigma = decode_sigma(image_array(keyframe.sigma)) if each else keyframe.relative_sigma
-        space.set_keyframe(rgb, image_array(keyframe.depth), pose_matrix(keyframe.pose), sigma)
-
     # -- back on the node's thread -------------------------------------------------------------------
+
+    def on_prepared(self, outcome: Outcome) -> None:
+        """What the thread that prepares has made goes to the one that draws."""
+        job = outcome.job
+        if outcome.error is not None or outcome.refused:
+            self.preparing = False
+            if outcome.refused:
+                self.refuse(job.message[0], outcome.refused)
+            else:
+                self.on_error("keyframe", outcome.error)
+        else:
+            self.todo.append(Job("show" if job.kind == "keyframe" else "learn", job.message, made=outcome.made))
+        self.next_job()
 
     def on_outcome(self, outcome: Outcome) -> None:
         self.job = None
@@ -254,44 +315,52 @@ class NerfNode(Node[NerfConfig]):
         if self.status is not None and (self.status.warning or self.warned):
             self.warned = bool(self.status.warning)
             self.diagnose("device", WARN if self.warned else OK, self.status.warning or self.status.device)
+        if kind == "learn" or (kind == "show" and (outcome.error is not None or outcome.refused)):
+            self.preparing = False
         if outcome.error is not None:
-            self.on_error(kind, outcome.error)
-        elif kind == "keyframe":
-            self.on_keyframe_taken(outcome)
+            self.on_error("keyframe" if kind == "show" else kind, outcome.error)
+        elif kind == "show":
+            self.on_shown(outcome)
+        elif kind == "learn":
+            self.learns = True
         elif kind == "draw":
             self.on_drawn(outcome)
         elif kind == "train":
             self.diagnose("vspace", OK, self.words(), iterations=self.status.iterations if self.status else 0)
-        learnt = self.state() == State.READY and not (self.status is not None and self.status.refreshing)
-        if self.keyframe is not None and not self.ready_ns and learnt:
-            self.ready_ns, self.shown = self.clock.now_ns(), self.keyframe
-            self.shown_seconds = (self.ready_ns - self.keyframe_ns) / 1e9
+        if self.keyframe is not None and not self.ready_ns and self.state() == State.READY:
+            self.ready_ns = self.clock.now_ns()
+            self.ready_seconds = (self.ready_ns - self.keyframe_ns) / 1e9
             self.publish_status()
         self.next_job()
 
-    def on_error(self, kind: str, error: Exception) -> None:
+    def on_error(self, kind: str, error: Exception | None) -> None:
         words = f"{kind}: {type(error).__name__}: {error}"
-        if kind in ("warm_up", "train"):
+        if kind in ("warm_up", "learn", "train"):
             # What fails once fails again: no endless loop at full load. A new keyframe tries again.
             self.failure = words
             self.diagnose("vspace", ERROR, words)
             self.publish_status()
         else:
             self.diagnose(kind, ERROR, words)
-        if type(error).__name__ not in ("OutOfMemoryError", "DeviceError", "MeshError"):  # no bugs, and told
-            self.fault(f"virtual space, {kind}", error)
+        if error is not None and type(error).__name__ not in ("OutOfMemoryError", "DeviceError", "MeshError"):
+            self.fault(f"virtual space, {kind}", error)  # those are no bugs, and told
 
-    def on_keyframe_taken(self, outcome: Outcome) -> None:
-        keyframe = outcome.job.message
+    def refuse(self, keyframe: Any, words: str) -> None:
+        self.diagnose("keyframe", ERROR, f"keyframe {keyframe.id} refused: {words}", id=keyframe.id)
+
+    def on_shown(self, outcome: Outcome) -> None:
+        (keyframe, self.keyframe_ns), made = outcome.job.message, outcome.job.made
         if outcome.refused:
-            self.diagnose("keyframe", ERROR, f"keyframe {keyframe.id} refused: {outcome.refused}", id=keyframe.id)
+            self.refuse(keyframe, outcome.refused)
             return
         self.keyframe, self.failure = keyframe, ""
-        self.keyframe_ns, self.ready_ns = self.clock.now_ns(), 0
-        if self.status is None or not self.status.refreshing:
-            self.shown = keyframe
+        self.ready_ns = 0
         self.diagnose("keyframe", OK, f"keyframe {keyframe.id} in use", id=keyframe.id)
         self.publish_status()
+        if isinstance(self.space, VirtualSpace) and self.config.space.source != "warp":
+            self.preparer.submit(Job("scene", outcome.job.message, made=made))
+        else:
+            self.preparing = False
 
     def on_drawn(self, outcome: Outcome) -> None:
         request, view = outcome.job.message, outcome.view
@@ -301,16 +370,21 @@ class NerfNode(Node[NerfConfig]):
         now = self.clock.now_ns()
         # Wall time would make a replay differ from run to run.
         self.render_ms = 0.0 if self.lockstep else outcome.elapsed_ms
+        self.turns.drew(self.render_ms)
         self.drawn_ns.append(now)
         expected = view.expected_psnr_db
         self.expected_psnr_db, self.unseen_share = 0.0 if math.isnan(expected) else expected, view.unseen_share
-        self.diagnose("view", OK, f"{request.width} x {request.height} in {self.render_ms:.0f} ms")
+        words = f"{request.width} x {request.height} in {self.render_ms:.0f} ms"
+        if view.unseen_share > NOTHING_SEEN:
+            self.diagnose("view", WARN, f"{words}: no keyframe has seen anything from that pose; is it far off?")
+        else:
+            self.diagnose("view", OK, words)
         image = compressed_image_message(outcome.jpeg, "map", now)
         self.view_out.publish(
             RenderedView(
                 header=header("map", now),
                 request_id=request.id,
-                keyframe_id=0 if self.shown is None else self.shown.id,
+                keyframe_id=0 if self.keyframe is None else self.keyframe.id,
                 pose=request.pose,
                 fov_rad=request.fov_rad,
                 width=request.width,
@@ -349,7 +423,7 @@ class NerfNode(Node[NerfConfig]):
         else:
             words = f"training, {self.status.psnr_db:.1f} dB" if self.status.iterations else "training"
         if self.status.refreshing:
-            return f"{words}; keyframe {self.keyframe.id} takes over soon"
+            words += f"; learning keyframe {self.keyframe.id}"
         share = space.picture.panorama_share(self.status.psnr_db)
         return f"{words}; shown: {share:.0%} warped panorama" if share > 0 else words
 
@@ -361,7 +435,7 @@ class NerfNode(Node[NerfConfig]):
         return (len(self.drawn_ns) - 1) * 1e9 / span if span > 0 else 0.0
 
     def publish_status(self) -> None:
-        now, status, keyframe = self.clock.now_ns(), self.status, self.shown
+        now, status, keyframe = self.clock.now_ns(), self.status, self.keyframe
         message = VspaceStatus(
             header=header("map", now),
             state=int(self.state()),
@@ -390,7 +464,7 @@ class NerfNode(Node[NerfConfig]):
             message.ready_radius_m = status.ready_radius_m
             message.psnr_db = status.psnr_db if status.iterations else 0.0
             message.train_seconds = (now - self.keyframe_ns) / 1e9
-            message.ready_seconds = self.shown_seconds if message.state == State.READY else 0.0
+            message.ready_seconds = self.ready_seconds if message.state == State.READY else 0.0
             message.iterations = status.iterations
             message.ms_per_iteration = 0.0 if self.lockstep else status.ms_per_iteration
         self.status_out.publish(message)

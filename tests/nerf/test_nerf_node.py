@@ -1,11 +1,13 @@
 """The node in lockstep: keyframe in, status and views out, bad keyframes refused."""
 
 import dataclasses
+import threading
 
 import cv2
 import numpy as np
 import pytest
 
+from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import (
@@ -17,7 +19,7 @@ from instant_ic.msg import (
     pose_message,
 )
 from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpaceConfig, box_room
-from instant_ic.nodes.nerf import NerfConfig, NerfNode
+from instant_ic.nodes.nerf import Job, NerfConfig, NerfNode, read_mask
 
 EMPTY, TRAINING, READY = 0, 1, 2
 S = 1_000_000_000
@@ -194,37 +196,122 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
     assert bus.last("/vspace/status").state == READY
 
 
-def test_a_new_keyframe_replaces_the_old_without_a_gap(bus):
+def test_a_new_keyframe_is_shown_at_once_and_learnt_behind(bus):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.advance(2.0)
-    before = bus.last("/vspace/status")
-    assert before.state == READY
+    assert bus.last("/vspace/status").state == READY
     bus.publish("/keyframe", keyframe_message(2), latched=True)
     status = bus.last("/vspace/status")
-    assert (status.state, status.keyframe_id, status.iterations) == (READY, 1, 0)
-    assert status.ready_seconds == before.ready_seconds
-    assert "keyframe 2" in status.message
-    bus.advance(1.3)
-    states = [(s.state, s.keyframe_id) for s in bus.messages("/vspace/status")]
-    after = states[states.index((READY, 1)) :]
-    assert after == sorted(after)  # ready all the time, the first keyframe and then the second
-    assert after[-1] == (READY, 2)
-    assert 0 < bus.last("/vspace/status").ready_seconds < 1.3
-
-
-def test_each_keyframe_is_learnt_however_fast_they_come(bus):
-    bus.publish("/keyframe", keyframe_message(1), latched=True)
-    for number in range(2, 6):
-        bus.advance(0.1)
-        bus.publish("/keyframe", keyframe_message(number), latched=True)
+    assert (status.state, status.keyframe_id) == (READY, 2)
+    assert status.ready_seconds == 0  # nothing takes time in lockstep: it came, and was shown
+    bus.advance(0.55)
+    assert bus.last("/vspace/status").iterations == 20  # a training run of its own
     bus.advance(3.0)
-    ids = [s.keyframe_id for s in bus.messages("/vspace/status") if s.state == READY]
-    # The first was learnt, then the newest of those that waited.
-    assert list(dict.fromkeys(ids)) == [1, 5]
+    assert all(s.state == READY for s in bus.messages("/vspace/status") if s.keyframe_id == 2)
+    assert "idle" in bus.last("/vspace/status").message
+    bus.publish("/view/request", request_message(5))
+    assert bus.last("/vspace/view").keyframe_id == 2
+
+
+def test_the_newest_of_those_that_wait_is_taken(bus):
+    node = bus.node
+    node.preparing = True  # as while a thread prepares one
+    for number in (1, 2, 3):
+        bus.publish("/keyframe", keyframe_message(number), latched=True)
+    node.preparing = False
+    node.next_job()
+    bus.publish("/keyframe", keyframe_message(4, fit=False), latched=True)
+    assert next(s.keyframe_id for s in bus.messages("/vspace/status") if s.keyframe_id) == 3
+    assert bus.last("/vspace/status").keyframe_id == 3
+
+
+def test_a_pose_far_off_is_drawn_without_confidence_and_told(bus):
+    bus.publish("/keyframe", keyframe_message(1), latched=True)
+    bus.publish("/view/request", request_message(1))
+    bus.advance(0.6)
+    near = bus.last("/vspace/status")
+    assert near.unseen_share < 0.05
+    assert near.expected_psnr_db > 20
+    bus.publish("/view/request", request_message(2, pose=pose_matrix(x=300.0, yaw=2.0)))
+    level, words, _ = diagnosis(bus, "view")
+    assert (level, "far off" in words) == (1, True)
+    view = bus.last("/vspace/view")
+    assert (view.request_id, view.confidence) == (2, 0)
+    bus.advance(0.6)
+    far = bus.last("/vspace/status")
+    assert far.unseen_share == 1
+    assert far.expected_psnr_db < near.expected_psnr_db - 5
+    bus.publish("/view/request", request_message(3))
+    assert diagnosis(bus, "view")[0] == 0
+
+
+def test_a_keyframe_of_another_size_takes_over(bus):
+    bus.publish("/keyframe", keyframe_message(1), latched=True)
+    bus.advance(2.0)
+    picture = box_room.panorama(CAMERA, 96)
+    other = dataclasses.replace(
+        keyframe_message(2, depth=picture.depth_m[::2, ::2]),
+        panorama=compressed_image_message(cv2.imencode(".jpg", picture.rgb[..., ::-1])[1].tobytes(), "camera", 7 * S),
+    )
+    bus.publish("/keyframe", other, latched=True)
+    bus.advance(2.0)
+    assert bus.last("/vspace/status").keyframe_id == 2
+    bus.publish("/view/request", request_message(3))
+    assert bus.last("/vspace/view").confidence > 0.9
+
+
+def test_the_robots_mask(tmp_path):
+    mask = np.zeros((32, 64), np.uint8)
+    mask[20:, 10:20] = 255
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    with LockstepBus(start_ns=10 * S) as bus:
+        node = bus.add(NerfNode, NerfConfig(space=SPACE, robot_mask=str(tmp_path / "mask.png")))
+        bus.publish("/keyframe", keyframe_message(1), latched=True)
+        assert node.space.keyframe.usable.mean() == pytest.approx(1 - 12 * 10 / (32 * 64))
+    for content, words in ((None, "no such file"), (np.zeros((32, 32), np.uint8), "twice as wide")):
+        path = tmp_path / "bad.png"
+        if content is not None:
+            cv2.imwrite(str(path), content)
+        with pytest.raises(NodeError, match=words):
+            read_mask(str(path))
+
+
+def test_pictures_go_on_while_a_keyframe_is_prepared():
+    """In real threads: a keyframe whose preparation is stuck holds up no picture."""
+    with LockstepBus(start_ns=10 * S) as bus:
+        node = bus.add(NerfNode, NerfConfig(space=SPACE))
+        bus.publish("/keyframe", keyframe_message(1), latched=True)
+        go_on, results = threading.Event(), []
+        whole = node.space.prepare
+
+        def slow(*arguments):
+            assert go_on.wait(30)
+            return whole(*arguments)
+
+        node.space.prepare = slow
+        thread = threading.Thread(target=lambda: results.append(node.work(Job("keyframe", (keyframe_message(2), 0)))))
+        thread.start()
+        for number in (1, 2, 3):
+            bus.publish("/view/request", request_message(number))
+        bus.advance(0.5)  # and training goes on
+        assert [view.request_id for view in bus.messages("/vspace/view")] == [1, 2, 3]
+        assert bus.last("/vspace/status").iterations > 0
+        go_on.set()
+        thread.join(30)
+        assert results[0].error is None
+        node.space.show(results[0].made)
+        bus.publish("/view/request", request_message(4))
+        assert bus.last("/vspace/view").request_id == 4
 
 
 @pytest.mark.parametrize(
-    "request_", [request_message(3, 4000, 4000), request_message(3, fov=3.5), request_message(3, 4, 4)]
+    "request_",
+    [
+        request_message(3, 4000, 4000),
+        request_message(3, fov=3.5),
+        request_message(3, 4, 4),
+        request_message(3, pose=np.diag([1.0, 1, 1, 1]) + np.array([[0, 0, 0, np.nan]] + [[0] * 4] * 3)),
+    ],
 )
 def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
@@ -236,7 +323,14 @@ def test_a_request_that_cannot_be_drawn_is_told(bus, request_):
 
 
 @pytest.mark.parametrize(
-    "values", [{"train_slice_ms": 0}, {"jpeg_quality": 101}, {"lockstep_iterations": -1}, {"train_nice": 20}]
+    "values",
+    [
+        {"render_fps": 0},
+        {"train_ms_per_frame": -1},
+        {"jpeg_quality": 101},
+        {"lockstep_iterations": -1},
+        {"train_nice": 20},
+    ],
 )
 def test_parameters_are_checked(values):
     with pytest.raises(ValueError, match=next(iter(values))):
