@@ -38,6 +38,7 @@ MAX_CLIENT_MESSAGE = 4096
 MAX_BAD_MESSAGES = 20
 MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
+OWN_S = 1.5
 START_TIMEOUT_S = 10.0
 SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' blob: data:; form-action 'self'; "
@@ -121,6 +122,8 @@ class ConsoleServer:
         self._next_number = 1
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}
+        self._looks: dict[int, Look] = {}
+        self._own: dict[tuple[int, FrameKind], float] = {}  # when a client last got a frame of its own
         self._foreground = frozenset({FrameKind.PANORAMA})
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
@@ -179,9 +182,23 @@ class ConsoleServer:
         text = json.dumps({"type": kind, **message}, separators=(",", ":"), allow_nan=False)
         self._call(self._publish, kind, text)
 
-    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes) -> None:
-        """Sends a picture or map to every client; only the newest of a kind waits."""
-        self._call(self._send_frame, kind, PendingFrame(header, payload))
+    def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        """Sends a picture or map to every client; only the newest of a kind waits.
+
+        Args:
+            kind: what it is.
+            header: of the frame, JSON.
+            payload: the picture.
+            client: send it to this one alone, which for ``OWN_S`` then gets none of the others' of this kind.
+        """
+        self._call(self._send_frame, kind, PendingFrame(header, payload), client)
+
+    def watching(self) -> dict[int, Look]:
+        """Where those look who do not drive, by client; empty while nobody drives."""
+        driver = self.gate.driver
+        return (
+            {} if driver is None else {number: look for number, look in self._looks.copy().items() if number != driver}
+        )
 
     def show(self, *kinds: FrameKind) -> None:
         """Says which of PANORAMA and VIEW the page shows, or soon will; what is not named is sent rarely."""
@@ -353,6 +370,8 @@ class ConsoleServer:
                 await sender
             self.gate.forget(session.number, time.monotonic())
             del self._sessions[session.number]
+            self._looks.pop(session.number, None)
+            self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
             self._emit_due()
             self._tell_session()
         return socket
@@ -477,7 +496,8 @@ class ConsoleServer:
             hfov=number(message, "hfov", 0.01, MAX_FOV_RAD),
             vfov=number(message, "vfov", 0.01, MAX_FOV_RAD),
         )
-        # The renderer has one camera: it looks where the driver looks, or the only one who watches.
+        self._looks[session.number] = look
+        # The renderer looks where the driver looks, or the only one who watches; elsewhere where it has time.
         if self.gate.driver in (session.number, None):
             self.backend.on_look(look)
 
@@ -549,10 +569,17 @@ class ConsoleServer:
         for session in self._sessions.values():
             session.put_text(kind, text)
 
-    def _send_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
+    def _send_frame(self, kind: FrameKind, frame: PendingFrame, client: int | None = None) -> None:
+        now = time.monotonic()
+        if client is not None:
+            if client in self._sessions:
+                self._own[client, kind] = now
+                self._sessions[client].put_frame(kind, frame)
+            return
         self._frames[kind] = frame
         for session in self._sessions.values():
-            session.put_frame(kind, frame)
+            if now - self._own.get((session.number, kind), -OWN_S) >= OWN_S:
+                session.put_frame(kind, frame)
 
     def _show(self, kinds: frozenset[FrameKind]) -> None:
         if kinds == self._foreground:

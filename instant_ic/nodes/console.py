@@ -96,6 +96,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.battery = self.latest("/battery", BatteryState, max_age_s=5.0)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_panorama, qos=SENSOR)
         self.subscribe("/vspace/view", RenderedView, self.on_view, qos=SENSOR)
+        self.subscribe("/vbot/odom", Odometry, self.on_vbot, qos=SENSOR)
         self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
         self.subscribe("/costmap", OccupancyGrid, self.on_costmap, qos=SENSOR)
         self.subscribe("/diagnostics", DiagnosticArray, self.on_diagnostics, qos=RELIABLE)
@@ -106,6 +107,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self._picture_ns: int | None = None
         self._picture_stamp = 0
         self._view = (0, 0, pose_message(np.eye(4)), 0.0)  # newest: request, when it came, its pose, its delay in s
+        self._told_ns = 0
+        self._wanted: tuple[Matrix, Look] | None = None  # what the last view was asked for
         self._asked = (0, 0)  # the last request: its number, when it went out
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
@@ -132,7 +135,7 @@ class ConsoleNode(Node[ConsoleConfig]):
             self.log.info("open %s in a browser", self.server.sign_in_url)
         if self.server.access.unguarded:
             self.log.warning("everybody on the network may drive: server.access.sign_in is never")
-        self.timer(1.0 / config.state_rate_hz, self.send_state)
+        self.timer(1.0 / config.state_rate_hz, self.tell_state)
         self.timer(0.2, self.send_plan)
         self.timer(1.0, self.send_health)
         self.timer(1.0 / config.map_rate_hz, self.send_grids)
@@ -219,12 +222,14 @@ class ConsoleNode(Node[ConsoleConfig]):
         if not (0 < message.fov_rad < math.pi):
             self.diagnose("view", ERROR, f"rendered view with a field of view of {message.fov_rad:.3g} rad: dropped")
             return
-        self.views.answered(int(message.request_id))
         came_ns = self.clock.steady_ns()
-        number, asked_ns = self._asked
-        delay_s = (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
-        self._view = int(message.request_id), came_ns, message.pose, delay_s
-        self.tell_shown()
+        self.views.answered(int(message.request_id), came_ns / 1e9)
+        page = self.views.page_of(int(message.request_id))
+        if page is None:
+            number, asked_ns = self._asked
+            delay_s = (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
+            self._view = int(message.request_id), came_ns, message.pose, delay_s
+            self.tell_shown()
         self.server.send_frame(
             FrameKind.VIEW,
             {
@@ -238,27 +243,46 @@ class ConsoleNode(Node[ConsoleConfig]):
                 "request_id": int(message.request_id),
             },
             bytes(message.image.data),
+            client=page,
         )
         self.request_view()
 
     def request_view(self) -> None:
-        """Asks the virtual space for the picture where the operator looks, if one is due."""
-        now, steady_s = self.clock.now_ns(), self.clock.steady_ns() / 1e9
+        """Asks the virtual space for the picture where the operator looks, if one is due; else where others do."""
+        steady_s = self.clock.steady_ns() / 1e9
         virtual = self.with_vbot()
-        if not self.views.due(steady_s, virtual=virtual) or not (virtual or self.vspace_alive()):
+        if not (virtual or self.vspace_alive()):
             return
         map_from_base = self.vbot_pose() if virtual else self.robot_pose()
         if map_from_base is None:
             return
-        look = self.look
+        wanted = map_from_base, self.look
+        moves = (
+            self._wanted is None
+            or wanted[1] != self._wanted[1]
+            or not np.allclose(wanted[0], self._wanted[0], atol=1e-4)
+        )
+        if self.views.due(steady_s, virtual=virtual, moves=moves):
+            self._wanted = wanted
+            self.ask_for_view(map_from_base, self.look, None)
+        elif self.shown == "virtual":
+            looks = self.server.watching()
+            page = self.views.watcher(steady_s, self.look, looks)
+            if page is not None:
+                self.ask_for_view(map_from_base, looks[page], page)
+
+    def ask_for_view(self, map_from_base: Matrix, look: Look, page: int | None) -> None:
+        """Asks for one view, of the driver's look or of a watching page's."""
         # The look direction is relative to the robot's heading, so of the mount only the place counts.
         map_from_camera = map_from_base @ self.camera_place() @ look.rotation()
         shape = view_shape(look, self.config.view)
-        number = self.views.asked(steady_s)
-        self._asked = number, self.clock.steady_ns()
+        steady_ns = self.clock.steady_ns()
+        number = self.views.asked(steady_ns / 1e9, page)
+        if page is None:
+            self._asked = number, steady_ns
         self.request_out.publish(
             ViewRequest(
-                header=header("map", now),
+                header=header("map", self.clock.now_ns()),
                 id=number,
                 pose=pose_message(map_from_camera),
                 fov_rad=shape.fov_rad,
@@ -294,8 +318,19 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     # ---- state ----------------------------------------------------------------------------------
 
+    def on_vbot(self, message: Odometry) -> None:
+        """Shows a step of the v-bot at once: the next timer would be half a period off."""
+        if self.with_vbot():
+            self.send_state()
+
+    def tell_state(self) -> None:
+        """Tells the state in time where the v-bot has not done so already."""
+        if self.clock.steady_ns() - self._told_ns > 0.6e9 / self.config.state_rate_hz:
+            self.send_state()
+
     def send_state(self) -> None:
         """Tells the page mode, poses and commands; asks for views at the rate of the mode."""
+        self._told_ns = self.clock.steady_ns()
         control = self.control.message
         self.mode = "none" if control is None else MODES.get(int(control.mode), "none")
         virtual = control is not None and int(control.shown) == ControlState.SHOWN_VIRTUAL

@@ -1,5 +1,6 @@
 """The console node in lockstep: what goes to the page, and what comes from it to the bus."""
 
+import base64
 import math
 
 import numpy as np
@@ -40,6 +41,7 @@ class FakeServer:
     def __init__(self, clock):
         self.clock = clock
         self.texts, self.frames, self.shown = {}, [], None
+        self.clients, self.watchers = [], {}
 
     def now_ms(self):
         return self.clock.now_ns() / 1e6 + 5000.0
@@ -47,8 +49,12 @@ class FakeServer:
     def publish(self, kind, message):
         self.texts[kind] = message
 
-    def send_frame(self, kind, header, payload):
+    def send_frame(self, kind, header, payload, client=None):
         self.frames.append((kind, header, payload))
+        self.clients.append(client)
+
+    def watching(self):
+        return self.watchers
 
     def show(self, *kinds):
         self.shown = kinds
@@ -205,10 +211,12 @@ def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup)
     bus, _, server = setup
     publish_tree(bus)
 
-    def ask(seconds, answer):
+    def ask(seconds, answer, speed=0.0):
         before = len(bus.messages("/view/request"))
-        for _ in range(round(seconds / 0.05)):
+        for step in range(round(seconds / 0.05)):
             bus.publish("/ic/state", control(bus, ControlState.VIRTUAL), latched=True)
+            pose = pose_matrix(x=0.05 * step * speed)
+            bus.publish("/vbot/odom", odometry_message(pose, speed, 0.0, "map", "vbot", bus.clock.now_ns()))
             bus.advance(0.05)
             if answer:
                 bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
@@ -216,12 +224,66 @@ def test_only_one_request_is_outstanding_and_the_rate_follows_the_answers(setup)
 
     assert ask(1.0, answer=False) in (2, 3)  # one each 0.5 s, by the time-out
     ask(0.6, answer=True)
-    assert ask(1.0, answer=True) in (9, 10, 11)
+    assert ask(1.0, answer=True) in (4, 5, 6)  # nothing moves
+    assert ask(1.0, answer=True, speed=0.3) in (9, 10, 11)
     _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
     assert payload == b"VIEW"
     assert frame_header["fov"] == pytest.approx(1.8)
     assert frame_header["render_ms"] is None
     assert frame_header["p"] == pytest.approx([1, 2, 1.5])
+
+
+def virtual_state(bus, **values):
+    return control(bus, ControlState.VIRTUAL, **({"shown": ControlState.SHOWN_VIRTUAL} | values))
+
+
+def test_a_step_of_the_vbot_is_shown_and_its_view_asked_for_at_once(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    for _ in range(6):  # it stands; every request is answered
+        bus.publish("/ic/state", virtual_state(bus), latched=True)
+        bus.publish("/vbot/odom", odometry_message(pose_matrix(), 0.0, 0.0, "map", "vbot", bus.clock.now_ns()))
+        bus.advance(0.05)
+        if bus.messages("/view/request"):
+            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
+    bus.advance(0.01)  # between two timers
+    asked = len(bus.messages("/view/request"))
+    bus.publish("/vbot/odom", odometry_message(pose_matrix(x=0.01), 0.2, 0.1, "map", "vbot", bus.clock.now_ns()))
+    assert len(bus.messages("/view/request")) == asked + 1
+    assert matrix_of(bus.last("/view/request").pose)[0, 3] == pytest.approx(0.01)
+    assert server.texts["state"]["vbot"][0] == pytest.approx(0.01)
+    assert server.texts["state"]["twist"] == pytest.approx([0.2, 0.1])
+
+
+def test_a_watchers_view_goes_to_him_alone_and_is_not_told_to_the_arbiter(setup):
+    bus, _, server = setup
+    publish_tree(bus)
+    server.watchers = {7: Look(yaw=1.5), 8: Look(yaw=0.1)}
+    answered = 0
+    for _ in range(40):
+        bus.publish("/ic/state", virtual_state(bus), latched=True)
+        bus.publish("/vbot/odom", odometry_message(pose_matrix(), 0.0, 0.0, "map", "vbot", bus.clock.now_ns()))
+        bus.advance(0.05)
+        if len(bus.messages("/view/request")) > answered:
+            answered += 1
+            bus.publish("/vspace/view", view_message(bus, bus.last("/view/request").id))
+    views = [
+        client for (kind, _, _), client in zip(server.frames, server.clients, strict=True) if kind is FrameKind.VIEW
+    ]
+    assert views.count(7) in (3, 4, 5)  # 2 Hz for 2 s
+    assert views.count(8) == 0  # has enough of the driver's
+    assert views.count(None) >= 8
+    mine = [r for r in bus.messages("/view/request") if matrix_of(r.pose)[1, 0] > 0.9]  # looks left
+    assert len(mine) in (views.count(7), views.count(7) + 1)
+    told = {int(message.view_id) for message in bus.messages("/view/shown")}
+    assert not told & {int(request.id) for request in mine}
+
+
+def test_the_mask_of_a_view_goes_to_the_page(setup):
+    bus, _, server = setup
+    bus.publish("/vspace/view", view_message(bus, 1))
+    _, frame_header, _ = next(f for f in server.frames if f[0] is FrameKind.VIEW)
+    assert base64.b64decode(frame_header["mask"]) == b"MASK"
 
 
 @pytest.mark.parametrize(("vspace", "counts"), [(VspaceStatus.TRAINING, (3, 4)), (VspaceStatus.EMPTY, (0,))])

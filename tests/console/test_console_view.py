@@ -55,6 +55,51 @@ def test_one_request_outstanding_and_the_rate_of_the_mode():
     assert views.due(1.0, virtual=False)
 
 
+def test_what_moves_after_a_rest_is_asked_for_at_once():
+    views = ViewScheduler(ViewConfig(virtual_rate_hz=10, still_rate_hz=5))
+    assert views.due(0.0, virtual=True, moves=False)
+    views.answered(views.asked(0.0))
+    assert not views.due(0.12, virtual=True, moves=False)  # 5 Hz
+    assert views.due(0.03, virtual=True, moves=True)
+    views.answered(views.asked(0.03))
+    assert not views.due(0.10, virtual=True, moves=True)  # then 10 Hz
+    assert views.due(0.13, virtual=True, moves=True)
+
+
+def test_watchers_are_served_in_turn_where_the_driver_does_not_wait_for_it():
+    views = ViewScheduler(ViewConfig(virtual_rate_hz=10, watcher_rate_hz=2))
+    driver, watchers = Look(), {1: Look(yaw=1.0), 2: Look(pitch=-0.6), 3: Look(yaw=0.2)}
+
+    def one_for_the_driver(at, takes):
+        assert views.due(at, virtual=True)
+        views.answered(views.asked(at), at + takes)
+
+    one_for_the_driver(0.0, takes=0.07)
+    assert views.watcher(0.07, driver, watchers) is None  # ready at 0.14: the driver's next is due at 0.1
+    one_for_the_driver(0.1, takes=0.03)
+    first = views.watcher(0.13, driver, watchers)
+    number = views.asked(0.13, first)
+    assert views.watcher(0.14, driver, watchers) is None and not views.due(0.2, virtual=True)  # one outstanding
+    assert views.answered(number, 0.16)
+    assert views.page_of(number) == first
+    one_for_the_driver(0.2, takes=0.03)
+    second = views.watcher(0.23, driver, watchers)
+    assert {first, second} == {1, 2}  # 3 looks where the driver looks
+    views.answered(views.asked(0.23, second), 0.26)
+    one_for_the_driver(0.3, takes=0.03)
+    assert views.watcher(0.33, driver, watchers) is None  # each has had one within half a second
+    assert views.watcher(0.33, driver, {}) is None
+    one_for_the_driver(0.7, takes=0.03)
+    assert views.watcher(0.73, driver, watchers) == first
+    assert views.page_of(99) is None
+
+
+def test_lines_of_sight_apart():
+    assert Look(yaw=0.3).apart(Look(yaw=-0.2)) == pytest.approx(0.5)
+    assert Look(yaw=3.0).apart(Look(yaw=-3.0)) == pytest.approx(2 * math.pi - 6.0)
+    assert Look(pitch=0.4).apart(Look(pitch=0.4)) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_answer_that_never_comes_does_not_stop_the_requests():
     views = ViewScheduler(ViewConfig(response_timeout_s=0.5))
     views.asked(0.0)
