@@ -186,6 +186,13 @@ class Demo:
         with self._placing:
             self.robot, self.vbot = np.array([x, y, yaw]), np.array([x, y, yaw])
 
+    def reset(self) -> None:
+        """As at the start, but that the robot stays in the mode REAL; for tests that share a demo."""
+        self.forced_mode, self.faults, self.pictures = "real", [], True
+        self.recorder.missing, self.recorder.error, self.recorder.state = False, "", "idle"
+        self.place(0.0, 0.0, 0.0)
+        self.commands.clear()
+
     def step(self, seconds: float) -> None:
         """Moves both robots on."""
         with self._placing:

@@ -1,7 +1,18 @@
 """Chromium, the robot that the pages drive, and pages in which nothing may go wrong."""
 
 import pytest
-from console_pages import CHROMIUM, FLAGS, PAD, SIZE, WAIT_MS, expect_body, make_demo, watched_page
+from console_pages import (
+    CHROMIUM,
+    FLAGS,
+    KEEP_SOCKETS,
+    PAD,
+    SIZE,
+    WAIT_MS,
+    expect_body,
+    make_demo,
+    release_by_enter,
+    watched_page,
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,3 +68,46 @@ def pad_page(open_page):
     page.evaluate(f"() => {{ {PAD} }}")
     page.bring_to_front()
     return page
+
+
+@pytest.fixture(scope="module")
+def shared_demo():
+    demo = make_demo()
+    yield demo
+    demo.stop()
+
+
+@pytest.fixture(scope="module")
+def shared_page(browser, shared_demo):
+    context = browser.new_context(viewport=SIZE, accept_downloads=True)
+    context.set_default_timeout(WAIT_MS)
+    context.add_init_script(KEEP_SOCKETS)
+    page = watched_page(context)
+    page.goto(shared_demo.server.url)
+    yield page
+    context.close()
+
+
+@pytest.fixture
+def driver(shared_page, shared_demo):
+    """The driver's page, one for all tests of a module: a new one each would be most of their time."""
+    shared_demo.reset()
+    expect_body(shared_page, "driver", "you")
+    yield shared_page
+    for key in ("w", "a", "s", "d"):
+        shared_page.keyboard.up(key)
+    shared_page.evaluate("delete document.hidden; document.activeElement.blur()")
+    if shared_demo.estop:
+        release_by_enter(shared_page, shared_demo)
+    faults, shared_page.faults = shared_page.faults, []
+    assert not faults
+
+
+@pytest.fixture
+def pad(driver):
+    """The driver's page with a gamepad, which leaves afterwards."""
+    driver.evaluate(f"() => {{ {PAD} }}")
+    driver.bring_to_front()
+    yield driver
+    driver.evaluate("pad.connected = false")
+    expect_body(driver, "pad", "none")

@@ -144,6 +144,13 @@ def touch(page, kind, x, y):
     )
 
 
+# For tests that cut a page's link: the sockets that it has opened.
+KEEP_SOCKETS = """
+    window.sockets = [];
+    window.WebSocket = class extends WebSocket {
+        constructor(...given) { super(...given); window.sockets.push(this); }
+    };
+"""
 PAD = """
     const buttons = Array.from({length: 17}, () => ({pressed: false, value: 0}));
     window.pad = {index: 0, id: 'Pad', mapping: 'standard', connected: true, axes: [0, 0, 0, 0], buttons};

@@ -141,7 +141,7 @@ def test_wrong_parameters_are_refused(wrong, words):
         AccessConfig(**wrong)
 
 
-def test_without_a_token_nothing_but_the_form_comes_out(serve, files):
+def test_fault_no_authentication(serve, files):
     server = serve(**files)
 
     async def scenario():

@@ -7,22 +7,15 @@ import numpy as np
 import pytest
 from console_pages import (
     BROWSER_TEST,
-    RB,
     SIZE,
     WAIT_MS,
-    B,
     expect_body,
-    hold_and_push,
     likeness,
     make_demo,
     moving,
     picture_of,
-    release_by_enter,
     room_seen,
-    start_driving,
-    touch,
     wait_alike,
-    wait_stopped,
     wait_until,
 )
 
@@ -52,113 +45,6 @@ def test_page_draws_picture_and_map_without_errors(open_page, demo, query, viewe
     obstacle, floor = shot[330:350, 470:490].mean(axis=(0, 1)), shot[390:410, 320:340].mean(axis=(0, 1))
     assert np.ptp(obstacle) < 25
     assert floor[0] > floor[2] + 10
-
-
-def test_key_drives_while_held_and_stops_on_key_up(open_page, demo):
-    page = open_page()
-    start_driving(page, demo)
-    assert demo.commands[-1] == pytest.approx((0.28, 0.0))  # 70 % of 0.4 m/s
-    page.keyboard.down("a")
-    wait_until(lambda: demo.commands[-1][1] > 0, page, "turns left")
-    page.keyboard.up("a")
-    wait_until(lambda: demo.commands[-1] == pytest.approx((0.28, 0.0)), page, "straight on")
-    page.keyboard.up("w")
-    wait_stopped(page, demo)
-    page.keyboard.press("Minus")
-    start_driving(page, demo, "ArrowDown")
-    assert demo.commands[-1][0] == pytest.approx(-0.24)  # 60 %
-    page.keyboard.up("ArrowDown")
-    wait_stopped(page, demo)
-
-
-@pytest.mark.parametrize(
-    "event",
-    [
-        "window.dispatchEvent(new Event('blur'))",
-        "Object.defineProperty(document, 'hidden', {get: () => true});"
-        "document.dispatchEvent(new Event('visibilitychange'))",
-        "window.dispatchEvent(new PageTransitionEvent('pagehide'))",
-        "window.dispatchEvent(new KeyboardEvent('keydown', {code: 'KeyW', metaKey: true}))",
-    ],
-    ids=["blur", "hidden", "pagehide", "system key"],
-)
-def test_key_held_while_the_window_loses_focus_stops_the_robot(open_page, demo, event):
-    page = open_page()
-    start_driving(page, demo)
-    page.evaluate(event)
-    wait_stopped(page, demo)  # although the key is still down
-
-
-def test_closed_page_stops_the_robot(open_page, demo):
-    page, other = open_page(), open_page(driver="other")
-    start_driving(page, demo)
-    page.close()
-    wait_stopped(other, demo)
-
-
-def test_lost_link_is_told_and_does_not_drive_on_when_it_comes_back(open_page, demo):
-    page = open_page()
-    start_driving(page, demo)
-    port = demo.server.port
-    demo.stop()
-    assert demo.commands[-1] == (0.0, 0.0)
-    expect_body(page, "link", "lost")
-    assert page.locator("#banner-title").inner_text() == "LINK LOST"
-    again = make_demo(port)
-    try:
-        expect_body(page, "link", "up")
-        expect_body(page, "driver", "you")
-        page.wait_for_timeout(200)
-        assert not moving(again)  # the key is still down, but must be pressed anew
-        page.keyboard.up("w")
-        start_driving(page, again)
-        page.keyboard.up("w")
-        wait_stopped(page, again)
-    finally:
-        again.stop()
-    page.faults.clear()  # the browser reports the refused connections
-
-
-def test_emergency_stop_by_space_and_release_by_holding(open_page, demo):
-    page = open_page()
-    start_driving(page, demo)
-    page.keyboard.press("Space")
-    wait_stopped(page, demo)
-    assert demo.estop
-    expect_body(page, "estop", "set")
-    expect_body(page, "mode", "stopped")
-    page.keyboard.up("w")
-    page.keyboard.down("w")
-    page.wait_for_timeout(200)
-    assert not moving(demo)
-    page.keyboard.up("w")
-    page.locator("#release").click()  # a tap is not enough
-    page.wait_for_timeout(200)
-    assert demo.estop
-    box = page.locator("#release").bounding_box()
-    page.mouse.move(box["x"] + 20, box["y"] + 10)
-    page.mouse.down()
-    expect_body(page, "estop", "free")
-    page.mouse.up()
-    assert not demo.estop
-
-
-def test_watcher_stops_by_the_button_and_takes_over(open_page, demo):
-    page, other = open_page(), open_page(driver="other")
-    start_driving(page, demo)
-    other.keyboard.down("s")
-    other.wait_for_timeout(100)
-    assert demo.commands[-1][0] > 0  # a watcher's keys do nothing
-    other.keyboard.up("s")
-    other.locator("#take").click()
-    expect_body(other, "driver", "you")
-    expect_body(page, "driver", "other")
-    wait_stopped(page, demo)
-    page.locator("#estop").click()
-    expect_body(other, "estop", "set")
-    assert demo.estop
-    assert page.locator("#release").is_hidden()
-    assert other.locator("#release").is_visible()
 
 
 def test_passage_to_the_rendered_view_and_back(open_page, demo):
@@ -237,34 +123,6 @@ def test_old_panorama_is_aimed_anew_when_the_robot_turns(open_page, sharp_demo):
     wait_alike(page, lambda: room_seen(demo.robot, 0.0, math.radians(-10)))
 
 
-@pytest.mark.parametrize("end", ["pointerup", "pointercancel"])
-def test_phone_fits_and_its_stick_drives_until_it_is_let_go(open_page, demo, end):
-    page = open_page(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
-    for name in ("#mode", "#link", "#map", "#panel", "#stick", "#estop"):
-        box = page.locator(name).bounding_box()
-        assert box["x"] >= 0 and box["y"] >= 0, name
-        assert box["x"] + box["width"] <= 390 and box["y"] + box["height"] <= 844, name
-    box = page.locator("#stick").bounding_box()
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    touch(page, "pointerdown", x, y)
-    touch(page, "pointermove", x, y - 60)
-    wait_until(lambda: moving(demo), page, "the stick drives")
-    assert demo.commands[-1] == pytest.approx((0.28, 0.0), abs=0.03)
-    touch(page, end, x, y - 60)
-    wait_stopped(page, demo)
-
-
-def test_faults_and_silence_are_told(open_page, demo):
-    page = open_page()
-    expect_body(page, "picture", "live")
-    text = "<img src=x onerror=alert(1)> no packets"
-    demo.faults = [{"level": "error", "name": "vlp16_driver", "text": text}]
-    page.locator("#faults li").wait_for()
-    assert page.locator("#faults li").inner_text() == f"vlp16_driver {text}"  # as text, not as HTML
-    demo.pictures = False
-    expect_body(page, "picture", "stale")
-
-
 def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(browser, tmp_path):
     files = {}
     for role in ("token_file", "watch_token_file"):
@@ -297,39 +155,3 @@ def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(brow
             context.close()
     finally:
         demo.stop()
-
-
-def test_gamepad_drives_only_while_its_shoulder_button_is_held(pad_page, demo):
-    pad_page.evaluate("plug('standard'); pad.axes = [0, -1, 0, 0]")
-    expect_body(pad_page, "pad", "ready")
-    pad_page.wait_for_timeout(200)
-    assert not moving(demo)
-    pad_page.evaluate(f"press({RB}, true)")
-    wait_until(lambda: moving(demo), pad_page, "the gamepad drives")
-    assert demo.commands[-1] == pytest.approx((0.28, 0.0), abs=1e-6)  # 70 % of 0.4 m/s
-    pad_page.evaluate(f"press({RB}, false)")
-    wait_stopped(pad_page, demo)
-
-
-@pytest.mark.parametrize(
-    "loss", ["pad.connected = false", "window.dispatchEvent(new Event('blur'))", f"press({B}, true)"]
-)
-def test_gamepad_lost_blurred_or_stopped_ends_the_drive_until_it_is_pressed_anew(pad_page, demo, loss):
-    hold_and_push(pad_page)
-    wait_until(lambda: moving(demo), pad_page, "the gamepad drives")
-    pad_page.evaluate(loss)
-    wait_stopped(pad_page, demo)
-    assert demo.estop == (loss == f"press({B}, true)")
-    if demo.estop:  # released with the shoulder button still held: nothing moves
-        release_by_enter(pad_page, demo)
-        expect_body(pad_page, "pad", "ready")
-        pad_page.wait_for_timeout(200)
-        assert not moving(demo)
-
-
-def test_gamepads_right_stick_looks_and_an_unknown_layout_is_told(pad_page, demo):
-    pad_page.evaluate("plug('')")
-    pad_page.get_by_text("the browser does not know this gamepad's layout").wait_for()
-    pad_page.evaluate("plug('standard'); pad.axes = [0, 0, 1, 0]")
-    wait_until(lambda: demo.look.yaw < -0.2, pad_page, "the look turns right")
-    assert not moving(demo)

@@ -34,7 +34,7 @@ def test_commands_are_given_on_at_the_rate_and_a_change_at_once():
     assert gate.take_due(0.08) == (0.3, -0.2)  # 1/20 s after the last
 
 
-def test_lost_link_stops_the_robot_by_the_watchdog():
+def test_fault_robot_runs_its_last_command_after_the_link_is_lost():
     """Robot runs its last command after the link is lost: zero 0.25 s after the last command."""
     given = run(driving_gate(), 0.01, 1.0)
     first_zero = next(time for time, command in given if command == (0.0, 0.0))
@@ -52,7 +52,7 @@ def test_watchdog_counts_and_lets_a_fresh_command_through():
     assert gate.take_due(0.6) == (0.2, 0.0)
 
 
-def test_dead_man_release_sends_a_zero_at_once():
+def test_fault_dead_man_release_sends_no_zero():
     gate = driving_gate()
     gate.receive(1, 2, 0.0, 0.0, 0.0, 0.01)
     assert gate.take_due(0.01) == (0.0, 0.0)
@@ -69,7 +69,7 @@ def test_one_zero_goes_out_even_without_repetition():
     assert run(gate, 0.03, 0.5) == []
 
 
-def test_idle_zeros_of_a_watcher_do_not_fight_the_drivers_commands():
+def test_fault_idle_zeros_of_one_client_fight_anothers_commands():
     gate = driving_gate()
     assert gate.receive(2, 1, 0.0, 0.0, 0.0, 0.01) is Verdict.NOT_DRIVER
     assert gate.command == (0.3, 0.1)
@@ -130,7 +130,7 @@ def test_take_over_stops_the_robot_and_the_old_driver_no_longer_counts():
     assert gate.receive(1, 2, 0.0, 0.3, 0.0, 0.03) is Verdict.NOT_DRIVER
 
 
-def test_closed_socket_stops_the_robot_and_frees_the_lease():
+def test_fault_socket_close_leaves_the_throttle():
     gate = driving_gate()
     gate.forget(1, 0.01)
     assert gate.take_due(0.01) == (0.0, 0.0)
@@ -138,7 +138,7 @@ def test_closed_socket_stops_the_robot_and_frees_the_lease():
     assert gate.request(2, 0.02)
 
 
-def test_silent_driver_loses_the_lease_and_a_living_one_keeps_it():
+def test_fault_silent_driver_keeps_the_lease():
     gate = driving_gate()
     gate.touch(1, 1.5)
     run(gate, 1.6, 3.4, step=0.01)
@@ -147,7 +147,7 @@ def test_silent_driver_loses_the_lease_and_a_living_one_keeps_it():
     assert gate.driver is None
 
 
-def test_old_future_and_out_of_order_commands_are_dropped():
+def test_fault_old_future_and_out_of_order_commands_are_obeyed():
     gate = driving_gate()
     assert gate.receive(1, 2, 0.31, 0.4, 0.0, 0.01) is Verdict.OLD
     assert gate.receive(1, 2, -0.31, 0.4, 0.0, 0.01) is Verdict.OLD

@@ -97,7 +97,7 @@ def test_page_and_modules_are_served_with_a_content_policy(serve):
     asyncio.run(scenario())
 
 
-def test_first_client_drives_and_others_watch_until_they_take_over(serve):
+def test_fault_any_client_drives(serve):
     server, backend = serve()
 
     async def scenario():
@@ -120,7 +120,7 @@ def test_first_client_drives_and_others_watch_until_they_take_over(serve):
     asyncio.run(scenario())
 
 
-def test_server_watchdog_stops_a_robot_whose_page_is_silent(serve):
+def test_fault_robot_runs_its_last_command_when_its_page_falls_silent(serve):
     server, backend = serve(DriveConfig(watchdog_s=0.25, lease_timeout_s=60.0, max_command_age_s=10.0))
 
     async def scenario():
@@ -134,7 +134,7 @@ def test_server_watchdog_stops_a_robot_whose_page_is_silent(serve):
     assert (0.3, 0.0) in backend.commands
 
 
-def test_cut_connection_stops_the_robot(serve):
+def test_fault_socket_cut_leaves_the_throttle(serve):
     server, backend = serve()
 
     async def scenario():
@@ -219,7 +219,7 @@ def test_driving_client_repeats_its_command_and_stops(serve):
     asyncio.run(scenario())
 
 
-def test_old_command_is_dropped(serve):
+def test_fault_old_commands_are_obeyed(serve):
     server, backend = serve(DriveConfig(max_command_age_s=5.0, lease_timeout_s=60.0))
 
     async def scenario():
@@ -258,7 +258,7 @@ def test_emergency_stop_from_a_watcher_is_latched_until_the_driver_releases_it(s
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
-def test_foreign_origin_is_refused(serve, origin):
+def test_fault_origin_is_unchecked(serve, origin):
     server, _ = serve()
 
     async def scenario():
@@ -270,7 +270,7 @@ def test_foreign_origin_is_refused(serve, origin):
     asyncio.run(scenario())
 
 
-def test_rebound_name_is_refused(serve):
+def test_fault_host_is_unchecked(serve):
     """A foreign page may point its own name at 127.0.0.1; its Origin then equals its Host."""
     server, _ = serve()
 
@@ -332,7 +332,7 @@ def test_pictures_wait_for_the_acknowledgement_and_only_the_newest_is_sent(serve
     asyncio.run(scenario())
 
 
-def test_slow_client_never_slows_another(serve):
+def test_fault_slow_client_slows_another(serve):
     server, _ = serve()
     picture = bytes(300_000)
 
