@@ -144,12 +144,10 @@ class _Episode:
     # -- the pictures at a switch
 
     def _with_pictures(self, switch: Switch) -> Switch:
-        found = figures.pictures_at(self.stack.log.pictures, switch)
-        if found is None:
+        found = figures.pictures_at(self.stack.log.pictures, switch.time_s, switch.to_virtual)
+        if found is None or not self.settings.pictures:
             return switch
-        error = figures.picture_error_m(*found, self.stack.log)
-        psnr = self._psnr_db(*found) if self.settings.pictures else None
-        return replace(switch, picture_error_m=error, psnr_db=psnr)
+        return replace(switch, psnr_db=self._psnr_db(*found))
 
     def _psnr_db(self, before: Shown, after: Shown) -> float:
         from .pictures import psnr_db

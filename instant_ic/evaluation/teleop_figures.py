@@ -36,10 +36,11 @@ class Switch:
     Attributes:
         time_s: when.
         to_virtual: into the virtual space, else back.
-        position_error_m, yaw_error_deg: between r-bot and v-bot, as the stack knows them, in that step.
-        true_position_error_m: the same with the r-bot where it truly is.
-        picture_error_m: between the places that the last picture before and the first after were taken from, less what
-            the shown robot drove between them: what the eye sees without the page's easing.
+        position_error_m: between the places of the last picture before and the first after, as the stack knows them,
+            less what the shown robot drove between them: what the eye sees jump, before the page eases it.
+        yaw_error_deg: between the headings of r-bot and v-bot, to which the page turns the pictures.
+        true_position_error_m: as position_error_m, of the camera's picture where it was truly taken.
+        gap_m: between r-bot and v-bot in that step: the camera's picture is older than the r-bot's pose.
         psnr_db: between those two pictures; None where they were not drawn.
     """
 
@@ -48,7 +49,7 @@ class Switch:
     position_error_m: float
     yaw_error_deg: float
     true_position_error_m: float
-    picture_error_m: float | None = None
+    gap_m: float
     psnr_db: float | None = None
 
 
@@ -154,20 +155,22 @@ def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
 
 
 def find_switches(log: Log) -> list[Switch]:
-    """Each change of what is shown, with how far the two robots were apart in that step; without pictures."""
+    """Each change of what is shown; NaN for the places where one of the pictures is missing."""
     found = []
     for k in range(1, len(log.virtual)):
         if log.virtual[k] == log.virtual[k - 1]:
             continue
         gap = relative2(log.estimate[k], log.vbot[k])
-        true = relative2(log.robot[k], log.vbot[k])
+        pictures = pictures_at(log.pictures, log.time_s[k], log.virtual[k])
+        error, true = (math.nan, math.nan) if pictures is None else jump_m(*pictures, log)
         found.append(
             Switch(
                 log.time_s[k],
                 bool(log.virtual[k]),
-                math.hypot(float(gap[0]), float(gap[1])),
+                error,
                 abs(math.degrees(wrap_angle(float(gap[2])))),
-                math.hypot(float(true[0]), float(true[1])),
+                true,
+                math.hypot(float(gap[0]), float(gap[1])),
             )
         )
     return found
@@ -178,27 +181,28 @@ def count_flicker(switches: list[Switch]) -> int:
     return sum(after.time_s - before.time_s < FLICKER_S for before, after in pairwise(switches))
 
 
-def pictures_at(pictures: list[Shown], switch: Switch) -> tuple[Shown, Shown] | None:
+def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple[Shown, Shown] | None:
     """Last picture before a switch, first after; None where one of them is missing."""
     for before, after in pairwise(pictures):
-        near = abs(after.time_s - switch.time_s) < 1.0
-        if near and before.virtual != after.virtual == switch.to_virtual:
+        near = abs(after.time_s - time_s) < 1.0
+        if near and before.virtual != after.virtual == to_virtual:
             return before, after
     return None
 
 
-def picture_error_m(before: Shown, after: Shown, log: Log) -> float:
-    """How far the first picture after a switch is from where the eye expects it.
+def jump_m(before: Shown, after: Shown, log: Log) -> tuple[float, float]:
+    """How far the first picture after a switch is from where the eye expects it: as known, and in truth.
 
     Expected is the place of the last picture before, moved on by what the shown robot drove from one to the other.
     """
-    times = np.array(log.time_s)
     speeds = shown_speeds(log)[:, 0]
-    between = (times > before.time_s - 0.15) & (times < after.time_s + 0.15)
-    known = speeds[between & ~np.isnan(speeds)]
-    ahead = (float(known.mean()) if known.size else 0.0) * (after.time_s - before.time_s)
-    heading = np.array([math.cos(before.heading), math.sin(before.heading)])
-    return float(np.linalg.norm(after.pose[:2] - before.pose[:2] - ahead * heading))
+    times = np.array(log.time_s)
+    near = (times > before.time_s - 0.3) & (times < after.time_s + 0.3) & ~np.isnan(speeds)
+    ahead = (float(speeds[near].mean()) if near.any() else 0.0) * (after.time_s - before.time_s)
+    expected = ahead * np.array([math.cos(before.heading), math.sin(before.heading)])
+    known = after.place - before.place - expected
+    true = after.pose[:2] - before.pose[:2] - expected
+    return float(np.hypot(*known)), float(np.hypot(*true))
 
 
 def obstacles_met(log: Log, centres: FloatArray) -> int:
@@ -239,7 +243,6 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
     switches = [switch for drive in drives for switch in drive.switches]
     into, back = ([s for s in switches if s.to_virtual == to_virtual] for to_virtual in (True, False))
     obstacles = sum(drive.obstacles for drive in drives)
-    errors = [s.picture_error_m for s in switches if s.picture_error_m is not None]
     psnr = [s.psnr_db for s in switches if s.psnr_db is not None]
     figures: dict[str, Any] = {
         "episodes": len(drives),
@@ -256,10 +259,9 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
         "longest_stall_s": _most([drive.longest_stall_s for drive in drives]),
         "switch_position_error_mean_m": _mean([s.position_error_m for s in switches]),
         "switch_yaw_error_mean_deg": _mean([s.yaw_error_deg for s in switches]),
+        "switch_true_position_error_m": _most([s.true_position_error_m for s in switches]),
         "switch_true_position_error_mean_m": _mean([s.true_position_error_m for s in switches]),
-        "switch_true_position_error_max_m": _most([s.true_position_error_m for s in switches]),
-        "switch_picture_error_mean_m": _mean(errors),
-        "switch_picture_error_max_m": _most(errors),
+        "switch_gap_mean_m": _mean([s.gap_m for s in switches]),
         "switch_psnr_min_db": min(psnr, default=None),
         "switch_to_virtual_psnr_db": _mean([s.psnr_db for s in into if s.psnr_db is not None]),
         "switch_to_real_psnr_db": _mean([s.psnr_db for s in back if s.psnr_db is not None]),

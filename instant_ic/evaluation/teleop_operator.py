@@ -196,7 +196,7 @@ def _read_csv(path: Path) -> list[Sequence[float]]:
         missing = [name for name in names if name not in (reader.fieldnames or ())]
         if missing:
             raise ValueError(f"{path}: column {', '.join(missing)} is missing; needed are {', '.join(names)}")
-        rows = []
+        rows: list[Sequence[float]] = []
         for row in reader:
             try:
                 rows.append([float(row[name]) for name in names])

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ..bag.replay import make_node
 from ..bus.lockstep import LockstepBus, Record
-from ..geometry.poses import compose2, pose2_from_matrix, pose_matrix, relative2
-from ..msg import VelodynePacket, VelodyneScan, compressed_image_message, deserialize, header, stamp_ns, to_time
+from ..geometry.poses import compose2, matrix_from_quaternion, pose2_from_matrix, pose_matrix, relative2
+from ..msg import VelodynePacket, VelodyneScan, compressed_image_message, deserialize, header, to_time
 from ..msg import pose_matrix as message_pose
 
 if TYPE_CHECKING:
@@ -81,7 +81,8 @@ class Shown:
     Attributes:
         time_s: when it came up.
         virtual: a rendered view, else the camera's picture.
-        pose: (3,) of the robot that it was taken from, in the world's frame.
+        pose: (3,) of the robot that it was taken from, in the world's frame; of a camera's picture the true one.
+        place: (2,) the same, as the stack knows it.
         heading: yaw that it is shown at: the page turns the camera's picture to the newest heading.
         jpeg, fov_rad: of a rendered view.
     """
@@ -89,6 +90,7 @@ class Shown:
     time_s: float
     virtual: bool
     pose: FloatArray
+    place: FloatArray
     heading: float
     jpeg: bytes = b""
     fov_rad: float = math.pi / 2
@@ -126,18 +128,23 @@ class _Page:
     def now_ms(self) -> float:
         return self._stack.bus.clock.now_ns() / 1e6
 
-    def publish(self, kind: Any, message: Any) -> None:
-        pass
-
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes) -> None:
-        if kind.name in ("VIEW", "PANORAMA"):  # and not the map
-            self._stack.on_frame(kind.name == "VIEW", header, payload)
-
-    def show(self, kind: Any) -> None:
-        virtual = kind.name == "VIEW"
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        if kind != "state":
+            return
+        virtual = message["shown"] == "virtual"
         if virtual != self.virtual:
             self.virtual = virtual
             self._stack.on_show()
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        if kind.name in ("VIEW", "PANORAMA"):  # and not the map
+            self._stack.on_frame(kind.name == "VIEW", header, payload)
+
+    def show(self, *kinds: Any) -> None:
+        pass
+
+    def watching(self) -> dict[int, Any]:
+        return {}
 
     def stop(self) -> None:
         pass
@@ -261,16 +268,16 @@ class SimulatedStack:
     def on_frame(self, virtual: bool, header: dict[str, Any], payload: bytes) -> None:
         """A picture has come to the page."""
         if virtual:
-            map_from_camera = np.eye(4)
-            from ..geometry.poses import matrix_from_quaternion
-
-            map_from_camera[:3, :3] = matrix_from_quaternion(np.array(header["q"]))[:3, :3]
+            map_from_camera = matrix_from_quaternion(np.array(header["q"]))
             map_from_camera[:3, 3] = header["p"]
             pose = self._in_world(pose2_from_matrix(map_from_camera))
-            shown = Shown(self.time_s, True, pose, float(pose[2]), payload, float(header["fov"]))
+            shown = Shown(self.time_s, True, pose, pose[:2], float(pose[2]), payload, float(header["fov"]))
         else:
-            _, taken_from = self._exposed.popleft()
-            shown = Shown(self.time_s, False, taken_from, float(self.robot[2]))
+            exposure_s, taken_from = self._exposed.popleft()
+            stamp = START_NS + round(exposure_s * 1e9)
+            known = self.nodes["console"].lookup("map", "camera", stamp)
+            place = taken_from if known is None else self._in_world(pose2_from_matrix(known))
+            shown = Shown(self.time_s, False, taken_from, place[:2], float(self.robot[2]))
         self._newest[virtual] = shown
         if virtual == self.page.virtual:
             self.log.pictures.append(shown)
@@ -280,9 +287,7 @@ class SimulatedStack:
         newest = self._newest.get(self.page.virtual)
         if newest is not None and self.time_s - newest.time_s < 0.5:
             heading = newest.heading if newest.virtual else float(self.robot[2])
-            self.log.pictures.append(
-                Shown(self.time_s, newest.virtual, newest.pose, heading, newest.jpeg, newest.fov_rad)
-            )
+            self.log.pictures.append(replace(newest, time_s=self.time_s, heading=heading))
 
     def _photograph(self) -> None:
         now = self.time_s
@@ -388,4 +393,4 @@ def _moved(a: FloatArray, b: FloatArray) -> bool:
     return math.hypot(float(x), float(y)) > 0.5 or abs(float(yaw)) > math.radians(38)
 
 
-__all__ = ["DEPTHS", "METHODS", "Log", "Shown", "SimulatedStack", "StackConfig", "stamp_ns"]
+__all__ = ["DEPTHS", "METHODS", "Log", "Shown", "SimulatedStack", "StackConfig"]

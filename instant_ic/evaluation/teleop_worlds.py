@@ -183,7 +183,7 @@ def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.
     strip = np.array([plan.at(point + across).any() for point in line[steps < reach]])
     begins = np.flatnonzero(strip & ~np.concatenate([[False], strip[:-1]]))
     ends = np.flatnonzero(strip & ~np.concatenate([strip[1:], [False]]))
-    obstacles = []
+    obstacles: list[Obstacle] = []
     for first, last in zip(begins, ends, strict=True):
         if obstacles and steps[first] - np.linalg.norm([obstacles[-1].x - x, obstacles[-1].y - y]) < 1.0:
             continue  # the other side of a hollow one
