@@ -79,6 +79,9 @@ def run_checks(expectation: Expectation, run_dir: Path) -> Iterator[Finding]:
     yield from check_serial(expectation)
     yield from check_camera(expectation)
     yield from check_lidar(expectation)
+    from instant_ic.cli.doctor_running import check_running
+
+    yield from check_running(run_dir)
 
 
 def check_machine(run_dir: Path) -> Iterator[Finding]:

@@ -127,6 +127,8 @@ class ArbiterInputs:
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
     estop: bool = False
+    estop_button: bool = False
+    """The button on the robot is pressed: nothing else ends the stop."""
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) hits of the newest scan and 3D points in ``base_link``, where the robot is now."""
     costmap: Costmap | None = None
@@ -277,7 +279,7 @@ class Arbiter:
             time_to_obstacle_s=math.inf if prediction is None else prediction.time_to_obstacle_s,
             trajectory=np.zeros((0, 3)) if prediction is None else prediction.poses,
             subgoal=self._subgoal,
-            estop=inputs.estop,
+            estop=inputs.estop or inputs.estop_button,
             operator_command=situation.command,
             vbot_action=self._vbot_action(situation),
             vbot_target=(
@@ -405,7 +407,7 @@ class Arbiter:
     # Guards give the reason when they hold, "" when they do not.
 
     def _estop_pressed(self, situation: _Situation) -> str:
-        return "emergency stop" if situation.inputs.estop else ""
+        return "emergency stop" if situation.inputs.estop or situation.inputs.estop_button else ""
 
     def _source_lost(self, situation: _Situation) -> str:
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
@@ -564,7 +566,7 @@ class Arbiter:
 
     def _may_resume(self, situation: _Situation) -> str:
         inputs = situation.inputs
-        if inputs.estop or situation.command != (0.0, 0.0) or inputs.robot_pose is None:
+        if inputs.estop or inputs.estop_button or situation.command != (0.0, 0.0) or inputs.robot_pose is None:
             return ""
         if self._operator_missed(situation):
             return ""
@@ -699,8 +701,10 @@ class Arbiter:
 
     def _why_stopped(self, situation: _Situation) -> str:
         inputs = situation.inputs
-        if inputs.estop:
-            return "emergency stop: release it to go on"
+        if inputs.estop or inputs.estop_button:
+            button = inputs.estop_button
+            where = "emergency stop button: let it out, then release the stop here" if button else ""
+            return where or "emergency stop: release it to go on"
         lacking = self._lacking(inputs, Mode.REAL, situation.now_ns)
         if lacking:
             return "stopped: " + _no_data(lacking)

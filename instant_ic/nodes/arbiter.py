@@ -455,6 +455,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             robot_velocity=velocity,
             operator_command=_twist(self.operator),
             estop=self.estop,
+            estop_button=self.button is not None and self.button[0],
             scan_points=points,
             costmap=self.costmap,
             walls=self.walls,

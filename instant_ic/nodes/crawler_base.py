@@ -15,10 +15,11 @@ from instant_ic.base.controller import BaseController, BaseState, ControllerConf
 from instant_ic.base.odometry import OdometryEstimate
 from instant_ic.base.recent import RecentCount
 from instant_ic.base.roboclaw import SerialPort, open_serial
-from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import (
     BatteryState,
+    Bool,
     Odometry,
     Twist,
     TwistStamped,
@@ -82,6 +83,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.refuse_pace()
         self.controller = BaseController(self.config, self.clock.now_ns, type(self).open_port)
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
+        self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
+        self.button: bool | None = None  # the controller's emergency stop input
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
         self.subscribe_raw("/cmd_vel", self.on_command, qos=SENSOR)
         self.started_ns = self.clock.now_ns()
@@ -229,6 +232,10 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         text = f"{health.battery_v:.1f} V" + (f", below {config.battery_empty_v} V: charge it" if low else "")
         self.diagnose("battery", WARN if low else OK, text)
         faults, warnings = health.status.faults, health.status.warnings
+        pressed = "emergency stop" in faults
+        if pressed != self.button:
+            self.button = pressed
+            self.button_out.publish(Bool(data=pressed))
         self.diagnose(
             "controller",
             ERROR if faults else WARN if warnings else OK,

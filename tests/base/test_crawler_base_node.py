@@ -148,6 +148,13 @@ def test_low_battery_and_faults_are_told(bench: Bench) -> None:
     assert bench.bus.last("/battery").percentage == 0.0
 
 
+def test_the_controllers_emergency_stop_input_is_told_on_each_change(bench: Bench) -> None:
+    for status in (0, 0x0001, 0x0001, 0):
+        bench.emulator.status = status
+        bench.run(1.5)
+    assert [message.data for message in bench.bus.messages("/robot/estop")] == [False, True, False]
+
+
 def test_recent_events_leave_the_window() -> None:
     recent = RecentCount(10.0)
     assert recent.count(0) == 0

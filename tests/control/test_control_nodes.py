@@ -13,6 +13,7 @@ from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor
 from instant_ic.bus import OK, WARN, params
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.transport import Received
+from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
     POINT_DTYPE,
@@ -207,27 +208,119 @@ def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
 
 
 @pytest.mark.parametrize(
-    ("topic", "words", "limit_s"),
+    ("topic", "words", "period_s"),
     [
-        ("/scan", "LiDAR scan", 0.45),
-        ("/wheel/odom", "wheel odometry", 0.35),
-        ("/operator/cmd_vel", "you drive the robot", 0.35),
-        ("/camera/image/compressed", "camera picture", 1.1),
-        ("/pose", "SLAM pose", 1.1),
+        ("/scan", "LiDAR scan", 0.1),
+        ("/lidar/points", "3D points", 0.1),
+        ("/wheel/odom", "wheel odometry", 0.05),
+        ("/operator/cmd_vel", "you drive the robot", 0.05),
+        ("/camera/image/compressed", "camera picture", 0.1),
+        ("/pose", "SLAM pose", 0.1),
     ],
 )
-def test_each_loss_sends_zero_within_its_time(topic: str, words: str, limit_s: float) -> None:
+def test_each_loss_sends_zero_within_0_3_s_of_the_next_message(topic: str, words: str, period_s: float) -> None:
     stack = Stack(np.zeros((0, 2, 2)))
+    stack.cloud = kerb(8.0)
     stack.drive(1.5, None)
     assert twist_values(stack.drive(1.0, (0.4, 0.0))[-1].applied_command)[0] == pytest.approx(0.4)
     stack.silent.add(topic)
-    states = stack.drive(limit_s, (0.4, 0.0))
+    # The next one was due a period after the last; a step of the loop comes on top.
+    states = stack.drive(period_s + 0.3, (0.4, 0.0))
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
     assert words in states[-1].reason
     assert states[-1].mode == ControlState.REAL  # a short gap changes no view
     states = stack.drive(2.0, (0.4, 0.0))
     expected = ControlState.REAL if topic == "/operator/cmd_vel" else ControlState.STOPPED
     assert states[-1].mode == expected
+
+
+def test_a_camera_at_5_hz_is_late_by_its_own_rhythm() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.page = False
+    period_ns, next_ns = 200_000_000, stack.now
+    stack.silent.add("/camera/image/compressed")
+    for k in range(80):
+        if stack.now >= next_ns and k < 60:
+            next_ns += period_ns
+            stack.bus.publish("/camera/image/compressed", compressed_image_message(b"", "camera", stack.now))
+            last_ns = stack.now
+        state = stack.step((0.4, 0.0) if k > 30 else None)
+        age_s = (stack.now - last_ns) / 1e9
+        if k > 32 and age_s <= 0.3:
+            assert "picture" not in state.reason
+        if age_s > 0.36:
+            assert twist_values(state.applied_command) == (0.0, 0.0)
+    assert "camera picture" in state.reason
+
+
+def test_pictures_that_do_not_reach_the_operator_stop_the_robot() -> None:
+    """The camera goes on at the robot; on the way to the page its pictures are lost."""
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    stack.drive(1.0, (0.4, 0.0))
+    frozen = stack.picture_ns
+    for _ in range(10):
+        stack.step((0.4, 0.0))
+        stack.picture_ns = frozen
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+    assert "camera picture" in stack.bus.last("/ic/state").reason
+
+
+def test_both_robots_stand_when_the_views_stop_and_the_real_view_comes_back() -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, None)
+    states = stack.drive(6.0, (0.4, 0.0))
+    assert states[-1].mode == ControlState.VIRTUAL
+    assert {s.shown for s in states if s.mode in (ControlState.REAL, ControlState.ENTERING)} == {0}
+    stack.silent.add("views")
+    states = stack.drive(0.4, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
+    assert states[-1].vbot_action == ControlState.VBOT_HELD
+    stack.drive(0.6, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/vbot/odom")) == (0.0, 0.0)
+    states = stack.drive(1.0, (0.4, 0.0))
+    assert (states[-1].mode, states[-1].shown) == (ControlState.STOPPED, ControlState.SHOWN_REAL)
+
+
+def test_the_button_on_the_robot_stops_and_only_the_operator_ends_it_once_it_is_out() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    stack.drive(1.0, (0.4, 0.0))
+    stack.bus.publish("/robot/estop", Bool(data=True), latched=True)
+    assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)  # before any timer
+    state = stack.drive(0.5, None)[-1]
+    assert (state.mode, state.estop) == (ControlState.STOPPED, True)
+    assert "let it out, then release the stop here" in state.reason
+    stack.bus.publish("/operator/estop", Bool(data=False), latched=True)  # while it is pressed
+    assert stack.drive(1.0, (0.0, 0.0))[-1].estop
+    stack.bus.publish("/robot/estop", Bool(data=False), latched=True)
+    state = stack.drive(1.0, (0.0, 0.0))[-1]
+    assert (state.mode, state.estop) == (ControlState.STOPPED, True)
+    assert "button" not in state.reason
+    stack.bus.publish("/operator/estop", Bool(data=False), latched=True)
+    assert stack.drive(1.0, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+def test_a_button_that_repeats_its_state_is_missed_where_that_is_set() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.arbiter.reconfigure(dataclasses.replace(stack.arbiter.config, timeouts=TimeoutConfig(estop_input=0.5)))
+    stack.drive(1.5, None)  # none has spoken: there is none
+    stack.bus.publish("/robot/estop", Bool(data=False), latched=True)
+    assert twist_values(stack.drive(0.4, (0.4, 0.0))[-1].applied_command)[0] > 0.2
+    state = stack.drive(0.2, (0.4, 0.0))[-1]
+    assert twist_values(state.applied_command) == (0.0, 0.0)
+    assert "emergency stop button" in state.reason
+
+
+def test_a_changed_command_is_obeyed_before_the_next_timer() -> None:
+    stack = Stack(np.zeros((0, 2, 2)))
+    stack.drive(1.5, None)
+    count = len(stack.bus.messages("/cmd_vel"))
+    stack.send("/operator/cmd_vel", twist_stamped(0.4, 0.0, stack.now))
+    assert twist_values(stack.bus.last("/cmd_vel"))[0] == pytest.approx(0.4)
+    for speed in (0.3, 0.2, 0.1):  # not more than one between two timers
+        stack.send("/operator/cmd_vel", twist_stamped(speed, 0.0, stack.now))
+    assert len(stack.bus.messages("/cmd_vel")) == count + 1
 
 
 def test_the_robot_goes_on_after_a_long_loss_only_when_the_controls_were_let_go() -> None:
