@@ -55,6 +55,12 @@ def seen(keyframe: tuple[float, float, float], origin: tuple[float, float, float
     return reached.astype(np.float32).reshape(directions.shape[:-1])
 
 
+def distances(origin: tuple[float, float, float], directions: Array) -> Array:
+    """Metres along ``directions`` (..., 3) from ``origin`` to what stands there."""
+    rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
+    return _cast(np.asarray(origin, np.float32), rays)[0].reshape(directions.shape[:-1])
+
+
 def _cast(eye: Array, rays: Array) -> tuple[Array, NDArray[np.int8], NDArray[np.int8]]:
     """Distance, axis of the face and material of what unit ``rays`` (N, 3) meet first."""
     inverse = 1.0 / np.where(np.abs(rays) < 1e-6, np.float32(1e-6), rays)

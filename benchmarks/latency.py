@@ -1,0 +1,346 @@
+#!/usr/bin/env python3
+"""From a key pressed in Chromium to the base, and to the motion shown in the virtual space; prints JSON.
+
+    python benchmarks/latency.py --presses 30 --json latency.json
+
+The nodes are the real ones, each a process of its own, at their rates and with their parameters: console, arbiter and
+virtual_robot for the way to the base; console, virtual_robot and nerf (source warp) for the way to the picture. What
+they hear of the robot is made up here: scan, poses, odometry, pictures, one keyframe, and in the second part the
+arbiter's state. In the whole stack SLAM, depth and the simulator load the machine as well: benchmarks/stack.py has the
+way to the base there.
+
+Measured from the browser's time of the key event: ``base_ms`` to the command on /cmd_vel; ``shown_forward_ms`` to the
+drawing of the first rendered view from another place (0.5 mm and more); ``shown_turn_ms`` to the first drawing with
+another heading (0.05 degrees and more). The robot's own acceleration is in it. ``steps_ms`` tells where the time goes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from instant_ic.bus import LATCHED, SENSOR
+from instant_ic.console import demo_world
+from instant_ic.evaluation.stack import Stack, free_port, machine_pace
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.projections import equirect_directions
+from instant_ic.msg import (
+    ControlState,
+    Keyframe,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    VspaceStatus,
+    compressed_image_message,
+    header,
+    image_message,
+    message_type,
+    odometry_message,
+    pose_message,
+    scan_message,
+    to_time,
+    transform_message,
+    twist_message,
+    twist_values,
+)
+from instant_ic.msg import pose_matrix as matrix_of
+
+CHROMIUM_FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+LAUNCH = """launch:
+- node: {{exec: console, param: [{{from: $(config console.yaml)}}, {{name: server.port, value: {port}}}]}}
+- node: {{exec: virtual_robot, param: [{{from: $(config control.yaml)}}]}}
+{more}
+"""
+ARBITER = "- node: {exec: arbiter, param: [{from: $(config control.yaml)}]}"
+NERF = "- node: {exec: nerf, param: [{from: $(config nerf.yaml)}, {name: space.source, value: warp}]}"
+CAMERA_Z = 1.2
+WATCH = """
+window.presses = [];
+let last = null;
+addEventListener("keydown", (event) => {
+    if (event.repeat) return;
+    const pressed = performance.timeOrigin + event.timeStamp;
+    presses.push({code: event.code, pressed, from: last, forward: 0, turn: 0});
+}, true);
+addEventListener("drawn", ({detail}) => {
+    const now = performance.timeOrigin + performance.now(), press = presses.at(-1);
+    if (press?.from) {
+        const apart = Math.hypot(...[0, 1].map((i) => detail.view.p[i] - press.from.p[i]));
+        if (!press.forward && apart > 0.0005 && detail.blend > 0.99) press.forward = now;
+        if (!press.turn && Math.abs(detail.pose[2] - press.from.yaw) > 0.00087) press.turn = now;
+    }
+    if (detail.view && detail.pose) last = {p: detail.view.p, yaw: detail.pose[2]};
+});
+"""
+
+
+class Robot:
+    """What the nodes hear of a made-up robot in the demonstration's room; the base obeys at once."""
+
+    def __init__(self, stack: Stack, virtual: bool) -> None:
+        self.stack, self.virtual = stack, virtual
+        self.stop, self.error = threading.Event(), ""
+        self.marks: dict[str, int] = {}  # step -> when it was first seen since the last press, ns
+        observer = stack.observer
+        self.out = {
+            topic: observer.publisher(topic, kind, qos=qos)
+            for topic, kind, qos in (
+                ("/tf", message_type("TFMessage"), SENSOR),
+                ("/tf_static", message_type("TFMessage"), LATCHED),
+                ("/scan", message_type("LaserScan"), SENSOR),
+                ("/wheel/odom", message_type("Odometry"), SENSOR),
+                ("/pose", PoseWithCovarianceStamped, SENSOR),
+                ("/camera/image/compressed", message_type("CompressedImage"), SENSOR),
+                ("/keyframe", Keyframe, LATCHED),
+                *([("/ic/state", ControlState, LATCHED)] if virtual else [("/vspace/status", VspaceStatus, LATCHED)]),
+            )
+        }
+        self.vbot = np.eye(4)
+        self.mode = -1
+        self.views = 0
+        self.requested = np.eye(4)
+        observer.subscribe("/cmd_vel", message_type("TwistStamped"), self.on_moving("cmd_vel"), SENSOR)
+        observer.subscribe("/operator/cmd_vel", message_type("TwistStamped"), self.on_moving("operator"), SENSOR)
+        observer.subscribe("/vbot/odom", message_type("Odometry"), self.on_vbot, SENSOR)
+        observer.subscribe("/view/request", message_type("ViewRequest"), self.on_request, SENSOR)
+        observer.subscribe("/vspace/view", message_type("RenderedView"), self.on_view, SENSOR)
+        if not virtual:
+            observer.subscribe("/ic/state", ControlState, self.on_state, LATCHED)
+        directions = equirect_directions(1280, 640)
+        ok, jpeg = cv2.imencode(".jpg", demo_world.shade((0, 0, CAMERA_Z), directions))
+        assert ok
+        self.jpeg = jpeg.tobytes()
+        self.depth_m = demo_world.distances((0, 0, CAMERA_Z), equirect_directions(512, 256)).astype(np.float32)
+        self.thread = threading.Thread(target=self.run, daemon=True)
+        self.thread.start()
+
+    def mark(self, step: str) -> None:
+        self.marks.setdefault(step, time.time_ns())
+
+    def on_moving(self, step: str) -> Callable[[Any], None]:
+        def on_command(message: Any) -> None:
+            if any(twist_values(message)):
+                self.mark(step)
+
+        return on_command
+
+    def on_vbot(self, message: Any) -> None:
+        self.vbot = matrix_of(message)
+        if any(twist_values(message)):
+            self.mark("vbot")
+
+    def on_request(self, message: Any) -> None:
+        pose = matrix_of(message.pose)
+        if np.abs(pose - self.requested).max() > 0.0005:
+            self.mark("request")
+        self.requested = pose
+
+    def on_view(self, message: Any) -> None:
+        self.views += 1
+        if "request" in self.marks and np.abs(matrix_of(message.pose) - self.requested).max() < 1e-6:
+            self.mark("view")
+
+    def on_state(self, message: Any) -> None:
+        self.mode = int(message.mode)
+
+    def run(self) -> None:
+        try:
+            step = 0
+            due = time.monotonic()
+            while not self.stop.is_set():
+                self.stack.observer.spin_once()
+                if time.monotonic() >= due:
+                    due = max(due + 0.05, time.monotonic() - 0.2)
+                    self.tell(step)
+                    step += 1
+                time.sleep(0.0005)
+        except Exception as error:  # noqa: BLE001 - told by whoever waits
+            self.error = f"{type(error).__name__}: {error}"
+
+    def tell(self, step: int) -> None:
+        """20 times a second."""
+        now, here, send = time.time_ns(), np.eye(4), lambda topic, message: self.out[topic].publish(message)
+        tf = message_type("TFMessage")
+        if step % 20 == 0:
+            mounts = [("camera", CAMERA_Z), ("velodyne", 0.6)]
+            send("/tf_static", tf([transform_message(pose_matrix(z=z), "base_link", name, now) for name, z in mounts]))
+        send(
+            "/tf",
+            tf([transform_message(here, "map", "odom", now), transform_message(here, "odom", "base_link", now)]),
+        )
+        send("/wheel/odom", odometry_message(here, 0.0, 0.0, "odom", "base_link", now))
+        if step % 2 == 0:
+            angles = 2 * np.pi / 720
+            ranges = np.full(720, 6.0, np.float32)  # free all round
+            send("/scan", scan_message(ranges, -np.pi, angles, 0.4, 100.0, "velodyne", now))
+            covariance = PoseWithCovariance(pose=pose_message(here), covariance=np.eye(6).ravel() * 1e-4)
+            send("/pose", PoseWithCovarianceStamped(header=header("map", now), pose=covariance))
+            send("/camera/image/compressed", compressed_image_message(self.jpeg, "camera", now))
+        if self.virtual:
+            self.tell_virtual(step, now)
+        elif step % 10 == 0:
+            send("/vspace/status", vspace_status(now))
+
+    def tell_virtual(self, step: int, now: int) -> None:
+        if step == 0:
+            self.out["/keyframe"].publish(
+                Keyframe(
+                    header=header("map", now), id=1, pose=pose_message(pose_matrix(z=CAMERA_Z)),
+                    panorama=compressed_image_message(self.jpeg, "camera", now),
+                    depth=image_message(self.depth_m, "32FC1", "camera", now),
+                    sigma=image_message(np.empty((0, 0), np.uint8), "mono8", "camera", now),
+                    source="lidar", scale=1.0, quality=1.0, relative_sigma=0.01, fit=True, message="",
+                )
+            )  # fmt: skip
+        self.out["/ic/state"].publish(
+            ControlState(
+                header=header("map", now), mode=ControlState.VIRTUAL, reason="", estop=False, blocked=False,
+                transitions=1, robot_pose=pose_message(self.vbot), vbot_start=pose_message(np.eye(4)),
+                vbot_pose=pose_message(self.vbot), operator_command=twist_message(), applied_command=twist_message(),
+                pose_gap_m=0.0, yaw_gap_rad=0.0, time_to_obstacle_s=float("inf"), shown=ControlState.SHOWN_VIRTUAL,
+                vbot_action=ControlState.VBOT_DRIVEN, vbot_target=pose_message(np.eye(4)), robot_twist=twist_message(),
+            )
+        )  # fmt: skip
+
+
+def vspace_status(now: int) -> Any:
+    return VspaceStatus(
+        header=header("map", now), state=VspaceStatus.EMPTY, keyframe_id=0, keyframe_pose=pose_message(np.eye(4)),
+        keyframe_stamp=to_time(0), ready_radius_m=0.0, psnr_db=0.0, train_seconds=0.0, ready_seconds=0.0, iterations=0,
+        ms_per_iteration=0.0, render_ms=0.0, render_fps=0.0, device="", message="", expected_psnr_db=0.0,
+        unseen_share=0.0,
+    )  # fmt: skip
+
+
+def part(virtual: bool, args: argparse.Namespace) -> dict[str, Any]:
+    """One of the two ways, with a stack and a browser of its own."""
+    from playwright.sync_api import sync_playwright
+
+    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
+    port = free_port()
+    launch = run_dir / "latency.yaml"
+    launch.write_text(LAUNCH.format(port=port, more=NERF if virtual else ARBITER))
+    try:
+        with Stack(str(launch), run_dir, {}) as stack, sync_playwright() as playwright:
+            robot = Robot(stack, virtual)
+            try:
+                wait(
+                    robot,
+                    lambda: robot.views > 3 if virtual else robot.mode == ControlState.REAL,
+                    args.wait,
+                    "the nodes",
+                )
+                browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+                page = browser.new_page(viewport={"width": args.width, "height": args.height})
+                page.add_init_script(WATCH)
+                page.goto(f"http://127.0.0.1:{port}/")
+                shows = f'body[data-driver="you"][data-blend="{int(virtual)}.00"][data-picture="live"]'
+                page.locator(shows).wait_for(timeout=args.wait * 1000)
+                page.wait_for_timeout(2000)
+                rows = press_keys(page, robot, ["KeyW", "KeyA", "KeyS", "KeyD"] if virtual else ["KeyW", "KeyS"], args)
+                browser.close()
+            finally:
+                robot.stop.set()
+                robot.thread.join(timeout=5.0)
+            return figures(rows, virtual)
+    finally:
+        shutil.rmtree(run_dir, ignore_errors=True)
+
+
+def wait(robot: Robot, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        robot.stack.check_alive(what)
+        if robot.error or time.monotonic() > deadline:
+            raise RuntimeError(f"no {what} within {timeout_s:g} s; {robot.error}\n{robot.stack.log_tail()}")
+        time.sleep(0.02)
+
+
+def press_keys(page: Any, robot: Robot, keys: list[str], args: argparse.Namespace) -> list[dict[str, Any]]:
+    rows, jitter = [], random.Random(1)
+    for number in range(args.presses * (len(keys) // 2)):
+        robot.marks.clear()
+        key = keys[number % len(keys)]
+        page.keyboard.down(key)
+        page.wait_for_timeout(500)
+        page.keyboard.up(key)
+        page.wait_for_timeout(900 + jitter.uniform(0, 100))  # not in step with any timer
+        row = page.evaluate("presses.at(-1)")
+        rows.append(row | {"marks": dict(robot.marks)})
+    return rows
+
+
+def figures(rows: list[dict[str, Any]], virtual: bool) -> dict[str, Any]:
+    """Medians and 95th percentiles, ms."""
+    straight = [row for row in rows if row["code"] in ("KeyW", "KeyS")]
+    turns = [row for row in rows if row["code"] in ("KeyA", "KeyD")]
+
+    def since(chosen: list[dict[str, Any]], end: Callable[[dict[str, Any]], float]) -> dict[str, Any]:
+        values = sorted(end(row) - row["pressed"] for row in chosen if end(row))
+        if len(values) < 2:
+            return {"n": len(values), "missed": len(chosen) - len(values)}
+        p95 = statistics.quantiles(values, n=20, method="inclusive")[18]
+        return {
+            "p50": round(statistics.median(values), 1), "p95": round(p95, 1), "n": len(values),
+            "missed": len(chosen) - len(values),
+        }  # fmt: skip
+
+    def marked(step: str) -> Callable[[dict[str, Any]], float]:
+        return lambda row: row["marks"].get(step, 0) / 1e6
+
+    if not virtual:
+        return {
+            "base_ms": since(straight, marked("cmd_vel")),
+            "steps_ms": {"to_the_bus": since(straight, marked("operator"))},
+        }
+    steps = ("operator", "vbot", "request", "view")
+    return {
+        "shown_forward_ms": since(straight, lambda row: row["forward"]),
+        "shown_turn_ms": since(turns, lambda row: row["turn"]),
+        "steps_ms": {step: since(straight, marked(step)) for step in steps},
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presses", type=int, default=30, help="for each figure (default 30)")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    parser.add_argument("--width", type=int, default=960)
+    parser.add_argument("--height", type=int, default=600)
+    parser.add_argument("--wait", type=float, default=180.0, help="seconds for the nodes to come up (default 180)")
+    args = parser.parse_args()
+    if args.presses < 2:
+        parser.error("--presses must be 2 or more")
+    result: dict[str, Any] = {
+        "cores": os.cpu_count(),
+        # 1.0: fast enough for a whole simulated stack in real time. Below, and with other load, latencies are longer.
+        "machine_pace": round(machine_pace(), 2),
+        "load_average": round(os.getloadavg()[0], 1),
+        "targets_ms": {"base_p50": 40, "shown_p50": 150},
+    }
+    result |= {"real": part(False, args), "virtual": part(True, args)}
+    text = json.dumps(result, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
