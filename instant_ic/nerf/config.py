@@ -172,7 +172,8 @@ class VirtualSpaceConfig:
     mesh_fit_colours: bool = True
     """Whether the mesh's colours are multiplied, a factor a colour, to look like the newest keyframe's."""
     device: str = "auto"
-    """``auto`` (CUDA where torch finds it, else numba on the CPU), ``cpu``, ``cuda``, or ``torch-cpu`` (slow)."""
+    """``auto`` (``cuda`` where torch finds a GPU, else ``cpu``), ``cpu`` (numba), ``cuda`` (Triton where it works, else
+    plain torch), ``triton``, ``torch-cuda``, or ``torch-cpu`` (slow)."""
     panorama_width: int = 2048
     """Wider panoramas are area-averaged to this width."""
     keyframes: Annotated[int, Range(1, 8)] = 1
@@ -185,7 +186,7 @@ class VirtualSpaceConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        devices = ("auto", "cpu", "cuda", "torch-cpu")
+        devices = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
         _require(self.device in devices, "device", self.device, "one of " + ", ".join(devices))
         _require(self.source in ("field", "warp", "mesh"), "source", self.source, "field, warp or mesh")
         _require(self.source != "mesh" or bool(self.mesh), "mesh", self.mesh, "a file with source: mesh")

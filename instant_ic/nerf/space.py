@@ -22,6 +22,7 @@ from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, 
 
 from .compose import Layer, compose, exposure_gains, moved
 from .config import VirtualSpaceConfig
+from .devices import make_device
 from .field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from .occupancy import build_occupancy
 from .prior import KeyframeError, PanoramaPrior, prepare
@@ -86,10 +87,6 @@ class NotReadyError(RuntimeError):
     """Asked for training or a picture before the first keyframe."""
 
 
-class DeviceError(RuntimeError):
-    """The device that was asked for is not there."""
-
-
 @dataclass(frozen=True)
 class Prepared:
     """What the field is to learn, and the keyframes that it is of."""
@@ -137,8 +134,7 @@ class VirtualSpace:
         if self.config.source == "mesh":
             raise ValueError("source is mesh: nothing is learnt there; use make_space, which draws the mesh")
         self._robot = robot
-        self._device = make_device(self.config)
-        self._warning = ""
+        self._device, self._warning = make_device(self.config)
         self._can_warp = importlib.util.find_spec("numba") is not None
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
         self._store = KeyframeStore(self.config.keyframes + 2)
@@ -504,7 +500,7 @@ class VirtualSpace:
                 raise
             self._warning = f"{self._device.name} is out of memory; on the CPU from now on ({error})"
         parameters = self._device.parameters()
-        self._device = make_device(dataclasses.replace(self.config, device="cpu"))
+        self._device, _ = make_device(dataclasses.replace(self.config, device="cpu"))
         self._device.load(parameters)
         if self._scene is not None:
             self._device.set_scene(self._scene)
@@ -583,37 +579,4 @@ def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[
     return device.step(uniform, *rates)
 
 
-def make_device(config: VirtualSpaceConfig) -> Device:
-    """The device that ``config.device`` asks for.
-
-    Raises:
-        DeviceError: CUDA was asked for and torch finds none.
-    """
-    if config.device == "cuda" or (config.device == "auto" and _may_have_cuda()):
-        import torch
-
-        if torch.cuda.is_available():
-            from .torch_device import TorchDevice
-
-            return TorchDevice(config.field, config.train, "cuda")
-        if config.device == "cuda":
-            raise DeviceError("device is cuda, but torch finds no CUDA device; use auto or cpu")
-    if config.device != "torch-cpu":
-        try:
-            from .numba_device import NumbaDevice
-        except ImportError:
-            if config.device == "cpu":
-                raise
-        else:
-            return NumbaDevice(config.field, config.train)
-    from .torch_device import TorchDevice
-
-    return TorchDevice(config.field, config.train, "cpu")
-
-
-def _may_have_cuda() -> bool:
-    """Whether the machine has an NVIDIA device at all: importing torch only to learn that it has not costs seconds."""
-    return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
-
-
-__all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace", "make_device"]
+__all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace"]
