@@ -36,7 +36,7 @@ from . import triton_kernels as kernels
 
 TRAIN_BLOCK = 64
 ENTRIES = 256
-"""Table entries of one program of Adam."""
+"""Table entries of one program of Adam; the smallest table has four times as many."""
 TILE = 64
 """Rays of one program, 8 × 8: of a batch's stratum tile, and of a picture."""
 
@@ -112,7 +112,6 @@ class TritonDevice:
             "LEVELS": field.levels,
             "LP": max(_power_of_two(field.levels), 16 // features),
             "F": features,
-            "SIZE": 1 << field.log2_table,
             "HIDDEN": field.hidden,
             "HP": max(_power_of_two(field.hidden), 16),
         }
@@ -159,6 +158,7 @@ class TritonDevice:
 
     def _launch_step(self, scene: _GpuScene) -> None:
         b, p, q, train = self._buffers, self._p, scene.priors, self._train
+        levels, size, features = self._table_shape
         height, width = q["rgb"].shape[1:3]
         h, w = q["inverse_depth"].shape[1:]
         b.sums.zero_()
@@ -169,14 +169,13 @@ class TritonDevice:
         )  # fmt: skip
         count = len(b.points)
         kernels.gradient[(math.ceil(count / TRAIN_BLOCK),)](
-            p.table, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.keyframes,
+            p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.keyframes,
             b.points, b.target, b.weight, self._colour_weight, self._distance_weight, count,
             b.table_grad, b.network_grad, b.sums, **self._shape, B=TRAIN_BLOCK,
         )  # fmt: skip
-        size, features = self._shape["SIZE"], self._shape["F"]
-        kernels.adam_table[(self._shape["LEVELS"] * size // min(ENTRIES, size),)](
-            p.master, p.table, b.table_grad, *b.table_moments, b.rates, BETA1, BETA2, EPSILON,
-            SIZE=size, F=features, B=min(ENTRIES, size),
+        kernels.adam_table[(levels * size // ENTRIES,)](
+            p.master, p.table, b.table_grad, *b.table_moments, b.rates, size, BETA1, BETA2, EPSILON,
+            F=features, B=ENTRIES,
         )  # fmt: skip
         kernels.adam_network[(1,)](
             p.network, b.network_grad, *b.network_moments, b.rates[-1:], BETA1, BETA2, EPSILON,
@@ -200,6 +199,7 @@ class TritonDevice:
         p, scene = drawn.parameters, drawn.scene
         q = scene.priors
         rows, columns = rays.shape
+        size = self._table_shape[1]
         pixels = rows * columns
         directions = self._tensor(rays.directions)
         view = self._tensor(np.concatenate([rays.origin, np.eye(3, dtype=np.float32).reshape(-1)]))
@@ -209,7 +209,7 @@ class TritonDevice:
         height, width = q["rgb"].shape[1:3]
         h, w = q["inverse_depth"].shape[1:]
         kernels.draw[(math.ceil(rows / 8) * math.ceil(columns / 8),)](
-            p.table, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.grid, scene.low,
+            p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.grid, scene.low,
             q["rgb"], q["inverse_depth"], q["torn"], q["known"], q["camera_from_map"], scene.camera, q["band"],
             q["gains"], scene.keyframes, view, view[3:], directions, columns, rows, width, height, w, h,
             *scene.grid.shape, scene.cell_m, float(panorama_share), float(depth_share), colour, depth, confidence,

@@ -38,12 +38,12 @@ def _atan2(y, x):
 
 
 @triton.jit
-def _corner(ix, iy, iz, fx, fy, fz, corner: tl.constexpr, SIZE: tl.constexpr):
+def _corner(ix, iy, iz, fx, fy, fz, size, corner: tl.constexpr):
     """Entry within its level, and trilinear weight, of one of a cell's eight corners."""
     bx: tl.constexpr = corner & 1
     by: tl.constexpr = (corner >> 1) & 1
     bz: tl.constexpr = corner >> 2
-    entry = ((ix + bx) ^ ((iy + by) * _P1) ^ ((iz + bz) * _P2)) & (SIZE - 1)
+    entry = ((ix + bx) ^ ((iy + by) * _P1) ^ ((iz + bz) * _P2)) & (size - 1)
     weight = (fx if bx else 1 - fx) * (fy if by else 1 - fy) * (fz if bz else 1 - fz)
     return entry, weight
 
@@ -68,17 +68,17 @@ def _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS: tl.constex
 
 @triton.jit
 def _encode(
-    table, cells_per_m, origin, focus, keyframes, px, py, pz, wanted,
-    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, SIZE: tl.constexpr, B: tl.constexpr,
+    table, size, cells_per_m, origin, focus, keyframes, px, py, pz, wanted,
+    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Features (B, LP · F) of points; ``reference.encode``."""
     ix, iy, iz, fx, fy, fz, share = _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS, LP)
-    first = tl.arange(0, LP)[None, :] * SIZE
+    first = tl.arange(0, LP)[None, :] * size
     feature = tl.arange(0, F)[None, None, :]
     read = ((share > 0) & wanted[:, None])[:, :, None]
     total = tl.zeros((B, LP, F), tl.float32)
     for corner in tl.static_range(8):
-        entry, weight = _corner(ix, iy, iz, fx, fy, fz, corner, SIZE)
+        entry, weight = _corner(ix, iy, iz, fx, fy, fz, size, corner)
         value = tl.load(table + (first + entry)[:, :, None] * F + feature, mask=read, other=0.0)
         total += (weight * share)[:, :, None] * value.to(tl.float32)
     return tl.reshape(total, (B, LP * F))
@@ -244,11 +244,11 @@ def sample_rays(
         tl.store(weight + 2 * (surface + where * B) + 1, sure)
 
 
-@triton.jit(do_not_specialize=["keyframes", "count"])
+@triton.jit(do_not_specialize=["size", "keyframes", "count"])
 def gradient(
-    table, network, cells_per_m, origin, focus, keyframes, points, target, weight, colour_weight, distance_weight,
+    table, size, network, cells_per_m, origin, focus, keyframes, points, target, weight, colour_weight, distance_weight,
     count, table_grad, network_grad, sums,
-    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, SIZE: tl.constexpr,
+    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Adds the gradient of ``reference.loss`` of ``reference.query`` to ``table_grad`` and ``network_grad``.
@@ -261,7 +261,7 @@ def gradient(
     px = tl.load(points + 3 * n, mask=inside, other=0.0)
     py = tl.load(points + 3 * n + 1, mask=inside, other=0.0)
     pz = tl.load(points + 3 * n + 2, mask=inside, other=0.0)
-    x = _encode(table, cells_per_m, origin, focus, keyframes, px, py, pz, inside, LEVELS, LP, F, SIZE, B)
+    x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, inside, LEVELS, LP, F, B)
     w1, b1 = _first_layer(network, IN, HIDDEN, LP, F, HP)
     h = tl.maximum(tl.dot(x, tl.trans(w1)) + b1[None, :], 0.0)
     shown = tl.load(weight + 2 * n, mask=inside, other=0.0)
@@ -295,23 +295,22 @@ def gradient(
     tl.atomic_add(network_grad + HIDDEN * IN + j, tl.sum(dh, axis=0), mask=j < HIDDEN, sem="relaxed")
     dx = tl.reshape(tl.dot(dh, w1), (B, LP, F))
     ix, iy, iz, fx, fy, fz, share = _cells(cells_per_m, origin, focus, keyframes, px, py, pz, LEVELS, LP)
-    first = tl.arange(0, LP)[None, :] * SIZE
+    first = tl.arange(0, LP)[None, :] * size
     feature = tl.arange(0, F)[None, None, :]
     written = ((share > 0) & inside[:, None])[:, :, None] & (feature >= 0)
     for corner in tl.static_range(8):
-        entry, part = _corner(ix, iy, iz, fx, fy, fz, corner, SIZE)
+        entry, part = _corner(ix, iy, iz, fx, fy, fz, size, corner)
         where = table_grad + (first + entry)[:, :, None] * F + feature
         tl.atomic_add(where, (part * share)[:, :, None] * dx, mask=written, sem="relaxed")
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["size"])
 def adam_table(
-    table, half_table, table_grad, m, v, step_size, beta1, beta2, epsilon,
-    SIZE: tl.constexpr, F: tl.constexpr, B: tl.constexpr,
-):  # fmt: skip
+    table, half_table, table_grad, m, v, step_size, size, beta1, beta2, epsilon, F: tl.constexpr, B: tl.constexpr
+):
     """One Adam step on the entries with any gradient, whose gradient is cleared; ``reference.adam_touched``.
 
-    ``half_table`` gets the new values as float16. Each program has ``B`` entries of one level; SIZE is a multiple of B.
+    ``half_table`` gets the new values as float16. A program has ``B`` entries of one level; ``size`` is a multiple of B.
     """
     entry = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
     at = entry[:, None] * F + tl.arange(0, F)[None, :]
@@ -319,7 +318,7 @@ def adam_table(
     touched = (tl.max(tl.abs(g), axis=1) > 0)[:, None] & (at >= 0)
     mean = beta1 * tl.load(m + at, mask=touched, other=0.0) + (1 - beta1) * g
     square = beta2 * tl.load(v + at, mask=touched, other=0.0) + (1 - beta2) * g * g
-    step = tl.load(step_size + tl.program_id(0) * B // SIZE)
+    step = tl.load(step_size + tl.program_id(0) * B // size)
     value = tl.load(table + at, mask=touched, other=0.0) - step * mean / (tl.sqrt(square) + epsilon)
     tl.store(m + at, mean, mask=touched)
     tl.store(v + at, square, mask=touched)
@@ -357,12 +356,12 @@ def _cell(o, t, d, low, cell, count):
     return tl.minimum(tl.maximum(place, 0), count - 1)
 
 
-@triton.jit(do_not_specialize=["keyframes", "columns", "rows", "width", "height", "w", "h", "nx", "ny", "nz"])
+@triton.jit(do_not_specialize=["size", "keyframes", "columns", "rows", "width", "height", "w", "h", "nx", "ny", "nz"])
 def draw(
-    table, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, torn, known, poses, camera, band, gain,
-    keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
+    table, size, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, torn, known, poses, camera, band,
+    gain, keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
     panorama_share, depth_share, colour, depth, confidence,
-    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr, SIZE: tl.constexpr,
+    LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """A picture: march to the surface, the field's colour there, the panorama's share; one program 8 × 8 pixels.
@@ -413,7 +412,7 @@ def draw(
             of_prior, _ = _nearest_prior(inverse, torn, known, poses, band, keyframes, px, py, pz, w, h, active)
             value = depth_share * of_prior
         if depth_share < 1:
-            x = _encode(table, cells_per_m, origin, focus, keyframes, px, py, pz, active, LEVELS, LP, F, SIZE, B)
+            x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, active, LEVELS, LP, F, B)
             hidden = tl.maximum(tl.dot(x, tl.trans(w1)) + b1[None, :], 0.0)
             of_field, _ = _output(network, hidden, 3, IN, HIDDEN, HP)
             value += (1 - depth_share) * of_field
@@ -442,7 +441,7 @@ def draw(
     px, py, pz = ox + met * dx, oy + met * dy, oz + met * dz
     red, green, blue = met * 0, met * 0, met * 0
     if panorama_share < 1:
-        x = _encode(table, cells_per_m, origin, focus, keyframes, px, py, pz, shown, LEVELS, LP, F, SIZE, B)
+        x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, shown, LEVELS, LP, F, B)
         hidden = tl.maximum(tl.dot(x, tl.trans(w1)) + b1[None, :], 0.0)
         red, _ = _output(network, hidden, 0, IN, HIDDEN, HP)
         green, _ = _output(network, hidden, 1, IN, HIDDEN, HP)

@@ -92,8 +92,8 @@ def test_gradient_agrees_with_autograd(levels, features, hidden):
     sums = torch.zeros(4, device=DEVICE)
     block = 64
     kernels.gradient[(math.ceil(count / block),)](
-        device._p.table, device._p.network, to(cells), to(origin), to(focus), 2, to(points), to(target), to(weight),
-        to(colour_weight), to(distance_weight), count, table_grad, network_grad, sums, **device._shape, B=block,
+        device._p.table, 1 << 10, device._p.network, to(cells), to(origin), to(focus), 2, to(points), to(target),
+        to(weight), to(colour_weight), to(distance_weight), count, table_grad, network_grad, sums, **device._shape, B=block,
     )  # fmt: skip
     tensors = [torch.from_numpy(a.copy()).requires_grad_() for a in (p.table, *p.network())]
     field = TorchField(*tensors, *(torch.from_numpy(a) for a in (cells, origin, focus)))
@@ -125,7 +125,7 @@ def test_a_gradient_by_hand():
     table_grad, network_grad = torch.zeros(p.table.size, device=DEVICE), torch.zeros(40, device=DEVICE)
     sums = torch.zeros(4, device=DEVICE)
     kernels.gradient[(1,)](
-        device._p.table, device._p.network, to(np.ones(1, F)), to(np.zeros(3, F)), to(np.zeros((1, 4), F)), 1,
+        device._p.table, 1 << 10, device._p.network, to(np.ones(1, F)), to(np.zeros(3, F)), to(np.zeros((1, 4), F)), 1,
         to(np.full((1, 3), 0.5, F)), to(np.array([[0, 0, 0, 0.25]], F)), to(np.ones((1, 2), F)), to(np.ones(1, F)),
         to(np.ones(1, F)), 1, table_grad, network_grad, sums, **device._shape, B=64,
     )  # fmt: skip
@@ -168,7 +168,7 @@ def test_adam_agrees_with_the_reference():
         reference.adam_touched(table, grad, m, v, rates[:, None, None], 0.9, 0.99, 1e-7)
         gpu_grad = grad.reshape(-1).to(DEVICE)
         kernels.adam_table[(levels * size // block,)](
-            *ours, gpu_grad, *moments, rates.to(DEVICE), 0.9, 0.99, 1e-7, SIZE=size, F=4, B=block
+            *ours, gpu_grad, *moments, rates.to(DEVICE), size, 0.9, 0.99, 1e-7, F=4, B=block
         )
         assert not gpu_grad.any()
         np.testing.assert_allclose(ours[0].cpu().numpy(), table.numpy().reshape(-1), rtol=1e-4, atol=1e-6)
