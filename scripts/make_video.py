@@ -1,0 +1,219 @@
+#!/usr/bin/env python3
+"""Films the operator's page while somebody drives through an obstacle: docs/images/console.webp of the README.
+
+    python scripts/make_video.py docs/images/console.webp
+
+The page is the real one in Chromium, driven by its W key. What it shows comes from the real nodes (SLAM, depth, virtual
+space, arbiter, virtual robot, navigator, console) and a simulated robot, in one process and in simulated time as for
+`ic evaluate teleop`; the page's clock is the simulation's, so the film has the right pace however slow the machine is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from instant_ic.console import ConsoleServer, Look, ServerConfig
+from instant_ic.console.drive import DriveConfig
+from instant_ic.evaluation.teleop_stack import CAMERA_HEIGHT_M, STEP_S, SimulatedStack, StackConfig, _Page
+from instant_ic.evaluation.teleop_worlds import make_course
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.msg import ControlState
+
+CHROMIUM_FLAGS = [
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
+    "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
+CLOCK = """
+// The page lives in the film's time: what is drawn is drawn when the film says so.
+window.filmMs = 1;
+const waiting = [];
+performance.now = () => window.filmMs;
+window.requestAnimationFrame = (callback) => waiting.push(callback);
+window.film = (ms) => {
+    window.filmMs = ms;
+    for (const callback of waiting.splice(0)) callback(ms);
+};
+"""
+LONGEST_S = 120.0
+
+
+class Page(_Page):
+    """Gives what the console tells on to a real page as well, in the simulation's time."""
+
+    def __init__(self, stack: SimulatedStack, server: ConsoleServer) -> None:
+        super().__init__(stack)
+        self.stack, self.server = stack, server
+        self.mode = ""
+        server.now_ms = self.now_ms  # type: ignore[method-assign]
+
+    def now_ms(self) -> float:
+        return 1e3 * self.stack.time_s
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        super().publish(kind, message)
+        self.mode = message.get("mode", self.mode)
+        self.server.publish(kind, message)
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        super().send_frame(kind, header, payload, client)
+        self.server.send_frame(kind, header, self.photo() if kind.name == "PANORAMA" else payload)
+
+    def show(self, *kinds: Any) -> None:
+        self.server.show(*kinds)
+
+    def photo(self) -> bytes:
+        """The camera's picture that has just come, which the simulated stack leaves empty."""
+        import cv2
+
+        x, y, yaw = self.stack._newest[False].pose
+        frame = self.stack.simulation.renderer.render(pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw), 1280, 640)
+        return bytes(cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+
+
+class Operator:
+    """What the page sends; the newest command counts."""
+
+    def __init__(self, stack: SimulatedStack) -> None:
+        self.stack = stack
+        self.command = (0.0, 0.0)
+
+    def on_drive(self, linear: float, angular: float) -> None:
+        self.command = (linear, angular)
+
+    def on_look(self, look: Look) -> None:
+        self.stack.nodes["console"].on_look(look)
+
+    def on_estop(self, stop: bool) -> None:
+        raise RuntimeError("nobody presses the emergency stop in this film")
+
+    def on_record(self, on: bool) -> None:
+        raise RuntimeError("nobody records in this film")
+
+    def on_snapshot(self) -> None:
+        raise RuntimeError("nobody takes a snapshot in this film")
+
+    def on_bookmark(self, name: str) -> None:
+        raise RuntimeError("nobody sets a bookmark in this film")
+
+    def export_map(self) -> dict[str, bytes]:
+        return {}
+
+
+def film(args: argparse.Namespace) -> list[bytes]:
+    """PNG pictures of the page, ``args.fps`` a second of simulated time."""
+    from playwright.sync_api import sync_playwright
+
+    course = make_course(args.world, args.seed, 0)
+    words = ("console.view.width:=480", "console.view.height:=270", "console.map_rate_hz:=2.0")
+    config = StackConfig(depth=args.depth, seed=args.seed, overrides=words)
+    with SimulatedStack(course.world, config) as stack:
+        operator = Operator(stack)
+        patient = DriveConfig(watchdog_s=60.0, lease_timeout_s=600.0, max_command_age_s=60.0, beat_timeout_s=60.0)
+        page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
+        server = ConsoleServer(operator, ServerConfig(port=0, drive=patient), page_values)
+        stack.page = stack.nodes["console"].server = page_in = Page(stack, server)
+        server.start()
+        try:
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=CHROMIUM_FLAGS)
+                context = browser.new_context(viewport={"width": args.width, "height": args.height})
+                context.add_init_script(CLOCK)
+                page = context.new_page()
+                page.goto(f"{server.url}?quality=full")
+                frames = drive(stack, page, page_in, operator, args)
+                browser.close()
+        finally:
+            server.stop()
+    return frames
+
+
+def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args: argparse.Namespace) -> list[bytes]:
+    """Waits until the virtual space is ready, then holds W through the obstacle, and lets go behind it."""
+    frames: list[bytes] = []
+    steps = round(1.0 / args.fps / STEP_S)
+    ready_s = pressed_s = back_s = None
+    was_virtual = False
+    while True:
+        for _ in range(steps):
+            stack.step(lambda: operator.command)
+        page.wait_for_timeout(args.settle_ms)  # pictures come over a real socket and are decoded
+        for part in (0.5, 1.0):
+            page.evaluate("(ms) => film(ms)", 1e3 * (stack.time_s - (1 - part) / args.fps))
+        now, state = stack.time_s, stack.state
+        if now > LONGEST_S:
+            raise RuntimeError(f"the drive is not over after {LONGEST_S:g} s: {state and state.reason}")
+        if ready_s is None:
+            ready = state is not None and int(state.mode) == ControlState.REAL and vspace_ready(stack)
+            drives = page.locator('body[data-driver="you"][data-picture="live"]').count() > 0
+            ready_s = now if ready and drives else None
+            continue
+        frames.append(page.screenshot(type="png"))
+        print(f"\r{len(frames)} pictures, {now - ready_s:.1f} s, {told.mode}   ", end="", file=sys.stderr)
+        if pressed_s is None and now > ready_s + 0.8:
+            pressed_s = now
+            page.keyboard.down("w")
+        was_virtual |= told.virtual
+        if was_virtual and not told.virtual and back_s is None:
+            back_s = now
+        if back_s is not None and now > back_s + args.after_s:
+            page.keyboard.up("w")
+        if back_s is not None and now > back_s + args.after_s + 0.8:
+            print(file=sys.stderr)
+            return frames
+
+
+def vspace_ready(stack: SimulatedStack) -> bool:
+    status = stack.nodes["console"].vspace.message
+    return status is not None and int(status.state) == status.READY
+
+
+def write(frames: list[bytes], args: argparse.Namespace) -> None:
+    """An animated WebP, which GitHub shows in a README."""
+    from PIL import Image
+
+    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
+    small = [picture.resize((args.out_width, round(args.out_width * picture.height / picture.width)), Image.LANCZOS)
+             for picture in pictures]  # fmt: skip
+    small[0].save(
+        args.out, save_all=True, append_images=small[1:], duration=round(1000 / args.fps), loop=0,
+        quality=args.quality, method=6, minimize_size=False,
+    )  # fmt: skip
+    if args.frames:
+        args.frames.mkdir(parents=True, exist_ok=True)
+        for number, frame in enumerate(frames):
+            (args.frames / f"{number:04d}.png").write_bytes(frame)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="where the animated WebP goes")
+    parser.add_argument("--world", default="corridor", help="as for `ic evaluate teleop` (default corridor)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--depth", default="fused", choices=("fused", "lidar"))
+    parser.add_argument("--fps", type=int, default=10, help="pictures a second; 60 must be a multiple (default 10)")
+    parser.add_argument("--width", type=int, default=960)
+    parser.add_argument("--height", type=int, default=600)
+    parser.add_argument("--out-width", type=int, default=720)
+    parser.add_argument("--quality", type=int, default=50)
+    parser.add_argument("--after-s", type=float, default=2.0, help="seconds driven on after the way back (default 2)")
+    parser.add_argument("--settle-ms", type=int, default=120, help="real time for each picture to arrive (default 120)")
+    parser.add_argument("--frames", type=Path, metavar="DIR", help="also keep the single pictures here")
+    args = parser.parse_args()
+    if round(1 / STEP_S) % args.fps:
+        parser.error(f"--fps must divide {round(1 / STEP_S)}")
+    began = time.monotonic()
+    frames = film(args)
+    write(frames, args)
+    megabytes = args.out.stat().st_size / 1e6
+    print(f"{args.out}: {len(frames) / args.fps:.1f} s, {megabytes:.2f} MB, made in {time.monotonic() - began:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
