@@ -115,9 +115,13 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     contacts = 0
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
         task = progress.add_task("starting", total=settings.episodes)
+        so_far: list[teleop.Drive] = []
 
         def tell(drives: list[teleop.Drive]) -> None:
             nonlocal contacts
+            so_far.extend(drives)
+            if args.json:  # a run that is cut short leaves what it has
+                args.json.write_text(json.dumps(teleop.report(so_far, settings), indent=2) + "\n")
             contacts += sum(drive.contacts for drive in drives)
             progress.update(task, advance=1, description=f"driving, {contacts} contacts")
             if not console.is_terminal:
