@@ -27,7 +27,10 @@ ADVICE: tuple[tuple[str, str], ...] = (
     ("camera picture", "look at the camera and the link to the page (ic topic info /camera/image/compressed)"),
     ("picture of the virtual space", "look at nerf, the console and the machine's load (ic top)"),
     ("virtual space", "look at depth and keyframes; without a virtual space the robot stops before obstacles"),
-    ("no way round", "drive round by hand; ghosts in the map: ic map save, and start anew where nothing stands"),
+    (
+        "no way round",
+        "drive round by hand; what the map holds and no scan sees is forgotten in seconds (docs/control.md)",
+    ),
     ("path follower", "look at navigator (ic log navigator)"),
     ("v-bot", "look at virtual_robot (ic log virtual_robot)"),
 )

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Percent, Positive, check_ranges
+from ..ranges import NotNegative, Percent, Positive, Range, check_ranges
 from .footprint import Footprint
 from .heights import HeightConfig, HeightLayer, SortedPoints, shifted
 
@@ -22,6 +23,8 @@ INSCRIBED = 253
 LETHAL = 254
 UNKNOWN = 255
 
+_LOOKED = 1
+"""In what a scan saw: a beam went through."""
 SLACK_M = 1e-6
 """For comparing distances: five cells of 0.05 m are not quite 0.25 m in floating point."""
 
@@ -41,6 +44,7 @@ class CostmapConfig:
     inf_is_valid: bool = False
     lethal_cost_threshold: Percent = 65
     footprint_clearing_enabled: bool = True
+    static_seen_through: Annotated[int, Range(0, 255)] = 40
     points: HeightConfig = field(default_factory=HeightConfig)
 
     def __post_init__(self) -> None:
@@ -225,6 +229,8 @@ class RollingCostmap:
         self.size = round(config.width / config.resolution)
         self.heights = HeightLayer(config.points, self.size, config.resolution)
         self._observed = np.full((self.size, self.size), UNKNOWN, dtype=np.uint8)
+        # Scans in a row that have looked through a cell, saturating; a hit in it or beside it begins anew.
+        self._through = np.zeros((self.size, self.size), dtype=np.uint8)
         self._corner: tuple[int, int] | None = None  # window's first column and row in the endless grid
         self._body = footprint.points(0.5 * config.resolution)
         # What 3D points marked may never be seen again from near: a pose that is a cell off must not wipe it out.
@@ -237,6 +243,7 @@ class RollingCostmap:
     def reset(self) -> None:
         """Forgets what was seen, as after a jump of the map."""
         self._observed.fill(UNKNOWN)
+        self._through.fill(0)
         self.heights.reset()
 
     def update(
@@ -258,7 +265,9 @@ class RollingCostmap:
         if scan is not None and len(scan.ends):
             start = (scan.origin - origin) / resolution
             ends = np.ascontiguousarray((scan.ends - origin) / resolution)
-            _clear_and_mark(self._observed, float(start[0]), float(start[1]), ends, scan.hits)
+            looked = np.zeros_like(self._observed)
+            _clear_and_mark(self._observed, looked, float(start[0]), float(start[1]), ends, scan.hits)
+            self._count_through(looked)
         if points is not None:
             self.heights.update(points, np.zeros(3) if map_from_points is None else map_from_points, origin)
         if self.config.footprint_clearing_enabled:
@@ -267,6 +276,14 @@ class RollingCostmap:
         rows, columns = np.nonzero(self.heights.occupied())
         remembered = origin + (np.stack([columns, rows], axis=-1) + 0.5) * resolution
         return Costmap(self._inflate(master), resolution, origin, remembered)
+
+    def _count_through(self, looked: NDArray[np.uint8]) -> None:
+        import cv2
+
+        beside = cv2.dilate((looked == LETHAL).astype(np.uint8), np.ones((3, 3), np.uint8))
+        free = (looked == _LOOKED) & (beside == 0)
+        self._through[free] += self._through[free] < 255
+        self._through[beside > 0] = 0
 
     def _move_to(self, x: float, y: float) -> None:
         half = self.size // 2
@@ -279,6 +296,7 @@ class RollingCostmap:
         if self._corner is not None:
             dx, dy = corner[0] - self._corner[0], corner[1] - self._corner[1]
             self._observed = shifted(self._observed, dx, dy, UNKNOWN)
+            self._through = shifted(self._through, dx, dy, 0)
             self.heights.shift(dx, dy)
         self._corner = corner
 
@@ -291,7 +309,11 @@ class RollingCostmap:
             layer[index[:, 1], index[:, 0]] = value
 
     def _master(self, static: StaticMap | None, origin: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Layers joined as nav2's ``combination_method`` max does: what any holds occupied is occupied."""
+        """Layers joined as nav2's ``combination_method`` max does: what any holds occupied is occupied.
+
+        But for what the map alone holds and ``static_seen_through`` scans in a row have looked through: a ghost of a
+        scan that was put in the wrong place, or a thing that has gone.
+        """
         occupancy, shift = np.full((1, 1), -1, dtype=np.int8), np.zeros(2)
         resolution = self.config.resolution
         if static is not None:
@@ -306,6 +328,8 @@ class RollingCostmap:
             self.config.resolution,
             resolution,
             self.config.lethal_cost_threshold,
+            self._through,
+            self.config.static_seen_through or 256,
         )
 
     def _inflate(self, master: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -341,6 +365,8 @@ def _join(
     resolution: float,
     map_resolution: float,
     lethal_threshold: int,
+    through: NDArray[np.uint8],
+    seen_through: int,
 ) -> NDArray[np.uint8]:
     """Master grid from what was observed and the map, whose origin lies ``shift`` metres before the window's."""
     size_y, size_x = observed.shape
@@ -356,7 +382,8 @@ def _join(
             if 0 <= row < height and 0 <= columns[c] < width:
                 known = occupancy[row, columns[c]]
             seen = observed[r, c]
-            if known >= lethal_threshold or seen == 254 or hits[r, c] >= mark_threshold:
+            held = known >= lethal_threshold and through[r, c] < seen_through
+            if held or seen == 254 or hits[r, c] >= mark_threshold:
                 master[r, c] = 254
             else:
                 master[r, c] = seen if known < 0 else 0
@@ -379,6 +406,7 @@ def _inflate(master: NDArray[np.uint8], distance: NDArray[np.float32], cost_of_s
 @njit(cache=True)
 def _clear_and_mark(
     observed: NDArray[np.uint8],
+    looked: NDArray[np.uint8],
     start_x: float,
     start_y: float,
     ends: NDArray[np.float64],
@@ -386,7 +414,8 @@ def _clear_and_mark(
 ) -> None:
     """Clears along every beam up to its last cell, then marks the hits: a hit outlives a grazing beam.
 
-    Coordinates are in cells of ``observed``. Walks the cells a beam touches (Amanatides & Woo 1987).
+    ``looked`` is told what this scan saw: ``_LOOKED`` for a beam that went through, 254 for a hit. Coordinates are in
+    cells of ``observed``. Walks the cells a beam touches (Amanatides & Woo 1987).
     """
     height, width = observed.shape
     for i in range(ends.shape[0]):
@@ -402,6 +431,7 @@ def _clear_and_mark(
             if column < 0 or row < 0 or column >= width or row >= height:
                 break
             observed[row, column] = 0
+            looked[row, column] = _LOOKED
             if next_x < next_y:
                 next_x += per_x
                 column += step_x
@@ -415,6 +445,7 @@ def _clear_and_mark(
             column, row = math.floor(ends[i, 0]), math.floor(ends[i, 1])
             if 0 <= column < width and 0 <= row < height:
                 observed[row, column] = 254
+                looked[row, column] = 254
 
 
 @njit(cache=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..ranges import NotNegative, NotNegativeInt, check_ranges
 from .costmap import Costmap
-from .planner import HybridPlanner
+from .planner import HybridPlanner, Plan
 from .prediction import Prediction
 from .subgoal import behind_obstacle, extend_ahead
 from .walls import WallMap
@@ -67,5 +67,11 @@ def find_passage(
     plan = planner.plan(costmap, start, goal)
     straight = float(np.linalg.norm(goal[:2] - start[:2]))
     if plan.whole_length_m > straight + config.max_detour_m:
-        return Passage(False, "there is no way round the obstacle")
+        return Passage(False, f"there is no way round the obstacle ({_why(plan, straight, config)})")
     return Passage(True, "")
+
+
+def _why(plan: Plan, straight_m: float, config: PassageConfig) -> str:
+    if math.isfinite(plan.whole_length_m):
+        return f"{plan.whole_length_m - straight_m:.1f} m longer than straight on, {config.max_detour_m:.1f} m allowed"
+    return plan.reason or "none found"

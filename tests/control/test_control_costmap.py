@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, World, corridor, draw_map, matrix, rectangle
 
 from instant_ic.control.costmap import (
     FREE,
@@ -22,6 +23,7 @@ from instant_ic.control.costmap import (
     scan_rays,
 )
 from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits
 
 CONFIG = CostmapConfig(width=4.0, footprint_clearing_enabled=False)
 
@@ -172,3 +174,68 @@ def test_footprint_overlap_counts_lethal_points_under_the_rectangle() -> None:
 def test_bad_parameters_are_named(key: str, value: float) -> None:
     with pytest.raises(ValueError, match=key):
         CostmapConfig(**{key: value})
+
+
+class TestGhosts:
+    """Cells that the map alone holds occupied, and scans look through."""
+
+    def ghost(self) -> StaticMap:
+        static = open_map()
+        static.occupancy[60, 80:82] = 100  # x 1.0 to 1.1, y 0 to 0.05
+        return static
+
+    def test_what_only_the_map_holds_is_gone_after_as_many_scans_in_a_row_as_set(self) -> None:
+        rolling, place = RollingCostmap(CONFIG, Footprint()), np.array([1.025, 0.025])
+        beam = ScanRays(np.array([0.0, 0.025]), np.array([[1.825, 0.025]]), np.array([True]))
+        for _ in range(CONFIG.static_seen_through - 1):
+            assert rolling.update(np.zeros(3), self.ghost(), beam).cost_at(place) == LETHAL
+        assert rolling.update(np.zeros(3), self.ghost(), beam).cost_at(place) < INSCRIBED
+        # The window moves: what was found out moves with it.
+        assert rolling.update(np.array([0.2, 0.0, 0.0]), self.ghost(), None).cost_at(place) < INSCRIBED
+        # Hit again it is there again, and needs as many scans as before.
+        rolling.update(np.zeros(3), self.ghost(), one_hit(1.025, 0.025))
+        assert rolling.update(np.zeros(3), self.ghost(), beam).cost_at(place) == LETHAL
+
+    def test_a_hit_beside_it_keeps_it(self) -> None:
+        """A pose that is a cell off puts the wall's hits beside its cells: the wall is there all the same."""
+        rolling, place = RollingCostmap(CONFIG, Footprint()), np.array([1.025, 0.025])
+        beside = ScanRays(np.array([0.0, 0.025]), np.array([[1.825, 0.025], [1.025, 0.075]]), np.array([True, True]))
+        for _ in range(100):
+            costmap = rolling.update(np.zeros(3), self.ghost(), beside)
+        assert costmap.cost_at(place) == LETHAL
+
+    def test_what_no_scan_looks_through_stays_and_the_rule_can_be_switched_off(self) -> None:
+        place = np.array([1.025, 0.025])
+        elsewhere = ScanRays(np.zeros(2), np.array([[-1.0, 0.025]]), np.array([True]))
+        through = ScanRays(np.array([0.0, 0.025]), np.array([[1.825, 0.025]]), np.array([True]))
+        never = CostmapConfig(width=4.0, footprint_clearing_enabled=False, static_seen_through=0)
+        for config, rays in ((CONFIG, elsewhere), (never, through)):
+            rolling = RollingCostmap(config, Footprint())
+            for _ in range(300):
+                costmap = rolling.update(np.zeros(3), self.ghost(), rays)
+            assert costmap.cost_at(place) == LETHAL
+
+    def test_ghosts_beside_an_obstacle_close_the_way_round_only_for_a_while(self) -> None:
+        """A map with two walls that are not there, from scans put in the wrong place on a busy machine."""
+        from instant_ic.control.passage import PassageConfig, find_passage
+        from instant_ic.control.planner import HybridPlanner, PlannerConfig
+        from instant_ic.control.prediction import PredictionConfig, Predictor
+
+        walls = corridor()
+        ghosts = np.array([[[2.7, -1.2], [2.7, -0.3]], [[2.7, 0.3], [2.7, 1.2]]])
+        world = World(np.concatenate([walls, rectangle(2.5, -0.25, 3.0, 0.25)]))
+        static = draw_map(np.concatenate([walls, ghosts]), (-2, -1.2, 14, 1.2))
+        robot, forward, config = np.array([1.7, 0.0, 0.0]), (0.4, 0.0), CostmapConfig()
+        rays = scan_rays(
+            world.cast(*robot), -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M, matrix(robot), config
+        )
+        rolling, reasons = RollingCostmap(config, Footprint()), []
+        predictor = Predictor(PredictionConfig(), MotionLimits(), Footprint())
+        for k in range(config.static_seen_through + 1):
+            costmap = rolling.update(robot, static, rays)
+            if k in (0, config.static_seen_through):
+                ahead = predictor.predict(robot, forward, forward, costmap)
+                planner = HybridPlanner(PlannerConfig())
+                reasons.append(find_passage(costmap, ahead, True, None, planner, PassageConfig()).reason)
+        assert reasons[0].startswith("there is no way round the obstacle (no way to the goal: ")
+        assert reasons[1] == ""
