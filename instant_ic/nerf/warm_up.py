@@ -21,7 +21,7 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     small = dataclasses.replace(
         config,
         field=dataclasses.replace(config.field, log2_table=10),
-        train=dataclasses.replace(config.train, ray_columns=8, ray_rows=8),
+        train=dataclasses.replace(config.train, ray_columns=16, ray_rows=16),
         # Pictures of both the warp and the field.
         picture=dataclasses.replace(config.picture, panorama_until_db=-1e3, field_from_db=1e3),
     )
