@@ -29,13 +29,19 @@ def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
     Raises:
         DeviceError: a device was asked for that is not there, or does not work.
     """
+    warning = ""
     wants_gpu = config.device in ("cuda", "triton", "torch-cuda")
     if wants_gpu or (config.device == "auto" and _may_have_cuda()):
         import torch
 
         if torch.cuda.is_available():
-            return _make_gpu_device(config)
-        if wants_gpu:
+            try:
+                return _make_gpu_device(config)
+            except torch.OutOfMemoryError as error:
+                if wants_gpu:
+                    raise
+                warning = f"the GPU is out of memory; on the CPU ({error})"
+        elif wants_gpu:
             raise DeviceError(f"device is {config.device}, but torch finds no CUDA device; use auto or cpu")
     if config.device != "torch-cpu":
         try:
@@ -44,10 +50,10 @@ def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
             if config.device == "cpu":
                 raise
         else:
-            return NumbaDevice(config.field, config.train), ""
+            return NumbaDevice(config.field, config.train), warning
     from .torch_device import TorchDevice
 
-    return TorchDevice(config.field, config.train, "cpu"), ""
+    return TorchDevice(config.field, config.train, "cpu"), warning
 
 
 def _may_have_cuda() -> bool:

@@ -310,7 +310,7 @@ def adam_table(
 ):
     """One Adam step on the entries with any gradient, whose gradient is cleared; ``reference.adam_touched``.
 
-    ``half_table`` gets the new values as float16. A program has ``B`` entries of one level; ``size`` is a multiple of B.
+    ``half_table`` gets the new values as float16. A program has ``B`` entries of one level, by whole numbers.
     """
     entry = tl.program_id(0).to(tl.int64) * B + tl.arange(0, B)
     at = entry[:, None] * F + tl.arange(0, F)[None, :]

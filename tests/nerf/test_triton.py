@@ -93,7 +93,8 @@ def test_gradient_agrees_with_autograd(levels, features, hidden):
     block = 64
     kernels.gradient[(math.ceil(count / block),)](
         device._p.table, 1 << 10, device._p.network, to(cells), to(origin), to(focus), 2, to(points), to(target),
-        to(weight), to(colour_weight), to(distance_weight), count, table_grad, network_grad, sums, **device._shape, B=block,
+        to(weight), to(colour_weight), to(distance_weight), count, table_grad, network_grad, sums, **device._shape,
+        B=block,
     )  # fmt: skip
     tensors = [torch.from_numpy(a.copy()).requires_grad_() for a in (p.table, *p.network())]
     field = TorchField(*tensors, *(torch.from_numpy(a) for a in (cells, origin, focus)))
