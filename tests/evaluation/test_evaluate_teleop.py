@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from instant_ic.control.arbiter import Mode
 from instant_ic.evaluation import teleop, teleop_figures, teleop_worlds
 from instant_ic.evaluation.teleop_figures import Drive, Switch
 from instant_ic.evaluation.teleop_operator import RecordedOperator, ScriptedOperator, Sight, read_commands
+from instant_ic.evaluation.teleop_plot import Video, save_plot
 from instant_ic.evaluation.teleop_stack import Log, Shown, SimulatedStack, StackConfig
 from instant_ic.sim.contact import OccupancyMask
 
@@ -263,10 +265,22 @@ def short_course() -> teleop_worlds.Course:
 
 
 @pytest.mark.parametrize("method", ["ic", "stop", "shared"])
-def test_each_method_drives(method: str, short_course: teleop_worlds.Course) -> None:
-    settings = teleop.Settings(episodes=1, depth="lidar", methods=(method,), pictures=False)
+def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp_path: Path) -> None:
+    settings = teleop.Settings(episodes=1, world="corridor", depth="lidar", methods=(method,), pictures=False)
     episode = teleop._Episode(settings, short_course, 0, method)
-    drive = episode.run()
+    if method == "shared":  # its film and its plot, once
+        with Video(tmp_path / "drive.mp4") as video:
+            drive = episode.run(video.on_step)
+        assert video.pictures > 10 * (drive.seconds - 0.5)
+        read = cv2.VideoCapture(str(tmp_path / "drive.mp4"))
+        frames = int(read.get(cv2.CAP_PROP_FRAME_COUNT))
+        picture, plan = np.hsplit(read.read()[1], [640])
+        assert frames == video.pictures and plan.shape == (360, 360, 3)
+        assert picture.std() > 20 and (plan > 240).mean() > 0.5  # a corridor, and a drawing on white
+        save_plot(tmp_path / "drive.png", [drive], teleop.report([drive], settings), settings)
+        assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
+    else:
+        drive = episode.run()
     assert drive.completed and drive.contacts == 0 and not drive.switches
     assert 1.0 < drive.seconds < 4.0
     # He lets go where the picture, 0.2 s old, is 0.25 m before the goal; then come the command's way and braking.
