@@ -436,7 +436,10 @@ class ConsoleServer:
         }.get(kind)
         if handler is None:
             raise ProtocolError(f"unknown message type {kind!r:.40}")
-        if self.gate.touch(session.number, now, away=flag(message, "away", False)):
+        if kind == "ping":
+            session.away = flag(message, "away", False)
+        # A page that is not looked at goes on acknowledging pictures: no sign of an operator either.
+        if self.gate.touch(session.number, now, away=session.away):
             self._emit_due()
         handler(session, message, now)
 

@@ -37,6 +37,7 @@ class Session:
         self.socket = socket
         self.may_drive = may_drive
         self.bad_messages = 0
+        self.away = False
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}

@@ -121,8 +121,13 @@ def room_seen(pose, yaw, pitch, vfov_deg=60.0):
 
 
 def likeness(page, expected):
-    """Correlation of the page's picture with ``expected``, softened to the same sharpness."""
-    shown = cv2.resize(picture_of(page), expected.shape[1::-1], interpolation=cv2.INTER_AREA)
+    """Correlation of the page's picture with ``expected``."""
+    return likeness_of(picture_of(page), expected)
+
+
+def likeness_of(picture, expected):
+    """Correlation of two pictures of one view, softened to the same sharpness."""
+    shown = cv2.resize(picture, expected.shape[1::-1], interpolation=cv2.INTER_AREA)
     return np.corrcoef(cv2.blur(shown, (5, 5)).ravel(), cv2.blur(expected, (5, 5)).ravel())[0, 1]
 
 
@@ -142,6 +147,22 @@ def touch(page, kind, x, y):
         stick.dispatchEvent(new PointerEvent(kind, {pointerId: 7, clientX: x, clientY: y, bubbles: true})); }""",
         [kind, x, y],
     )
+
+
+def stick_middle(page):
+    box = page.locator("#stick").bounding_box()
+    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+
+def push_stick(page, demo):
+    x, y = stick_middle(page)
+    touch(page, "pointerdown", x, y)
+    touch(page, "pointermove", x, y - 60)
+    wait_until(lambda: moving(demo), page, "the stick drives")
+
+
+def release_stick(page, how="pointerup"):
+    touch(page, how, *stick_middle(page))
 
 
 # For tests that cut a page's link: the sockets that it has opened.

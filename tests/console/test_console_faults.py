@@ -13,27 +13,16 @@ from console_pages import (
     hold_and_push,
     make_demo,
     moving,
+    push_stick,
     release_by_enter,
+    release_stick,
     start_driving,
-    touch,
     wait_stopped,
     wait_until,
 )
 
 pytestmark = BROWSER_TEST
 STOPPED = (0.0, 0.0)
-
-
-def stick_middle(page):
-    box = page.locator("#stick").bounding_box()
-    return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-
-
-def push_stick(page, demo):
-    x, y = stick_middle(page)
-    touch(page, "pointerdown", x, y)
-    touch(page, "pointermove", x, y - 60)
-    wait_until(lambda: moving(demo), page, "the stick drives")
 
 
 # ---- a key is held, the window loses the focus, the robot drives on (leo_ui 1, innate-os 460) -------
@@ -61,7 +50,7 @@ def test_fault_key_held_window_loses_focus_robot_drives_on(driver, shared_demo, 
 @pytest.mark.parametrize("end", ["pointercancel", "lostpointercapture"])
 def test_fault_touch_is_cancelled_robot_drives_on(driver, shared_demo, end):
     push_stick(driver, shared_demo)
-    touch(driver, end, *stick_middle(driver))
+    release_stick(driver, end)
     wait_stopped(driver, shared_demo)
 
 
@@ -105,7 +94,7 @@ def test_fault_dead_man_release_sends_no_zero_by_key(driver, shared_demo):
 
 def test_fault_dead_man_release_sends_no_zero_by_stick(driver, shared_demo):
     push_stick(driver, shared_demo)
-    touch(driver, "pointerup", *stick_middle(driver))
+    release_stick(driver)
     wait_stopped(driver, shared_demo)
 
 

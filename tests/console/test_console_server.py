@@ -197,6 +197,7 @@ def test_zeros_end_when_the_drivers_page_beats_no_more_and_come_back_with_it(ser
             # A page that is hidden says so: it is no sign of an operator.
             count = len(backend.commands)
             await client.send({"type": "ping", "client_ms": 0, "away": True})
+            await client.look(0.1)  # nor is what it says besides
             await asyncio.sleep(0.3)
             assert len(backend.commands) == count
             await client.send({"type": "ping", "client_ms": 0})

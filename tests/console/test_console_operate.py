@@ -1,0 +1,312 @@
+"""What the operator has besides driving, in Chromium: recording, export, overlay, a phone, no mouse, no colours."""
+
+import io
+import itertools
+import json
+import re
+import zipfile
+
+import numpy as np
+import pytest
+from console_pages import (
+    BROWSER_TEST,
+    SETTLE_MS,
+    expect_body,
+    likeness_of,
+    moving,
+    push_stick,
+    release_stick,
+    room_seen,
+    start_driving,
+    wait_stopped,
+    wait_until,
+)
+
+pytestmark = BROWSER_TEST
+
+
+def text_of(page, selector):
+    return page.locator(selector).inner_text()
+
+
+# ---- recording and export ---------------------------------------------------------------------------
+
+
+def test_the_record_button_starts_tells_time_and_size_and_ends(driver, shared_demo):
+    expect_body(driver, "recording", "idle")
+    driver.locator("#record").click()
+    expect_body(driver, "recording", "recording")
+    assert shared_demo.recorder.state == "recording"
+    assert re.fullmatch(r"0:\d\d · \d+ MB", text_of(driver, "#record-text"))
+    button = driver.get_by_role("button", name="Stop recording")
+    assert button.get_attribute("aria-pressed") == "true"
+    driver.keyboard.press("r")
+    expect_body(driver, "recording", "idle")
+    assert driver.locator("#record").get_attribute("aria-pressed") == "false"
+
+
+def test_a_full_disk_and_a_missing_recorder_are_told_in_plain_words(driver, shared_demo):
+    recorder = shared_demo.recorder
+    recorder.state, recorder.error = "disk full", "only 90 MB are free"
+    driver.get_by_role("button", name="Stop recording (Disk full)").wait_for()
+    assert driver.locator("#record").get_attribute("title") == "only 90 MB are free"
+    recorder.missing = True
+    driver.locator('#record[aria-disabled="true"]').wait_for()
+    driver.locator("#record").click(force=True)  # "disabled" to whoever asks, but it says why
+    driver.get_by_text("no recorder runs: launch the station with recorder:=true").first.wait_for()
+    assert recorder.state == "disk full"  # it was asked for nothing
+
+
+def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(driver, shared_demo):
+    driver.keyboard.press("b")
+    driver.get_by_text("Marked: Mark 1 (nothing is being recorded)").wait_for()
+    start_driving(driver, shared_demo)
+    driver.locator("#more-open").focus()
+    driver.keyboard.press("Enter")
+    driver.locator("#marks-open").focus()
+    driver.keyboard.press("Enter")
+    wait_stopped(driver, shared_demo)  # the key is still down
+    driver.keyboard.up("w")
+    driver.keyboard.type("door was stuck")  # with keys that drive, look and stop elsewhere
+    driver.keyboard.press("Enter")
+    driver.locator("#marks-list li").nth(1).wait_for()
+    first, second = driver.locator("#marks-list li").all_inner_texts()
+    assert re.match(r"\d\d:\d\d:\d\d  door was stuck", first) and second.endswith("  Mark 1")
+    assert not shared_demo.estop and not moving(shared_demo)
+    # Nobody counts as at the controls: the zeros of an idle driver end.
+    count = len(shared_demo.commands)
+    driver.wait_for_timeout(500)  # beat_timeout_s
+    count = len(shared_demo.commands)
+    driver.wait_for_timeout(300)  # three zeros of an idle driver
+    assert len(shared_demo.commands) == count
+    driver.keyboard.press("Tab")
+    driver.keyboard.press("w")
+    driver.wait_for_timeout(SETTLE_MS)
+    assert not moving(shared_demo)
+    driver.keyboard.press("Escape")
+    driver.locator("#marks").wait_for(state="hidden")
+    start_driving(driver, shared_demo)
+
+
+def test_the_last_minute_is_kept(driver, shared_demo):
+    driver.locator("#more-open").click()
+    driver.get_by_role("button", name="Keep the last minute").click()
+    wait_until(lambda: shared_demo.recorder.snapshots, driver, "the snapshot")
+    driver.get_by_text("The last minute is being kept").wait_for()
+    assert driver.locator("#more").is_hidden()
+
+
+def saved(page, act):
+    with page.expect_download() as waiting:
+        act()
+    return waiting.value.suggested_filename, waiting.value.path().read_bytes()
+
+
+def test_picture_panorama_and_map_are_saved(driver, shared_demo):
+    from PIL import Image
+
+    shared_demo.place(-1.0, -0.5, 0.4)
+    driver.keyboard.press("c")
+    wait_until(lambda: abs(shared_demo.look.yaw) < 0.01, driver, "straight ahead")
+    seen = room_seen(shared_demo.robot, shared_demo.look.yaw, shared_demo.look.pitch)
+    for _ in range(100):  # the panorama of the new place comes
+        name, data = saved(driver, lambda: driver.keyboard.press("p"))
+        shown = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
+        if (found := likeness_of(shown, seen)) > 0.9:
+            break
+    assert re.fullmatch(r"picture_\d{8}_\d{6}\.png", name) and data[:4] == b"\x89PNG"
+    assert shown.shape == (600, 960, 3) and found > 0.9  # of the panorama's few pixels
+    driver.locator("#more-open").click()
+    name, data = saved(driver, driver.get_by_role("button", name="Save the panorama").click)
+    assert re.fullmatch(r"panorama_\d{8}_\d{6}\.jpg", name)
+    assert Image.open(io.BytesIO(data)).size == (192, 96)  # as the camera sent it
+    driver.locator("#more-open").click()
+    name, data = saved(driver, driver.get_by_role("button", name="Save the map").click)
+    assert name.endswith(".zip")
+    assert sorted(zipfile.ZipFile(io.BytesIO(data)).namelist()) == ["map.png", "map.yaml"]
+
+
+def test_what_cannot_be_saved_is_told(driver, shared_demo, monkeypatch):
+    monkeypatch.setattr(shared_demo, "export_map", dict)
+    driver.locator("#more-open").click()
+    driver.get_by_role("button", name="Save the map").click()
+    driver.get_by_text("Nothing saved: there is no map yet").wait_for()
+    assert any("404" in fault for fault in driver.faults)
+    driver.faults.clear()  # the browser reports the answer
+
+
+# ---- overlay ----------------------------------------------------------------------------------------
+
+
+def test_link_rates_and_readiness_are_told(driver, shared_demo):
+    wait_until(lambda: re.fullmatch(r"\d+ ms · (good|fair|poor)", text_of(driver, "#link-ms")), driver, "the link")
+    assert text_of(driver, "#vspace") == "Virtual space ready · 26 dB here · 97 % seen · within 2.0 m"
+    assert text_of(driver, "#battery") == "24.6 V · 81 %"
+    wait_until(lambda: re.fullmatch(r"\d+ · \d+ /s", text_of(driver, "#rates")), driver, "rates of pictures")
+    start_driving(driver, shared_demo)
+    wait_until(lambda: re.fullmatch(r"\d+ ms · \d+ /s", text_of(driver, "#command-ms")), driver, "rate of commands")
+
+
+def test_a_large_map_full_screen_and_help_by_key(driver):
+    driver.keyboard.press("m")
+    driver.get_by_role("button", name="Shrink the map").wait_for()
+    driver.keyboard.press("m")
+    driver.keyboard.press("f")
+    driver.wait_for_function("document.fullscreenElement !== null")
+    driver.keyboard.press("f")
+    driver.wait_for_function("document.fullscreenElement === null")
+    driver.keyboard.press("h")
+    driver.get_by_role("dialog", name="Help").wait_for()
+    driver.keyboard.press("h")
+    driver.get_by_role("dialog", name="Help").wait_for(state="hidden")
+
+
+# ---- without mouse, without sight, without colours -----------------------------------------------------
+
+
+def test_every_control_has_a_name_and_is_reached_by_tab(driver):
+    tree = driver.context.new_cdp_session(driver).send("Accessibility.getFullAXTree")["nodes"]
+    controls = [node for node in tree if node.get("role", {}).get("value") in ("button", "slider", "textbox", "link")]
+    names = [node["name"]["value"].strip() for node in controls if not node["ignored"]]
+    assert all(names) and len(names) == len(set(names)), names
+    driver.evaluate("document.activeElement.blur()")
+    reached, outlines = [], set()
+    for _ in range(40):
+        driver.keyboard.press("Tab")
+        found, outline = driver.evaluate(
+            "[document.activeElement.id, getComputedStyle(document.activeElement).outlineStyle]"
+        )
+        if found in reached:
+            break
+        if found:  # the end of the page comes between two rounds
+            reached.append(found)
+            outlines.add(outline)
+    assert set(reached) == set(
+        driver.evaluate(
+            "[...document.querySelectorAll('button, input')].filter((e) => e.checkVisibility()).map((e) => e.id)"
+        )
+    )
+    assert {"record", "more-open", "help-open", "fullscreen", "map-size", "scale", "estop"} <= set(reached)
+    assert outlines == {"solid"}  # where the focus is can be seen
+    assert not driver.evaluate("[...document.images].filter((i) => !i.alt).length")
+
+
+def test_a_change_of_mode_is_said_once_and_shown_by_word_and_shape(driver, shared_demo):
+    said = driver.locator("#announce[role=status][aria-live=polite]")
+    marks = {}
+    for mode, words in (
+        ("virtual", "Virtual view: you drive the virtual robot, the robot follows"),
+        ("stopped", "Stopped: the robot is held"),
+        ("real", "Real view: you see through the robot's camera"),
+    ):
+        shared_demo.forced_mode = mode
+        driver.get_by_text(words, exact=True).wait_for(state="attached")
+        assert said.inner_text() == words
+        assert text_of(driver, "#mode-name") == mode.upper()
+        marks[mode] = driver.locator("#mode-mark").evaluate(
+            "(mark) => { const s = getComputedStyle(mark); return s.borderRadius + s.transform; }"
+        )
+    assert len(set(marks.values())) == 3
+    # What lasts a moment only, as the passages do, is shown but not said.
+    shared_demo.forced_mode = "entering"
+    expect_body(driver, "mode", "entering")
+    assert text_of(driver, "#mode-name") == "ENTERING"
+    shared_demo.forced_mode = "returning"
+    expect_body(driver, "mode", "returning")
+    driver.evaluate("import('/static/hud.js').then((hud) => { hud.announce('flicker'); hud.announce('holds'); })")
+    driver.get_by_text("holds", exact=True).wait_for(state="attached")
+    heard = driver.evaluate(
+        """() => new Promise((done) => { const seen = [];
+        new MutationObserver(() => seen.push(document.getElementById('announce').textContent))
+            .observe(document.getElementById('announce'), {childList: true, characterData: true, subtree: true});
+        import('/static/hud.js').then((hud) => { hud.announce('flicker'); hud.announce('lasts'); });
+        setTimeout(() => done(seen), 700); })"""
+    )
+    assert heard == ["lasts"]
+
+
+def luminance(rgb):
+    """Relative luminance (WCAG 2.2) of sRGB, 0..255."""
+    share = np.asarray(rgb, float) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+# Deuteranopia, protanopia, tritanopia on linear RGB (Machado, Oliveira, Fernandes 2009, severity 1).
+BLIND = {
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+
+
+def lab(linear):
+    """CIE L*a*b* of linear sRGB, D65."""
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ linear
+    ratio = np.maximum(xyz / [0.9505, 1.0, 1.089], 0)
+    f = np.where(ratio > 0.008856, np.cbrt(ratio), 7.787 * ratio + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_text_can_be_read_over_a_white_picture_and_modes_told_apart_without_all_colours(driver):
+    colours = json.loads(
+        driver.evaluate(
+            """() => { const out = {}; const probe = document.createElement('i'); document.body.append(probe);
+            for (const name of ['text', 'dim', 'real', 'virtual', 'stopped', 'glass']) {
+                probe.style.setProperty('color', `var(--${name})`);
+                out[name] = getComputedStyle(probe).color.match(/[\\d.]+/g).map(Number);
+            }
+            probe.remove();
+            return JSON.stringify(out); }"""
+        )
+    )
+    red, green, blue, alpha = colours.pop("glass")
+    behind = luminance(alpha * np.array([red, green, blue]) + (1 - alpha) * 255)
+    contrast = {name: (luminance(rgb) + 0.05) / (behind + 0.05) for name, rgb in colours.items()}
+    assert min(contrast.values()) >= 4.5, contrast  # WCAG 1.4.3, AA
+    for first, second in itertools.combinations(("real", "virtual", "stopped"), 2):
+        for kind, matrix in BLIND.items():
+            seen = []
+            for name in (first, second):
+                share = np.array(colours[name]) / 255
+                linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+                seen.append(lab(np.clip(np.array(matrix) @ linear, 0, 1)))
+            # 10 is some four times a just noticeable difference.
+            assert np.linalg.norm(seen[0] - seen[1]) > 10, (kind, first, second)
+
+
+# ---- a phone ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390)], ids=["upright", "across"])
+def test_a_phone_shows_everything_and_its_stick_drives_until_it_is_let_go(
+    driver, shared_demo, open_page, width, height
+):
+    size = {"width": width, "height": height}
+    page = open_page(driver="other", at=shared_demo, viewport=size, is_mobile=True, has_touch=True)
+    page.locator("#take").tap()
+    expect_body(page, "driver", "you")
+    shared_demo.faults = [{"level": "error", "name": "vlp16_driver", "text": "no packets"}]
+    page.locator("#faults li").wait_for()
+    names = ["#mode", "#vspace", "#link", "#record", "#more-open", "#faults", "#map", "#panel", "#stick", "#estop"]
+    boxes = {}
+    for name in names:
+        box = page.locator(name).bounding_box()
+        boxes[name] = (box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"])
+    for name, (left, top, right, bottom) in boxes.items():
+        assert left >= 0 and top >= 0 and right <= width and bottom <= height, (name, boxes[name])
+    for (one, a), (other, b) in itertools.combinations(boxes.items(), 2):
+        assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1], (one, other)
+    for name in ("#record", "#more-open", "#stick", "#estop", "#map-size"):
+        box = page.locator(name).bounding_box()
+        assert min(box["width"], box["height"]) >= 44, name  # a finger
+    page.locator("#more-open").tap()
+    box = page.locator("#more").bounding_box()
+    assert box["y"] + box["height"] <= height and box["x"] >= 0
+    page.keyboard.press("Escape")
+    push_stick(page, shared_demo)
+    assert shared_demo.commands[-1] == pytest.approx((0.28, 0.0), abs=0.03)
+    release_stick(page)
+    wait_stopped(page, shared_demo)
+    driver.locator("#take").click()
+    expect_body(driver, "driver", "you")
