@@ -104,9 +104,9 @@ def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfi
     for device in (ours, theirs):
         device.set_scene(scene)
     for number in range(2):  # the second is the graph's
-        errors = [device.step(uniform[number], 0.01, 0.01) for device in (ours, theirs)]
-        if not np.allclose(*errors, rtol=AGREEMENT, atol=1e-4):
-            raise DeviceError(f"step {number + 1} has the errors {errors[0]}, plain torch {errors[1]}")
+        found, expected = (device.step(uniform[number], 0.01, 0.01) for device in (ours, theirs))
+        if not np.allclose(found, expected, rtol=AGREEMENT, atol=1e-4):
+            raise DeviceError(f"step {number + 1} has the errors {found}, plain torch {expected}")
     colours, depths, _ = zip(*(device.draw(rays, 0.5, 0.9) for device in (ours, theirs)), strict=True)
     alike = np.isclose(depths[0], depths[1], rtol=0.02) & np.all(np.abs(colours[0] - colours[1]) < 0.05, axis=1)
     if alike.mean() < 0.9:
