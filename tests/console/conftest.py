@@ -96,7 +96,10 @@ def driver(shared_page, shared_demo):
     yield shared_page
     for key in ("w", "a", "s", "d"):
         shared_page.keyboard.up(key)
-    shared_page.evaluate("delete document.hidden; document.activeElement.blur()")
+    shared_page.evaluate(
+        "() => { delete document.hidden; document.activeElement.blur();"
+        "for (const dialog of document.querySelectorAll('dialog[open]')) dialog.close(); }"
+    )
     if shared_demo.estop:
         release_by_enter(shared_page, shared_demo)
     faults, shared_page.faults = shared_page.faults, []
