@@ -21,6 +21,9 @@ from .warp import pinhole
 
 REACH_RAD = 0.3
 """So far behind an edge the background is continued, as seen from the keyframe."""
+GUESS_SHARE, GUESS_REACH = 0.6, 0.02
+"""Of the guess in the picture, reached so far (share of its width) inside of what is unseen: near what is seen the
+picture's own continuation is the better guess. Measured: benchmarks/keyframes.py."""
 _NEARER = 0.12  # a surface is in front of another where its inverse depth is greater by this share
 _SKY_M = 1e4
 _ROWS = 256  # of the pictures that the background is made in: it is smooth
@@ -60,15 +63,15 @@ class Background:
         in_front(inverse, torn_quads(inverse, _NEARER), 2 * reach, steps)
         removed = (content != ROOM) & ~sky
         hole = ((steps > 0) & (steps <= reach)) | removed
-        source = (steps == 0) & ~removed
+        # Nor is the far side's first pixel, which has a part of the near surface's colour.
+        source = ~_grown((steps > 0) | removed)
         if not source.any():
             source = ~hole
-        weight = (1 / (inverse * inverse)).astype(np.float32)
         keep = source | (content == ROBOT)  # the ground under the robot is known, or filled in already
-        filled = fill_holes(np.where(keep, inverse, 0).astype(np.float32), keep, weight)
+        filled = fill_holes(np.where(keep, inverse, 0).astype(np.float32), keep)
         rgb = area_average(prior.rgb, height, width) if prior.rgb.shape[:2] != inverse.shape else prior.rgb
         colours = np.where(source[..., None], rgb, 0).astype(np.float32)
-        rgb = np.where(hole[..., None], np.rint(fill_holes(colours, source, weight)), rgb).astype(np.uint8)
+        rgb = np.where(hole[..., None], np.rint(fill_holes(colours, source)), rgb).astype(np.uint8)
         inverse = np.where(hole, filled, inverse).astype(np.float32)
         whole = torn_quads(inverse, _NEARER)[:-1] == 0
         guessed = _any_corner(hole) & whole
@@ -106,6 +109,22 @@ class Background:
         paint(self.rgb, camera_from_map, gain, rays.origin, rays.directions, drawn, depth, colour)
         confidence[drawn & (marks.reshape(-1) == 2)] = 1
         return np.asarray(drawn)
+
+
+def mixed_in(image: Floats, guess: Floats, guessed: NDArray[np.bool_]) -> Floats:
+    """A picture continued from what is seen, (H, W, 3), and the guesses (H, W, 3) where there are some (H, W)."""
+    from .background_kernels import mix_guess
+
+    mixed = image.copy()
+    mix_guess(guess, guessed, max(1, round(GUESS_REACH * guessed.shape[1])), GUESS_SHARE, mixed)
+    return mixed
+
+
+def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """By a pixel to all sides; columns wrap."""
+    mask = mask | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
+    padded = np.pad(mask, ((1, 1), (0, 0)))
+    return padded[:-2] | mask | padded[2:]
 
 
 def _any_corner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -11,6 +11,9 @@ from .kernels import _OPTIONS
 from .march import along
 from .warp_kernels import NEAR_M, draw_triangle
 
+SAME_THING = np.float32(1.15)
+"""What is nearer than an edge of a thing by more than this factor is not the thing, but what it stands on."""
+
 
 @njit(**_OPTIONS)
 def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
@@ -27,6 +30,7 @@ def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
     height, width = inverse.shape
     queue = np.empty(height * width, np.int64)
     limit = np.zeros((height, width), np.float32)
+    near = np.zeros((height, width), np.float32)
     size = 0
     for v in range(height - 1):
         for u in range(width):
@@ -38,7 +42,7 @@ def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
             for corner in range(4):
                 y, x = v + corner // 2, right if corner % 2 else u
                 if inverse[y, x] > middle and steps[y, x] == 0:
-                    steps[y, x], limit[y, x] = 1, middle
+                    steps[y, x], limit[y, x], near[y, x] = 1, middle, inverse[y, x]
                     queue[size] = y * width + x
                     size += 1
     first = 0
@@ -50,8 +54,8 @@ def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
         for way in range(4):
             ny = y + (1 if way == 0 else -1 if way == 1 else 0)
             nx = (x + (1 if way == 2 else -1 if way == 3 else 0)) % width
-            if 0 <= ny < height and steps[ny, nx] == 0 and inverse[ny, nx] > limit[y, x]:
-                steps[ny, nx], limit[ny, nx] = steps[y, x] + 1, limit[y, x]
+            if 0 <= ny < height and steps[ny, nx] == 0 and limit[y, x] < inverse[ny, nx] < SAME_THING * near[y, x]:
+                steps[ny, nx], limit[ny, nx], near[ny, nx] = steps[y, x] + 1, limit[y, x], near[y, x]
                 queue[size] = ny * width + nx
                 size += 1
 
@@ -109,3 +113,28 @@ def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour)
             top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
             bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
             colour[n, c] = (top * (one - fv) + bottom * fv) * np.float32(1 / 255) * gain[c]
+
+
+@njit(**_OPTIONS)
+def mix_guess(guess, guessed, reach, share, image):  # type: ignore[no-untyped-def]
+    """Mixes guessed colours (H, W, 3) into a picture where ``guessed`` (H, W): the more, the farther off what is seen.
+
+    ``share`` is reached ``reach`` pixels (city blocks) inside.
+    """
+    height, width = guessed.shape
+    inside = np.zeros((height, width), np.int32)
+    for y in range(height):
+        for x in range(width):
+            if guessed[y, x]:
+                up = inside[y - 1, x] if y > 0 else reach
+                left = inside[y, x - 1] if x > 0 else reach
+                inside[y, x] = min(up, left) + 1
+    for y in range(height - 1, -1, -1):
+        for x in range(width - 1, -1, -1):
+            if guessed[y, x]:
+                down = inside[y + 1, x] if y + 1 < height else reach
+                right = inside[y, x + 1] if x + 1 < width else reach
+                inside[y, x] = min(inside[y, x], min(down, right) + 1)
+                weight = np.float32(share * min(1.0, inside[y, x] / reach))
+                for c in range(3):
+                    image[y, x, c] += weight * (guess[y, x, c] - image[y, x, c])

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, sample_equirect
 
+from .background import mixed_in
 from .compose import Layer, compose, exposure_gains, moved
 from .config import VirtualSpaceConfig
 from .devices import make_device
@@ -438,11 +439,12 @@ class VirtualSpace:
 
     @staticmethod
     def _filled(picture: _Picture, rays: Rays, projection: str) -> Floats:
-        """The picture (H, W, 3) with what nobody knows, nor guesses, continued from around it."""
+        """The picture (H, W, 3) with what nobody knows continued from around it, and the guesses mixed in."""
         shape = rays.shape
-        seen = ((picture.confidence > 0) | picture.guessed).reshape(shape).astype(np.float32)
-        image = picture.colour.reshape(*shape, 3)
-        return continue_unseen(image, picture.depth.reshape(shape), seen, wraps=projection == "equirect")
+        drawn = picture.colour.reshape(*shape, 3)
+        depth, confidence = picture.depth.reshape(shape), picture.confidence.reshape(shape)
+        image = continue_unseen(drawn, depth, confidence, wraps=projection == "equirect")
+        return mixed_in(image, drawn, picture.guessed.reshape(shape)) if picture.guessed.any() else image
 
     def _drawn(
         self, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, tuple[Floats, Floats, Floats]]

@@ -1,0 +1,158 @@
+"""What nobody has seen: continued behind edges, under the robot, and the sky; fixed in the map."""
+
+import math
+
+import numpy as np
+import pytest
+
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.nerf import KeyframeError, VirtualSpace, VirtualSpaceConfig
+from instant_ic.nerf.background import Background, mixed_in
+from instant_ic.nerf.background_kernels import in_front
+from instant_ic.nerf.config import GeometryConfig
+from instant_ic.nerf.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
+from instant_ic.nerf.view import perspective_rays
+
+H, W = 64, 128
+THING = np.s_[26:38, 56:72]  # rows and columns round the middle of the picture
+
+
+def keyframe(robot=None, body_below_deg=-90.0, sky=False, sky_share=0.05):
+    """A sphere of 4 m, bluish, with a red thing at 2 m ahead; unknown above 20° where there is a sky."""
+    rgb = np.zeros((H, W, 3), np.uint8)
+    rgb[...] = 40, 90, 160
+    rgb[::2, ::2] += 10
+    depth = np.full((H, W), 4.0, np.float32)
+    rgb[THING], depth[THING] = (200, 30, 30), 2.0
+    if sky:
+        rgb[:24], depth[:24] = (220, 230, 250), 0.0
+    config = GeometryConfig(body_below_deg=body_below_deg, sky_share=sky_share)
+    return prepare(rgb, depth, np.eye(4), 0.02, config, 2048, robot)
+
+
+def space_of(prior, **geometry):
+    config = VirtualSpaceConfig(device="cpu", source="warp", geometry=GeometryConfig(**geometry))
+    space = VirtualSpace(config)
+    depth = np.where(prior.content == SKY, 0, 1 / prior.inverse_depth)
+    space.set_keyframe(prior.rgb, depth, prior.map_from_camera, 0.02)
+    return space
+
+
+def test_the_near_side_of_an_edge_by_hand():
+    inverse = np.full((8, 16), 0.25, np.float32)
+    inverse[2:6, 4:9] = 0.5
+    torn = np.zeros((8, 16), np.uint8)
+    torn[2:6, 3] = torn[2:6, 8] = 1
+    torn[1, 3:9] = torn[5, 3:9] = 1
+    steps = np.zeros((8, 16), np.int32)
+    in_front(inverse, torn, 9, steps)
+    assert steps[2:6, 4:9].tolist() == [[1, 1, 1, 1, 1], [1, 2, 2, 2, 1], [1, 2, 2, 2, 1], [1, 1, 1, 1, 1]]
+    assert np.count_nonzero(steps) == 20  # nothing on the far side
+    steps[...] = 0
+    in_front(inverse, torn, 1, steps)
+    assert steps.max() == 1
+
+
+def test_behind_a_thing_its_background_goes_on():
+    background = Background.of(keyframe())
+    # The thing is gone from it, in depth and in colour.
+    assert 1 / background.inverse[THING] == pytest.approx(np.full((12, 16), 4.0), rel=1e-3)
+    assert background.rgb[THING][..., 0].max() < 60
+    assert np.array_equal(background.rgb[:20], keyframe().rgb[:20])
+    assert len(background.sky) == 0
+
+
+def test_what_opens_behind_a_thing_is_guessed_and_marked():
+    space = space_of(keyframe())
+    view = space.render(pose_matrix(y=1.0, yaw=-0.3), 96, 64, 1.2)
+    hidden = view.confidence == 0
+    assert 0.01 < hidden.mean() < 0.3
+    assert view.unseen_share == pytest.approx(hidden.mean())
+    assert np.median(view.rgb[hidden][:, 2]) > 140  # blue, as the far side
+    assert np.median(view.rgb[hidden][:, 0]) < 60
+    away = view.depth_m[hidden]
+    assert np.median(np.abs(away - 4.0)) < 0.6  # on the sphere round the keyframe
+
+
+def test_the_guess_lies_fixed_in_the_map():
+    """Two places in the map that nobody has seen have one colour in pictures from different poses."""
+    background = Background.of(keyframe())
+    drawn = []
+    for pose in (pose_matrix(y=0.6, yaw=-0.2), pose_matrix(x=0.2, y=0.9, yaw=-0.3)):
+        rays = perspective_rays(pose, 96, 64, 1.2)
+        picture = np.zeros((96 * 64, 3), np.float32), np.zeros(96 * 64, np.float32), np.zeros(96 * 64, np.float32)
+        done = background.draw(rays, np.ones(3, np.float32), np.ones(96 * 64, bool), picture)
+        ends = rays.origin + picture[1][:, None] * rays.directions
+        azimuth = np.arctan2(ends[:, 1], ends[:, 0])
+        inside = done & (np.abs(azimuth) < 0.2) & (np.abs(ends[:, 2]) < 0.5)
+        assert inside.sum() > 50
+        assert np.linalg.norm(ends[inside], axis=1) == pytest.approx(np.full(inside.sum(), 4.0), rel=0.01)
+        drawn.append(picture[0][inside].mean(axis=0))
+    assert drawn[0] == pytest.approx(drawn[1], abs=0.01)
+
+
+def test_guesses_are_mixed_in_by_hand():
+    image, guess = np.zeros((5, 7, 3), np.float32), np.ones((5, 7, 3), np.float32)
+    guessed = np.zeros((5, 7), bool)
+    guessed[1:4, 1:6] = True
+    mixed = mixed_in(image, guess, guessed)  # a reach of one pixel
+    assert mixed[..., 0] == pytest.approx(np.where(guessed, 0.6, 0.0))
+    wide = mixed_in(np.zeros((1, 200, 3), np.float32), np.ones((1, 200, 3), np.float32), np.arange(200)[None] >= 100)
+    # 0.02 · 200 = 4 pixels: a quarter of 0.6 more at each.
+    assert wide[0, 98:106, 0] == pytest.approx([0, 0, 0.15, 0.3, 0.45, 0.6, 0.6, 0.6])
+    assert not image.any()
+
+
+def test_the_robot_is_not_shown_and_not_learnt():
+    prior = keyframe(body_below_deg=-45.0)
+    rows = np.arange(H)
+    below = 90 - (rows + 0.5) * 180 / H < -45
+    assert np.array_equal(prior.content == ROBOT, np.repeat(below[:, None], W, 1))
+    assert np.array_equal(prior.usable == 0, prior.content == ROBOT)
+    space = space_of(keyframe(), body_below_deg=-45.0)
+    space.keyframe.rgb[below] = 255  # the robot's own colour, would it be shown
+    down = space.render(pose_matrix(pitch=math.pi / 2), 64, 64, 1.2)
+    assert down.confidence.max() == 0
+    assert down.rgb[20:44, 20:44].max() < 200
+    assert np.median(np.abs(down.depth_m[20:44, 20:44] - 4.0)) < 0.3
+    assert space.render(pose_matrix(yaw=2.0), 64, 48, 1.0).confidence.min() == 1
+
+
+def test_the_robots_mask_is_scaled_to_the_depth():
+    mask = np.zeros((16, 32), bool)
+    mask[12:, :4] = True
+    region = robot_region(H, -90, mask)
+    assert region[48:, :16].all()
+    assert region.sum() == 16 * 16
+    with pytest.raises(KeyframeError, match="twice as wide"):
+        robot_region(H, -90, np.zeros((16, 16), bool))
+
+
+def test_the_sky_is_endlessly_far_and_known():
+    prior = keyframe(sky=True)
+    assert (prior.content[:24] == SKY).all()
+    assert (prior.content[24:] == ROOM).all()
+    space = space_of(prior)
+    for x in (0.0, 1.0):
+        up = space.render(pose_matrix(x=x, pitch=-1.0), 64, 48, 0.8)
+        assert up.confidence.min() == 1
+        assert up.rgb.reshape(-1, 3).min(axis=0) == pytest.approx([220, 230, 250], abs=3)
+        assert up.depth_m.min() > 1000
+    # Where there is to be no sky, it is filled from around.
+    assert (keyframe(sky=True, sky_share=1.0).content == ROOM).all()
+
+
+def test_what_counts_as_sky():
+    unknown = np.zeros((H, W), bool)
+    unknown[:20] = True
+    assert sky_region(unknown, 0.05)[:20].all()
+    low = unknown[::-1]
+    assert not sky_region(low, 0.05).any()  # under one's feet is none
+    small = np.zeros((H, W), bool)
+    small[2:8, 10:20] = True
+    assert not sky_region(small, 0.05).any()
+    over_the_seam = np.zeros((H, W), bool)
+    over_the_seam[4:30, :14] = over_the_seam[4:30, -14:] = True
+    assert np.array_equal(sky_region(over_the_seam, 0.05), over_the_seam)
+    half = over_the_seam & (np.arange(W) < 64)
+    assert not sky_region(half, 0.05).any()  # each half alone is too small
