@@ -209,7 +209,7 @@ byId("yield").addEventListener("click", () => {
 byId("compass").addEventListener("click", () => look.centre());
 byId("map-size").addEventListener("click", enlargeMap);
 byId("map-canvas").addEventListener("click", enlargeMap);
-byId("fullscreen").addEventListener("click", fullScreen);
+for (const id of ["fullscreen", "fullscreen-more"]) byId(id).addEventListener("click", fullScreen);
 byId("help-open").addEventListener("click", help);
 byId("help-more").addEventListener("click", help);
 byId("save-picture").addEventListener("click", saveShownPicture);
