@@ -41,7 +41,7 @@ WATCH = """
     addEventListener("drawn", ({detail}) => {
         small.drawImage(document.getElementById("picture"), 0, 0, 48, 30);
         const rgb = btoa(String.fromCharCode(...small.getImageData(0, 0, 48, 30).data));
-        window.seen.push({rgb, blend: detail.blend, x: detail.pose?.[0], yaw: detail.pose?.[2]});
+        window.seen.push({rgb, pitch: detail.view?.q[1], blend: detail.blend, x: detail.pose?.[0], yaw: detail.pose?.[2]});
     });
 """
 
@@ -171,6 +171,9 @@ def test_the_picture_never_jumps_at_a_switch_and_the_rest_of_the_pose_is_eased_o
     expect_body(page, "picture", "live")
     page.wait_for_timeout(500)
     page.evaluate(WATCH)
+    # Views are made where this page looks: 10° down.
+    page.wait_for_function("window.seen.at(-1)?.pitch > 0.08", timeout=WAIT_MS)
+    page.evaluate("window.seen.splice(0)")
     pass_to(page, demo, "virtual")
     seen = page.evaluate("window.seen.splice(0)")
     step, total = steps(seen, "rgb")
@@ -214,6 +217,7 @@ def test_unseen_places_are_soft_not_noisy(open_page, passages, viewer):
     demo.forced_mode = "virtual"
     page = open_page(f"?viewer={viewer}", at=demo, bypass_csp=True)
     expect_body(page, "blend", "1.00")
+    never_grey(page)
     map_from_look = pose_matrix(yaw=-1.4) @ pose_matrix(pitch=math.radians(10))
     hfov = 2 * math.atan(math.tan(math.radians(30)) * SIZE["width"] / SIZE["height"])
     directions = perspective_directions(240, 150, hfov) @ map_from_look[:3, :3].T.astype(np.float32)

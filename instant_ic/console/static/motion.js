@@ -13,7 +13,7 @@ export class Motion {
     this.easeMs = 400;
     this._followed = null;
     this._residual = [0, 0, 0]; // what the other robot's pose had more, and is still left of it
-    this._since = 0;
+    this._easedMs = 0;
     this._robot = null;
   }
 
@@ -22,23 +22,24 @@ export class Motion {
   }
 
   /**
-   * Goes on to `now`. `robot`: name of the robot that is shown; at another name the difference of the two poses
+   * Goes on by `elapsedMs`. `robot`: name of the robot that is shown; at another name the difference of the two poses
    * is eased out. `pose` was true `ageMs` ago, `twist` [m/s, rad/s] its velocity then.
    */
-  follow(robot, pose, twist, ageMs, elapsedMs, now) {
+  follow(robot, pose, twist, ageMs, elapsedMs) {
     if (!pose) return;
     const target = moved(pose, twist, clamp(ageMs, 0, EXTRAPOLATION_MS) / 1000);
     if (robot !== this._robot && this._robot !== null && this.pose !== null) {
       const apart = difference(this.pose, target);
       this._residual = size(apart) < EASED_M && Math.abs(apart[2]) < EASED_RAD ? apart : [0, 0, 0];
-      this._since = now;
+      this._easedMs = 0;
       this._followed = target;
     }
     this._robot = robot;
     const left = this._followed ? difference(target, this._followed) : null;
     if (left === null || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
     else this._followed = sum(this._followed, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
-    const t = this.easeMs > 0 ? clamp((now - this._since) / this.easeMs, 0, 1) : 1;
+    this._easedMs += elapsedMs; // not the time itself: a page that hangs for a moment goes on from where it was
+    const t = this.easeMs > 0 ? clamp(this._easedMs / this.easeMs, 0, 1) : 1;
     this.pose = sum(this._followed, this._residual, 1 - t * t * (3 - 2 * t));
   }
 }

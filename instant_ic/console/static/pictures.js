@@ -89,7 +89,7 @@ export class Pictures {
   scene(state, look, tanHalf, elapsedMs) {
     const now = performance.now();
     const starts = this._step(state, elapsedMs);
-    this._follow(state, elapsedMs, now);
+    this._follow(state, elapsedMs);
     const lookTurn = lookRotation(look.yaw, look.pitch);
     const mapFromLook = multiply(rotationZ(this.motion.yaw ?? 0), lookTurn);
     const relative = (header) => multiply(transpose(fromQuaternion(header.q)), mapFromLook);
@@ -161,11 +161,11 @@ export class Pictures {
   }
 
   /** Follows the shown robot between the state messages. */
-  _follow(state, elapsedMs, now) {
+  _follow(state, elapsedMs) {
     const robot = shows(state) === "virtual" ? "virtual" : "real";
     const pose = robot === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
     const age = state ? (this.link.serverNow() ?? state.at_ms) - state.at_ms : 0;
-    this.motion.follow(robot, pose, state?.twist ?? [0, 0], age, elapsedMs, now);
+    this.motion.follow(robot, pose, state?.twist ?? [0, 0], age, elapsedMs);
   }
 }
 
