@@ -637,7 +637,10 @@ class Arbiter:
         return VbotAction.LED_BACK if self._leading_back else VbotAction.DRIVEN
 
     def _far_from_keyframe(self, situation: _Situation) -> str:
-        """Words for a v-bot that has left what the virtual space is fit to show; "" within."""
+        """Words for a v-bot that has left what the virtual space can show; "" where it can."""
+        expected_db = situation.inputs.vspace.expected_psnr_db
+        if 0.0 < expected_db < self.config.switch.min_expected_psnr_db:
+            return f"; the picture is mostly guessed here ({expected_db:.0f} dB expected)"
         if self._ready is None:
             return ""
         vspace = self._ready[1]

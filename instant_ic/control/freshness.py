@@ -44,7 +44,7 @@ class TimeoutConfig:
     odometry: _Timeout = 0.3
     pose: _Timeout = 0.3
     camera: _Timeout = 0.3
-    view: _Timeout = 0.3
+    view: _Timeout = 0.35
     vbot: _Timeout = 0.3
     nav: _Timeout = 0.3
     command: _Timeout = 0.3

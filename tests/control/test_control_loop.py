@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from itertools import pairwise
 from pathlib import Path
@@ -40,8 +41,10 @@ def drive(made: Loop, seconds: float, command: tuple[float, float]) -> None:
         assert not made.world.contact(frame.robot), f"contact at {frame.t:.2f} s, {frame.robot}"
 
 
-@pytest.mark.parametrize("mapped", [True, False])
-@pytest.mark.parametrize("box", [BOX, (2.2, -0.6, 3.0, 0.1), (2.5, -1.2, 3.0, 0.1)])
+@pytest.mark.parametrize(
+    ("box", "mapped"),
+    [(BOX, True), (BOX, False), ((2.2, -0.6, 3.0, 0.1), True), ((2.5, -1.2, 3.0, 0.1), False)],
+)
 def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped: bool) -> None:
     made = loop(box, mapped)
     drive(made, 23.0, FORWARD)
@@ -137,7 +140,7 @@ def test_side_walls_block_but_let_go() -> None:
 
 def test_tapping_forward_before_the_obstacle_does_not_flicker() -> None:
     made = loop()
-    for _ in range(40):
+    for _ in range(28):
         drive(made, 0.3, FORWARD)
         drive(made, 0.5, NOTHING)
     assert made.modes() == THROUGH[:4]
@@ -259,11 +262,19 @@ def test_the_reason_of_a_stop_is_told_once_and_what_to_do_first() -> None:
     assert made.step(NOTHING).decision.reason == "stopped: no camera picture for 1.6 s"  # for recover_s
 
 
+@functools.cache
+def seconds_to_entry() -> float:
+    probe = loop((3.0, -0.25, 3.5, 0.25))
+    while probe.modes()[-1] != "ENTERING":
+        drive(probe, 0.05, FORWARD)
+    return len(probe.frames) * 0.05
+
+
 @pytest.mark.parametrize(
     ("training_s", "position", "training", "mode"),
     [
-        (0.0, 0.0, True, "VIRTUAL"),
-        (1.0, 0.0, True, "VIRTUAL"),  # learns the next keyframe for a moment
+        (0.0, 0.0, True, "ENTERING"),
+        (1.0, 0.0, True, "ENTERING"),  # learns the next keyframe for a moment
         (1.0, -4.0, True, "REAL"),  # but the robot has left the last one's radius
         (3.0, 0.0, True, "REAL"),  # learns for longer than ready_hold_s
         (1.0, 0.0, False, "REAL"),  # empty: its node was started anew
@@ -276,11 +287,7 @@ def test_readiness_is_held_over_the_change_of_a_keyframe(
     made.vspace = Vspace(ready=True, position=np.array([position, 0.0]), ready_radius_m=4.0)
     other = Vspace(training=training, position=np.array([50.0, 0.0]), message="learning")
     # By the time of the switch with a space that is ready all the time.
-    probe = loop((3.0, -0.25, 3.5, 0.25))
-    while probe.modes()[-1] != "VIRTUAL":
-        drive(probe, 0.05, FORWARD)
-    switch_s = len(probe.frames) * 0.05
-    drive(made, switch_s - len(made.frames) * 0.05 - training_s - 0.05, FORWARD)
+    drive(made, seconds_to_entry() - len(made.frames) * 0.05 - training_s - 0.05, FORWARD)
     if training_s:
         made.vspace = other
     drive(made, training_s + 0.1, FORWARD)
@@ -334,7 +341,7 @@ def test_nothing_moves_before_everything_is_there() -> None:
     assert "no LiDAR scan yet" in decision.reason
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_one_switch_each_way_with_noise(seed: int) -> None:
     """Scan noise of 1.5 cm, a pose that wanders by centimetres: still one switch in, one out, no contact."""
     rng = np.random.default_rng(seed)

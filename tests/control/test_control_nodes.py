@@ -273,7 +273,7 @@ def test_both_robots_stand_when_the_views_stop_and_the_real_view_comes_back() ->
     assert states[-1].mode == ControlState.VIRTUAL
     assert {s.shown for s in states if s.mode in (ControlState.REAL, ControlState.ENTERING)} == {0}
     stack.silent.add("views")
-    states = stack.drive(0.4, (0.4, 0.0))
+    states = stack.drive(0.45, (0.4, 0.0))
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
     assert states[-1].vbot_action == ControlState.VBOT_HELD
     stack.drive(0.6, (0.4, 0.0))
