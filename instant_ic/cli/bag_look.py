@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 from collections import Counter
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bag import BagReader
+from instant_ic.bag import BagError, BagReader
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.compare import Tolerance, TopicDifference, compare
 from instant_ic.bag.convert import ConvertOptions
@@ -21,7 +22,9 @@ from instant_ic.bag.recover import reindex as reindex_bag
 from instant_ic.cli.commands.bag import pairs, topic_names
 from instant_ic.cli.errors import UserError
 from instant_ic.cli.progress import progress
+from instant_ic.msg import deserialize
 
+BOOKMARKS, _STRING = "/operator/bookmark", "std_msgs/msg/String"
 _LEFT_OUT = {
     "overflow": "left out because the disk was too slow",
     "disk_full": "left out while the disk was full",
@@ -56,6 +59,8 @@ def info(args: argparse.Namespace) -> int:
             f"  {topic['topic']:<{width}}  {topic['type']:<{type_width}}  {topic['messages']:>7} {hz}"
             f"  {topic['qos']}{lost}{f' ({by})' if by else ''}"
         )
+    for mark in told["bookmarks"]:
+        print(f"bookmark: {mark['at_s']:.3f} s  {mark['name']}")
     for key, words in _LEFT_OUT.items():
         if told[key]:
             print(f"{words}: {', '.join(f'{topic} {n}' for topic, n in sorted(told[key].items()))}")
@@ -64,6 +69,20 @@ def info(args: argparse.Namespace) -> int:
     for name in told["unlisted"]:
         print(f"{name} is in the folder but not in the bag: its recording was cut short: ic bag recover {args.bag}")
     return 0
+
+
+def _bookmarks(reader: BagReader) -> list[dict[str, Any]]:
+    """The moments that the operator has named, with their distance from the beginning."""
+    if not any(topic.topic == BOOKMARKS and topic.type_name == _STRING for topic in reader.topics):
+        return []
+    try:
+        found = [m for m in reader.messages({BOOKMARKS}) if m.type_name == _STRING]
+        return [
+            {"at_s": (m.stamp_ns - reader.start_ns) / 1e9, "name": deserialize(m.payload, _STRING).data} for m in found
+        ]
+    except BagError as error:  # all else can still be told
+        print(f"bookmarks cannot be read: {error}", file=sys.stderr)
+        return []
 
 
 def _info(reader: BagReader) -> dict[str, Any]:
@@ -103,6 +122,7 @@ def _info(reader: BagReader) -> dict[str, Any]:
             }
             for topic in reader.topics
         ],
+        "bookmarks": _bookmarks(reader),
         **{key: custom(key) for key in _LEFT_OUT},
         "recovered_from": reader.custom.get("recovered_from", ""),
         "unlisted": [file.name for file in reader.unlisted],

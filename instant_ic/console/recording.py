@@ -45,6 +45,7 @@ class RecordingDesk:
         self._wishes: queue.Queue[Callable[[], str] | None] = queue.Queue(maxsize=20)
         self._bookmarks: deque[dict[str, Any]] = deque(maxlen=MAX_BOOKMARKS)
         self._recording: Mapping[str, Any] = {}
+        self._asked_s = 0.0
         self._notice: dict[str, Any] = {"number": 0, "text": "", "level": "ok"}
         self._thread = threading.Thread(target=self._run, name="recording desk", daemon=True)
 
@@ -70,8 +71,11 @@ class RecordingDesk:
 
     def bookmark(self, name: str) -> None:
         """Notes a bookmark that has been published, for the list."""
-        seconds = self._recording.get("seconds") if self._recording.get("state") == "recording" else None
-        path = self._recording.get("path", "") if seconds is not None else ""
+        recording = self._recording
+        seconds: float | None = None
+        if recording.get("state") == "recording":
+            seconds = round(recording.get("seconds", 0.0) + time.monotonic() - self._asked_s, 1)
+        path = recording.get("path", "") if seconds is not None else ""
         at = f"{datetime.now():%H:%M:%S}"
         self._bookmarks.append({"name": name, "at": at, "seconds": seconds, "recording": _name(path)})
         self._wish(lambda: f"Marked: {name}" + ("" if path else " (nothing is being recorded)"))
@@ -128,7 +132,7 @@ class RecordingDesk:
                 f"the recorder writes {_name(status.get('path', ''))} all the time: there is nothing to begin or to end"
             )
             return told | {"recorder": "missing", "text": text, "state": "none"}
-        self._recording = recording
+        self._recording, self._asked_s = recording, time.monotonic()
         found = [
             {"name": _name(made.get("path", "")), "state": made.get("state", ""), "words": made.get("words", "")}
             for made in status.get("snapshots", [])[-MAX_SNAPSHOTS:]

@@ -11,7 +11,7 @@ from instant_ic.bag import BagReader, BagWriter
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.cli.commands.bag import size
 from instant_ic.cli.main import main
-from instant_ic.msg import Bool, scan_message, serialize
+from instant_ic.msg import Bool, message_type, scan_message, serialize
 
 SCAN, BOOL = "sensor_msgs/msg/LaserScan", "std_msgs/msg/Bool"
 S = 1_000_000_000
@@ -49,6 +49,22 @@ def test_info(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         "/operator/estop": (1, {}),
         "/scan": (10, {"front": 3}),
     }
+
+
+def test_info_lists_bookmarks(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    bag, text = make(tmp_path / "bag"), message_type("String")
+    assert "bookmark" not in ic(capsys, "bag", "info", bag)[1]
+    with BagWriter(tmp_path / "marked") as writer:
+        writer.write("/scan", BOOL, bytes(serialize(Bool(data=True))), 1 * S, SENSOR)
+        for stamp_ns, name in ((2 * S, "door stuck"), (4 * S + S // 2, "person")):
+            payload = bytes(serialize(text(data=name)))
+            writer.write("/operator/bookmark", "std_msgs/msg/String", payload, stamp_ns, SENSOR)
+    assert (
+        "bookmark: 1.000 s  door stuck\nbookmark: 3.500 s  person\n"
+        in ic(capsys, "bag", "info", tmp_path / "marked")[1]
+    )
+    told = json.loads(ic(capsys, "bag", "info", tmp_path / "marked", "--json")[1])
+    assert told["bookmarks"] == [{"at_s": 1.0, "name": "door stuck"}, {"at_s": 3.5, "name": "person"}]
 
 
 def test_info_names_a_file_that_is_not_in_the_bag(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -106,7 +106,8 @@ def test_bookmarks_are_listed_with_their_place_in_the_recording(desk):
         made.bookmark(f"door {n}")
     told = wait_for(lambda m: m["bookmarks"][-1]["name"] == f"door {MAX_BOOKMARKS - 1}")
     assert len(told["bookmarks"]) == MAX_BOOKMARKS and told["bookmarks"][0]["name"] == "door 0"
-    assert (told["bookmarks"][-1]["seconds"], told["bookmarks"][-1]["recording"]) == (12.5, "rec_1")
+    assert told["bookmarks"][-1]["recording"] == "rec_1"
+    assert 12.5 <= told["bookmarks"][-1]["seconds"] < 12.5 + WAIT_S  # and what has passed since it was asked
 
 
 def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
