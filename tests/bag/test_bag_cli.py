@@ -53,7 +53,7 @@ def test_info(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
 
 def test_info_lists_bookmarks(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     bag, text = make(tmp_path / "bag"), message_type("String")
-    assert "bookmark" not in ic(capsys, "bag", "info", bag)[1]
+    assert "bookmark:" not in ic(capsys, "bag", "info", bag)[1]
     with BagWriter(tmp_path / "marked") as writer:
         writer.write("/scan", BOOL, bytes(serialize(Bool(data=True))), 1 * S, SENSOR)
         for stamp_ns, name in ((2 * S, "door stuck"), (4 * S + S // 2, "person")):
