@@ -1,8 +1,12 @@
-"""Several keyframes against one, 2 m from the nearest, in simulated worlds with true depth; prints JSON.
+"""What keyframes do to the picture, in simulated worlds with true depth; prints JSON.
 
-    python benchmarks/keyframes.py [--mesh house.glb]
+    python benchmarks/keyframes.py [--mesh house.glb] [--only views,field,unseen,refresh,time]
 
-PSNR (dB) and SSIM of views ahead and aside by one keyframe, three behind each other, and three round the place.
+views: PSNR (dB) and SSIM 2 m from the nearest of one keyframe, three behind each other, and three round the place.
+field: the same of the field alone after --seconds, one field on all keyframes. unseen: pictures with what nobody has
+seen left black, continued from around, and as it is shown. refresh: a drive with a keyframe every 0.75 m; how far a
+picture falls behind what the keyframes before would have shown there, and how much unseen places flicker. time: CPU
+time of each step from a keyframe to its first picture, and of a picture.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ import argparse
 import json
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,33 +23,73 @@ from skimage.metrics import structural_similarity
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.nerf import VirtualSpace, VirtualSpaceConfig
+from instant_ic.nerf.config import PictureConfig
 
 SIZE, FOV, PANORAMA = (320, 180), math.pi / 2, 1024
 VIEWS = (pose_matrix(2.0), pose_matrix(2.0, 0.3, yaw=0.5), pose_matrix(2.0, yaw=-1.2))
+ASIDE = (*VIEWS, pose_matrix(1.0), pose_matrix(0.5, 0.5, yaw=0.5), pose_matrix(1.0, -0.6, yaw=-0.7))
 PLACES = {"one": (0.0,), "three behind": (-1.5, -0.75, 0.0), "three round": (-1.5, 4.0, 0.0)}
 """Of the keyframes along x, in the order in which they are taken."""
+STEP_M, KEYFRAME_M, AHEAD_M, WAY_M = 0.05, 0.75, 0.6, 3.0
+"""Of the drive: between pictures, between keyframes, how far the view is ahead of the robot, and how far it goes."""
+
+
+def psnr(picture: Any, truth: Any) -> float:
+    """In dB."""
+    return 10 * math.log10(255**2 / max(float(np.mean((picture.astype(float) - truth) ** 2)), 1e-3))
 
 
 def score(picture: Any, truth: Any) -> tuple[float, float]:
     """PSNR and SSIM (7 × 7 uniform window)."""
-    mse = float(np.mean((picture.astype(float) - truth) ** 2))
-    ssim = float(structural_similarity(picture, truth, channel_axis=2))
-    return round(10 * math.log10(255**2 / mse), 2), round(ssim, 3)
+    return round(psnr(picture, truth), 2), round(float(structural_similarity(picture, truth, channel_axis=2)), 3)
 
 
-def measure(renderer: Any, base: Any) -> dict[str, Any]:
-    """All arrangements in one world."""
-    truth = [renderer.render_perspective(base @ v, *SIZE, FOV, supersample=2).rgb for v in VIEWS]
+class World:
+    """A world, and the place in it that all poses are relative to."""
+
+    def __init__(self, renderer: Any, base: Any) -> None:
+        self.renderer, self.base = renderer, base
+
+    def keyframe(self, pose: Any) -> tuple[Any, ...]:
+        """Arguments of ``VirtualSpace.set_keyframe``."""
+        picture = self.renderer.render(self.base @ pose, PANORAMA, PANORAMA // 2, supersample=2)
+        return picture.rgb, picture.depth_m, self.base @ pose, 0.02
+
+    def truth(self, pose: Any) -> Any:
+        return self.renderer.render_perspective(self.base @ pose, *SIZE, FOV, supersample=2).rgb
+
+    def view(self, space: VirtualSpace, pose: Any) -> Any:
+        return space.render(self.base @ pose, *SIZE, FOV)
+
+
+def warp(keyframes: int = 1) -> VirtualSpace:
+    return VirtualSpace(VirtualSpaceConfig(source="warp", keyframes=keyframes))
+
+
+def views(world: World, _: argparse.Namespace) -> dict[str, Any]:
+    """All arrangements of keyframes."""
+    return _arrangements(world, lambda: warp(3), 0.0)
+
+
+def field(world: World, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The same by the field alone."""
+    config = VirtualSpaceConfig(keyframes=3, picture=PictureConfig(panorama_until_db=0, field_from_db=0))
+    return _arrangements(world, lambda: VirtualSpace(config), arguments.seconds)
+
+
+def _arrangements(world: World, make: Callable[[], VirtualSpace], seconds: float) -> dict[str, Any]:
+    truth = [world.truth(pose) for pose in VIEWS]
     result = {}
     for name, places in PLACES.items():
-        space = VirtualSpace(VirtualSpaceConfig(source="warp", keyframes=3))
+        space = make()
         for x in places:
-            pose = base @ pose_matrix(x)
-            picture = renderer.render(pose, PANORAMA, PANORAMA // 2, supersample=2)
-            space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
-        space.render(base, *SIZE, FOV)
+            space.set_keyframe(*world.keyframe(pose_matrix(x)))
+            start = time.thread_time()
+            while time.thread_time() - start < seconds / len(places) and not space.train(iterations=5).converged:
+                pass
+        world.view(space, np.eye(4))
         start = time.process_time()
-        drawn = [space.render(base @ v, *SIZE, FOV) for v in VIEWS]
+        drawn = [world.view(space, pose) for pose in VIEWS]
         spent = (time.process_time() - start) / len(VIEWS)
         result[name] = {
             "psnr_ssim": [score(view.rgb, real) for view, real in zip(drawn, truth, strict=True)],
@@ -54,17 +99,107 @@ def measure(renderer: Any, base: Any) -> dict[str, Any]:
     return result
 
 
+def unseen(world: World, _: argparse.Namespace) -> dict[str, Any]:
+    """One keyframe; means over views around it."""
+    space = warp()
+    space.set_keyframe(*world.keyframe(np.eye(4)))
+    assert space._shown is not None
+    alone = space._shown.keyframes[0].warp
+    assert alone is not None
+    rows = []
+    for pose in ASIDE:
+        real, shown, continued = world.truth(pose), world.view(space, pose), alone.render(world.base @ pose, *SIZE, FOV)
+        black = continued.rgb.copy()
+        black[continued.confidence == 0] = 0
+        rows.append([value for picture in (black, continued.rgb, shown.rgb) for value in score(picture, real)])
+    mean = np.mean(rows, axis=0)
+    names = ("black", "continued", "shown")
+    return {name: [round(float(mean[2 * n]), 2), round(float(mean[2 * n + 1]), 4)] for n, name in enumerate(names)}
+
+
+def refresh(world: World, _: argparse.Namespace) -> dict[str, Any]:
+    """The drive, with one keyframe and with three: each picture against what it had been without the newest."""
+    result = {}
+    for keyframes in (1, 3):
+        space, before = warp(keyframes), warp(keyframes)
+        first = world.keyframe(np.eye(4))
+        space.set_keyframe(*first)
+        before.set_keyframe(*first)
+        taken, drops, quality, flicker = [first], [], [], []
+        last: Any = None
+        for number in range(round(WAY_M / STEP_M)):
+            x = number * STEP_M
+            if number and number % round(KEYFRAME_M / STEP_M) == 0:
+                taken.append(world.keyframe(pose_matrix(x)))
+                before = warp(keyframes)
+                for one in taken[:-1]:
+                    before.set_keyframe(*one)
+                space.show(space.prepare(*taken[-1]), dissolve=True)
+            pose = pose_matrix(x + AHEAD_M, 0.15 * math.sin(2 * x), yaw=0.2 * math.sin(1.5 * x))
+            real, shown = world.truth(pose), world.view(space, pose)
+            quality.append(psnr(shown.rgb, real))
+            if len(taken) > 1:
+                drops.append(psnr(world.view(before, pose).rgb, real) - quality[-1])
+            both = shown.confidence == 0 if last is None else (shown.confidence == 0) & (last.confidence == 0)
+            if last is not None and both.any():
+                flicker.append(float(np.abs(shown.rgb[both].astype(float) - last.rgb[both]).mean()))
+            last = shown
+        result[f"keyframes {keyframes}"] = {
+            "mean_psnr_db": round(float(np.mean(quality)), 2),
+            "worst_psnr_db": round(min(quality), 2),
+            "worst_drop_db": round(max(drops), 2),
+            "change_of_unseen_between_pictures": round(float(np.mean(flicker)), 2) if flicker else 0.0,
+        }
+    return result
+
+
+def times(world: World, _: argparse.Namespace) -> dict[str, Any]:
+    """CPU time of the last of four keyframes (2048 × 1024), kernels compiled."""
+    result: dict[str, Any] = {}
+    for keyframes in (1, 3):
+        space = VirtualSpace(VirtualSpaceConfig(keyframes=keyframes))
+        spent: dict[str, int] = {}
+
+        def timed(name: str, call: Callable[..., Any], *arguments: Any, into: dict[str, int] = spent) -> Any:
+            start = time.process_time()
+            made = call(*arguments)
+            into[name] = round((time.process_time() - start) * 1e3)
+            return made
+
+        for x in (0.0, 0.4, 0.8, 1.2):
+            pose = world.base @ pose_matrix(x)
+            picture = world.renderer.render(pose, 2048, 1024)
+            depth_m = np.ascontiguousarray(picture.depth_m[::2, ::2])
+            prepared = timed("prepare_ms", space.prepare, picture.rgb, depth_m, pose, 0.02)
+            timed("show_ms", space.show, prepared)
+            timed("first_picture_640x360_ms", space.render, pose, 640, 360, FOV)
+            timed("learn_ms", space.learn, timed("scene_ms", space.scene_of, prepared))
+        for width, height in ((320, 180), (640, 360), (1280, 720)):
+            timed(f"{width}x{height}_ms", space.render, world.base @ pose_matrix(1.7), width, height, FOV)
+        result[f"keyframes {keyframes}"] = spent
+    return result
+
+
+PARTS = {"views": views, "field": field, "unseen": unseen, "refresh": refresh, "time": times}
+
+
 def main() -> None:
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import corridor_world, load_world
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mesh", help="small_house.glb, to measure in it as well")
+    parser.add_argument("--only", default=",".join(PARTS), help="parts, by commas")
+    parser.add_argument("--seconds", type=float, default=8.0, help="CPU time of the field's training")
     arguments = parser.parse_args()
-    result = {"corridor": measure(EquirectRenderer(corridor_world()), pose_matrix(3.0, z=1.2))}
+    parts = arguments.only.split(",")
+    if unknown := sorted(set(parts) - set(PARTS)):
+        parser.error(f"--only: no such part: {', '.join(unknown)}; there are {', '.join(PARTS)}")
+    worlds = {"corridor": World(EquirectRenderer(corridor_world()), pose_matrix(3.0, z=1.2))}
     if arguments.mesh:
         start = pose_matrix(6.3, -2.4, 1.0, yaw=math.pi)
-        result["mesh"] = measure(EquirectRenderer(load_world(arguments.mesh)), start)
+        worlds["mesh"] = World(EquirectRenderer(load_world(arguments.mesh)), start)
+    result = {part: {name: PARTS[part](world, arguments) for name, world in worlds.items()} for part in parts}
     print(json.dumps(result, indent=2))
 
 

@@ -28,7 +28,12 @@ def warm_up(config: VirtualSpaceConfig) -> None:
     space = VirtualSpace(small)
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[::2] = 255
-    space.set_keyframe(rgb, np.full((32, 64), 2.0, np.float32), np.eye(4), 0.05)
+    depth = np.full((32, 64), 4.0, np.float32)
+    depth[12:20, 28:36] = 2.0  # something behind which nobody has seen
+    aside = np.eye(4)
+    aside[1, 3] = 1.0
+    for pose in (np.eye(4), aside)[: config.keyframes]:
+        space.set_keyframe(rgb, depth, pose, 0.05)
     space.train(iterations=1)
-    space.render(np.eye(4), 32, 16, math.pi / 2)
+    space.render(aside if config.keyframes == 1 else np.eye(4), 32, 16, math.pi / 2)
     space.render_equirect(np.eye(4), 64)

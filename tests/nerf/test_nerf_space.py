@@ -340,13 +340,19 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
     assert space.status.state == State.TRAINING
 
 
-def test_warm_up_leaves_nothing_to_compile():
-    from instant_ic.nerf import kernels, march
+@pytest.mark.parametrize("keyframes", [1, 2])
+def test_warm_up_leaves_nothing_to_compile(keyframes):
+    from instant_ic.nerf import background_kernels, compose_kernels, fill_kernels, kernels, march, warp_kernels
 
-    warm_up(CONFIG)
-    before = [len(f.signatures) for f in (kernels.gradient, kernels.query, kernels.adam_touched, march.trace)]
-    trained(1).render(CAMERA, 64, 36, 1.5)
-    assert [len(f.signatures) for f in (kernels.gradient, kernels.query, kernels.adam_touched, march.trace)] == before
+    modules = (background_kernels, compose_kernels, fill_kernels, kernels, march, warp_kernels)
+    compiled = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]
+    config = dataclasses.replace(CONFIG, keyframes=keyframes)
+    warm_up(config)
+    before = [len(function.signatures) for function in compiled]
+    space = refreshed(trained(1, config))
+    space.train(iterations=1)
+    assert space.render(pose_matrix(x=2.0, y=-1.0, yaw=1.0), 64, 36, 1.5).unseen_share > 0
+    assert [len(function.signatures) for function in compiled] == before
 
 
 def test_torch_on_the_cpu_is_the_fallback():
