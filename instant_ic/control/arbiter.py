@@ -363,14 +363,12 @@ class Arbiter:
 
     def _lacking(self, inputs: ArbiterInputs, mode: Mode, now_ns: int) -> list[tuple[Source, float]]:
         """Sources that ``mode`` needs and that are stale, with their ages."""
-        lacking = []
+        lacking, switch = [], self.config.switch
+        required = {"camera": switch.require_camera, "view": switch.require_view}
         for source in SOURCES:
             if mode not in source.modes or (source.optional and source.key not in inputs.ages):
                 continue
-            if (source.key, False) in (
-                ("camera", self.config.switch.require_camera),
-                ("view", self.config.switch.require_view),
-            ):
+            if not required.get(source.key, True):
                 continue
             age = inputs.age(source.key)
             if Mode.REAL not in source.modes:
@@ -500,16 +498,12 @@ class Arbiter:
             return False
         if not (switch.require_view and switch.require_camera):
             return True
-        if self._seconds_old(inputs, "view") or inputs.view_position is None or inputs.picture_position is None:
+        if inputs.age("view") > self.config.timeouts.allowed_s("view", inputs.usual.get("view")):
+            return False
+        if inputs.view_position is None or inputs.picture_position is None:
             return False
         apart = inputs.view_position[:2] - inputs.picture_position[:2]
         return float(np.linalg.norm(apart)) <= switch.picture_position_m
-
-    def _seconds_old(self, inputs: ArbiterInputs, key: str) -> float:
-        """Seconds that a source is old beyond what it may be; 0 while it is fresh."""
-        source = next(source for source in SOURCES if source.key == key)
-        age, allowed_s = inputs.age(key), self._allowed_s(source, inputs)
-        return age if age > allowed_s else 0.0
 
     def _rejoined(self, situation: _Situation) -> str:
         now_ns, switch, inputs = situation.now_ns, self.config.switch, situation.inputs
@@ -632,8 +626,9 @@ class Arbiter:
             return VbotAction.EASED
         if self.mode != Mode.VIRTUAL:
             return VbotAction.WITH_ROBOT
-        if any(source.key == "view" for source, _ in self._lacking(situation.inputs, self.mode, situation.now_ns)):
-            return VbotAction.HELD  # nobody sees where it goes
+        lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
+        if any(source.key in ("view", "command") for source, _ in lacking):
+            return VbotAction.HELD  # nobody sees where it goes, or nobody drives
         return VbotAction.LED_BACK if self._leading_back else VbotAction.DRIVEN
 
     def _far_from_keyframe(self, situation: _Situation) -> str:
@@ -704,10 +699,10 @@ class Arbiter:
 
     def _why_stopped(self, situation: _Situation) -> str:
         inputs = situation.inputs
-        if inputs.estop or inputs.estop_button:
-            button = inputs.estop_button
-            where = "emergency stop button: let it out, then release the stop here" if button else ""
-            return where or "emergency stop: release it to go on"
+        if inputs.estop_button:
+            return "emergency stop button: let it out, then release the stop here"
+        if inputs.estop:
+            return "emergency stop: release it to go on"
         lacking = self._lacking(inputs, Mode.REAL, situation.now_ns)
         if lacking:
             return "stopped: " + _no_data(lacking)
