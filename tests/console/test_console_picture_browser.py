@@ -34,14 +34,15 @@ SLOW_PASSAGE = {"dissolve_ms": 1500, "ease_ms": 1500, "colour_release_s": 60}
 TINT = (0.72, 0.9, 1.08)  # blue, green, red
 
 WATCH = """
-    // Every picture drawn, small, and what was drawn: {rgb, blend, yaw, x}.
+    // Every picture drawn, small, and what was drawn.
     window.seen = [];
     const small = new OffscreenCanvas(48, 30).getContext("2d", {willReadFrequently: true});
     small.imageSmoothingQuality = "high";
     addEventListener("drawn", ({detail}) => {
         small.drawImage(document.getElementById("picture"), 0, 0, 48, 30);
         const rgb = btoa(String.fromCharCode(...small.getImageData(0, 0, 48, 30).data));
-        window.seen.push({rgb, pitch: detail.view?.q[1], blend: detail.blend, x: detail.pose?.[0], yaw: detail.pose?.[2]});
+        const [pitch, yaw] = [detail.view?.q[1], detail.pose?.[2]];
+        window.seen.push({rgb, pitch, yaw, blend: detail.blend});
     });
 """
 

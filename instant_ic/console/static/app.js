@@ -236,7 +236,7 @@ document.addEventListener("visibilitychange", () => { lastFrame = performance.no
 function showBanner() {
   // A stopped robot starts only with hands off; whoever still holds a key must be told.
   const held = state?.mode === "stopped" && (state.command ?? []).some((value) => value !== 0);
-  hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), held, session.driver);
+  hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), held, session.driver, state?.reason ?? "");
 }
 
 function fit(canvas, pixels = 1) {
@@ -282,7 +282,7 @@ const rounded = (values, digits) => (values ? values.map((value) => value.toFixe
 
 function frame(now) {
   requestAnimationFrame(frame);
-  if (viewer.slow && now - lastFrame < SLOW_FRAME_MS) return;
+  if (viewer.slow && now - lastFrame < (pictures.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS)) return;
   const elapsed = Math.min(now - lastFrame, 200);
   lastFrame = now;
   look.step(elapsed / 1000);
