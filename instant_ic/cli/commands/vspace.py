@@ -99,6 +99,10 @@ def _add_train(verbs: Any) -> None:
                        "one, whose metres are an estimate: no LiDAR scales them here)")  # fmt: skip
     parser.add_argument("--depth-sigma", type=positive, metavar="SHARE", help="standard deviation of the depth against "
                         f"it (default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)")  # fmt: skip
+    parser.add_argument("--camera-height", type=positive, metavar="M", help="of the camera above the floor: what is "
+                        "estimated is scaled so that the floor lies there (default: the model's metres)")  # fmt: skip
+    parser.add_argument("--as-estimated", action="store_true", help="take the model's depth as it comes; otherwise "
+                        "floor and ceiling are made level and walls upright where they nearly are")  # fmt: skip
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--seconds", type=positive, metavar="S", help="train for about so long")
     length.add_argument("--iterations", type=positive_int, metavar="N", help="train so many iterations (default: 600)")
@@ -178,11 +182,16 @@ def train(args: argparse.Namespace) -> int:
 
     from ..progress import progress
 
+    if args.camera_height and (args.depth or args.as_estimated):
+        other = "--depth" if args.depth else "--as-estimated"
+        raise UserError(f"--camera-height scales an estimate, and {other} is taken as it is: leave one of them out", 2)
     rgb = load_picture(args.panorama)
     if args.depth:
         depth, sigma = load_depth(args.depth), args.depth_sigma or _TRUE_SIGMA
     else:
         depth, sigma = estimated_depth(args.model, rgb), args.depth_sigma or _MODEL_SIGMA
+        if not args.as_estimated:
+            depth = _tidied(depth, args.camera_height, args.panorama)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -218,6 +227,23 @@ def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.fl
         raise UserError(f"{model}: its {kind} depth has no metres without a LiDAR; give --depth, or a metric model")
     print(f"no --depth: the metres are {loaded.manifest.name}'s estimate, not measured", file=sys.stderr)
     return loaded.estimate(rgb)
+
+
+def _tidied(depth: NDArray[np.float32], camera_height_m: float | None, panorama: Path) -> NDArray[np.float32]:
+    """Estimated depth with level floor and ceiling and upright walls; says where they lie."""
+    from instant_ic.depth.tidy import tidy
+
+    try:
+        room = tidy(depth, camera_height_m)
+    except ValueError as error:
+        raise UserError(f"{panorama}: {error}") from error
+    found = [
+        f"{name} {'not found' if away is None else f'{away:.2f} m {where} the camera'}"
+        for name, away, where in (("floor", room.floor_m, "under"), ("ceiling", room.ceiling_m, "over"))
+    ]
+    scaled = f"; estimated metres times {room.scale:.2f}" if camera_height_m else ""
+    print(", ".join(found) + scaled, file=sys.stderr)
+    return room.depth_m
 
 
 def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args: argparse.Namespace) -> VirtualSpace:
