@@ -86,6 +86,7 @@ class Demo:
         self.commands: list[tuple[float, float]] = []
         self.look = Look()
         self.estop = False
+        self.button = False  # on the robot
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
         self.pictures = True
@@ -199,10 +200,12 @@ class Demo:
             self._step(seconds)
 
     def _step(self, seconds: float) -> None:
-        v, w = (0.0, 0.0) if self.estop else self._command
+        stopped = self.estop or self.button
+        v, w = (0.0, 0.0) if stopped else self._command
         before = self.mode
-        if self.estop:
-            self.mode, self.reason = "stopped", "Emergency stop"
+        if stopped:
+            words = "emergency stop button: let it out, then release the stop here"
+            self.mode, self.reason = "stopped", words if self.button else "emergency stop: release it to go on"
         elif self.forced_mode is not None:
             self.mode, self.reason = self.forced_mode, ""
         elif self.mode == "stopped":
@@ -257,7 +260,7 @@ class Demo:
                 "mode": self.mode,
                 "shown": "virtual" if self.mode == "virtual" else "real",
                 "reason": self.reason,
-                "estop": self.estop,
+                "estop": self.estop or self.button,
                 "blocked": False,
                 "transitions": self._transitions,
                 "robot": self.robot.round(4).tolist(),

@@ -226,6 +226,16 @@ def test_emergency_stop_by_space_and_release_by_holding(driver, shared_demo):
     assert not shared_demo.estop
 
 
+def test_the_button_on_the_robot_is_told_with_where_to_let_it_out(driver, shared_demo):
+    shared_demo.button = True
+    expect_body(driver, "estop", "set")
+    assert driver.locator("#banner-title").inner_text() == "EMERGENCY STOP"
+    words = "Emergency stop button: let it out, then release the stop here"
+    assert driver.locator("#banner-text").inner_text() == driver.locator("#mode-reason").inner_text() == words
+    shared_demo.button = False
+    expect_body(driver, "estop", "free")
+
+
 def test_controls_held_through_a_stop_are_told_to_be_let_go(driver, shared_demo):
     """The arbiter starts again only with hands off; whoever still holds a key must be told why nothing moves."""
     start_driving(driver, shared_demo)

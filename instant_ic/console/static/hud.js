@@ -34,7 +34,7 @@ export function showMode(state, driver) {
   if (mode !== document.body.dataset.mode && mode in SAID) announce(SAID[mode]);
   document.body.dataset.mode = mode;
   write(byId("mode-name"), name);
-  write(byId("mode-reason"), state?.reason || usual);
+  write(byId("mode-reason"), sentence(state?.reason) || usual);
 }
 
 export function showLatency(link, pictures) {
@@ -126,8 +126,10 @@ export function showSession(session) {
   byId("yield").hidden = session.driver !== "you" || watchers === 0;
 }
 
+const sentence = (words) => (words ? words[0].toUpperCase() + words.slice(1) : "");
+
 /** One banner at a time: a lost link first, then the emergency stop, then a key held through a stop. */
-export function showBanner(connected, everConnected, estop, held, driver) {
+export function showBanner(connected, everConnected, estop, held, driver, reason) {
   document.body.dataset.link = connected ? "up" : everConnected ? "lost" : "connecting";
   document.body.dataset.estop = estop ? "set" : "free";
   const banner = byId("banner");
@@ -138,6 +140,7 @@ export function showBanner(connected, everConnected, estop, held, driver) {
   write(byId("banner-text"), lost
     ? "The robot was told to stop. Connecting again…"
     : !estop ? "Let go of the controls to go on."
+    : reason.includes("button") ? sentence(reason) // on the robot: to be let out there first
     : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
   byId("release").hidden = lost || !estop || driver !== "you";
 }
