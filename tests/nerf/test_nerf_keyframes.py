@@ -243,6 +243,29 @@ def test_the_keyframe_that_is_nearer_to_a_surface_has_more_say():
     assert colour[0, 0] == pytest.approx(1 / (1 + (0.05 / 0.3625) ** 6), abs=1e-3)
 
 
+@pytest.mark.parametrize("keyframes", [1, 3])
+def test_a_refresh_costs_no_picture_more_than_a_decibel(keyframes):
+    """A drive with a keyframe every 0.6 m: each picture against what the older keyframes would show."""
+    config = dataclasses.replace(CONFIG, source="warp", keyframes=keyframes)
+    space, without = VirtualSpace(config), VirtualSpace(config)
+    worst, taken = math.inf, []
+    for number in range(16):
+        x = -2.0 + 0.2 * number
+        if number % 3 == 0:
+            pose = pose_matrix(x=x, y=-0.3)
+            picture = box_room.panorama(pose, 96)
+            if taken:
+                without.set_keyframe(*taken[-1])
+            taken.append((picture.rgb, picture.depth_m, pose, 0.02))
+            space.show(space.prepare(*taken[-1]), dissolve=True)
+        view = pose_matrix(x=x + 0.7, y=-0.3, yaw=0.3 * math.sin(x))
+        truth = box_room.perspective(view, 64, 36, 1.5).rgb
+        shown = psnr_db(space.render(view, 64, 36, 1.5).rgb, truth)
+        if len(taken) > 1:
+            worst = min(worst, shown - psnr_db(without.render(view, 64, 36, 1.5).rgb, truth))
+    assert worst > -1.0
+
+
 def composed_plainly(layers, rays):
     """The rules of ``compose`` in plain numpy."""
     depth, confidence = (np.stack([getattr(one, key) for one in layers]) for key in ("depth", "confidence"))
