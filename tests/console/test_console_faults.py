@@ -255,7 +255,8 @@ def test_faults_and_a_silent_camera_are_told(driver, shared_demo):
     text = "<img src=x onerror=alert(1)> no packets"
     shared_demo.faults = [{"level": "error", "name": "vlp16_driver", "text": text}]
     driver.locator("#faults li").wait_for()
-    assert driver.locator("#faults li").inner_text() == f"vlp16_driver {text}"  # as text, not as HTML
+    assert driver.locator("#faults li").inner_text() == f"LiDAR {text}"  # as text, not as HTML
+    assert driver.locator("#faults li").get_attribute("title") == f"vlp16_driver: {text}"
     shared_demo.pictures = False
     expect_body(driver, "picture", "stale")
     shared_demo.reset()

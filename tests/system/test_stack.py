@@ -48,7 +48,8 @@ def outcome(tmp_path_factory):
     bag = tmp_path_factory.mktemp("drive") / "bag"
     ports = free_ports()
     try:
-        with Stack("sim.yaml", run_dir, {**ports, "record": bag}, pace=machine_pace()) as stack:
+        # One recorder is enough: the page's would write into the working directory.
+        with Stack("sim.yaml", run_dir, {**ports, "record": bag, "recorder": False}, pace=machine_pace()) as stack:
             recorder = DriveRecorder(stack)
             url = f"http://127.0.0.1:{ports['console_port']}/"
             asyncio.run(drive_through_obstacle(stack, recorder, url, beyond_x_m=5.6))

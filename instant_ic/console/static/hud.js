@@ -18,6 +18,12 @@ const SAID = {
   stopped: "Stopped: the robot is held",
 };
 const ANNOUNCE_MS = 400;
+// What an operator calls the nodes whose faults are told.
+const NODES = {
+  theta_camera: "Camera", vlp16_driver: "LiDAR", crawler_base: "Base", grid_slam: "Map and pose", arbiter: "Control",
+  virtual_robot: "Virtual robot", navigator: "Path planner", depth_estimator: "Depth", depth_scaler: "Depth",
+  nerf: "Virtual space", console: "Console", operator_recorder: "Recorder", host_bridge: "Link to the robot",
+};
 const HOLD_MS = 800;
 const TOAST_MS = 2600;
 const byId = (id) => document.getElementById(id);
@@ -70,9 +76,9 @@ export function showHealth(health) {
   list.replaceChildren(...faults.map(({ level, name, text }) => {
     const item = document.createElement("li");
     item.className = level;
-    item.title = text;
+    item.title = `${name}: ${text}`; // whole, and with the node's name for `ic log`
     const bold = document.createElement("b");
-    bold.textContent = name;
+    bold.textContent = NODES[name] ?? name;
     item.append(bold, ` ${text}`);
     return item;
   }));
