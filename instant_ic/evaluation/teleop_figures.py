@@ -37,9 +37,11 @@ class Switch:
         time_s: when.
         to_virtual: into the virtual space, else back.
         position_error_m: between the places of the last picture before and the first after, as the stack knows them,
-            less what the shown robot drove between them: what the eye sees jump, before the page eases it.
+            less what the shown robot drove from when the one came to when the other did.
         yaw_error_deg: between the headings of r-bot and v-bot, to which the page turns the pictures.
-        true_position_error_m: as position_error_m, of the camera's picture where it was truly taken.
+        true_position_error_m: the same, of the camera's picture where it was truly taken.
+        jump_m: the same, less what the shown robot drove from when the one came up to when the other did: with how
+            long a camera's picture had been there already. What the eye sees, before the page eases it.
         gap_m: between r-bot and v-bot in that step: the camera's picture is older than the r-bot's pose.
         psnr_db: between those two pictures; None where they were not drawn.
     """
@@ -49,6 +51,7 @@ class Switch:
     position_error_m: float
     yaw_error_deg: float
     true_position_error_m: float
+    jump_m: float
     gap_m: float
     psnr_db: float | None = None
 
@@ -74,6 +77,8 @@ class Drive:
     flicker: int = 0
     transitions: int = 0
     mode_seconds: dict[str, float] = field(default_factory=dict)
+    disobeyed_seconds: dict[str, float] = field(default_factory=dict)
+    """By mode."""
     gap_mean_m: float = math.nan
     gap_max_m: float = math.nan
     longest_freeze_s: float = 0.0
@@ -113,8 +118,8 @@ def ramped(commands: FloatArray, limits: MotionLimits) -> FloatArray:
     return out
 
 
-def obedience(log: Log, limits: MotionLimits | None = None) -> float:
-    """Share of the time under command in which the shown robot did what was commanded; NaN without commands.
+def obeys(log: Log, limits: MotionLimits | None = None) -> FloatArray:
+    """(N,) 1 where the shown robot did what was commanded, 0 where it did not, NaN where nothing was to be done.
 
     It did where its speed, ahead and about, lies between the least and the greatest that the ramped command had within
     the last ``LATENCY_S``, give or take ``TOLERANCE_*``. A robot that stands, is slowed, or turns otherwise does not.
@@ -123,16 +128,19 @@ def obedience(log: Log, limits: MotionLimits | None = None) -> float:
     wanted, speeds = ramped(commands, limits or MotionLimits()), shown_speeds(log)
     window = round(LATENCY_S / STEP_S)
     tolerance = np.array([TOLERANCE_M_S, TOLERANCE_RAD_S])
-    good = counted = 0
+    out = np.full(len(commands), math.nan)
     for k in range(len(commands)):
-        if not commands[k].any() or np.isnan(speeds[k]).any():
-            continue
-        recent = wanted[max(0, k - window) : k + 1]
-        counted += 1
-        good += bool(
-            ((speeds[k] >= recent.min(axis=0) - tolerance) & (speeds[k] <= recent.max(axis=0) + tolerance)).all()
-        )
-    return good / counted if counted else math.nan
+        if commands[k].any() and not np.isnan(speeds[k]).any():
+            recent = wanted[max(0, k - window) : k + 1]
+            low, high = recent.min(axis=0) - tolerance, recent.max(axis=0) + tolerance
+            out[k] = float(((speeds[k] >= low) & (speeds[k] <= high)).all())
+    return out
+
+
+def obedience(log: Log, limits: MotionLimits | None = None) -> float:
+    """Share of the time under command in which the shown robot obeyed; NaN without commands."""
+    done = obeys(log, limits)
+    return math.nan if np.isnan(done).all() else float(np.nanmean(done))
 
 
 def longest_stall_s(log: Log) -> float:
@@ -162,7 +170,7 @@ def find_switches(log: Log) -> list[Switch]:
             continue
         gap = relative2(log.estimate[k], log.vbot[k])
         pictures = pictures_at(log.pictures, log.time_s[k], log.virtual[k])
-        error, true = (math.nan, math.nan) if pictures is None else jump_m(*pictures, log)
+        error, true, jump = (math.nan,) * 3 if pictures is None else picture_errors_m(*pictures, log)
         found.append(
             Switch(
                 log.time_s[k],
@@ -170,6 +178,7 @@ def find_switches(log: Log) -> list[Switch]:
                 error,
                 abs(math.degrees(wrap_angle(float(gap[2])))),
                 true,
+                jump,
                 math.hypot(float(gap[0]), float(gap[1])),
             )
         )
@@ -190,19 +199,21 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
     return None
 
 
-def jump_m(before: Shown, after: Shown, log: Log) -> tuple[float, float]:
-    """How far the first picture after a switch is from where the eye expects it: as known, and in truth.
+def picture_errors_m(before: Shown, after: Shown, log: Log) -> tuple[float, float, float]:
+    """How far the places of two pictures are apart that should be one: as known, in truth, and as the eye sees it.
 
-    Expected is the place of the last picture before, moved on by what the shown robot drove from one to the other.
+    The shown robot drives from one picture to the next; its mean speed round the switch says how far.
     """
     speeds = shown_speeds(log)[:, 0]
     times = np.array(log.time_s)
     near = (times > before.time_s - 0.3) & (times < after.time_s + 0.3) & ~np.isnan(speeds)
-    ahead = (float(speeds[near].mean()) if near.any() else 0.0) * (after.time_s - before.time_s)
-    expected = ahead * np.array([math.cos(before.heading), math.sin(before.heading)])
-    known = after.place - before.place - expected
-    true = after.pose[:2] - before.pose[:2] - expected
-    return float(np.hypot(*known)), float(np.hypot(*true))
+    speed = float(speeds[near].mean()) if near.any() else 0.0
+    heading = np.array([math.cos(before.heading), math.sin(before.heading)])
+    between = speed * (after.came_s - before.came_s) * heading
+    shown_between = speed * (after.time_s - before.time_s) * heading
+    known, true = after.place - before.place, after.pose[:2] - before.pose[:2]
+    error, truly, seen = (float(np.hypot(*apart)) for apart in (known - between, true - between, known - shown_between))
+    return error, truly, seen
 
 
 def obstacles_met(log: Log, centres: FloatArray) -> int:
@@ -222,6 +233,10 @@ def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
     drive.transitions = int((np.diff(modes) != 0).sum())
     drive.mode_seconds = {mode.name.lower(): round(float((modes == mode).sum()) * STEP_S, 2) for mode in Mode}
     robot, vbot = np.array(log.robot), np.array(log.vbot)
+    disobeyed = obeys(log) == 0.0
+    drive.disobeyed_seconds = {
+        mode.name.lower(): round(float(disobeyed[modes == mode].sum()) * STEP_S, 2) for mode in Mode
+    }
     drive.driven_m = float(np.linalg.norm(np.diff(robot[:, :2], axis=0), axis=1).sum())
     virtual = np.array(log.virtual)
     if virtual.any():
@@ -261,6 +276,8 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
         "switch_yaw_error_mean_deg": _mean([s.yaw_error_deg for s in switches]),
         "switch_true_position_error_m": _most([s.true_position_error_m for s in switches]),
         "switch_true_position_error_mean_m": _mean([s.true_position_error_m for s in switches]),
+        "switch_jump_m": _most([s.jump_m for s in switches]),
+        "switch_jump_mean_m": _mean([s.jump_m for s in switches]),
         "switch_gap_mean_m": _mean([s.gap_m for s in switches]),
         "switch_psnr_min_db": min(psnr, default=None),
         "switch_to_virtual_psnr_db": _mean([s.psnr_db for s in into if s.psnr_db is not None]),
@@ -272,6 +289,10 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
         "transitions": sum(drive.transitions for drive in drives),
         "mode_seconds": {
             name: round(sum(d.mode_seconds.get(name, 0.0) for d in drives), 2) for name in drives[0].mode_seconds
+        },
+        "disobeyed_seconds": {
+            name: round(sum(d.disobeyed_seconds.get(name, 0.0) for d in drives), 2)
+            for name in drives[0].disobeyed_seconds
         },
         "gap_mean_m": _mean([drive.gap_mean_m for drive in drives]),
         "gap_max_m": _most([drive.gap_max_m for drive in drives]),

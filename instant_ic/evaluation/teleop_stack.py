@@ -80,6 +80,7 @@ class Shown:
 
     Attributes:
         time_s: when it came up.
+        came_s: when it came to the page: at a switch the newest picture is shown that is already there.
         virtual: a rendered view, else the camera's picture.
         pose: (3,) of the robot that it was taken from, in the world's frame; of a camera's picture the true one.
         place: (2,) the same, as the stack knows it.
@@ -88,6 +89,7 @@ class Shown:
     """
 
     time_s: float
+    came_s: float
     virtual: bool
     pose: FloatArray
     place: FloatArray
@@ -271,13 +273,13 @@ class SimulatedStack:
             map_from_camera = matrix_from_quaternion(np.array(header["q"]))
             map_from_camera[:3, 3] = header["p"]
             pose = self._in_world(pose2_from_matrix(map_from_camera))
-            shown = Shown(self.time_s, True, pose, pose[:2], float(pose[2]), payload, float(header["fov"]))
+            shown = Shown(self.time_s, self.time_s, True, pose, pose[:2], float(pose[2]), payload, float(header["fov"]))
         else:
             exposure_s, taken_from = self._exposed.popleft()
             stamp = START_NS + round(exposure_s * 1e9)
             known = self.nodes["console"].lookup("map", "camera", stamp)
             place = taken_from if known is None else self._in_world(pose2_from_matrix(known))
-            shown = Shown(self.time_s, False, taken_from, place[:2], float(self.robot[2]))
+            shown = Shown(self.time_s, self.time_s, False, taken_from, place[:2], float(self.robot[2]))
         self._newest[virtual] = shown
         if virtual == self.page.virtual:
             self.log.pictures.append(shown)

@@ -45,8 +45,10 @@ def ramp(n: int, late: int = 0) -> list[float]:
     return [min(0.4, 0.04 * max(0, k + 1 - late)) for k in range(n)]
 
 
-def photo(time_s: float, x: float, virtual: bool) -> Shown:
-    return Shown(time_s, virtual, np.array([x, 0.0, 0.0]), np.array([x, 0.0]), 0.0)
+def photo(time_s: float, x: float, virtual: bool, came_s: float | None = None) -> Shown:
+    return Shown(
+        time_s, time_s if came_s is None else came_s, virtual, np.array([x, 0.0, 0.0]), np.array([x, 0.0]), 0.0
+    )
 
 
 class TestObedience:
@@ -80,16 +82,15 @@ class TestSwitches:
     def test_each_change_of_the_picture_and_how_far_it_jumps(self) -> None:
         log = log_of([0.4] * 60, [0.4] * 60, [False] * 20 + [True] * 20 + [False] * 20)
         # 0.4 m/s: between pictures 0.1 s apart the eye expects 4 cm. It gets 5 cm, and on the way back 1 cm.
-        log.pictures = [
-            photo(0.9, 0.36, False),
-            photo(1.0, 0.41, True),
-            photo(1.9, 0.76, True),
-            photo(2.0, 0.77, False),
-        ]
+        # That one had come 0.05 s before already, when it was 2 cm less to expect: it is 1 cm off, the eye sees 3 cm.
+        log.pictures = [photo(0.9, 0.36, False), photo(1.0, 0.41, True), photo(1.9, 0.76, True)]
+        log.pictures.append(photo(2.0, 0.77, False, came_s=1.95))
         into, back = teleop_figures.find_switches(log)
         assert (into.to_virtual, back.to_virtual) == (True, False)
         assert into.position_error_m == pytest.approx(0.01, abs=1e-6)
-        assert back.position_error_m == pytest.approx(0.03, abs=1e-6)
+        assert into.jump_m == pytest.approx(0.01, abs=1e-6)
+        assert back.position_error_m == pytest.approx(0.01, abs=1e-6)
+        assert back.jump_m == pytest.approx(0.03, abs=1e-6)
         assert into.yaw_error_deg == 0.0
 
     def test_without_pictures_the_jump_is_not_known(self) -> None:
@@ -103,7 +104,7 @@ class TestSwitches:
 
     def test_flicker_is_what_is_taken_back_at_once(self) -> None:
         def at(time_s: float, to_virtual: bool) -> Switch:
-            return Switch(time_s, to_virtual, 0.0, 0.0, 0.0, 0.0)
+            return Switch(time_s, to_virtual, 0.0, 0.0, 0.0, 0.0, 0.0)
 
         calm = [at(1.0, True), at(9.0, False), at(20.0, True), at(30.0, False)]
         assert teleop_figures.count_flicker(calm) == 0
@@ -125,7 +126,7 @@ class TestSwitches:
 
 def test_summary_by_hand() -> None:
     def drive(index: int, method: str, seconds: float, completed: bool, switches: int) -> Drive:
-        made = [Switch(float(k), k % 2 == 0, 0.01 * (k + 1), 0.1, 0.02, 0.0, 20.0 + k) for k in range(switches)]
+        made = [Switch(float(k), k % 2 == 0, 0.01 * (k + 1), 0.1, 0.02, 0.03, 0.0, 20.0 + k) for k in range(switches)]
         return Drive(
             index, method, completed, seconds=seconds, way_m=8.0, driven_m=8.8, obstacles=1,
             obedience=1.0 - 0.1 * index, switches=made, mode_seconds={"real": seconds}, gap_max_m=math.nan,
