@@ -1,14 +1,18 @@
 """Measures the virtual space on this machine and prints JSON: kernels, time to quality, pictures, memory.
 
-    python benchmarks/nerf.py [--seconds 20] [--world corridor|room]
+    python benchmarks/nerf.py [--seconds 60] [--world corridor|room] [--only PART ...]
 
-CPU time of the whole process is measured, not wall time, so that other load on the machine counts little. The scene is
-the simulator's corridor (true depth, 1024 × 512 panorama), or the box room of the tests.
+CPU time of the process is measured, not wall time, so that other load on the machine counts little; a machine's own
+speed counts fully, so hash encoding and iterations stand beside a peer's in the same run. The peer is nerfstudio's
+``HashEncoding(implementation="torch")`` where nerfstudio is installed, else ``benchmarks/peer_hash.py``, which does the
+same operations in torch; ``peer`` says which. The scene is the simulator's corridor (true depth, 1024 × 512 panorama),
+or the box room of the tests. What needs a GPU is written ``not measured`` where there is none.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import platform
@@ -16,23 +20,26 @@ import resource
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
+from peer_hash import peer_encoding
 from skimage.metrics import structural_similarity
 
 from instant_ic import paths
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.nerf import PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room, kernels
+from instant_ic.nerf import FieldConfig, PictureConfig, VirtualSpace, VirtualSpaceConfig, box_room, kernels
 from instant_ic.nerf.prior import fill_holes
 from instant_ic.nerf.warm_up import warm_up
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
 FOV = math.pi / 2
+LOG2_TABLE = 17
 
 
 @njit(nogil=True, fastmath=True)
@@ -57,21 +64,86 @@ def cpu_seconds(call: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times)
 
 
-def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[str, float]:
-    """CPU nanoseconds a sample, points along a wall, all levels counted whole."""
+def wall_points(samples: int) -> Any:
+    """Points along a wall, (N, 3)."""
+    place = np.arange(samples)
+    return np.stack([np.full(samples, 2.0), place % 256 * 0.02, place // 256 * 0.02], axis=1).astype(np.float32)
+
+
+def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[str, Any]:
+    """CPU nanoseconds a sample of ours and of the peer, all levels counted whole, by turns in one run."""
+    import torch
+
     rng = np.random.default_rng(0)
-    table = rng.normal(size=(levels, 1 << 17, features)).astype(np.float32)
+    table = rng.normal(size=(levels, 1 << LOG2_TABLE, features)).astype(np.float32)
     grad, touched = np.zeros_like(table), np.zeros(table.shape[:2], np.uint8)
     cells = np.geomspace(2, 80, levels).astype(np.float32)
-    place = np.arange(samples)
-    points = np.stack([np.full(samples, 2.0), place % 256 * 0.02, place // 256 * 0.02], axis=1).astype(np.float32)
-    focus = np.zeros((1, 4), np.float32)
-    result = {}
-    for name, backward in (("forward", False), ("forward_backward", True)):
+    points, focus = wall_points(samples), np.zeros((1, 4), np.float32)
+    peer_name, peer = peer_encoding(levels, features, LOG2_TABLE, 16, 640)
+    # The peer's cube is the unit cube.
+    unit = torch.from_numpy(points - points.min(axis=0)) / float(np.ptp(points, axis=0).max())
+
+    def ours(backward: bool) -> None:
         _encode_all(table, grad, touched, cells, focus, points, backward)
-        spent = cpu_seconds(lambda b=backward: _encode_all(table, grad, touched, cells, focus, points, b), 9)
-        result[f"{name}_ns"] = round(spent / samples * 1e9, 1)
+
+    def theirs(backward: bool) -> None:
+        with torch.set_grad_enabled(backward):
+            out = peer(unit)
+        if backward:
+            out.backward(torch.ones_like(out))
+
+    result: dict[str, Any] = {"peer": peer_name}
+    for name, backward in (("forward", False), ("forward_backward", True)):
+        ours(backward)
+        theirs(backward)
+        times = [
+            (cpu_seconds(lambda b=backward: ours(b), 3), cpu_seconds(lambda b=backward: theirs(b), 1)) for _ in range(3)
+        ]
+        mine, peers = (statistics.median(column) / samples * 1e9 for column in zip(*times, strict=True))
+        result[f"{name}_ns"] = round(mine, 1)
+        result[f"{name}_peer_ns"] = round(peers, 1)
+        result[f"{name}_times_faster"] = round(peers / mine, 1)
     return result
+
+
+def whole_iteration(repeats: int = 5) -> dict[str, Any]:
+    """CPU milliseconds of a training step of 16 384 samples: ours with its rays, and the peer's encoding with torch's
+    network, autograd and Adam on the same number of samples.
+    """
+    import torch
+
+    picture = box_room.panorama(np.eye(4), 256)
+    space = VirtualSpace(VirtualSpaceConfig(device="cpu"))
+    space.set_keyframe(picture.rgb, picture.depth_m, np.eye(4), 0.02)
+    space.train(iterations=3)
+    config = space.config.field
+    samples = 2 * space.config.train.ray_columns * space.config.train.ray_rows
+    name, encoding = peer_encoding(config.levels, config.features, config.log2_table, 16, 640)
+    network = torch.nn.Sequential(
+        torch.nn.Linear(config.levels * config.features, config.hidden),
+        torch.nn.ReLU(),
+        torch.nn.Linear(config.hidden, 4),
+    )
+    adam = torch.optim.Adam([*encoding.parameters(), *network.parameters()], lr=0.01, eps=1e-15)
+    rng = np.random.default_rng(0)
+
+    def step() -> None:
+        points = torch.from_numpy(rng.random((samples, 3), np.float32))
+        target = torch.from_numpy(rng.random((samples, 4), np.float32))
+        adam.zero_grad()
+        ((network(encoding(points)) - target) ** 2).mean().backward()
+        adam.step()
+
+    step()
+    ours = cpu_seconds(lambda: space.train(iterations=1), 4 * repeats) * 1e3
+    theirs = cpu_seconds(step, repeats) * 1e3
+    return {
+        "samples": samples,
+        "ms": round(ours, 1),
+        "peer": name,
+        "peer_ms": round(theirs, 1),
+        "times_faster": round(theirs / ours, 1),
+    }
 
 
 def scene(world: str) -> tuple[Any, Any, list[Any], list[Any]]:
@@ -140,62 +212,229 @@ def against_warp(picture: Any, pose: Any, poses: list[Any], truth: list[Any], it
     return result
 
 
-def measure(world: str, seconds: float) -> dict[str, Any]:
-    """Trains for about ``seconds`` of CPU and follows the pictures' PSNR on the way."""
-    config = VirtualSpaceConfig(train=TrainConfig())
-    start = time.process_time()
-    warm_up(config)
-    warm = time.process_time() - start
+def shown(source: str) -> VirtualSpaceConfig:
+    """``field``: the field alone; ``shown``: as it is by default; ``density``: the field alone, as density."""
+    alone = PictureConfig(panorama_until_db=30.0, field_from_db=30.0)
+    if source == "shown":
+        return VirtualSpaceConfig()
+    geometry = "density" if source == "density" else "distance"
+    return VirtualSpaceConfig(picture=alone, field=FieldConfig(geometry=geometry))
+
+
+def time_to_quality(world: str, seconds: float, source: str) -> dict[str, Any]:
+    """Trains for up to ``seconds`` of CPU (to the schedule's end) and follows the views' PSNR on the way.
+
+    ``within_*_cpu_s`` counts from the keyframe's arrival, its preparation included.
+    """
     picture, pose, poses, truth = scene(world)
-    space = VirtualSpace(config)
-    take = cpu_seconds(lambda: space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02), 3)
-    spent, curve = 0.0, []
+    space = VirtualSpace(shown(source))
+    start = time.process_time()
+    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+    space.render(pose, *SIZES[0], FOV)
+    first_picture = time.process_time() - start
+    spent, curve = first_picture, []
     while spent < seconds and not space.status.converged:
         start = time.process_time()
-        space.train(iterations=5 if spent < 2 else 25)
+        space.train(iterations=5 if space.status.iterations < 60 else 20)
         spent += time.process_time() - start
-        views = [psnr_db(space.render(p, *SIZES[0], FOV).rgb, t) for p, t in zip(poses, truth, strict=True)]
-        ready = space.status.ready_iterations > 0
-        curve.append((spent, statistics.mean(views), space.status.psnr_db, ready, views))
-    final = curve[-1][1]
+        drawn = [space.render(p, *SIZES[0], FOV).rgb for p in poses]
+        views = [psnr_db(a, b) for a, b in zip(drawn, truth, strict=True)]
+        curve.append((spent, statistics.mean(views), space.status.ready_iterations > 0))
+    final = max(row[1] for row in curve[-3:])
 
     def reached(db: float) -> float:
         return round(next(row[0] for row in curve if row[1] >= final - db), 2)
 
-    frames = {
-        f"{w}x{h}": round(cpu_seconds(lambda w=w, h=h: space.render(poses[1], w, h, FOV), 5) * 1e3, 1) for w, h in SIZES
-    }
-    ready = next((row[0] for row in curve if row[3]), None)
     return {
-        "warm_up_cpu_s": round(warm, 2),
-        "keyframe_cpu_ms": round(take * 1e3, 1),
+        "first_picture_cpu_s": round(first_picture, 2),
         "iterations": space.status.iterations,
-        "train_cpu_s": round(spent, 2),
-        "ms_per_iteration": round(spent / space.status.iterations * 1e3, 1),
-        "ready_after_cpu_s": None if ready is None else round(ready, 2),
+        "cpu_s": round(spent, 2),
+        "ms_per_iteration": round((spent - first_picture) / space.status.iterations * 1e3, 1),
+        "ready_after_cpu_s": next((round(row[0], 2) for row in curve if row[2]), None),
         "within_3_db_cpu_s": reached(3),
         "within_1_db_cpu_s": reached(1),
-        "final_view_psnr_db": [round(v, 2) for v in curve[-1][4]],
-        "final_training_psnr_db": round(curve[-1][2], 2),
-        "frame_cpu_ms": frames,
-        "against_warp": against_warp(picture, pose, poses, truth, 60) if world == "corridor" else {},
+        "training_psnr_db": round(space.status.psnr_db, 2),
+        "views": scores(drawn, truth),
+        "curve_cpu_s_psnr_db": [(round(row[0], 1), round(row[1], 2)) for row in curve[:: max(1, len(curve) // 15)]],
     }
+
+
+def scores(drawn: list[Any], truth: list[Any]) -> list[tuple[float, float]]:
+    """PSNR in dB and SSIM of each view."""
+    return [
+        (round(psnr_db(a, b), 2), round(float(structural_similarity(a, b, channel_axis=2)), 3))
+        for a, b in zip(drawn, truth, strict=True)
+    ]
+
+
+def geometries(world: str, seconds: float) -> dict[str, Any]:
+    """Views of the field alone after the same CPU time with each geometry."""
+    picture, pose, poses, truth = scene(world)
+    result = {}
+    for name, source in (("distance", "field"), ("density", "density")):
+        space = VirtualSpace(shown(source))
+        space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+        spent = 0.0
+        while spent < seconds and not space.status.converged:
+            start = time.process_time()
+            space.train(iterations=5)
+            spent += time.process_time() - start
+        drawn = [space.render(p, *SIZES[0], FOV) for p in poses]
+        picture_s = cpu_seconds(lambda space=space: space.render(poses[1], *SIZES[0], FOV), 3)
+        result[name] = {
+            "cpu_s": round(spent, 1),
+            "iterations": space.status.iterations,
+            "views": scores([view.rgb for view in drawn], truth),
+            "frame_320x180_cpu_ms": round(picture_s * 1e3, 1),
+        }
+    return result
+
+
+def pictures(world: str, train_ms: float = 30.0) -> dict[str, Any]:
+    """CPU milliseconds of a picture and pictures a second on one thread, alone and with a slice of training each."""
+    picture, pose, poses, _ = scene(world)
+    result: dict[str, Any] = {"train_ms_per_frame": train_ms}
+    for source in ("shown", "field", "density"):
+        space = VirtualSpace(shown(source))
+        space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+        space.train(iterations=40)
+        sizes = {}
+        for width, height in SIZES:
+            space.render(poses[1], width, height, FOV)
+
+            def frame(w: int = width, h: int = height, space: VirtualSpace = space) -> None:
+                space.render(poses[1], w, h, FOV)
+
+            def with_training(frame: Callable[[], None] = frame, space: VirtualSpace = space) -> None:
+                frame()
+                space.train(budget_ms=train_ms)
+
+            alone, training = cpu_seconds(frame, 5), cpu_seconds(with_training, 5)
+            sizes[f"{width}x{height}"] = {
+                "cpu_ms": round(alone * 1e3, 1),
+                "fps_alone": round(1 / alone, 1),
+                "fps_while_training": round(1 / training, 1),
+            }
+        result[source] = sizes
+    return result
+
+
+def gpu(world: str, seconds: float) -> dict[str, Any] | str:
+    """Time to quality and pictures on a GPU, of the device that ``cuda`` gives; beside tiny-cuda-nn's encoding if it is
+    installed. Wall time: a GPU's work is no CPU time.
+    """
+    import torch
+
+    if not torch.cuda.is_available():
+        return "not measured: torch finds no CUDA device"
+    picture, pose, poses, truth = scene(world)
+    space = VirtualSpace(dataclasses.replace(shown("field"), device="cuda"))
+    start, curve = time.perf_counter(), []
+    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
+    while time.perf_counter() - start < seconds and not space.status.converged:
+        space.train(iterations=10)
+        views = [psnr_db(space.render(p, *SIZES[0], FOV).rgb, t) for p, t in zip(poses, truth, strict=True)]
+        curve.append((time.perf_counter() - start, statistics.mean(views)))
+    final = curve[-1][1]
+
+    def fps(width: int, height: int, training: bool) -> float:
+        times = []
+        for _ in range(20):
+            begin = time.perf_counter()
+            space.render(poses[1], width, height, FOV)
+            if training:
+                space.train(iterations=1)
+            times.append(time.perf_counter() - begin)
+        return round(1 / statistics.median(times), 1)
+
+    return {
+        "device": space.status.device,
+        "within_1_db_s": round(next(row[0] for row in curve if row[1] >= final - 1), 2),
+        "final_psnr_db": round(final, 2),
+        "fps": {f"{w}x{h}": {"alone": fps(w, h, False), "while_training": fps(w, h, True)} for w, h in SIZES},
+        "hash_8x2_T17_ns": gpu_hash(8, 2),
+    }
+
+
+def gpu_hash(levels: int, features: int, samples: int = 1 << 18) -> dict[str, Any]:
+    """Nanoseconds a sample, forward and backward, of the peers on the GPU."""
+    import torch
+
+    points = torch.from_numpy(wall_points(samples)).cuda()
+    points = (points - points.amin(dim=0)) / 4.0 % 1.0
+    encodings: dict[str, Any] = {}
+    name, peer = peer_encoding(levels, features, LOG2_TABLE, 16, 640)
+    encodings[name] = peer.cuda()
+    try:
+        import tinycudann
+    except ImportError:
+        pass
+    else:
+        settings = {
+            "otype": "HashGrid", "n_levels": levels, "n_features_per_level": features,
+            "log2_hashmap_size": LOG2_TABLE, "base_resolution": 16, "per_level_scale": 40 ** (1 / (levels - 1)),
+        }  # fmt: skip
+        encodings["tiny-cuda-nn"] = tinycudann.Encoding(3, settings)
+    result: dict[str, Any] = {}
+    for label, encoding in encodings.items():
+        times = []
+        for _ in range(12):
+            torch.cuda.synchronize()
+            start = time.perf_counter()
+            encoding(points).float().sum().backward()
+            torch.cuda.synchronize()
+            times.append(time.perf_counter() - start)
+        result[label] = round(statistics.median(times[2:]) / samples * 1e9, 2)
+    if "tiny-cuda-nn" not in result:
+        result["tiny-cuda-nn"] = "not measured: not installed"
+    return result
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=20.0, help="CPU seconds of training (default 20)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="CPU seconds of training, at most (default 60)")
     parser.add_argument("--world", choices=("corridor", "room"), default="corridor")
+    parts = ("hash", "iteration", "quality", "pictures", "geometry", "warp", "gpu")
+    parser.add_argument("--only", choices=parts, action="append", help="this part; may be given several times")
     arguments = parser.parse_args()
-    result = {
+    wanted, world, seconds = arguments.only or parts, arguments.world, arguments.seconds
+    import torch
+
+    torch.set_num_threads(1)
+    start = time.process_time()
+    warm_up(VirtualSpaceConfig())
+    warm_up(VirtualSpaceConfig(field=FieldConfig(geometry="density")))
+    result: dict[str, Any] = {
         "machine": platform.processor() or platform.machine(),
-        "hash_8x2_T17": hash_encoding(8, 2),
-        "hash_8x4_T17": hash_encoding(8, 4),
-        "world": arguments.world,
-        **measure(arguments.world, arguments.seconds),
-        "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024),
+        "cpu": cpu_name(),
+        "world": world,
+        "warm_up_cpu_s": round(time.process_time() - start, 2),
     }
+    if "hash" in wanted:
+        result["hash_8x2_T17"], result["hash_8x4_T17"] = hash_encoding(8, 2), hash_encoding(8, 4)
+    if "iteration" in wanted:
+        result["iteration"] = whole_iteration()
+    if "quality" in wanted:
+        result["time_to_quality"] = {name: time_to_quality(world, seconds, name) for name in ("field", "shown")}
+    result["peak_rss_mb"] = round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    if "pictures" in wanted:
+        result["pictures"] = pictures(world)
+    if "geometry" in wanted:
+        result["geometry"] = {f"{s:g}_cpu_s": geometries(world, s) for s in (seconds / 8, seconds / 2)}
+    if "warp" in wanted and world == "corridor":
+        result["against_warp"] = against_warp(*scene(world), 60)
+    if "gpu" in wanted:
+        result["gpu"] = gpu(world, seconds)
     print(json.dumps(result, indent=2))
+
+
+def cpu_name() -> str:
+    """The processor's name, where Linux tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 if __name__ == "__main__":

@@ -49,8 +49,9 @@ class TrainConfig:
     ray_columns: Annotated[int, Range(8, 1024)] = 128
     """Strata in azimuth; a batch has ``ray_columns * ray_rows`` rays, one jittered in each."""
     ray_rows: Annotated[int, Range(8, 1024)] = 64
-    iterations: PositiveInt = 600
-    """Length of the learning-rate schedule; training idles after it."""
+    iterations: PositiveInt = 2000
+    """Length of the learning-rate schedule; training idles after it. A short one is worse at every moment: rates that
+    fall early leave the finest levels unlearnt."""
     table_lr: _UpToOne = 0.04
     network_lr: _UpToOne = 0.01
     final_lr_share: _UpToOne = 0.03
@@ -64,7 +65,7 @@ class TrainConfig:
     """Weight of the colour error of samples beside the surface against those on it."""
     depth_weight: Share = 0.1
     """With ``density``: weight of the squared error of a ray's depth, in bands and by its uncertainty."""
-    opacity_weight: Share = 0.01
+    opacity_weight: Share = 0.1
     """With ``density``: weight of what of the light passes through a surface, squared."""
     distortion_weight: Share = 0.01
     """With ``density``: weight of how far a ray's density is spread (distortion loss of mip-NeRF 360)."""
@@ -131,9 +132,9 @@ class PictureConfig:
     The share of the panorama falls linearly in the PSNR of the training rays.
     """
 
-    panorama_until_db: float = 36.0
+    panorama_until_db: float = 40.0
     """The panorama alone up to this PSNR. Views of a field are below their warp until about here (docs/nerf.md)."""
-    field_from_db: float = 40.0
+    field_from_db: float = 44.0
     """The field alone from this PSNR on; at or under ``panorama_until_db`` the panorama is never used."""
 
     refresh_pictures: Annotated[int, Range(1, 60)] = 6

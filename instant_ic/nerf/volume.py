@@ -165,7 +165,7 @@ def composite(  # type: ignore[no-untyped-def]
         depth_share: of the guiding depth in the depth that comes out; the rest is the mean over the samples.
         origin: (3,); directions: (P, 3).
         depth: in and out, (P,): metres along the ray, 0 where it meets nothing.
-        colour: out, (P, 3) in 0..1; not written where nothing is met.
+        colour: out, (P, 3) in 0..1, before a mid-grey ground as in training; not written where nothing is met.
     """
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
     h = np.zeros((w1.shape[0], BLOCK), np.float32)
@@ -214,7 +214,7 @@ def composite(  # type: ignore[no-untyped-def]
                 mean += w[s] * offset[r, s]
                 opacity += w[s]
             pixel = pixels[r]
-            colour[pixel, 0] = min(max(red / opacity + half, np.float32(0)), np.float32(1))
-            colour[pixel, 1] = min(max(green / opacity + half, np.float32(0)), np.float32(1))
-            colour[pixel, 2] = min(max(blue / opacity + half, np.float32(0)), np.float32(1))
+            colour[pixel, 0] = min(max(red + half, np.float32(0)), np.float32(1))
+            colour[pixel, 1] = min(max(green + half, np.float32(0)), np.float32(1))
+            colour[pixel, 2] = min(max(blue + half, np.float32(0)), np.float32(1))
             depth[pixel] *= np.float32(1) + (np.float32(1) - depth_share) * share[r] * mean / opacity

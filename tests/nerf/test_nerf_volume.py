@@ -148,7 +148,9 @@ def test_a_dense_wall_is_drawn_where_it_stands():
         device.set_scene(scene)
         colour, depth, confidence = device.draw(rays, 0.0, 0.0)
         assert np.median(depth) == pytest.approx(expected, abs=0.004)
-        assert colour == pytest.approx(np.tile([0.6, 0.7, 0.8], (512, 1)), abs=2e-3)
+        # What of the light is not stopped comes from a mid-grey ground: 2 bands at e^raw a band.
+        stopped = 1 - math.exp(-2 * math.exp(raw))
+        assert colour == pytest.approx(np.tile(0.5 + stopped * np.array([0.1, 0.2, 0.3]), (512, 1)), abs=2e-3)
         assert confidence.min() == 1
         assert np.median(device.draw(rays, 0.0, 1.0)[1]) == pytest.approx(2.0, abs=0.004)  # the guiding depth alone
 
