@@ -178,16 +178,16 @@ def write(frames: list[bytes], args: argparse.Namespace) -> None:
     from PIL import Image
 
     pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
-    small = [picture.resize((args.out_width, round(args.out_width * picture.height / picture.width)), Image.LANCZOS)
-             for picture in pictures]  # fmt: skip
-    small[0].save(
-        args.out, save_all=True, append_images=small[1:], duration=round(1000 / args.fps), loop=0,
-        quality=args.quality, method=6, minimize_size=False,
-    )  # fmt: skip
     if args.frames:
         args.frames.mkdir(parents=True, exist_ok=True)
         for number, frame in enumerate(frames):
             (args.frames / f"{number:04d}.png").write_bytes(frame)
+    small = [picture.resize((args.out_width, round(args.out_width * picture.height / picture.width)), Image.LANCZOS)
+             for picture in pictures]  # fmt: skip
+    small[0].save(
+        args.out, save_all=True, append_images=small[1:], duration=round(1000 / args.fps / args.speed), loop=0,
+        quality=args.quality, method=4,
+    )  # fmt: skip
 
 
 def main() -> int:
@@ -201,7 +201,8 @@ def main() -> int:
     parser.add_argument("--height", type=int, default=600)
     parser.add_argument("--out-width", type=int, default=720)
     parser.add_argument("--quality", type=int, default=50)
-    parser.add_argument("--after-s", type=float, default=2.0, help="seconds driven on after the way back (default 2)")
+    parser.add_argument("--speed", type=float, default=1.5, help="how much faster it plays (default 1.5)")
+    parser.add_argument("--after-s", type=float, default=1.5, help="seconds driven on after the way back (default 1.5)")
     parser.add_argument("--settle-ms", type=int, default=120, help="real time for each picture to arrive (default 120)")
     parser.add_argument("--frames", type=Path, metavar="DIR", help="also keep the single pictures here")
     args = parser.parse_args()
