@@ -157,10 +157,14 @@ def test_a_mesh_that_lies_elsewhere_is_told(room):
     path, picture, camera = room
     space = space_of(path)
     space.set_keyframe(picture.rgb, 1.6 * picture.depth_m, camera, 0.05)
-    assert "60% nearer or farther" in space.status.warning
+    assert "only 0% of the mesh" in space.status.warning
     assert "mesh_pose" in space.status.warning
     space.set_keyframe(picture.rgb, picture.depth_m, camera @ pose_matrix(40.0), 0.05)
-    assert "0% of the directions" in space.status.warning
+    assert "only 0% of the mesh" in space.status.warning
+    space.set_keyframe(picture.rgb, np.full_like(picture.depth_m, np.nan), camera, 0.05)
+    assert not space.status.warning  # nothing is known of it
+    space.set_keyframe(picture.rgb, picture.depth_m, camera @ pose_matrix(0.4, 0.5, yaw=1.0), 0.05)
+    assert "is space.mesh_pose right?" in space.status.warning
     space.set_keyframe(picture.rgb, picture.depth_m, camera, 0.05)
     assert not space.status.warning
 
