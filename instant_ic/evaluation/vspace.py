@@ -289,11 +289,7 @@ def evaluate(
     renderer = EquirectRenderer(made)
     start = start_pose(made, start)
     config = config or VirtualSpaceConfig(device="cpu", panorama_width=max(settings.panorama_width, 64))
-    if settings.keyframes > 1:
-        if not hasattr(config, "keyframes"):
-            raise ValueError("the virtual space keeps one keyframe only")
-        kept: dict[str, Any] = {"keyframes": settings.keyframes}
-        config = replace(config, **kept)
+    config = replace(config, keyframes=settings.keyframes)
     model = DepthModel.load(places.shipped_file("models", DEFAULT_MODEL), threads=1)
     warm_up(config)
     width, height = settings.size
