@@ -1,0 +1,123 @@
+"""What the arbiter did in a recorded drive: states, holds, what jumped at each switch, how regular its sources were.
+
+    ic launch sim record:=drive          # drive through the virtual space on the page, then Ctrl-C
+    python benchmarks/switches.py drive --json switches.json
+
+Times are those of the stack. What jumps at a switch is read off what the page had: the place of its newest camera
+picture when it was taken, by /tf, against the pose of its newest view; and the headings of the two robots.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.msg import ControlState, deserialize, pose_matrix, stamp_ns, transform_matrix
+
+SOURCES = (
+    *("/scan", "/lidar/points", "/wheel/odom", "/pose", "/camera/image/compressed", "/vspace/view"),
+    *("/vbot/odom", "/nav/cmd_vel", "/operator/cmd_vel"),
+)
+NAMES = {getattr(ControlState, name): name.lower() for name in ("REAL", "VIRTUAL", "STOPPED", "ENTERING", "RETURNING")}
+
+
+def main() -> None:
+    """Reads the bag, prints JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("bag", type=Path)
+    parser.add_argument("--json", type=Path, help="also write it there")
+    args = parser.parse_args()
+    text = json.dumps(measure(args.bag), indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    print(text)
+
+
+def measure(bag: Path) -> dict[str, Any]:
+    """Figures of the drive in ``bag``."""
+    tree, states, pages, stamps = TransformBuffer(cache_s=86400.0), [], [], {topic: [] for topic in SOURCES}
+    wanted = {"/ic/state", "/view/shown", "/tf", "/tf_static", *SOURCES}
+    with AnyReader([bag]) as reader:
+        connections = [c for c in reader.connections if c.topic in wanted]
+        for connection, at_ns, raw in reader.messages(connections):
+            topic = connection.topic
+            if topic in stamps:
+                stamps[topic].append(at_ns)
+                continue
+            message = deserialize(raw, connection.msgtype)
+            if topic == "/ic/state":
+                states.append((at_ns, message))
+            elif topic == "/view/shown":
+                pages.append((at_ns, message))
+            else:
+                for t in message.transforms:
+                    parent, child = t.header.frame_id, t.child_frame_id
+                    tree.set(parent, child, stamp_ns(t), transform_matrix(t), static=topic == "/tf_static")
+    return {
+        "seconds": seconds_by_state(states),
+        "transitions": [NAMES[m.mode] for k, (_, m) in enumerate(states) if k == 0 or states[k - 1][1].mode != m.mode],
+        "held_s": holds(states),
+        "switches": [
+            jump(tree, pages, at_ns, before, after)
+            for (_, before), (at_ns, after) in pairwise(states)
+            if before.shown != after.shown and ControlState.STOPPED not in (before.mode, after.mode)
+        ],
+        "gap_ms": {topic: gaps(np.array(times)) for topic, times in stamps.items() if len(times) > 2},
+    }
+
+
+def seconds_by_state(states: list[tuple[int, Any]]) -> dict[str, float]:
+    """Seconds in each state."""
+    total: Counter[str] = Counter()
+    for (at, message), (then, _) in pairwise(states):
+        total[NAMES[message.mode]] += (then - at) / 1e9
+    return {name: round(seconds, 2) for name, seconds in total.items()}
+
+
+def holds(states: list[tuple[int, Any]]) -> dict[str, float]:
+    """Seconds that a state which moves was held, by the words without their numbers."""
+    total: Counter[str] = Counter()
+    for (at, message), (then, _) in pairwise(states):
+        if message.mode != ControlState.STOPPED and message.reason.startswith("stopped: "):
+            total[message.reason.partition(" for ")[0]] += (then - at) / 1e9
+    return {words: round(seconds, 2) for words, seconds in total.items()}
+
+
+def jump(tree: TransformBuffer, pages: list[tuple[int, Any]], at_ns: int, before: Any, after: Any) -> dict[str, Any]:
+    """What lies between the picture before a switch and the one after it."""
+    had = [message for stamp, message in pages if stamp <= at_ns]
+    error_m = math.nan
+    if had:
+        try:
+            taken = tree.lookup("map", "camera", stamp_ns(had[-1].picture_stamp))[:2, 3]
+            error_m = float(np.linalg.norm(taken - pose_matrix(had[-1].view_pose)[:2, 3]))
+        except TransformError:
+            pass
+    return {
+        "to": NAMES[after.mode],
+        "position_error_m": round(error_m, 4) if math.isfinite(error_m) else None,
+        "yaw_error_deg": round(abs(math.degrees(before.yaw_gap_rad)), 3),
+    }
+
+
+def gaps(times_ns: np.ndarray) -> dict[str, float]:
+    """Milliseconds between messages."""
+    milliseconds = np.diff(times_ns) / 1e6
+    return {
+        "median": round(float(np.median(milliseconds)), 1),
+        "p99": round(float(np.percentile(milliseconds, 99)), 1),
+        "max": round(float(milliseconds.max()), 1),
+    }
+
+
+if __name__ == "__main__":
+    main()
