@@ -44,6 +44,7 @@ class Settings:
         depth: of ``DEPTHS``.
         log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
         pictures: whether the pictures on either side of a switch are drawn and compared.
+        overrides: ``node.key:=value`` words on top of the shipped parameters.
     """
 
     episodes: int = 50
@@ -53,6 +54,7 @@ class Settings:
     depth: str = "fused"
     log: Path | None = None
     pictures: bool = True
+    overrides: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
@@ -61,6 +63,7 @@ class Settings:
             unknown = [name for name in given if name not in allowed]
             if unknown or not given:
                 raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
+        StackConfig(overrides=self.overrides)  # raises ValueError on a word that is none
 
 
 class _Episode:
@@ -68,7 +71,7 @@ class _Episode:
 
     def __init__(self, settings: Settings, course: Course, index: int, method: str) -> None:
         seed = 1000 * settings.seed + index
-        config = StackConfig(method=method, depth=settings.depth, seed=seed)
+        config = StackConfig(method=method, depth=settings.depth, seed=seed, overrides=settings.overrides)
         self.settings, self.course = settings, course
         self.drive = Drive(index, method, way_m=course.way_m)
         log = read_commands(settings.log) if settings.log is not None else None
@@ -255,6 +258,7 @@ def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
         "world": settings.world,
         "operator": "scripted" if settings.log is None else "recorded",
         "depth": settings.depth,
+        "parameters": list(settings.overrides),
         "methods": _finite(methods),
         "targets": figures.targets(methods["ic"]) if "ic" in methods else {},
         "each": rows,

@@ -34,6 +34,8 @@ FloatArray: TypeAlias = NDArray[np.float64]
 
 METHODS = ("ic", "stop", "shared")
 DEPTHS = ("fused", "lidar")
+NODES = ("crawler_base", "vlp16_driver", "grid_slam", "virtual_robot", "navigator", "arbiter", "console")
+VSPACE_NODES = ("depth_estimator", "depth_scaler", "nerf")
 STEP_S = 1 / 60
 START_NS = 1_700_000_000_000_000_000
 CAMERA_HEIGHT_M = 1.2
@@ -72,6 +74,10 @@ class StackConfig:
             raise ValueError(f"method must be one of {', '.join(METHODS)} (got {self.method!r})")
         if self.depth not in DEPTHS:
             raise ValueError(f"depth must be one of {', '.join(DEPTHS)} (got {self.depth!r})")
+        for word in self.overrides:
+            if word.partition(".")[0] not in (*NODES, *VSPACE_NODES) or ":=" not in word:
+                names = ", ".join((*NODES, *VSPACE_NODES))
+                raise ValueError(f"parameter {word!r}: expected NODE.KEY:=VALUE with one of the nodes {names}")
 
 
 @dataclass(frozen=True)
@@ -221,10 +227,9 @@ class SimulatedStack:
             "console.map_rate_hz:=0.1",
             *config.overrides,
         ]
-        names = ["crawler_base", "vlp16_driver", "grid_slam", "virtual_robot", "navigator", "arbiter", "console"]
+        names = list(NODES)
         if config.method == "ic":
-            names += ["depth_estimator"] if config.depth == "fused" else []
-            names += ["depth_scaler", "nerf"]
+            names += [name for name in VSPACE_NODES if name != "depth_estimator" or config.depth == "fused"]
         pictures = {"/camera/image/compressed": "/camera/for_depth"}
         remaps = {
             "crawler_base": {"/cmd_vel": "/base/cmd_vel"},

@@ -250,6 +250,8 @@ class TestOperator:
         (["--log", "x.csv"], "is for --operator recorded"),
         (["--operator", "recorded", "--log", "/no/such.csv"], "there is no such bag or CSV file"),
         (["--video", "film.avi"], "is an .mp4"),
+        (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
+        (["-p", "arbiter.no_key:=1"], "unknown parameter 'no_key'"),
         (["--json", "/no/such/folder/out.json"], "is no folder"),
     ],
 )

@@ -53,6 +53,14 @@ def add_kind(kinds: Any) -> None:
         help="what the virtual space's depth is made of: network and LiDAR, or the LiDAR alone (default: %(default)s)",
     )
     parser.add_argument(
+        "-p",
+        "--param",
+        action="append",
+        default=[],
+        metavar="NODE.KEY:=VALUE",
+        help="another parameter than the shipped one, as virtual_robot.vbot.ease_m_s:=0.05; may be repeated",
+    )
+    parser.add_argument(
         "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="courses at a time (default: all cores)"
     )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
@@ -110,7 +118,9 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     from ...evaluation import teleop
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
-    settings = teleop.Settings(args.episodes, args.seed, args.world, methods, args.depth, args.log)
+    settings = teleop.Settings(
+        args.episodes, args.seed, args.world, methods, args.depth, args.log, overrides=tuple(args.param)
+    )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     contacts = 0
     with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
