@@ -207,6 +207,10 @@ class Rays:
     shape: tuple[int, int]
     stride: int = 4
 
+    def some(self, chosen: NDArray[np.integer]) -> Rays:
+        """The rays of some pixels, as one column."""
+        return Rays(self.origin, self.directions[chosen], self.axial[chosen], (len(chosen), 1))
+
 
 class Device(Protocol):
     """One device's way to train and render; ``numba_device`` and ``torch_device`` have it."""

@@ -411,7 +411,7 @@ class VirtualSpace:
         step = max(1, rays.shape[1] // _PROBE[0])
         height, width = rays.shape
         chosen = np.arange(height * width).reshape(height, width)[step // 2 :: step, step // 2 :: step].reshape(-1)
-        some = Rays(rays.origin, rays.directions[chosen], rays.axial[chosen], (len(chosen), 1))
+        some = rays.some(chosen)
         priors = self.keyframes
         if self._texture is None or self._texture[0] is not priors[0]:
             self._texture = priors[0], Texture.of(priors[0].rgb)

@@ -100,22 +100,45 @@ def _equirect(width: int, height: int) -> tuple[Floats, Floats]:
     return equirect_directions(width, height).reshape(-1, 3), np.ones(width * height, np.float32)
 
 
-def _turned(pose: NDArray[np.float64], directions: Floats, axial: Floats, shape: tuple[int, int], stride: int) -> Rays:
+class LensRays(Rays):
+    """Rays of a lens, turned into the map only where that is asked for: a GPU turns them itself.
+
+    Attributes:
+        lens: unit vectors of the camera's frame, (P, 3); the same array for all pictures of one size and projection.
+        turn: map_from_camera rotation, (3, 3) float32.
+    """
+
+    lens: Floats
+    turn: Floats
+
+    def __init__(self, pose: NDArray[np.float64], lens: Floats, axial: Floats, shape: tuple[int, int], stride: int):
+        turn, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
+        # Not by assignment: rays are frozen.
+        vars(self).update(origin=origin, axial=axial, shape=shape, stride=stride, lens=lens, turn=turn)
+
+    @functools.cached_property
+    def directions(self) -> Floats:  # type: ignore[override]
+        return _turned(self.lens, self.turn)
+
+    def some(self, chosen: NDArray[np.integer]) -> Rays:
+        return Rays(self.origin, _turned(self.lens[chosen], self.turn), self.axial[chosen], (len(chosen), 1))
+
+
+def _turned(directions: Floats, turn: Floats) -> Floats:
     # Not by matmul: BLAS would start threads for it, which wait for each other ten times as long as they compute.
-    turned = np.einsum("pj,ij->pi", directions, pose[:3, :3].astype(np.float32))
-    return Rays(pose[:3, 3].astype(np.float32), turned, axial, shape, stride)
+    return np.einsum("pj,ij->pi", directions, turn)
 
 
 def perspective_rays(pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
     """Rays of a pinhole picture along the camera's x axis."""
-    return _turned(pose, *_perspective(width, height, round(fov_rad, 6)), (height, width), 4)
+    return LensRays(pose, *_perspective(width, height, round(fov_rad, 6)), (height, width), 4)
 
 
 def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
     """Rays of a panorama, ``width`` × ``width / 2``."""
     pixels = _STRIDE_RAD / (2 * math.pi / width)
     stride = 4 if pixels >= 4 else 2 if pixels >= 2 else 1
-    return _turned(pose, *_equirect(width, width // 2), (width // 2, width), stride)
+    return LensRays(pose, *_equirect(width, width // 2), (width // 2, width), stride)
 
 
 def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: bool = False) -> Floats:
