@@ -28,6 +28,7 @@ from .field import (
     ray_sources,
     sample_weights,
 )
+from .view import LensRays
 
 # Compiled kernels stay with what else the project keeps; has to be set before triton is imported.
 os.environ.setdefault("TRITON_CACHE_DIR", str(paths.cache_dir() / "triton"))
@@ -120,6 +121,7 @@ class TritonDevice:
         self._colour_weight, self._distance_weight = (self._tensor(w) for w in sample_weights(train))
         self._level_rates = level_rates(train, field.levels)
         self._scene: _GpuScene | None = None
+        self._newest_lens: tuple[Floats, Tensor] | None = None
         self._p = self._uploaded(FieldParameters.random(field, train.seed))
         self._buffers = self._new_buffers()
         self._steps = 0
@@ -201,8 +203,8 @@ class TritonDevice:
         rows, columns = rays.shape
         size = self._table_shape[1]
         pixels = rows * columns
-        directions = self._tensor(rays.directions)
-        view = self._tensor(np.concatenate([rays.origin, np.eye(3, dtype=np.float32).reshape(-1)]))
+        directions, turn = self._lens(rays)
+        view = self._tensor(np.concatenate([rays.origin, turn.reshape(-1)]))
         room = -(-pixels // 4) * 4  # all three begin at 16 bytes, for which the kernel is compiled
         out = torch.empty(5 * room, device=self._device)
         colour, depth, confidence = out[: 3 * room], out[3 * room : 4 * room], out[4 * room :]
@@ -218,6 +220,14 @@ class TritonDevice:
         result = out.cpu().numpy()
         seen = result[3 * room :].reshape(2, room)[:, :pixels]
         return result[: 3 * pixels].reshape(pixels, 3), seen[0], seen[1]
+
+    def _lens(self, rays: Rays) -> tuple[Tensor, Floats]:
+        """Directions of a view on the GPU, and how they are turned into the map; a lens is uploaded once."""
+        if not isinstance(rays, LensRays):
+            return self._tensor(rays.directions), np.eye(3, dtype=np.float32)
+        if self._newest_lens is None or self._newest_lens[0] is not rays.lens:
+            self._newest_lens = rays.lens, self._tensor(rays.lens)
+        return self._newest_lens[1], rays.turn
 
     def parameters(self, frozen: _Drawn | None = None) -> FieldParameters:
         p = self._p if frozen is None else frozen.parameters
