@@ -6,10 +6,11 @@ by shared control that goes round by itself. Figures are those of ``teleop_figur
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -23,7 +24,16 @@ from ..geometry.poses import pose_matrix
 from . import teleop_figures as figures
 from .teleop_figures import Drive, Switch
 from .teleop_operator import Operator, Sight, make_operator, read_commands
-from .teleop_stack import CAMERA_HEIGHT_M, DEPTHS, METHODS, STEP_S, Shown, SimulatedStack, StackConfig
+from .teleop_stack import (
+    CAMERA_HEIGHT_M,
+    DEPTHS,
+    METHODS,
+    NODES,
+    VSPACE_NODES,
+    Shown,
+    SimulatedStack,
+    StackConfig,
+)
 from .teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -187,14 +197,27 @@ def run_episode(
     methods: tuple[str, ...] = (),
 ) -> list[Drive]:
     """One course driven by each method in turn; the same for the same settings and index, times apart."""
-    logging.getLogger("instant_ic").setLevel(logging.ERROR)
     course = make_course(settings.world, settings.seed, index)
-    return [_Episode(settings, course, index, method).run(on_step) for method in methods or settings.methods]
+    with _quiet():
+        return [_Episode(settings, course, index, method).run(on_step) for method in methods or settings.methods]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The nodes' loggers tell errors only: what they warn of while a robot starts is no news."""
+    loggers = [logging.getLogger(name) for name in (*NODES, *VSPACE_NODES)]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def prepare() -> None:
     """Compiles the kernels that the nodes compile at their start elsewhere, so that no episode counts that time."""
-    logging.getLogger("instant_ic").setLevel(logging.ERROR)
     warm_up()
 
 
@@ -273,4 +296,4 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-__all__ = ["STEP_S", "Drive", "Settings", "evaluate", "report", "run_episode"]
+__all__ = ["Drive", "Settings", "evaluate", "report", "run_episode"]
