@@ -105,7 +105,9 @@ def picture_of(page):
     """Pixels of the picture alone, (H, W, 3) float."""
     from PIL import Image
 
-    page.add_style_tag(content="body > :not(#picture) { visibility: hidden !important }")
+    # A machine that is too slow for new pictures makes the page grey them; what they show is the same.
+    plain = "#picture { filter: none !important; transition: none !important }"
+    page.add_style_tag(content=f"body > :not(#picture) {{ visibility: hidden !important }} {plain}")
     shot = page.screenshot(type="png")
     page.evaluate("document.head.lastElementChild.remove()")
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)
