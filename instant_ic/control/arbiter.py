@@ -70,7 +70,7 @@ class SwitchConfig:
     picture_position_m: Positive = 0.02
     picture_yaw_deg: Positive = 0.5
     enter_timeout_s: Positive = 2.0
-    return_timeout_s: Positive = 3.0
+    return_timeout_s: Positive = 6.0
     min_virtual_s: NotNegative = 1.0
     min_real_s: NotNegative = 1.0
     return_margin_m: Positive = 0.5
@@ -655,7 +655,8 @@ class Arbiter:
                 reason = f"blocked: obstacle in {prediction.distance_m:.1f} m; {why}"
         if self.mode == Mode.ENTERING:
             reason = "obstacle ahead: the virtual space is about to be shown"
-            left = max(0.0, 1.0 - self._seconds_in_mode(situation.now_ns) / self.config.switch.enter_timeout_s)
+            waited = self._seconds_in_mode(situation.now_ns) / self.config.switch.enter_timeout_s
+            left = max(0.0, 1.0 - waited**2)  # hardly felt while the view comes in time
             command = (command[0] * left, command[1] * left)
         elif self.mode == Mode.RETURNING:
             reason = "you drive the robot; the real view is about to come back"

@@ -234,6 +234,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def on_shown(self, message: ShownPictures) -> None:
         """Notes what new pictures the operator's page has."""
         now_ns, stamp, view = self.clock.steady_ns(), stamp_ns(message.picture_stamp), int(message.view_id)
+        new = stamp != self.page[0] or view != self.view[0]
         if stamp not in (0, self.page[0]):
             if self.page[0] > 0:
                 self.page_rhythm.heard((now_ns - self.page[1]) / 1e9)
@@ -245,6 +246,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             else:
                 self.rhythms["view"] = Rhythm()  # in REAL views are asked for rarely
             self.view = view, now_ns
+        if new and self.arbiter.mode in (Mode.ENTERING, Mode.RETURNING):
+            self.tick()  # whether view and picture agree is true of now, not of the next timer
 
     def ages(self) -> dict[str, float]:
         shown, steady_ns = self.shown.message, self.clock.steady_ns()

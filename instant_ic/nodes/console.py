@@ -88,6 +88,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.request_out = self.publisher("/view/request", ViewRequest, qos=SENSOR)
         self.shown_out = self.publisher("/view/shown", ShownPictures, qos=SENSOR)
         self.control = self.latest("/ic/state", ControlState, max_age_s=1.0, qos=LATCHED)
+        self.subscribe("/ic/state", ControlState, self.on_control, qos=LATCHED)
         self.vbot = self.latest("/vbot/odom", Odometry, max_age_s=0.5)
         self.trajectory = self.latest("/ic/trajectory", Path, max_age_s=0.5)
         self.path = self.latest("/nav/path", Path, max_age_s=5.0)
@@ -317,6 +318,11 @@ class ConsoleNode(Node[ConsoleConfig]):
         return status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
 
     # ---- state ----------------------------------------------------------------------------------
+
+    def on_control(self, message: ControlState) -> None:
+        """Shows the other picture at once where it is to be shown: both go on moving."""
+        if self.mode not in ("none", MODES.get(int(message.mode))):
+            self.send_state()
 
     def on_vbot(self, message: Odometry) -> None:
         """Shows a step of the v-bot at once: the next timer would be half a period off."""

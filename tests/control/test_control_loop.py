@@ -144,7 +144,7 @@ def test_tapping_forward_before_the_obstacle_does_not_flicker() -> None:
         drive(made, 0.3, FORWARD)
         drive(made, 0.5, NOTHING)
     assert made.modes() == THROUGH[:4]
-    drive(made, 20.0, FORWARD)
+    drive(made, 23.0, FORWARD)
     assert made.modes() == THROUGH
 
 
@@ -156,7 +156,7 @@ def test_stopping_inside_the_obstacle_the_robot_waits_and_goes_on() -> None:
     waiting = made.frames[-1]
     assert waiting.decision.mode == Mode.VIRTUAL
     assert waiting.speed == pytest.approx(0.0, abs=0.01)
-    drive(made, 14.0, FORWARD)
+    drive(made, 17.0, FORWARD)
     assert made.modes() == THROUGH
 
 
@@ -165,7 +165,7 @@ def test_turning_away_before_the_obstacle_gives_the_real_view_back() -> None:
     drive(made, 4.6, FORWARD)
     assert made.modes()[-1] == "VIRTUAL"
     drive(made, 3.0, (0.0, 0.8))
-    drive(made, 12.0, NOTHING)
+    drive(made, 16.0, NOTHING)
     assert made.modes() == THROUGH
 
 
@@ -387,7 +387,7 @@ def test_speed_that_the_base_cannot_drive_does_not_lengthen_the_look_ahead() -> 
 
 def test_at_the_return_the_way_is_free_beyond_the_horizon_that_switches_in() -> None:
     made = loop()
-    drive(made, 20.0, FORWARD)
+    drive(made, 23.0, FORWARD)
     (back,) = [f for f in made.frames if f.decision.changed and f.t > 3.0 and f.decision.mode == Mode.REAL]
     predictor, switch = made.arbiter.predictor, SwitchConfig()
     speed = (back.speed, 0.0)

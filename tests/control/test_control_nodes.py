@@ -189,7 +189,7 @@ def modes(states: list[ControlState]) -> list[int]:
 
 def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
     stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
-    states = stack.drive(1.5, None) + stack.drive(17.0, (0.4, 0.0))
+    states = stack.drive(1.5, None) + stack.drive(20.0, (0.4, 0.0))
     said = ControlState
     assert modes(states) == [said.STOPPED, said.REAL, said.ENTERING, said.VIRTUAL, said.RETURNING, said.REAL]
     assert not stack.contact
