@@ -117,7 +117,7 @@ class LensRays(Rays):
         vars(self).update(origin=origin, axial=axial, shape=shape, stride=stride, lens=lens, turn=turn)
 
     @functools.cached_property
-    def directions(self) -> Floats:  # type: ignore[override]
+    def directions(self) -> Floats:
         return _turned(self.lens, self.turn)
 
     def some(self, chosen: NDArray[np.integer]) -> Rays:
