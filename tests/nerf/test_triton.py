@@ -18,6 +18,7 @@ from instant_ic.geometry.poses import pose_matrix  # noqa: E402
 from instant_ic.nerf import FieldConfig, TrainConfig, box_room, reference  # noqa: E402
 from instant_ic.nerf import triton_kernels as kernels  # noqa: E402
 from instant_ic.nerf.config import GeometryConfig  # noqa: E402
+from instant_ic.nerf.devices import check_device  # noqa: E402
 from instant_ic.nerf.field import FieldParameters, Lattice, Scene, ray_sources  # noqa: E402
 from instant_ic.nerf.occupancy import build_occupancy  # noqa: E402
 from instant_ic.nerf.prior import prepare  # noqa: E402
@@ -252,3 +253,11 @@ def test_a_frozen_field_stays_as_training_goes_on():
 def test_other_geometries_are_refused():
     with pytest.raises(ValueError, match="distance only"):
         TritonDevice(FieldConfig(geometry="density"), TRAIN, DEVICE)
+
+
+def test_the_check_at_the_start_finds_the_kernels_right():
+    check_device(
+        lambda field, train: TritonDevice(field, train, DEVICE),
+        lambda field, train: TorchDevice(field, train, "cpu"),
+        FIELD,
+    )
