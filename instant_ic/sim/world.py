@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.sim.contact import OccupancyMask, occupied_mask
 from instant_ic.geometry.raycast import RayCaster
+from instant_ic.sim.contact import OccupancyMask, occupied_mask
 from instant_ic.sim.textures import TextureSet, is_clamped, texture_set
 
 FloatArray = npt.NDArray[np.floating]
