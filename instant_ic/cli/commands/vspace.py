@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from instant_ic.nerf import View, VirtualSpace, VirtualSpaceConfig
 
+DEVICES = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
+"""As in ``VirtualSpaceConfig``, whose module is not loaded for this."""
 PREVIEW = "preview.png"
 PREVIEW_S = 1.0
 _SIZES = {"perspective": (640, 360), "equirect": (1024, 512), "cube": (512, 512)}
@@ -80,7 +82,7 @@ def add_parser(subparsers: Any) -> None:
 
 def _folder(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("space", type=Path, metavar="DIR", help="folder that ic vspace train has made")
-    parser.add_argument("--device", choices=("auto", "cpu", "cuda", "torch-cpu"), help="(default: as it was trained)")
+    parser.add_argument("--device", choices=DEVICES, help="(default: as it was trained)")
 
 
 def _add_train(verbs: Any) -> None:
@@ -106,7 +108,7 @@ def _add_train(verbs: Any) -> None:
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--seconds", type=positive, metavar="S", help="train for about so long")
     length.add_argument("--iterations", type=positive_int, metavar="N", help="train so many iterations (default: 600)")
-    parser.add_argument("--device", default="auto", choices=("auto", "cpu", "cuda", "torch-cpu"), help="(%(default)s)")
+    parser.add_argument("--device", default="auto", choices=DEVICES, help="(%(default)s)")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder, made when absent")
     parser.set_defaults(func=train)
 
