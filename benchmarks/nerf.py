@@ -76,7 +76,7 @@ def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[st
 
     rng = np.random.default_rng(0)
     table = rng.normal(size=(levels, 1 << LOG2_TABLE, features)).astype(np.float32)
-    grad, touched = np.zeros_like(table), np.zeros(table.shape[:2], np.uint8)
+    grad, touched = np.zeros_like(table), kernels.no_marks(table)
     cells = np.geomspace(2, 80, levels).astype(np.float32)
     points, focus = wall_points(samples), np.zeros((1, 4), np.float32)
     peer_name, peer = peer_encoding(levels, features, LOG2_TABLE, 16, 640)

@@ -45,7 +45,7 @@ class ColourOnlyField:
         self._level_rates = level_rates(config.train, config.field.levels)
         self._grads = [np.zeros_like(a) for a in (self._p.table, *self._p.network())]
         self._moments = [(np.zeros_like(g), np.zeros_like(g)) for g in self._grads]
-        self._touched = np.zeros(self._p.table.shape[:2], np.uint8)
+        self._touched = kernels.no_marks(self._p.table)
 
     @property
     def iterations(self) -> int:

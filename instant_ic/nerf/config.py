@@ -53,7 +53,7 @@ class TrainConfig:
     """Length of the learning-rate schedule; training idles after it. A short one is worse at every moment: rates that
     fall early leave the finest levels unlearnt."""
     table_lr: _UpToOne = 0.04
-    network_lr: _UpToOne = 0.01
+    network_lr: _UpToOne = 0.02
     final_lr_share: _UpToOne = 0.03
     fine_lr_share: _UpToOne = 0.1
     """Learning rate of the finest level against the coarsest's, between them by equal ratios: it keeps grain down."""

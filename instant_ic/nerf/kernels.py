@@ -5,7 +5,8 @@ interpreter lock and give the same bits for the same input.
 
 Layout: ``table`` (levels, size, features), ``w1`` (hidden, levels·features), ``b1`` (hidden,), ``w2`` (4, hidden),
 ``b2`` (4,). Outputs 0..2 are the colour minus 0.5, output 3 the signed distance. Points are handled in blocks of
-``BLOCK`` with the point as the last axis, so that the compiler vectorises over points.
+``BLOCK`` with the point as the last axis, so that the compiler vectorises over points. numba's cache on disk looks at a
+function's own file only: after a change here, touch ``march.py`` and ``volume.py``, which have these functions inlined.
 """
 
 from __future__ import annotations
@@ -19,9 +20,16 @@ from numba import njit
 from .vectors import adam2, adam4, gather2, gather4, scatter2, scatter4
 
 BLOCK = 64
+MARKED = 4
+"""So many table entries share a mark: 64 bytes with four features, a cache line."""
 _P1 = 2654435761
 _P2 = 805459861
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+
+
+def no_marks(table: np.ndarray) -> np.ndarray:
+    """Marks of a table's touched entries, (levels, size / MARKED) uint8, all 0."""
+    return np.zeros((table.shape[0], table.shape[1] // MARKED), np.uint8)
 
 
 @njit(**_OPTIONS)
@@ -111,7 +119,7 @@ def encode_block(  # type: ignore[no-untyped-def]
 def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # type: ignore[no-untyped-def]
     """Adds the gradient of a block's features ``dx`` to ``table_grad`` and marks the entries in ``touched``.
 
-    ``entries``, ``weights``: of ``encode_block``.
+    ``entries``, ``weights``: of ``encode_block``; ``touched``: of ``no_marks``.
     """
     levels, _, features = table_grad.shape
     for level in range(levels):
@@ -125,7 +133,7 @@ def encode_backward_block(table_grad, touched, entries, weights, count, dx):  # 
                 scatter2(grad, of_point(at, i), of_point(by, i), (d[0, i], d[1, i]))
         for corner in range(8):
             for i in range(count):
-                marks[at[corner, i]] = 1
+                marks[at[corner, i] // np.uint32(MARKED)] = 1
 
 
 @njit(**_OPTIONS)
@@ -256,19 +264,23 @@ def gradient(  # type: ignore[no-untyped-def]
 def adam_touched(  # type: ignore[no-untyped-def]
     table, table_grad, touched, m, v, step_size, beta1, beta2, epsilon
 ):
-    """One Adam step on the touched entries; clears their gradient and mark.
+    """One Adam step on the entries with any gradient; clears gradients and marks.
 
-    Untouched entries keep value and moments, as in ``torch.optim.SparseAdam``. ``step_size`` (levels,) already holds
-    the bias correction of the step, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
+    ``touched``: as ``encode_backward_block`` marks them; where there is no mark no entry is looked at. Other entries
+    keep value and moments, as in ``torch.optim.SparseAdam``. ``step_size`` (levels,) already holds the bias correction
+    of the step, ``lr · √(1 − β2ᵗ) / (1 − β1ᵗ)``.
     """
     levels, size, features = table.shape
     for level in range(levels):
         step, marks = step_size[level], touched[level]
         rows, grad, mean, square = table[level], table_grad[level], m[level], v[level]
-        for entry in range(size):
-            if marks[entry]:
-                marks[entry] = 0
+        for group in range(size // MARKED):
+            if marks[group] == 0:
+                continue
+            marks[group] = 0
+            for entry in range(group * MARKED, (group + 1) * MARKED):
                 if features == 4:
-                    adam4(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)
-                else:
+                    if grad[entry, 0] != 0 or grad[entry, 1] != 0 or grad[entry, 2] != 0 or grad[entry, 3] != 0:
+                        adam4(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)
+                elif grad[entry, 0] != 0 or grad[entry, 1] != 0:
                     adam2(rows, grad, mean, square, np.uint32(entry), step, beta1, beta2, epsilon)

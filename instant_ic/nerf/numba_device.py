@@ -63,7 +63,7 @@ class NumbaDevice:
         self._p = parameters
         table = parameters.table
         self._table_grad = np.zeros_like(table)
-        self._touched = np.zeros(table.shape[:2], np.uint8)
+        self._touched = kernels.no_marks(table)
         self._table_moments = (np.zeros_like(table), np.zeros_like(table))
         self._network_grads = tuple(np.zeros_like(a) for a in parameters.network())
         self._network_moments = tuple((np.zeros_like(a), np.zeros_like(a)) for a in parameters.network())

@@ -84,7 +84,7 @@ def test_gradient_agrees_with_autograd(levels, features, count):
     target = rng.normal(size=(count, 4)).astype(F)
     colour_weight = rng.random(count).astype(F)
     distance_weight = rng.random(count).astype(F)
-    table_grad, touched = np.zeros_like(p.table), np.zeros(p.table.shape[:2], np.uint8)
+    table_grad, touched = np.zeros_like(p.table), kernels.no_marks(p.table)
     g1, gb1, g2, gb2 = (np.zeros_like(a) for a in p.network())
     errors = kernels.gradient(
         p.table, *p.network(), lattice.cells_per_m, lattice.origin, FOCUS, points, target,
@@ -102,7 +102,7 @@ def test_gradient_agrees_with_autograd(levels, features, count):
         scale = float(theirs.abs().max())
         np.testing.assert_allclose(ours / scale, theirs.numpy() / scale, atol=1e-3)
     has_gradient = (expected[0] != 0).any(dim=2).numpy()
-    assert not np.any(has_gradient & (touched == 0))
+    assert not np.any(has_gradient & (np.repeat(touched, kernels.MARKED, axis=1) == 0))
 
 
 def test_adam_agrees_with_torchs_sparse_adam():
@@ -110,13 +110,13 @@ def test_adam_agrees_with_torchs_sparse_adam():
     table = rng.normal(size=(1, 32, 4)).astype(F)
     theirs = torch.from_numpy(table[0].copy()).requires_grad_()
     ours, m, v, grad = table.copy(), np.zeros_like(table), np.zeros_like(table), np.zeros_like(table)
-    touched = np.zeros((1, 32), np.uint8)
+    touched = kernels.no_marks(table)
     second, m2, v2 = (torch.from_numpy(a.copy()) for a in (table, m, v))
     adam = torch.optim.SparseAdam([theirs], lr=0.01, betas=(0.9, 0.99), eps=1e-15)
     for step in range(1, 6):
         rows = rng.choice(32, 7, replace=False)
         values = rng.normal(size=(7, 4)).astype(F)
-        grad[0, rows], touched[0, rows] = values, 1
+        grad[0, rows], touched[0, rows // kernels.MARKED] = values, 1  # and their neighbours are left alone
         step_size = 0.01 * math.sqrt(1 - 0.99**step) / (1 - 0.9**step)
         reference.adam_touched(second, torch.from_numpy(grad.copy()), m2, v2, step_size, 0.9, 0.99, 1e-15)
         kernels.adam_touched(ours, grad, touched, m, v, np.full(1, step_size, F), F(0.9), F(0.99), F(1e-15))

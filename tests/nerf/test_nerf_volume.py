@@ -10,6 +10,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpaceConfig, box_room, volume, volume_reference
 from instant_ic.nerf.config import GeometryConfig
 from instant_ic.nerf.field import VOLUME_SAMPLES, FieldParameters, Lattice, Scene, ray_sources
+from instant_ic.nerf.kernels import no_marks
 from instant_ic.nerf.numba_device import NumbaDevice
 from instant_ic.nerf.occupancy import build_occupancy
 from instant_ic.nerf.prior import prepare
@@ -80,7 +81,7 @@ def test_gradient_agrees_with_autograd(scene, losses):
     assert set(sources) == {0, 1}
     priors = torch_priors(scene, "cpu")
     points, target, weight = sample_rays(torch.from_numpy(uniform), 16, 8, priors, torch.from_numpy(sources))
-    table_grad, touched = np.zeros_like(p.table), np.zeros(p.table.shape[:2], np.uint8)
+    table_grad, touched = np.zeros_like(p.table), no_marks(p.table)
     grads = [np.zeros_like(a) for a in p.network()]
     lattice, focus = scene.lattice, scene.focus
     errors = volume.volume_gradient(
