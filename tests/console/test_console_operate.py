@@ -288,6 +288,8 @@ def test_a_phone_shows_everything_and_its_stick_drives_until_it_is_let_go(
     expect_body(page, "driver", "you")
     shared_demo.faults = [{"level": "error", "name": "vlp16_driver", "text": "no packets"}]
     page.locator("#faults li").wait_for()
+    shared_demo.button = True  # the longest words that the mode comes with
+    page.get_by_text("Emergency stop button: let it out").first.wait_for()
     names = ["#mode", "#vspace", "#link", "#record", "#more-open", "#faults", "#map", "#panel", "#stick", "#estop"]
     boxes = {}
     for name in names:
@@ -300,6 +302,8 @@ def test_a_phone_shows_everything_and_its_stick_drives_until_it_is_let_go(
     for name in ("#record", "#more-open", "#stick", "#estop", "#map-size"):
         box = page.locator(name).bounding_box()
         assert min(box["width"], box["height"]) >= 44, name  # a finger
+    shared_demo.button = False
+    expect_body(page, "estop", "free")
     page.locator("#more-open").tap()
     box = page.locator("#more").bounding_box()
     assert box["y"] + box["height"] <= height and box["x"] >= 0
