@@ -177,7 +177,8 @@ def write(frames: list[bytes], args: argparse.Namespace) -> None:
     """An animated WebP, which GitHub shows in a README."""
     from PIL import Image
 
-    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in frames]
+    kept = frames[round(args.skip_s * args.fps) :: args.every]
+    pictures = [Image.open(io.BytesIO(frame)).convert("RGB") for frame in kept]
     if args.frames:
         args.frames.mkdir(parents=True, exist_ok=True)
         for number, frame in enumerate(frames):
@@ -185,8 +186,8 @@ def write(frames: list[bytes], args: argparse.Namespace) -> None:
     small = [picture.resize((args.out_width, round(args.out_width * picture.height / picture.width)), Image.LANCZOS)
              for picture in pictures]  # fmt: skip
     small[0].save(
-        args.out, save_all=True, append_images=small[1:], duration=round(1000 / args.fps / args.speed), loop=0,
-        quality=args.quality, method=4,
+        args.out, save_all=True, append_images=small[1:], duration=round(1000 * args.every / args.fps / args.speed),
+        loop=0, quality=args.quality, method=2,
     )  # fmt: skip
 
 
@@ -199,8 +200,10 @@ def main() -> int:
     parser.add_argument("--fps", type=int, default=10, help="pictures a second; 60 must be a multiple (default 10)")
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--height", type=int, default=600)
-    parser.add_argument("--out-width", type=int, default=720)
+    parser.add_argument("--out-width", type=int, default=704)
     parser.add_argument("--quality", type=int, default=50)
+    parser.add_argument("--every", type=int, default=2, help="of the pictures made, every which is kept (default 2)")
+    parser.add_argument("--skip-s", type=float, default=4.4, help="seconds left out at the beginning (default 4.4)")
     parser.add_argument("--speed", type=float, default=1.5, help="how much faster it plays (default 1.5)")
     parser.add_argument("--after-s", type=float, default=1.5, help="seconds driven on after the way back (default 1.5)")
     parser.add_argument("--settle-ms", type=int, default=120, help="real time for each picture to arrive (default 120)")
@@ -212,7 +215,8 @@ def main() -> int:
     frames = film(args)
     write(frames, args)
     megabytes = args.out.stat().st_size / 1e6
-    print(f"{args.out}: {len(frames) / args.fps:.1f} s, {megabytes:.2f} MB, made in {time.monotonic() - began:.0f} s")
+    seconds = (len(frames) / args.fps - args.skip_s) / args.speed
+    print(f"{args.out}: {seconds:.1f} s, {megabytes:.2f} MB, made in {time.monotonic() - began:.0f} s")
     return 0
 
 
