@@ -302,7 +302,7 @@ def once(call):
 
 @pytest.mark.parametrize("call", ["step", "draw", "set_scene"])
 def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monkeypatch):
-    monkeypatch.setattr("instant_ic.nerf.space._may_have_cuda", lambda: False)
+    monkeypatch.setattr("instant_ic.nerf.devices._may_have_cuda", lambda: False)
     # Pictures by the field.
     ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), picture=FIELD_ONLY.picture)
     space, whole = trained(6, ready), trained(6, ready)
