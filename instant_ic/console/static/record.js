@@ -72,7 +72,7 @@ export class Recording {
     button.setAttribute("aria-pressed", this.running);
     button.setAttribute("aria-disabled", !usable);
     button.setAttribute("aria-label", this.running ? `Stop recording (${shown})` : shown);
-    button.title = text || (this.running ? this._told.path : "Record all topics (R)");
+    button.title = text || (this.running ? this._told.path : "Record what the robot and the page send (R)");
   }
 
   _showLists() {
