@@ -34,7 +34,7 @@ def graph_file(stem: Path) -> Path:
 
 
 def ros_map(
-    values: NDArray[np.int8], resolution: float, origin: Sequence[float], image: str
+    values: NDArray[np.int8], resolution: float, origin: Sequence[float] | NDArray[np.float64], image: str
 ) -> tuple[NDArray[np.uint8], str]:
     """Picture (H, W), largest y on top, and YAML text of a map, as map_server reads them.
 
