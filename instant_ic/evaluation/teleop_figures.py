@@ -38,7 +38,8 @@ class Switch:
         to_virtual: into the virtual space, else back.
         position_error_m: between the places of the last picture before and the first after, as the stack knows them,
             less what the shown robot drove from when the one came to when the other did.
-        yaw_error_deg: between the headings of r-bot and v-bot, to which the page turns the pictures.
+        yaw_error_deg: between the headings of v-bot and r-bot (in truth), to which the page turns the pictures, just
+            before it.
         true_position_error_m: the same, of the camera's picture where it was truly taken.
         jump_m: the same, less what the shown robot drove from when the one came up to when the other did: with how
             long a camera's picture had been there already. What the eye sees, before the page eases it.
@@ -176,7 +177,7 @@ def find_switches(log: Log) -> list[Switch]:
                 log.time_s[k],
                 bool(log.virtual[k]),
                 error,
-                abs(math.degrees(wrap_angle(float(gap[2])))),
+                abs(math.degrees(log.yaw_gap_rad[k - 1])),
                 true,
                 jump,
                 math.hypot(float(gap[0]), float(gap[1])),

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from ..bag.replay import make_node
 from ..bus.lockstep import LockstepBus, Record
-from ..geometry.poses import compose2, matrix_from_quaternion, pose2_from_matrix, pose_matrix, relative2
-from ..msg import VelodynePacket, VelodyneScan, compressed_image_message, deserialize, header, to_time
+from ..geometry.poses import compose2, matrix_from_quaternion, pose2_from_matrix, pose_matrix, relative2, wrap_angle
+from ..msg import VelodynePacket, VelodyneScan, compressed_image_message, deserialize, header, stamp_ns, to_time
 from ..msg import pose_matrix as message_pose
 
 if TYPE_CHECKING:
@@ -170,6 +170,8 @@ class Log:
     estimate: list[FloatArray] = field(default_factory=list)
     """The r-bot's pose as the stack knows it."""
     vbot: list[FloatArray] = field(default_factory=list)
+    yaw_gap_rad: list[float] = field(default_factory=list)
+    """v-bot's heading less the r-bot's true one when the v-bot told it."""
     command: list[tuple[float, float]] = field(default_factory=list)
     blocked: list[bool] = field(default_factory=list)
     reason: list[str] = field(default_factory=list)
@@ -190,6 +192,7 @@ class SimulatedStack:
         self.log = Log()
         self.state: Any = None
         self.vbot: FloatArray = self.start.copy()
+        self.yaw_gap_rad = 0.0
         self.page = _Page(self)
         self.command_delay_ns = round(1e9 * self.rng.uniform(*config.command_latency_s))
         self._commands: deque[tuple[int, Record]] = deque()
@@ -261,7 +264,10 @@ class SimulatedStack:
         elif topic == "/ic/state":
             self.state = deserialize(record.payload, record.type_name)
         elif topic == "/vbot/odom":
-            self.vbot = self._in_world(pose2_from_matrix(message_pose(deserialize(record.payload, record.type_name))))
+            message = deserialize(record.payload, record.type_name)
+            self.vbot = self._in_world(pose2_from_matrix(message_pose(message)))
+            truth = self.simulation.poses_at([(stamp_ns(message) - START_NS) / 1e9])[0]
+            self.yaw_gap_rad = wrap_angle(float(self.vbot[2] - truth[2]))
         elif topic == "/keyframe":
             self.log.keyframes += 1
             pose = message_pose(deserialize(record.payload, record.type_name))
@@ -390,6 +396,7 @@ class SimulatedStack:
         log.robot.append(self.robot)
         log.estimate.append(self._in_world(pose2_from_matrix(message_pose(state.robot_pose))))
         log.vbot.append(self.vbot.copy())
+        log.yaw_gap_rad.append(self.yaw_gap_rad)
         log.command.append(command)
         log.blocked.append(bool(state.blocked))
         log.reason.append(str(state.reason))

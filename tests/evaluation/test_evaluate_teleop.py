@@ -34,6 +34,7 @@ def log_of(speeds: list[float], commands: list[float], virtual: list[bool] | Non
         log.virtual.append(virtual[k])
         for track in (log.robot, log.estimate, log.vbot):
             track.append(pose.copy())
+        log.yaw_gap_rad.append(0.0)
         log.command.append((commands[k], 0.0))
         log.blocked.append(False)
         log.reason.append("")
@@ -99,7 +100,7 @@ class TestSwitches:
 
     def test_yaw_error_is_that_between_the_robots(self) -> None:
         log = log_of([0.0] * 4, [0.0] * 4, [False, False, True, True])
-        log.vbot[2][2] = math.radians(3.0)
+        log.yaw_gap_rad[1] = math.radians(-3.0)  # afterwards the v-bot is another's: driven, or set beside the r-bot
         assert teleop_figures.find_switches(log)[0].yaw_error_deg == pytest.approx(3.0)
 
     def test_flicker_is_what_is_taken_back_at_once(self) -> None:
