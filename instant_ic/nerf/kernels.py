@@ -5,18 +5,20 @@ interpreter lock and give the same bits for the same input.
 
 Layout: ``table`` (levels, size, features), ``w1`` (hidden, levels·features), ``b1`` (hidden,), ``w2`` (4, hidden),
 ``b2`` (4,). Outputs 0..2 are the colour minus 0.5, output 3 the signed distance. Points are handled in blocks of
-``BLOCK`` with the point as the last axis, so that the compiler vectorises over points. numba's cache on disk looks at a
-function's own file only: after a change here, touch ``march.py`` and ``volume.py``, which have these functions inlined.
+``BLOCK`` with the point as the last axis, so that the compiler vectorises over points. Every module of kernels takes
+its options from here, so that stale machine code is gone before any is loaded.
 """
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
 
+from .numba_cache import forget_stale
 from .vectors import adam2, adam4, gather2, gather4, scatter2, scatter4
 
 BLOCK = 64
@@ -25,6 +27,7 @@ MARKED = 4
 _P1 = 2654435761
 _P2 = 805459861
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "fastmath": True, "error_model": "numpy"}
+forget_stale(Path(__file__).parent)
 
 
 def no_marks(table: np.ndarray) -> np.ndarray:
