@@ -126,12 +126,13 @@ class Video:
             rgb = photograph(stack, shown, *_PICTURE, math.pi / 2)
         frame = np.ascontiguousarray(cv2.resize(rgb, _PICTURE)[..., ::-1])
         mode = Mode(stack.log.mode[-1]).name
-        for words, row in (
-            (f"{'virtual space' if shown.virtual else 'camera'}  ({mode})", 24),
-            (stack.log.reason[-1], 346),
+        for words, top in (
+            (f"{'virtual space' if shown.virtual else 'camera'}  ({mode})", 0),
+            (stack.log.reason[-1], 334),
         ):
-            for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-                cv2.putText(frame, words[:80], (10, row), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA)
+            frame[top : top + 26] //= 2
+            at = (10, top + 18)
+            cv2.putText(frame, words[:80], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
         return frame
 
 
