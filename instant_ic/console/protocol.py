@@ -39,9 +39,6 @@ class FrameKind(IntEnum):
     COSTMAP = 4  # the same layout; 0..100 cost
 
 
-PICTURES = (FrameKind.PANORAMA, FrameKind.VIEW)
-
-
 @dataclass(frozen=True)
 class Frame:
     """One binary frame."""

@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from .kernels import _OPTIONS
-from .march import along
-from .warp_kernels import NEAR_M, draw_triangle
+from .march import along, panorama_pixels
+from .warp_kernels import NEAR_M, beyond, draw_triangle
 
 SAME_THING = np.float32(1.15)
 """What is nearer than an edge of a thing by more than this factor is not the thing, but what it stands on."""
@@ -82,12 +82,7 @@ def draw_quads(  # type: ignore[no-untyped-def]
             x, y, z = along(view_from_camera, origin, directions[v, u], np.float32(1) / inverse[v, u])
             patch[corner, 0], patch[corner, 1], patch[corner, 2] = x, y, z
             tangled = tangled or x < NEAR_M
-            code = 1 if x < NEAR_M else 0
-            code |= 2 if y > half * x else 0
-            code |= 4 if y < -half * x else 0
-            code |= 8 if z > half * aspect * x else 0
-            code |= 16 if z < -half * aspect * x else 0
-            common &= code
+            common &= beyond(x, y, z, half, half * aspect)
         if common == 0:
             draw_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
             draw_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
@@ -102,13 +97,7 @@ def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour)
         if not wanted[n]:
             continue
         x, y, z = along(camera_from_map, origin, directions[n], depth[n])
-        u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
-        v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
-        v = min(max(v, np.float32(0)), np.float32(height - 1))
-        u0, v0 = math.floor(u), math.floor(v)
-        fu, fv = u - np.float32(u0), v - np.float32(v0)
-        v1 = min(v0 + 1, height - 1)
-        left, right = u0 % width, (u0 + 1) % width
+        v0, v1, fv, left, right, fu = panorama_pixels(x, y, z, height, width)
         for c in range(3):
             top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
             bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu

@@ -230,12 +230,7 @@ class Device(Protocol):
             Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
         """
 
-    def freeze(self) -> Any:
-        """The present scene and a copy of the parameters, for ``draw``; training does not change it."""
-
-    def draw(
-        self, rays: Rays, panorama_share: float, depth_share: float, frozen: Any = None
-    ) -> tuple[Floats, Floats, Floats]:
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,).
 
         Args:
@@ -243,11 +238,10 @@ class Device(Protocol):
             panorama_share: of the keyframe's panorama in the colour of surfaces that it has seen; the rest is the
                 field's. With 1 the colour of surfaces without confidence is not worked out.
             depth_share: of the keyframe's depth in the signed distance; the rest is the field's.
-            frozen: what ``freeze`` gave, or the present field.
         """
 
-    def parameters(self, frozen: Any = None) -> FieldParameters:
-        """A copy of the present parameters, or of the frozen ones."""
+    def parameters(self) -> FieldParameters:
+        """A copy of the present parameters."""
 
 
 @dataclass

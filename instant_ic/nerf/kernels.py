@@ -195,6 +195,17 @@ def layer_backward_block(w, x, dy, gw, gb, dx):  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
+def network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx):  # type: ignore[no-untyped-def]
+    """Gradients of the network: adds to ``g1`` to ``gb2``, writes ``dh`` and ``dx``; ``h`` is behind its ReLU."""
+    layer_backward_block(w2, h, dy, g2, gb2, dh)
+    for j in range(h.shape[0]):
+        for i in range(BLOCK):
+            if h[j, i] <= 0:
+                dh[j, i] = 0
+    layer_backward_block(w1, x, dh, g1, gb1, dx)
+
+
+@njit(**_OPTIONS)
 def query(table, w1, b1, w2, b2, cells_per_m, origin, focus, points, out):  # type: ignore[no-untyped-def]
     """The field at ``points`` (N, 3) into ``out`` (N, 4): colour minus 0.5, signed distance."""
     x = np.zeros((w1.shape[1], BLOCK), np.float32)
@@ -253,12 +264,7 @@ def gradient(  # type: ignore[no-untyped-def]
             error = y[3, i] - target[start + i, 3]
             distance_error += weight * error * error
             dy[3, i] = np.float32(2) * weight * error
-        layer_backward_block(w2, h, dy, g2, gb2, dh)
-        for j in range(h.shape[0]):
-            for i in range(BLOCK):
-                if h[j, i] <= 0:
-                    dh[j, i] = 0
-        layer_backward_block(w1, x, dh, g1, gb1, dx)
+        network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx)
         encode_backward_block(table_grad, touched, entries, weights, count, dx)
     return colour_error, distance_error
 

@@ -332,6 +332,16 @@ def trace(  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
+def panorama_pixels(x, y, z, height, width):  # type: ignore[no-untyped-def]
+    """The four pixels of a panorama round a direction: rows and the lower's weight, columns and the right one's."""
+    u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
+    v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
+    v = min(max(v, np.float32(0)), np.float32(height - 1))
+    u0, v0 = math.floor(u), math.floor(v)
+    return v0, min(v0 + 1, height - 1), v - np.float32(v0), u0 % width, (u0 + 1) % width, u - np.float32(u0)
+
+
+@njit(**_OPTIONS)
 def mix_panorama(  # type: ignore[no-untyped-def]
     rgb, inverse, torn, known, camera_from_map, gains, band, origin, directions, depth, confidence, share, colour
 ):
@@ -353,13 +363,7 @@ def mix_panorama(  # type: ignore[no-untyped-def]
             x, y, z = along(camera_from_map[k], origin, directions[n], depth[n])
             if k == count - 1 or prior_agrees(x, y, z, inverse[k], torn[k], known[k], band[k]) > 0:
                 break
-        u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
-        v = np.float32((math.pi / 2 - math.atan2(z, math.sqrt(x * x + y * y))) * (height / math.pi) - 0.5)
-        v = min(max(v, np.float32(0)), np.float32(height - 1))
-        u0, v0 = math.floor(u), math.floor(v)
-        fu, fv = u - np.float32(u0), v - np.float32(v0)
-        v1 = min(v0 + 1, height - 1)
-        left, right = u0 % width, (u0 + 1) % width
+        v0, v1, fv, left, right, fu = panorama_pixels(x, y, z, height, width)
         for c in range(3):
             top = np.float32(rgb[k, v0, left, c]) * (one - fu) + np.float32(rgb[k, v0, right, c]) * fu
             bottom = np.float32(rgb[k, v1, left, c]) * (one - fu) + np.float32(rgb[k, v1, right, c]) * fu

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.geometry.projections import CUBE_FACES
 from instant_ic.geometry.raycast import RayCaster
 
 from .config import VirtualSpaceConfig
@@ -22,7 +21,7 @@ from .mesh_file import MeshError, load_mesh
 from .prior import KeyframeError, area_average
 from .readiness import UNSEEN_GAIN, Texture
 from .space import State, Status, TrainStats, VirtualSpace
-from .view import View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
+from .view import Drawn, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
 
 if TYPE_CHECKING:
     from .prior import PanoramaPrior
@@ -75,7 +74,7 @@ def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_
     return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config, robot)
 
 
-class MeshSpace:
+class MeshSpace(Drawn):
     """A mesh in the map, drawn by ray casting. One thread at a time.
 
     Raises:
@@ -197,35 +196,6 @@ class MeshSpace:
             device="cpu (embree)",
             warning=self._warning,
         )
-
-    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
-
-        Raises:
-            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
-        """
-        check_size(width, height)
-        return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
-
-    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
-        """A panorama, ``width`` × ``width / 2``. Raises as ``render``."""
-        check_size(width, width // 2)
-        if width % 2:
-            raise ValueError(f"a panorama's width must be even (got {width})")
-        return self._view(equirect_rays(checked_pose(map_from_camera), width), "equirect")
-
-    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View:
-        """Six faces of 90°, (6, size, size), in the order of ``projections.CUBE_FACES``. Raises as ``render``."""
-        check_size(size, size)
-        pose, faces = checked_pose(map_from_camera), []
-        for rotation in CUBE_FACES.values():
-            turned = pose.copy()
-            turned[:3, :3] = pose[:3, :3] @ rotation
-            faces.append(self._view(perspective_rays(turned, size, size, math.pi / 2), "cube"))
-        rgb, depth, confidence = (
-            np.stack([getattr(f, key) for f in faces]) for key in ("rgb", "depth_m", "confidence")
-        )
-        return View(rgb, depth, confidence, "cube")
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
         """PSNR that a view will have: the mesh's at the newest keyframe, and what of the view it does not hold.

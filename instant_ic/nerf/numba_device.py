@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -115,14 +115,9 @@ class NumbaDevice:
             grad[...] = 0
         return colour / share[0], distance / share[1]
 
-    def freeze(self) -> DrawnField:
-        return replace(self._drawn, parameters=self.parameters())
-
-    def draw(
-        self, rays: Rays, panorama_share: float, depth_share: float, frozen: DrawnField | None = None
-    ) -> tuple[Floats, Floats, Floats]:
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         height, width = rays.shape
-        drawn = frozen or self._drawn
+        drawn = self._drawn
         # A density is composited round the keyframes' own depth.
         axial_depth, confidence = self._trace(drawn, rays, 1.0 if self._density else depth_share)
         depth = axial_depth / rays.axial
@@ -188,6 +183,6 @@ class NumbaDevice:
         )  # fmt: skip
         depth[pixels] *= rays.axial[pixels]
 
-    def parameters(self, frozen: DrawnField | None = None) -> FieldParameters:
-        p = self._p if frozen is None else frozen.parameters
+    def parameters(self) -> FieldParameters:
+        p = self._p
         return FieldParameters(p.table.copy(), *(a.copy() for a in p.network()))

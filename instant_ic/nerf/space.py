@@ -18,8 +18,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import CUBE_FACES, perspective_directions, sample_equirect
-
 from .background import mixed_in
 from .compose import Layer, compose, exposure_gains, moved
 from .config import VirtualSpaceConfig
@@ -30,7 +28,7 @@ from .prior import KeyframeError, PanoramaPrior, prepare
 from .readiness import Texture, error_terms, expected_psnr_db
 from .saved import Progress, SavedSpace, read, write
 from .store import Keyframe, KeyframeSet, KeyframeStore, ready
-from .view import MAX_VIEW, View, check_size, checked_pose, continue_unseen, equirect_rays, perspective_rays
+from .view import Drawn, View, checked_pose, continue_unseen, perspective_rays
 from .warp import dissolve
 
 T = TypeVar("T")
@@ -106,7 +104,7 @@ class _Picture:
     guessed: NDArray[np.bool_]
 
 
-class VirtualSpace:
+class VirtualSpace(Drawn):
     """The newest keyframes: shown at once by warping, and one hash-grid field that learns from all of them.
 
     A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
@@ -354,46 +352,6 @@ class VirtualSpace:
         assert prior is not None
         sigma = max(prior.relative_sigma, 1e-3)
         return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
-
-    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
-
-        Raises:
-            NotReadyError: no keyframe yet.
-            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
-        """
-        check_size(width, height)
-        return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
-
-    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
-        """A panorama, ``width`` × ``width / 2``. Raises as ``render``."""
-        check_size(width, width // 2)
-        if width % 2:
-            raise ValueError(f"a panorama's width must be even (got {width})")
-        return self._view(equirect_rays(checked_pose(map_from_camera), width), "equirect")
-
-    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View:
-        """Six faces of 90°, (6, size, size), in the order of ``geometry.projections.CUBE_FACES``. Raises as ``render``.
-
-        What is not known is continued across the faces' edges.
-        """
-        check_size(size, size)
-        pose, faces = checked_pose(map_from_camera), []
-        round_about: View | None = None
-        for rotation in CUBE_FACES.values():
-            turned = pose.copy()
-            turned[:3, :3] = pose[:3, :3] @ rotation
-            face = self._view(perspective_rays(turned, size, size, math.pi / 2), "cube")
-            unseen = face.confidence == 0
-            if unseen.any():
-                round_about = round_about or self.render_equirect(pose, min(4 * size, MAX_VIEW))
-                directions = perspective_directions(size, size, math.pi / 2)[unseen] @ rotation.T.astype(np.float32)
-                face.rgb[unseen] = np.rint(sample_equirect(round_about.rgb, directions))
-            faces.append(face)
-        rgb, depth, confidence = (
-            np.stack([getattr(f, key) for f in faces]) for key in ("rgb", "depth_m", "confidence")
-        )
-        return View(rgb, depth, confidence, "cube")
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
         """PSNR that a view from a pose will have, judged without its truth (``readiness``); −inf without a keyframe.

@@ -133,21 +133,9 @@ class TorchDevice:
         error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
         return error, losses[0] / share[0], losses[1] / share[1]
 
-    def freeze(self) -> tuple[TorchField, list[TorchPrior], TorchGrid]:
-        field = self._field
-        table, w1, b1, w2, b2 = (p.detach().clone() for p in field.parameters())
-        copy = TorchField(table, w1, b1, w2, b2, field.cells_per_m, field.origin, field.focus)
-        return copy, self._priors, self._grid
-
     @torch.no_grad()
-    def draw(
-        self,
-        rays: Rays,
-        panorama_share: float,
-        depth_share: float,
-        frozen: tuple[TorchField, list[TorchPrior], TorchGrid] | None = None,
-    ) -> tuple[Floats, Floats, Floats]:
-        drawn = frozen or (self._field, self._priors, self._grid)
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        drawn = self._field, self._priors, self._grid
         origin = torch.from_numpy(rays.origin).to(self._device)
         directions = torch.from_numpy(rays.directions).to(self._device)
         shares = panorama_share, depth_share
@@ -187,6 +175,5 @@ class TorchDevice:
         reference.mix_panorama(priors, origin, directions, guide, confidence, shares[0], colour)
         return colour, depth, confidence
 
-    def parameters(self, frozen: tuple[TorchField, list[TorchPrior], TorchGrid] | None = None) -> FieldParameters:
-        field = self._field if frozen is None else frozen[0]
-        return FieldParameters(*(p.detach().cpu().numpy().copy() for p in field.parameters()))
+    def parameters(self) -> FieldParameters:
+        return FieldParameters(*(p.detach().cpu().numpy().copy() for p in self._field.parameters()))

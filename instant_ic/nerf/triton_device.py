@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -64,14 +64,6 @@ class _GpuScene:
     cell_m: float
     camera: Tensor
     keyframes: int
-
-
-@dataclass(frozen=True)
-class _Drawn:
-    """What drawing needs."""
-
-    parameters: _Parameters
-    scene: _GpuScene
 
 
 @dataclass
@@ -184,21 +176,9 @@ class TritonDevice:
             COUNT=len(p.network), B=_power_of_two(len(p.network)),
         )  # fmt: skip
 
-    def freeze(self) -> _Drawn:
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         assert self._scene is not None, "set_scene first"
-        copy = replace(
-            self._p, master=self._p.master.clone(), table=self._p.table.clone(), network=self._p.network.clone()
-        )
-        return _Drawn(copy, self._scene)
-
-    def draw(
-        self, rays: Rays, panorama_share: float, depth_share: float, frozen: _Drawn | None = None
-    ) -> tuple[Floats, Floats, Floats]:
-        drawn = frozen
-        if drawn is None:
-            assert self._scene is not None, "set_scene first"
-            drawn = _Drawn(self._p, self._scene)
-        p, scene = drawn.parameters, drawn.scene
+        p, scene = self._p, self._scene
         q = scene.priors
         rows, columns = rays.shape
         size = self._table_shape[1]
@@ -229,8 +209,8 @@ class TritonDevice:
             self._newest_lens = rays.lens, self._tensor(rays.lens)
         return self._newest_lens[1], rays.turn
 
-    def parameters(self, frozen: _Drawn | None = None) -> FieldParameters:
-        p = self._p if frozen is None else frozen.parameters
+    def parameters(self) -> FieldParameters:
+        p = self._p
         network = p.network.cpu().numpy()
         ends = np.cumsum([math.prod(shape) for shape in self._network_shapes])
         parts = np.split(network, ends[:-1])

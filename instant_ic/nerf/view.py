@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import functools
 import math
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.geometry.projections import equirect_directions, perspective_directions
+from instant_ic.geometry.projections import CUBE_FACES, equirect_directions, perspective_directions, sample_equirect
 
 from .field import Floats, Rays
 from .prior import fill_holes
@@ -158,3 +159,51 @@ def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: b
     side = width // 4
     around = np.r_[width - side : width, 0:width, 0:side]
     return continue_unseen(image[:, around], depth_m[:, around], confidence[:, around])[:, side : side + width]
+
+
+class Drawn(abc.ABC):
+    """A space that is drawn ray by ray: its pictures in each projection."""
+
+    @abc.abstractmethod
+    def _view(self, rays: Rays, projection: str) -> View:
+        """What the rays see, (H, W); what is not known is continued from around it."""
+
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
+        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+
+        Raises:
+            NotReadyError: no keyframe yet, where one is needed.
+            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+        """
+        check_size(width, height)
+        return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
+
+    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
+        """A panorama, ``width`` × ``width / 2``. Raises as ``render``."""
+        check_size(width, width // 2)
+        if width % 2:
+            raise ValueError(f"a panorama's width must be even (got {width})")
+        return self._view(equirect_rays(checked_pose(map_from_camera), width), "equirect")
+
+    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View:
+        """Six faces of 90°, (6, size, size), in the order of ``geometry.projections.CUBE_FACES``. Raises as ``render``.
+
+        What is not known is continued across the faces' edges.
+        """
+        check_size(size, size)
+        pose, faces = checked_pose(map_from_camera), []
+        round_about: View | None = None
+        for rotation in CUBE_FACES.values():
+            turned = pose.copy()
+            turned[:3, :3] = pose[:3, :3] @ rotation
+            face = self._view(perspective_rays(turned, size, size, math.pi / 2), "cube")
+            unseen = face.confidence == 0
+            if unseen.any():
+                round_about = round_about or self.render_equirect(pose, min(4 * size, MAX_VIEW))
+                directions = perspective_directions(size, size, math.pi / 2)[unseen] @ rotation.T.astype(np.float32)
+                face.rgb[unseen] = np.rint(sample_equirect(round_about.rgb, directions))
+            faces.append(face)
+        rgb, depth, confidence = (
+            np.stack([getattr(f, key) for f in faces]) for key in ("rgb", "depth_m", "confidence")
+        )
+        return View(rgb, depth, confidence, "cube")

@@ -18,8 +18,8 @@ from .kernels import (
     BLOCK,
     encode_backward_block,
     encode_block,
-    layer_backward_block,
     layer_block,
+    network_backward_block,
     relu_block,
 )
 
@@ -144,12 +144,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
                 thickness = np.float32(math.exp(raw)) * span[r, s] if inside else np.float32(0)
                 dy[3, first + s] = thickness * (left[s] * pull[s] - behind)
                 behind += w[s] * pull[s]
-        layer_backward_block(w2, h, dy, g2, gb2, dh)
-        for j in range(h.shape[0]):
-            for i in range(BLOCK):
-                if h[j, i] <= 0:
-                    dh[j, i] = 0
-        layer_backward_block(w1, x, dh, g1, gb1, dx)
+        network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx)
         encode_backward_block(table_grad, touched, entries, corner_weights, BLOCK, dx)
     return colour_error, depth_error
 

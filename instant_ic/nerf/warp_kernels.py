@@ -19,6 +19,17 @@ MAX_TAPS = 8
 
 
 @njit(**_OPTIONS)
+def beyond(x, y, z, half, tall):  # type: ignore[no-untyped-def]
+    """Planes of the view that a point lies beyond, one bit each; ``half``, ``tall``: tangents of half its angles."""
+    code = 1 if x < NEAR_M else 0
+    code |= 2 if y > half * x else 0
+    code |= 4 if y < -half * x else 0
+    code |= 8 if z > tall * x else 0
+    code |= 16 if z < -tall * x else 0
+    return code
+
+
+@njit(**_OPTIONS)
 def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices, outside):  # type: ignore[no-untyped-def]
     """Corners of the mesh in the view's frame, and the planes of the view that they lie beyond.
 
@@ -35,11 +46,7 @@ def place_vertices(inverse, directions, view_from_camera, half, aspect, vertices
         for u in range(width):
             x, y, z = along(m, origin, directions[v, u], np.float32(1) / inverse[v, u])
             vertices[v, u, 0], vertices[v, u, 1], vertices[v, u, 2] = x, y, z
-            code = 1 if x < NEAR_M else 0
-            code |= 2 if y > half * x else 0
-            code |= 4 if y < -half * x else 0
-            code |= 8 if z > tall * x else 0
-            code |= 16 if z < -tall * x else 0
+            code = beyond(x, y, z, half, tall)
             outside[v, u] = code
 
 
@@ -137,12 +144,7 @@ def draw_mesh(  # type: ignore[no-untyped-def]
                     x, y, z = along(m, origin, corners[down, across % (2 * width)], depth)
                     patch[k, 0], patch[k, 1], patch[k, 2] = x, y, z
                     tangled = tangled or x < NEAR_M
-                    code = 1 if x < NEAR_M else 0
-                    code |= 2 if y > half * x else 0
-                    code |= 4 if y < -half * x else 0
-                    code |= 8 if z > half * aspect * x else 0
-                    code |= 16 if z < -half * aspect * x else 0
-                    common &= code
+                    common &= beyond(x, y, z, half, half * aspect)
                 if common:
                     continue
                 mark = KNOWN if known[row, column] else FILLED

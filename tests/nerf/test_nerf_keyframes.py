@@ -19,6 +19,7 @@ from instant_ic.nerf import (
 from instant_ic.nerf import compose as composing
 from instant_ic.nerf.compose import Layer, compose, exposure_gain, exposure_gains, moved
 from instant_ic.nerf.config import GeometryConfig
+from instant_ic.nerf.field import Rays
 from instant_ic.nerf.prior import MOVED, prepare
 from instant_ic.nerf.view import perspective_rays
 
@@ -223,7 +224,7 @@ def layer(prior, depth, confidence, colour, gain=1.0):
 def test_composing_by_hand():
     # Both keyframes stand where the view does; three pixels straight ahead, far beyond what either has looked through.
     near, rays = prior_of(np.eye(4)), perspective_rays(np.eye(4), 16, 16, 0.01)
-    rays = dataclasses.replace(rays, directions=np.tile(np.array([[1.0, 0, 0]], np.float32), (5, 1)))
+    rays = Rays(rays.origin, np.tile(np.array([[1.0, 0, 0]], np.float32), (5, 1)), rays.axial, rays.shape)
     newest = layer(near, [5, 9, 0, 5, 0], [1, 1, 0, 0.5, 0], [0.2, 0.2, 0.2, 0.2, 0.1])
     older = layer(near, [5.1, 6, 7, 9, 0], [1, 1, 1, 1, 0], [0.3, 0.3, 0.3, 0.3, 0.9], gain=2.0)
     colour, depth, confidence = compose([newest, older], rays)
@@ -236,7 +237,7 @@ def test_composing_by_hand():
 
 def test_the_keyframe_that_is_nearer_to_a_surface_has_more_say():
     rays = perspective_rays(np.eye(4), 16, 16, 0.01)
-    rays = dataclasses.replace(rays, directions=np.array([[1.0, 0, 0]], np.float32))
+    rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
     layers = [layer(prior_of(pose_matrix(x=x)), [8], [1], [value]) for x, value in ((-2.5, 0.0), (2.0, 1.0))]
     # Surface at 8 m, seen from 10.5 and from 6: penalties 0.05 + 10.5/8 − 1 = 0.3625 and 0.05, to the power of −6.
     colour, _, _ = compose(layers, rays)

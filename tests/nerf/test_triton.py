@@ -229,20 +229,16 @@ def test_rendering_agrees_with_the_reference(scene, share, depth_share):
     assert np.quantile(np.abs(colour[same] - expected_colour[same]), 0.98) < 0.02
 
 
-def test_a_frozen_field_stays_as_training_goes_on():
+def test_training_changes_pictures_and_can_be_taken_up_again():
     scene = room_scene()
     device = TritonDevice(FIELD, TRAIN, DEVICE)
     device.set_scene(scene)
     rays = perspective_rays(pose_matrix(0.3, -0.1, 0, yaw=0.2), 8, 8, 1.0)
     uniform = np.random.default_rng(0).random((TRAIN.ray_columns * TRAIN.ray_rows, 3), F)
-    frozen = device.freeze()
-    before, kept = device.draw(rays, 0.0, 1.0), device.parameters()
+    before = device.draw(rays, 0.0, 1.0)
     for _ in range(2):
         device.step(uniform, 0.04, 0.01)
-    for ours, then in zip(device.draw(rays, 0.0, 1.0, frozen), before, strict=True):
-        assert np.array_equal(ours, then)
     assert not np.array_equal(device.draw(rays, 0.0, 1.0)[0], before[0])
-    assert np.array_equal(device.parameters(frozen).table, kept.table)
     # And what was trained can be taken up again.
     other = TritonDevice(FIELD, TRAIN, DEVICE)
     other.load(device.parameters())
