@@ -53,16 +53,19 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
 
     Of surfaces at different depths the nearest counts, of those that depths only disagree about the one that is seen
     most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two surfaces mix, only where
-    no keyframe has a plain one. What nobody has seen is as the newest has it. Needs numba.
+    no keyframe has a plain one. What a newer keyframe has looked through is left out of an older one: it has moved, or
+    is an error of its depth. What nobody has seen is as the newest has it. Needs numba.
     """
     from .compose_kernels import blend
 
     poses = np.array([layer.prior.map_from_camera for layer in layers])
+    room = np.array([[disagreement(a.prior, b.prior) for b in layers] for a in layers], np.float32)
     colour = np.empty_like(layers[0].colour)
     depth, confidence = np.empty_like(layers[0].depth), np.empty_like(layers[0].confidence)
     blend(
         *(np.stack([getattr(layer, key) for layer in layers]) for key in ("colour", "depth", "confidence", "gain")),
-        np.stack([layer.prior.torn for layer in layers]), np.linalg.inv(poses).astype(np.float32),
+        *(np.stack([getattr(layer.prior, key) for layer in layers]) for key in ("torn", "inverse_depth")),
+        np.stack([layer.prior.known == 1 for layer in layers]), room, np.linalg.inv(poses).astype(np.float32),
         np.ascontiguousarray(poses[:, :3, 3], np.float32), rays.origin, rays.directions,
         *(np.float32(value) for value in (EDGE, ASIDE_RAD, SAME_PLACE, SAME_SURFACE, LEAST_PENALTY, SHARPNESS)),
         colour, depth, confidence,

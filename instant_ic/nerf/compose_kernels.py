@@ -25,14 +25,15 @@ def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def blend(  # type: ignore[no-untyped-def]
-    colours, depths, confidences, gains, torn, camera_from_map, places, origin, directions,
+    colours, depths, confidences, gains, torn, inverse, known, room, camera_from_map, places, origin, directions,
     edge, aside_rad, same_place, same_surface, least_penalty, sharpness, colour, depth, confidence,
 ):  # fmt: skip
     """The layers of a view into one, by the rules of ``compose``.
 
     Args:
         colours: (K, P, 3); depths, confidences: (K, P); newest keyframe first.
-        gains: (K, 3); torn: (K, h, w); camera_from_map: (K, 4, 4); places: of the cameras, (K, 3).
+        gains: (K, 3); torn, inverse, known: of the keyframes' depth, (K, h, w); room: as ``opinion`` takes it, (K, K).
+        camera_from_map: (K, 4, 4); places: of the cameras, (K, 3).
         origin: (3,); directions: (P, 3).
         edge … sharpness: the constants of ``compose``.
         colour: out, (P, 3); depth, confidence: out, (P,).
@@ -57,6 +58,10 @@ def blend(  # type: ignore[no-untyped-def]
                 row, column, _ = panorama_pixel(px, py, pz, height, width)
                 if torn[k, row, column]:
                     rank[k] -= edge
+            for newer in range(k):
+                x, y, z = along(camera_from_map[newer], origin, directions[n], t)
+                if opinion(x, y, z, inverse[newer], known[newer], room[newer, k]) == AGAINST:
+                    rank[k] = 0
             best = max(best, rank[k])
         if best <= 0:  # nobody has seen it: as the newest has it
             for c in range(3):

@@ -235,6 +235,19 @@ def test_composing_by_hand():
     assert confidence.tolist() == [1, 1, 1, 1, 0]
 
 
+def test_what_a_newer_keyframe_has_looked_through_is_left_out_of_an_older_one():
+    newest, rays = prior_of(np.eye(4)), perspective_rays(np.eye(4), 16, 16, 0.01)
+    rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
+    height, width = newest.inverse_depth.shape
+    wall = 1 / newest.inverse_depth[height // 2, width // 2]
+    layers = [layer(newest, [wall], [1], [0.2]), layer(prior_of(pose_matrix(x=-0.3)), [0.5 * wall], [1], [0.9])]
+    colour, depth, confidence = compose(layers, rays)
+    assert (colour[0, 0], depth[0], confidence[0]) == (pytest.approx(0.2), pytest.approx(wall), 1)
+    # The other way round nobody newer has looked there: the nearer surface counts.
+    colour, depth, _ = compose([layer(newest, [0.5 * wall], [1], [0.9]), layer(newest, [wall], [1], [0.2])], rays)
+    assert (colour[0, 0], depth[0]) == (pytest.approx(0.9), pytest.approx(0.5 * wall))
+
+
 def test_the_keyframe_that_is_nearer_to_a_surface_has_more_say():
     rays = perspective_rays(np.eye(4), 16, 16, 0.01)
     rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
