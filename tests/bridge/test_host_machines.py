@@ -36,7 +36,7 @@ def test_the_operator_drives_a_robot_on_another_machine_and_a_cut_cable_stops_it
             left = [process for host in ("robot", "station") for process in processes_of(machines.run_dir(host))]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    assert nodes == {"console", "host_bridge"} and left == []
+    assert nodes == {"console", "host_bridge", "operator_recorder"} and left == []
     assert not any("Traceback" in log for log in logs)
     assert result.picture_age_s < 5.0  # a picture of now; a busy machine makes one a second
     assert result.driven_m > 0.3
