@@ -48,6 +48,7 @@ class SwitchConfig:
         return_dwell_s: s that they must agree before the return begins.
         picture_position_m: m between the places of view and camera picture at a switch; what jumps is no more.
         picture_yaw_deg: degrees, likewise.
+        return_picture_m: m, likewise at the return, where the v-bot is still being drawn on until it is seen and done.
         enter_timeout_s: s that a fitting view is waited for, while the r-bot slows to a stand.
         return_timeout_s: s after which the return ends although view and picture do not meet: they come too rarely.
         min_virtual_s: s; shortest stay in the virtual space.
@@ -69,8 +70,9 @@ class SwitchConfig:
     return_dwell_s: NotNegative = 0.5
     picture_position_m: Positive = 0.02
     picture_yaw_deg: Positive = 0.5
+    return_picture_m: Positive = 0.015
     enter_timeout_s: Positive = 2.0
-    return_timeout_s: Positive = 6.0
+    return_timeout_s: Positive = 8.0
     min_virtual_s: NotNegative = 1.0
     min_real_s: NotNegative = 1.0
     return_margin_m: Positive = 0.5
@@ -487,9 +489,10 @@ class Arbiter:
     def _view_fits(self, situation: _Situation) -> str:
         if self._hold_reason(situation) or not self._vbot_spoke(situation.inputs, situation.now_ns):
             return ""
-        return "you drive the virtual robot" if self._pictures_agree(situation) else ""
+        agree = self._pictures_agree(situation, self.config.switch.picture_position_m)
+        return "you drive the virtual robot" if agree else ""
 
-    def _pictures_agree(self, situation: _Situation) -> bool:
+    def _pictures_agree(self, situation: _Situation, within_m: float) -> bool:
         """Whether view and camera picture show the same place, so that nothing jumps when one follows the other."""
         inputs, switch = situation.inputs, self.config.switch
         if inputs.robot_pose is None:
@@ -503,7 +506,7 @@ class Arbiter:
         if inputs.view_position is None or inputs.picture_position is None:
             return False
         apart = inputs.view_position[:2] - inputs.picture_position[:2]
-        return float(np.linalg.norm(apart)) <= switch.picture_position_m
+        return float(np.linalg.norm(apart)) <= within_m
 
     def _rejoined(self, situation: _Situation) -> str:
         now_ns, switch, inputs = situation.now_ns, self.config.switch, situation.inputs
@@ -553,10 +556,10 @@ class Arbiter:
         waited = self._seconds_in_mode(situation.now_ns) / switch.return_timeout_s
         if waited >= 2.0:
             return words  # a pose that trembles by more than the thresholds; the page eases what is left
-        near = situation.gap_m <= switch.picture_position_m
+        near = situation.gap_m <= switch.return_picture_m
         if not near or abs(situation.yaw_gap_rad) > math.radians(switch.picture_yaw_deg):
             return ""
-        return words if waited >= 1.0 or self._pictures_agree(situation) else ""
+        return words if waited >= 1.0 or self._pictures_agree(situation, switch.return_picture_m) else ""
 
     def _may_resume(self, situation: _Situation) -> str:
         inputs = situation.inputs

@@ -35,7 +35,7 @@ class VbotConfig:
     max_lead_m: Positive = 3.0
     slow_lead_m: NotNegative = 1.0
     wall_clearance_m: NotNegative = 0.12
-    ease_m_s: Positive = 0.045
+    ease_m_s: Positive = 0.035
     ease_deg_s: Positive = 6.0
     ease_time_s: Positive = 0.25
     lead_back_m_s: Positive = 0.2
