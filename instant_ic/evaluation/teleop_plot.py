@@ -50,11 +50,11 @@ def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], setti
         names = [name for name in METHODS if name in report["methods"]]
         values = [report["methods"][name][key] for name in names]
         axis.bar(names, [v or 0.0 for v in values], color=[_COLOURS[name] for name in names])
+        axis.set_ylim(0, 1.2 * max([v or 0.0 for v in values]) or 1.0)
         for k, value in enumerate(values):
             words = "none" if value is None else f"{value:.3g}"
             axis.annotate(words, (k, value or 0.0), ha="center", va="bottom", fontsize=8)
         axis.set_title(label, fontsize=9)
-        axis.margins(y=0.2)
     figure.suptitle(f"{settings.world}, seed {settings.seed}: dashed is the v-bot, grey what the robot may run into")
     save_figure(figure, path)
 
