@@ -68,6 +68,19 @@ def expect_body(page, name, value):
     expect(page.locator("body")).to_have_attribute(f"data-{name}", value, timeout=WAIT_MS)
 
 
+def kept_values(page, name):
+    """Keeps every value of a body's data attribute from now on: one that lasts shorter than a look is not missed."""
+    page.evaluate(
+        """name => {
+            const kept = (window.keptValues ??= {})[name] = [];
+            new MutationObserver(() => kept.push(document.body.dataset[name])).observe(document.body, {
+                attributeFilter: [`data-${name}`] });
+        }""",
+        name,
+    )
+    return lambda: page.evaluate("name => window.keptValues[name]", name)
+
+
 def wait_until(predicate, page, what):
     """Waits for something on the robot's side while the page lives on."""
     deadline = time.monotonic() + WAIT_MS / 1000

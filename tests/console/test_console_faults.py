@@ -11,6 +11,7 @@ from console_pages import (
     B,
     expect_body,
     hold_and_push,
+    kept_values,
     make_demo,
     moving,
     push_stick,
@@ -192,8 +193,9 @@ def test_fault_robot_runs_its_last_command_after_the_link_is_lost(open_page):
 def test_fault_dead_path_that_closes_no_socket_is_taken_for_a_link(driver, shared_demo):
     """The other side falls silent without a word, as behind a lost radio: the page finds out by itself."""
     start_driving(driver, shared_demo)
+    links = kept_values(driver, "link")
     driver.evaluate("() => { const dead = sockets.at(-1); dead.send = () => {}; dead.onmessage = null; }")
-    expect_body(driver, "link", "lost")
+    wait_until(lambda: "lost" in links(), driver, "the page tells the loss")
     wait_stopped(driver, shared_demo)
     expect_body(driver, "link", "up")
     expect_body(driver, "driver", "you")
