@@ -1,0 +1,117 @@
+"""The small depth picture that goes with a rendered view, and the view as it looks from a little beside its place.
+
+Virtual-reality headsets call it positional time warp: the newest picture is shown from where the eye is now, so that
+motion is seen before the next picture has been drawn. What is stored is the inverse of the depth along the camera's
+axis: on a plane that is linear over the picture, so little of it is enough.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .projections import perspective_directions
+
+WIDTH = 96
+NEAREST_M = 0.2
+"""What is nearer counts as this far."""
+STEPS = 2
+MOST_PARALLAX = 0.5
+"""Of the motion over the depth: what is nearer is taken to be so far that it moves by no more."""
+
+
+@functools.lru_cache(maxsize=2)
+def _axial(width: int, height: int, fov_rad: float) -> NDArray[np.float32]:
+    """Metres along the axis for each metre along the ray, (H, W)."""
+    along: NDArray[np.float32] = 1 / np.linalg.norm(perspective_directions(width, height, fov_rad), axis=2)
+    return along
+
+
+def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WIDTH) -> tuple[bytes, float]:
+    """Depth of a perspective picture for whoever shows it.
+
+    Args:
+        depth_m: (H, W) along the rays, metres; 0 where nothing is met.
+        fov_rad: horizontal field of view.
+        width: columns of the result; of all depths in one of its pixels the nearest counts.
+
+    Returns:
+        Grey PNG, (h, ``width``), and the depth along the axis in metres that its 255 stands for: v means
+        ``near_m * 255 / v``, 0 nothing. Without any depth the PNG is empty, and the number 0.
+
+    Raises:
+        ValueError: no picture, or no field of view.
+    """
+    import cv2
+
+    if depth_m.ndim != 2 or depth_m.size == 0:
+        raise ValueError(f"depth must be (H, W) (got shape {depth_m.shape})")
+    rows, columns = depth_m.shape
+    axial = np.asarray(depth_m, np.float32) * _axial(columns, rows, round(fov_rad, 6))
+    known = np.isfinite(axial) & (axial > 0)
+    inverse = np.where(known, 1 / np.maximum(np.where(known, axial, 1), NEAREST_M), 0).astype(np.float32)
+    width = min(width, columns)
+    height = max(1, round(rows * width / columns))
+    # An edge that is moved takes a fringe of its background along: it stays whole, and the background stretches.
+    cell = math.ceil(columns / width) + 1
+    small = cv2.resize(cv2.dilate(inverse, np.ones((cell, cell), np.uint8)), (width, height))
+    most = float(small.max())
+    if most <= 0:
+        return b"", 0.0
+    ok, png = cv2.imencode(".png", np.rint(small * (255 / most)).astype(np.uint8))
+    if not ok:
+        raise ValueError(f"PNG encoder refused a picture of shape {small.shape}")
+    return bytes(png.tobytes()), 1 / most
+
+
+def decode_depth(png: bytes, near_m: float) -> NDArray[np.float32]:
+    """Inverse depth along the axis, (h, w), 1/m, of what ``encode_depth`` made.
+
+    Raises:
+        ValueError: no grey picture.
+    """
+    import cv2
+
+    grey = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) if png else None
+    if grey is None or grey.ndim != 2 or grey.dtype != np.uint8:
+        raise ValueError(f"a depth picture of {len(png)} bytes is no grey PNG of 8 bits")
+    return grey.astype(np.float32) * np.float32(1 / (255 * near_m))
+
+
+def reproject(
+    picture: NDArray[np.uint8], inverse: NDArray[np.float32], moved_m: NDArray[np.floating], fov_rad: float
+) -> NDArray[np.uint8]:
+    """The picture as it looks when the camera has moved: what the page's shader does, for one without a page.
+
+    Each pixel looks for its place in the picture by steps against the depth there, from the nearest depth on: so what
+    is near covers what is far. At what opens up behind an edge the far side goes on.
+
+    Args:
+        picture: (H, W, C), perspective.
+        inverse: (h, w) of ``decode_depth``.
+        moved_m: (3,) in the picture's camera frame (x forward, y left, z up).
+        fov_rad: horizontal field of view.
+    """
+    import cv2
+
+    def sample(image: NDArray[np.generic], at: NDArray[np.float32]) -> NDArray[np.generic]:
+        # 0 is the middle of the picture, 1 its right and its upper edge.
+        rows, columns = image.shape[:2]
+        u, v = (1 + at[..., 0]) * (columns / 2) - 0.5, (1 - at[..., 1]) * (rows / 2) - 0.5
+        return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+
+    rows, columns = picture.shape[:2]
+    half = math.tan(fov_rad / 2) * np.array([1, rows / columns])
+    x, y = (2 * np.arange(columns) + 1) / columns - 1, 1 - (2 * np.arange(rows) + 1) / rows
+    here = np.stack(np.meshgrid(x, y), axis=2).astype(np.float32)
+    forward, left, up = (float(value) for value in moved_m)
+    per_inverse = (np.array([-left, up]) / half - forward * here).astype(np.float32)  # of a point at 1 m
+    size = math.hypot(forward, left, up)
+    most = min(float(inverse.max()), MOST_PARALLAX / size if size > 0 else math.inf)
+    found = np.full((rows, columns), most, np.float32)
+    for _ in range(STEPS):
+        found = np.minimum(sample(inverse, here + per_inverse * found[..., None]), np.float32(most))
+    return sample(picture, here + per_inverse * found[..., None]).astype(np.uint8)
