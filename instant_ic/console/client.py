@@ -228,11 +228,9 @@ class ConsoleClient:
 
     async def _beat(self) -> None:
         assert self._socket is not None
-        beat = 0
         while not self._socket.closed:
-            if beat % 2 == 0:  # well within the server's drive.beat_timeout_s
-                await self.send({"type": "ping", "client_ms": time.monotonic() * 1000})
+            # Well within the server's drive.beat_timeout_s.
+            await self.send({"type": "ping", "client_ms": time.monotonic() * 1000})
             if self._command != (0.0, 0.0) and self._offset_ms is not None:
                 await self.send_drive(*self._command)
-            beat += 1
             await asyncio.sleep(0.05)

@@ -119,6 +119,9 @@ class Demo:
         self.commands.append((linear, angular))
         self._command = (linear, angular)
 
+    def on_operator(self, there: bool) -> None:
+        """See Backend."""
+
     def on_estop(self, stop: bool) -> None:
         """See Backend."""
         self.estop = stop

@@ -24,7 +24,7 @@ class DriveConfig:
     max_command_age_s: float = 0.3  # older commands (by the client's stamp) are dropped
     stop_repeat_s: float = 0.3  # zeros are given on at rate_hz for this long after a stop
     keep_alive_hz: float = 10.0  # zeros of an idle driver whose page lives: the operator is there
-    beat_timeout_s: float = 0.4  # nothing heard from the driver's page for this long: no more zeros
+    beat_timeout_s: float = 0.25  # nothing heard from the driver's page for this long: he is lost, and the arbiter told
     lease_timeout_s: float = 2.0  # a driver who is silent for this long loses the lease
 
     def __post_init__(self) -> None:
@@ -52,7 +52,8 @@ class DriveGate:
     """One driver by lease; the newest command that still holds; zero whenever in doubt.
 
     Zeros mean "the operator is there and wants nothing"; silence means that nobody is there. So an idle driver's zeros
-    are given on only while the page is heard, and after its loss one zero goes out, then nothing.
+    are given on only while the page is heard, and after its loss one zero goes out, then nothing. :meth:`driver_alive`
+    tells of the loss itself.
     """
 
     def __init__(self, config: DriveConfig) -> None:
@@ -105,18 +106,16 @@ class DriveGate:
         self._sequence.pop(client, None)
 
     def touch(self, client: int, now: float, *, away: bool = False) -> bool:
-        """Any sign of life of ``client``; True when a driver is back who was away for ``beat_timeout_s``.
+        """Any sign of life of ``client``; True when by it the driver has come back, or gone.
 
         ``away``: its page is not looked at. It keeps the lease, but the operator does not count as there.
         """
         if self.driver != client:
             return False
+        was_there = self.driver_alive(now)
         self._driver_seen = now
-        if away:
-            return False
-        back = not self.driver_alive(now)
-        self._driver_beat = now
-        return back
+        self._driver_beat = -math.inf if away else now  # a page that says so need not be missed first
+        return was_there == away
 
     def driver_alive(self, now: float) -> bool:
         """Whether somebody drives whose page was heard, and looked at, within ``beat_timeout_s``."""
@@ -129,7 +128,7 @@ class DriveGate:
         if verdict is not Verdict.ACCEPTED:
             return verdict
         self._sequence[client] = sequence
-        self._driver_seen = self._driver_beat = now
+        self._driver_seen = now
         self.last_age_s = age_s
         self._accepted.append(now)
         limits = self.config
@@ -141,7 +140,7 @@ class DriveGate:
             self.stop(now)
         else:
             self._command = command
-            self._received = now
+            self._received = self._driver_beat = now
         return verdict
 
     def _judge(self, client: int, sequence: int, age_s: float) -> Verdict:
@@ -202,6 +201,8 @@ class DriveGate:
             deadlines += [self._received + self.config.watchdog_s, self._emitted + self._period_s(now)]
         elif self.driver_alive(now) or self._emitted_command is not None:
             deadlines.append(self._emitted + self._period_s(now))
+        if self.driver_alive(now):
+            deadlines.append(self._driver_beat + self.config.beat_timeout_s)
         if self.driver is not None:
             deadlines.append(self._driver_seen + self.config.lease_timeout_s)
         return max(now, min(deadlines)) if deadlines else None

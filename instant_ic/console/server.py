@@ -61,6 +61,9 @@ class Backend(Protocol):
     def on_drive(self, linear: float, angular: float) -> None:
         """Command to give on now, m/s and rad/s: 20 Hz while driving; zeros while the driver is there and idle."""
 
+    def on_operator(self, there: bool) -> None:
+        """A driver is there now, or not any more: his page is silent, hidden or closed, or he gave the lease back."""
+
     def on_estop(self, stop: bool) -> None:
         """Emergency stop set (any client) or released (the driver)."""
 
@@ -127,6 +130,7 @@ class ConsoleServer:
         self._foreground = frozenset({FrameKind.PANORAMA})
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
+        self._operator = False  # whether the backend has been told that a driver is there
         self._gate_wake = asyncio.Event()
         self._finish = asyncio.Event()
         self._started: threading.Event = threading.Event()
@@ -548,9 +552,13 @@ class ConsoleServer:
                 self._tell_session()
 
     def _emit_due(self, *, wake: bool = True) -> None:
-        command = self.gate.take_due(time.monotonic())
+        now = time.monotonic()
+        command = self.gate.take_due(now)
         if command is not None:
             self.backend.on_drive(*command)
+        if (there := self.gate.driver_alive(now)) != self._operator:
+            self._operator = there
+            self.backend.on_operator(there)
         if wake:
             self._gate_wake.set()
 

@@ -128,6 +128,8 @@ class ArbiterInputs:
     """(3,) map_from_base of the r-bot; None while unknown."""
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
+    operator_gone: bool = False
+    """Whoever gave that command is known to have gone since: it is void, whatever its age."""
     estop: bool = False
     estop_button: bool = False
     """The button on the robot is pressed: nothing else ends the stop."""
@@ -292,7 +294,7 @@ class Arbiter:
     # -- what the step starts from
 
     def _assess(self, inputs: ArbiterInputs, now_ns: int) -> _Situation:
-        fresh = inputs.age("command") <= self.config.timeouts.command
+        fresh = inputs.age("command") <= self.config.timeouts.command and not inputs.operator_gone
         command = clip_twist(*inputs.operator_command, self.config.limits) if fresh else (0.0, 0.0)
         if command != (0.0, 0.0):
             self._driven = _Driven(command, now_ns)
@@ -372,13 +374,27 @@ class Arbiter:
                 continue
             if not required.get(source.key, True):
                 continue
-            age = inputs.age(source.key)
-            if Mode.REAL not in source.modes:
-                # It need not have spoken before the change: its silence counts from there.
-                age = min(age, self._seconds_in_mode(now_ns))
-            if age > self._allowed_s(source, inputs):
+            age = self._source_age_s(source, inputs, now_ns)
+            if age > self._allowed_s(source, inputs) or (source.key == "command" and inputs.operator_gone):
                 lacking.append((source, age))
         return lacking
+
+    def _source_age_s(self, source: Source, inputs: ArbiterInputs, now_ns: int) -> float:
+        age = inputs.age(source.key)
+        # What only another mode needs need not have spoken before the change: its silence counts from there.
+        return min(age, self._seconds_in_mode(now_ns)) if Mode.REAL not in source.modes else age
+
+    def stale_in_s(self, inputs: ArbiterInputs, now_ns: int) -> float:
+        """Seconds from this step until the first of the sources that are fresh will be stale; inf for none.
+
+        A step then, and the command is zero when the time-out is over, not a period of steps later.
+        """
+        left = [math.inf]
+        for source in SOURCES:
+            if self.mode in source.modes:
+                left.append(self._allowed_s(source, inputs) - self._source_age_s(source, inputs, now_ns))
+        left.append(self.config.timeouts.command - inputs.age("command"))
+        return min(one for one in left if one > 0.0)
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.allowed_s(source.key, inputs.usual.get(source.key) if source.steady else None)
@@ -574,7 +590,8 @@ class Arbiter:
 
     def _operator_missed(self, situation: _Situation) -> bool:
         """Whether the machine stopped because of the operator's silence, which goes on."""
-        return self._await_operator and situation.inputs.age("command") > self.config.timeouts.command
+        inputs = situation.inputs
+        return self._await_operator and (inputs.operator_gone or inputs.age("command") > self.config.timeouts.command)
 
     # Actions
 

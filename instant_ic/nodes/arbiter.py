@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -99,6 +100,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.rhythms = {source.key: Rhythm() for source in SOURCES if source.steady}
         self.page_rhythm = Rhythm()  # of the camera pictures at the operator's page
         self.heard: dict[str, int] = {}  # stamp of the newest message of each source
+        self.lost_told = False  # a step was made for the driver's loss
         self.page: tuple[int, int] = (-1, 0)  # newest camera picture there: its stamp, when it was told
         self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: its request, when it was told
         self.picture_delay_s: float | None = None  # from the camera to the operator
@@ -136,6 +138,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         _ = self.tf  # listens from now on
         self.timer(self.config.wall_period_s, self.update_walls)
         self.timer(1.0 / self.config.costmap.update_frequency, self.update_costmap)
+        self.cancel_extra: Callable[[], None] = lambda: None  # of a step between two timers
         self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: ArbiterNodeConfig) -> None:
@@ -213,6 +216,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.early = False
         self.tick()
 
+    def look_again(self, in_s: float) -> None:
+        """Has one step made in ``in_s`` where the next timer may be later: time-outs are exact."""
+        self.cancel_extra()
+        if in_s < 1.0 / self.config.rate_hz:
+            self.cancel_extra = self.timer(in_s + 0.001, self.tick).cancel
+
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
         now_ns = self.clock.steady_ns()
         if self.camera_ns is not None:
@@ -246,8 +255,11 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             else:
                 self.rhythms["view"] = Rhythm()  # in REAL views are asked for rarely
             self.view = view, now_ns
-        if new and self.arbiter.mode in (Mode.ENTERING, Mode.RETURNING):
-            self.tick()  # whether view and picture agree is true of now, not of the next timer
+        gone, told = self.operator_gone(), self.lost_told
+        self.lost_told = gone
+        if (new and self.arbiter.mode in (Mode.ENTERING, Mode.RETURNING)) or (gone and not told):
+            # Whether view and picture agree is true of now, not of the next timer; a lost driver is not waited with.
+            self.tick()
 
     def ages(self) -> dict[str, float]:
         shown, steady_ns = self.shown.message, self.clock.steady_ns()
@@ -457,6 +469,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             robot_pose=pose,
             robot_velocity=velocity,
             operator_command=_twist(self.operator),
+            operator_gone=self.operator_gone(),
             estop=self.estop,
             estop_button=self.button is not None and self.button[0],
             scan_points=points,
@@ -477,6 +490,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         self.cmd_vel.publish(twist_stamped(*decision.command, now_ns))
         self.tell(decision, inputs, now_ns)
+        self.look_again(self.arbiter.stale_in_s(inputs, self.clock.steady_ns()))
+
+    def operator_gone(self) -> bool:
+        """Whether the console has lost its driver since the newest command."""
+        shown, command = self.shown.message, self.operator.message
+        return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
     def carried_on(self, odometry: Odometry) -> NDArray[np.float64]:
         """Pose (3,) of the v-bot now: its message is up to a period old."""

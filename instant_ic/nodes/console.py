@@ -109,6 +109,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self._picture_stamp = 0
         self._view = (0, 0, pose_message(np.eye(4)), 0.0)  # newest: request, when it came, its pose, its delay in s
         self._told_ns = 0
+        self._lost_ns: int | None = None  # when the driver was lost last
         self._wanted: tuple[Matrix, Look] | None = None  # what the last view was asked for
         self._asked = (0, 0)  # the last request: its number, when it went out
         self._grids: dict[FrameKind, Any] = {}
@@ -155,6 +156,12 @@ class ConsoleNode(Node[ConsoleConfig]):
     def on_drive(self, linear: float, angular: float) -> None:
         """Gives a command on at once: a round by the node's thread would cost latency."""
         self.command_out.publish(twist_stamped(linear, angular, self.clock.now_ns()))
+
+    def on_operator(self, there: bool) -> None:
+        """Tells the arbiter at once that the driver is gone; that he is back it sees by his commands."""
+        if not there:
+            self._lost_ns = self.clock.steady_ns()
+            self.tell_shown()
 
     def on_estop(self, stop: bool) -> None:
         """Sets or releases the emergency stop."""
@@ -293,18 +300,20 @@ class ConsoleNode(Node[ConsoleConfig]):
         )
 
     def tell_shown(self) -> None:
-        """Tells the arbiter what there is to be shown, and how old it is."""
-        now_ns = self.clock.steady_ns()
+        """Tells the arbiter what there is to be shown, how old it is, and when the driver was lost. On any thread."""
+        now_ns, stamp, lost_ns = self.clock.steady_ns(), self.clock.now_ns(), self._lost_ns
         view_id, came_ns, pose, delay_s = self._view
         self.shown_out.publish(
             ShownPictures(
-                header=header("map", self.clock.now_ns()),
+                header=header("map", stamp),
                 picture_stamp=to_time(self._picture_stamp),
                 picture_age_s=math.inf if self._picture_ns is None else (now_ns - self._picture_ns) / 1e9,
                 view_id=view_id,
                 view_pose=pose,
                 view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
                 view_delay_s=delay_s,
+                # By the steady clock: after the machine's was set back, no command must look older than the loss.
+                operator_lost=to_time(0 if lost_ns is None else stamp - (now_ns - lost_ns)),
             )
         )
 

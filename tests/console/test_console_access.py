@@ -23,6 +23,9 @@ class Nobody:
     def on_drive(self, linear, angular):
         self.commands.append((linear, angular))
 
+    def on_operator(self, there):
+        pass
+
     def on_estop(self, stop):
         self.estops.append(stop)
 

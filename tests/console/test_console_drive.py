@@ -40,8 +40,8 @@ def test_fault_robot_runs_its_last_command_after_the_link_is_lost():
     first_zero = next(time for time, command in given if command == (0.0, 0.0))
     assert first_zero == 0.25
     assert [t for t, c in given if c == (0.3, 0.1)] == [0.05, 0.1, 0.15, 0.2]
-    # Zeros until nothing was heard for 0.4 s, then silence: the arbiter must see that nobody is there.
-    assert [t for t, c in given if c == (0.0, 0.0)] == [0.25, 0.3, 0.35]
+    # One zero, then silence: the arbiter must see that nobody is there.
+    assert [t for t, c in given if c == (0.0, 0.0)] == [0.25]
 
 
 def test_watchdog_counts_and_lets_a_fresh_command_through():
@@ -94,11 +94,12 @@ def test_an_idle_driver_is_told_by_zeros_as_long_as_its_page_beats():
     assert {command for _, command in given} == {(0.0, 0.0)}
     assert 10 <= len(given) <= 11  # keep_alive_hz
     assert gate.next_deadline(1.99) == pytest.approx(given[-1][0] + 0.1, abs=0.011)
-    # The last beat was at 1.9: 0.4 s later it is over, long before the lease is.
+    # The last beat was at 1.9: 0.25 s later it is over, long before the lease is.
     given = run(gate, 2.0, 3.0)
-    assert 2.19 < given[-1][0] < 2.31
+    assert 2.04 < given[-1][0] < 2.16
     assert gate.driver == 1
     assert gate.next_deadline(3.0) == pytest.approx(3.9)  # of the lease alone
+    assert not gate.driver_alive(3.49)
     assert gate.touch(1, 3.5)  # back
     assert gate.take_due(3.5) == (0.0, 0.0)
     assert not gate.touch(1, 3.6)
@@ -107,8 +108,31 @@ def test_an_idle_driver_is_told_by_zeros_as_long_as_its_page_beats():
 def test_a_page_that_nobody_looks_at_keeps_the_lease_but_is_nobody():
     gate = DriveGate(CONFIG)
     gate.request(1, 0.0)
-    assert [t for t, _ in beating(gate, 0.0, 5.0, away=True) if t >= 0.4] == []
+    assert gate.touch(1, 0.0, away=True)  # at once: the arbiter must hear of it
+    assert not gate.driver_alive(0.0)
+    assert beating(gate, 0.0, 5.0, away=True) == []
     assert gate.driver == 1
+
+
+def test_the_server_wakes_when_an_idle_drivers_beat_is_overdue():
+    gate = DriveGate(CONFIG)
+    gate.request(1, 0.0)
+    now, woken = 0.0, []
+    while (deadline := gate.next_deadline(now)) is not None and deadline < 1.9:
+        now = max(deadline, now + 0.001)
+        gate.take_due(now)
+        woken.append((round(now, 3), gate.driver_alive(now)))
+    assert woken[-1][0] < 0.4
+    assert all(alive for at, alive in woken if at < 0.25)
+    assert (0.25, False) in woken  # to the millisecond
+
+
+def test_a_zero_of_a_hidden_page_does_not_make_it_seen():
+    gate = driving_gate()
+    gate.touch(1, 0.1, away=True)
+    assert gate.receive(1, 2, 0.0, 0.0, 0.0, 0.11) is Verdict.ACCEPTED  # the page stops as it is hidden
+    assert gate.take_due(0.11) == (0.0, 0.0)
+    assert not gate.driver_alive(0.11)
 
 
 @pytest.mark.parametrize("leave", ["leave", "forget"])

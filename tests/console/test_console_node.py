@@ -23,6 +23,7 @@ from instant_ic.msg import (
     path_message,
     pose_message,
     pose_stamped,
+    stamp_ns,
     to_time,
     transform_message,
     twist_message,
@@ -120,7 +121,7 @@ def vspace_status(state):
     )  # fmt: skip
 
 
-def view_message(bus, request_id, fov=1.8):
+def view_message(bus, request_id, fov=1.8, near_m=0.7):
     return RenderedView(
         header=header("map", bus.clock.now_ns()),
         request_id=request_id,
@@ -133,6 +134,8 @@ def view_message(bus, request_id, fov=1.8):
         render_ms=math.nan,
         image=compressed_image_message(b"VIEW", "map", bus.clock.now_ns()),
         confidence_png=np.frombuffer(b"MASK", np.uint8),
+        depth_near_m=near_m,
+        depth_png=np.frombuffer(b"DEPTH", np.uint8),
     )
 
 
@@ -277,6 +280,22 @@ def test_a_watchers_view_goes_to_him_alone_and_is_not_told_to_the_arbiter(setup)
     assert len(mine) in (views.count(7), views.count(7) + 1)
     told = {int(message.view_id) for message in bus.messages("/view/shown")}
     assert not told & {int(request.id) for request in mine}
+
+
+def test_the_loss_of_the_driver_is_told_with_its_time_at_once(setup):
+    bus, node, _ = setup
+    publish_tree(bus)
+    bus.advance(0.1)
+    assert stamp_ns(bus.last("/view/shown").operator_lost) == 0
+    node.on_operator(True)
+    node.on_operator(False)
+    lost_ns = bus.clock.now_ns()
+    assert stamp_ns(bus.last("/view/shown").operator_lost) == lost_ns  # at once
+    bus.advance(0.2)
+    node.on_operator(True)
+    bus.advance(0.1)
+    assert stamp_ns(bus.last("/view/shown").operator_lost) == lost_ns  # and on, for whoever missed it
+    assert stamp_ns(bus.last("/view/shown")) > lost_ns
 
 
 def test_the_mask_of_a_view_goes_to_the_page(setup):

@@ -186,6 +186,9 @@ class Backend:
     def on_drive(self, linear, angular):
         pass
 
+    def on_operator(self, there):
+        pass
+
     def on_estop(self, stop):
         self._add(("estop", stop))
 

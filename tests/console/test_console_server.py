@@ -20,11 +20,14 @@ class Recorder:
     """Backend that keeps what it is told."""
 
     def __init__(self):
-        self.commands, self.estops, self.looks = [], [], []
+        self.commands, self.estops, self.looks, self.operator = [], [], [], []
         self._news = threading.Condition()
 
     def on_drive(self, linear, angular):
         self._add(self.commands, (linear, angular))
+
+    def on_operator(self, there):
+        self._add(self.operator, there)
 
     def on_estop(self, stop):
         self._add(self.estops, stop)
@@ -201,9 +204,39 @@ def test_zeros_end_when_the_drivers_page_beats_no_more_and_come_back_with_it(ser
             await asyncio.sleep(0.3)
             assert len(backend.commands) == count
             await client.send({"type": "ping", "client_ms": 0})
-            await in_thread(backend.wait, lambda b: len(b.commands) >= count + 2)
+            await in_thread(backend.wait, lambda b: len(b.commands) > count)
 
     asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("how", ["silent", "hidden", "given back", "cut"])
+def test_the_loss_of_the_driver_is_told_at_once(serve, how):
+    """Not by the silence alone: that has to last before it counts. The page's beats are made by the test."""
+    server, backend = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await in_thread(backend.wait, lambda b: b.operator[:1] == [True])
+            client._tasks.pop().cancel()  # the beats
+            await silent_for(backend, WAIT_S)
+            assert backend.operator[-1] is False
+            if how != "silent":
+                told = len(backend.operator)
+                await client.send({"type": "ping", "client_ms": 0})
+                await in_thread(backend.wait, lambda b: len(b.operator) > told)
+            if how == "hidden":
+                await client.send({"type": "ping", "client_ms": 0, "away": True})
+            elif how == "given back":
+                await client.send({"type": "yield"})
+            elif how == "cut":
+                client._socket._response.connection.transport.abort()
+            await in_thread(backend.wait, lambda b: b.operator[-1] is False)
+            await client.close()
+
+    asyncio.run(scenario())
+    # Each turn once.
+    assert backend.operator == [True, False] * (1 if how == "silent" else 2)
 
 
 def test_driving_client_repeats_its_command_and_stops(serve):

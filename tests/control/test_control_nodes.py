@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor
 from instant_ic.bus import OK, WARN, params
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.transport import Received
+from instant_ic.console.drive import DriveConfig, DriveGate
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import (
@@ -89,7 +91,7 @@ class Stack:
         self.contact = False
         self.page = True
         """Whether the operator has a page, with views of the v-bot two steps old; none comes with "views" in silent."""
-        self.picture_ns = self.view_ns = 0
+        self.picture_ns = self.view_ns = self.lost_ns = 0
         self.views: list[tuple[int, object]] = []
 
     @property
@@ -101,6 +103,16 @@ class Stack:
             self.bus.publish(topic, message)
 
     def step(self, command: tuple[float, float] | None) -> ControlState:
+        now = self.now
+        self.sense()
+        if command is not None:
+            self.send("/operator/cmd_vel", twist_stamped(*command, now))
+        self.bus.advance_to(now + STEP_NS)
+        self.move()
+        return self.bus.last("/ic/state")
+
+    def sense(self) -> None:
+        """All but the operator's command."""
         now, map_from_base = self.now, matrix(self.base.pose)
         if "/tf" not in self.silent:
             self.bus.publish(
@@ -129,13 +141,11 @@ class Stack:
             self.send("/vspace/status", self.status(now))
         if self.page:
             self.show(now)
-        if command is not None:
-            self.send("/operator/cmd_vel", twist_stamped(*command, now))
-        self.bus.advance_to(now + STEP_NS)
+
+    def move(self) -> None:
         self.k += 1
         self.base.step(twist_values(self.bus.last("/cmd_vel")), 0.05)
         self.contact |= self.world.contact(self.base.pose)
-        return self.bus.last("/ic/state")
 
     def show(self, now: int) -> None:
         """What the console tells of the pictures that the operator has."""
@@ -155,6 +165,7 @@ class Stack:
                 view_pose=pose,
                 view_age_s=(now - self.view_ns) / 1e9 if self.views else math.inf,
                 view_delay_s=(now - asked_ns) / 1e9,
+                operator_lost=to_time(self.lost_ns),
             ),
         )
 
@@ -398,9 +409,79 @@ def test_a_lost_operator_stops_the_robot_in_virtual_mode_within_its_time() -> No
     assert np.abs(stack.base.pose - stood).max() > 0.01  # it may have to turn first
     assert stack.drive(3.0, None)[-1].mode == ControlState.STOPPED
     stood = stack.base.pose.copy()
-    assert "the operator's link is lost" in stack.drive(20.0, None)[-1].reason
+    assert "the operator's link is lost" in stack.drive(3.0, None)[-1].reason
     np.testing.assert_allclose(stack.base.pose, stood, atol=1e-12)
     assert stack.drive(0.2, (0.0, 0.0))[-1].mode == ControlState.REAL
+
+
+def lose_the_operator(stack: Stack, beats_end_s: float, hidden: bool = False, console_dies: bool = False) -> float:
+    """Runs on in VIRTUAL with hands off and the console's gate before the arbiter; seconds to the zero command.
+
+    Counted from the page's last beat, ``beats_end_s`` from now; with ``console_dies`` from the last that the console
+    said. All in simulated time, in steps of a millisecond.
+    """
+    gate, began_ns, last_s, there = DriveGate(DriveConfig()), stack.now, 0.0, True
+    gate.request(1, 0.0)
+    for ms in range(round(1000 * beats_end_s) + 1000):
+        now_s = ms / 1000
+        dead = console_dies and now_s > beats_end_s
+        if now_s <= beats_end_s and ms % 50 == 0:
+            last_s = now_s
+            gate.touch(1, now_s)
+        if hidden and now_s == beats_end_s:
+            last_s = now_s
+            gate.touch(1, now_s, away=True)
+        command = None if dead else gate.take_due(now_s)
+        if command is not None:
+            last_s = now_s if console_dies else last_s
+            stack.send("/operator/cmd_vel", twist_stamped(*command, stack.now))
+        if not dead and gate.driver_alive(now_s) != there:
+            there = not there
+            stack.lost_ns = 0 if there else stack.now
+            stack.show(stack.now)
+        if ms % 50 == 0:
+            stack.page = not dead
+            stack.sense()
+        stack.bus.advance_to(began_ns + ms * 1_000_000)
+        if ms % 50 == 0:
+            stack.move()
+        if now_s > beats_end_s and twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0):
+            return now_s - last_s
+    raise AssertionError("the robot is never told to stand")
+
+
+@pytest.fixture(scope="module")
+def virtual_stack() -> Iterator[Stack]:
+    """One that is in the virtual space, a metre before the box; for tests that leave it there."""
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, None)
+    for _ in range(200):
+        if stack.step((0.4, 0.0)).mode == ControlState.VIRTUAL:
+            break
+    yield stack
+    stack.bus.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "beats_end_s", "most_s"),
+    [({}, 0.4, 0.26), ({}, 0.449, 0.26), ({"hidden": True}, 0.43, 0.005), ({"console_dies": True}, 0.43, 0.305)],
+    ids=["page falls silent", "page falls silent at another time", "page is hidden", "console dies"],
+)
+def test_the_robot_stands_within_0_3_s_of_the_loss_of_the_operators_page(
+    virtual_stack: Stack, fault: dict[str, bool], beats_end_s: float, most_s: float
+) -> None:
+    stack = virtual_stack
+    stack.lost_ns, stack.page = 0, True
+    stack.drive(0.3, (0.4, 0.0))
+    assert twist_values(stack.bus.last("/cmd_vel")) != (0.0, 0.0)
+    assert lose_the_operator(stack, beats_end_s, **fault) <= most_s
+    state = stack.bus.last("/ic/state")
+    assert state.mode == ControlState.VIRTUAL
+    assert "the operator's link is lost" in state.reason
+    assert state.vbot_action == ControlState.VBOT_HELD
+    # Back: the next command, and it goes on.
+    stack.page = True
+    assert twist_values(stack.drive(0.3, (0.4, 0.0))[-1].applied_command) != (0.0, 0.0)
 
 
 def test_diagnoses_of_the_start_are_cleared() -> None:

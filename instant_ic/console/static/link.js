@@ -1,6 +1,6 @@
 // The WebSocket: reconnects, measures round trip and clock offset, decodes binary frames.
 
-const PING_MS = 100; // the server takes a driver who is silent for beat_timeout_s (0.4 s) as gone
+const PING_MS = 50; // the server takes a driver who is silent for beat_timeout_s (0.25 s) as gone
 const SILENCE_MS = 1000; // nothing heard for this long: the link counts as lost
 const PREFIX_BYTES = 12;
 const VERSION = 1;
@@ -27,6 +27,9 @@ export class Link extends EventTarget {
     this._sequence = 0;
     this._connect();
     setInterval(() => this._beat(), PING_MS);
+    // At once: hidden pages beat once a second or not at all.
+    document.addEventListener("visibilitychange", () => this._ping());
+    window.addEventListener("pagehide", () => this._ping(true));
   }
 
   /** The server's clock now, ms; null before the first answer. */
@@ -36,8 +39,8 @@ export class Link extends EventTarget {
 
   /** How good the link is: "good", "fair", "poor"; null while it is not known. By its round trips, the usual and the slow. */
   get quality() {
-    if (!this.connected || this._samples.length < 5) return null;
-    const sorted = this._samples.slice(-30).map((sample) => sample.roundTrip).sort((a, b) => a - b);
+    if (!this.connected || this._samples.length < 10) return null;
+    const sorted = this._samples.slice(-60).map((sample) => sample.roundTrip).sort((a, b) => a - b);
     const usual = sorted[sorted.length >> 1], slow = sorted[Math.floor(sorted.length * 0.9)];
     if (usual <= 80 && slow <= 150) return "good";
     return usual <= 200 && slow <= 400 ? "fair" : "poor";
@@ -117,8 +120,8 @@ export class Link extends EventTarget {
     this._ping();
   }
 
-  _ping() {
-    this.send({ type: "ping", client_ms: performance.now(), away: document.hidden || this.away });
+  _ping(leaving = false) {
+    this.send({ type: "ping", client_ms: performance.now(), away: leaving || document.hidden || this.away });
   }
 
   _receive(data) {
@@ -137,10 +140,10 @@ export class Link extends EventTarget {
     const now = performance.now();
     const roundTrip = now - message.client_ms;
     this._samples.push({ roundTrip, offset: message.server_ms + roundTrip / 2 - now });
-    if (this._samples.length > 50) this._samples.shift();
+    if (this._samples.length > 100) this._samples.shift();
     // The quickest answer was delayed least, so its offset is the truest.
     this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
-    const recent = this._samples.slice(-20).map((s) => s.roundTrip).sort((a, b) => a - b);
+    const recent = this._samples.slice(-40).map((s) => s.roundTrip).sort((a, b) => a - b);
     this.roundTripMs = recent[recent.length >> 1];
     this.commandAgeMs = message.command_age_ms;
     this.commandHz = message.command_hz;
