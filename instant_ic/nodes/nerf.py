@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.depth.keyframes import decode_sigma
+from instant_ic.geometry.depth_picture import encode_depth
 from instant_ic.msg import (
     CompressedImage,
     Keyframe,
@@ -94,6 +95,8 @@ class Outcome:
     jpeg: bytes = b""
     made: Any = None
     mask_png: bytes = b""
+    depth_png: bytes = b""
+    depth_near_m: float = 0.0
     elapsed_ms: float = 0.0
     refused: str = ""
     error: Exception | None = None
@@ -285,7 +288,9 @@ class NerfNode(Node[NerfConfig]):
             view = space.render(pose_matrix(request.pose), request.width, request.height, request.fov_rad)
             quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality]
             _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], quality)
-            return Outcome(job, view=view, jpeg=jpeg.tobytes(), mask_png=view.mask_png())
+            depth_png, near_m = encode_depth(view.depth_m, request.fov_rad)
+            pictures = {"jpeg": jpeg.tobytes(), "mask_png": view.mask_png(), "depth_png": depth_png}
+            return Outcome(job, view=view, depth_near_m=near_m, **pictures)
         return Outcome(job)
 
     def yield_to_others(self) -> None:
@@ -393,6 +398,8 @@ class NerfNode(Node[NerfConfig]):
                 render_ms=self.render_ms,
                 image=image,
                 confidence_png=np.frombuffer(outcome.mask_png, np.uint8),
+                depth_near_m=outcome.depth_near_m,
+                depth_png=np.frombuffer(outcome.depth_png, np.uint8),
             )
         )
         self.image_out.publish(image)

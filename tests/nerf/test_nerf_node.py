@@ -9,6 +9,7 @@ import pytest
 
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.geometry.depth_picture import decode_depth, encode_depth
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import (
     Keyframe,
@@ -113,8 +114,13 @@ def test_the_first_view_comes_before_any_training(bus):
     bus.publish("/view/request", request_message(1))
     (view,) = bus.messages("/vspace/view")
     picture = cv2.imdecode(view.image.data, cv2.IMREAD_COLOR)[..., ::-1]
-    truth = box_room.perspective(CAMERA, 160, 90, 1.57).rgb
-    assert 10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2)) > 20
+    true = box_room.perspective(CAMERA, 160, 90, 1.57)
+    assert 10 * np.log10(255**2 / np.mean((picture.astype(float) - true.rgb) ** 2)) > 20
+    # The page gets its depth along, small; by a hundredth of the range, and but for a few edges.
+    inverse = decode_depth(view.depth_png.tobytes(), view.depth_near_m)
+    assert inverse.shape == (54, 96)
+    there = decode_depth(*encode_depth(true.depth_m, 1.57))
+    assert np.quantile(np.abs(inverse - there), 0.9) < 0.02 * there.max()
     status = bus.last("/vspace/status")
     assert (status.state, status.iterations) == (TRAINING, 0)
     assert "100% warped panorama" in status.message
@@ -237,6 +243,7 @@ def test_a_pose_far_off_is_drawn_without_confidence_and_told(bus):
     assert (level, "far off" in words) == (1, True)
     view = bus.last("/vspace/view")
     assert (view.request_id, view.confidence) == (2, 0)
+    assert (len(view.depth_png), view.depth_near_m) == (0, 0)
     bus.advance(0.6)
     far = bus.last("/vspace/status")
     assert far.unseen_share == 1
