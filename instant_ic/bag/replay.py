@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import inspect
 import threading
@@ -110,12 +111,19 @@ def shipped_parameter_files(name: str) -> list[Path]:
         if file.name in ("sim.yaml", "fleet_sim.yaml"):  # the fleet's lowers rates, so that many robots fit in
             continue
         try:
-            content = yaml.safe_load(file.read_text())
+            named = name in _sections(file, file.stat().st_mtime_ns)
         except (OSError, yaml.YAMLError):
             continue  # a broken file that this node may not even use: whoever names it gets the message
-        if isinstance(content, dict) and name in content:
+        if named:
             found.append(file)
     return found
+
+
+@functools.lru_cache(maxsize=64)
+def _sections(file: Path, changed_ns: int) -> frozenset[str]:
+    """Nodes that a parameter file names; read again when it has changed. Reading takes longer than making a node."""
+    content = yaml.safe_load(file.read_text())
+    return frozenset(content) if isinstance(content, dict) else frozenset()
 
 
 def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequence[str]) -> ReplayNode:

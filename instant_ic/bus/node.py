@@ -625,6 +625,11 @@ class Node(Generic[ConfigT]):
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
+    def due(self) -> bool:
+        """Whether results of workers or timers wait to be run; for the lockstep bus."""
+        timer_ns = self.next_timer_ns()
+        return bool(self._soon) or (timer_ns is not None and timer_ns <= self.clock.steady_ns())
+
     def _guard(self, what: str, function: Callable[..., None], *args: Any) -> None:
         self._running = (what, time.monotonic())
         try:

@@ -93,6 +93,8 @@ class TransformBuffer:
                 known = ", ".join(sorted(self._frames())) or "none"
                 raise TransformError(f"no path from {source} to {target} (frames known: {known})")
             common_from_source = self._product(up_source[: up_source.index(common)], stamp_ns)
+            if up_target[0] == common:  # most often: nothing to go down again
+                return common_from_source.copy()
             common_from_target = self._product(up_target[: up_target.index(common)], stamp_ns)
         return inverse(common_from_target) @ common_from_source
 
@@ -117,8 +119,10 @@ class TransformBuffer:
         return chain
 
     def _product(self, chain: list[str], stamp_ns: int | None) -> Matrix:
-        ancestor_from_frame = np.eye(4)
-        for frame in chain:
+        if not chain:
+            return np.eye(4)
+        ancestor_from_frame = self._at(chain[0], stamp_ns)
+        for frame in chain[1:]:
             ancestor_from_frame = self._at(frame, stamp_ns) @ ancestor_from_frame
         return ancestor_from_frame
 
