@@ -23,7 +23,8 @@ from instant_ic.console.gridimage import GridImage, grey_png, grid_image
 from instant_ic.console.protocol import FrameKind
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.server import ConsoleServer, ServerConfig
-from instant_ic.console.view import Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.console.view import Lead, LeadConfig, Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.geometry.depth_picture import encode_depth
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix, quaternion_from_matrix, wrap_angle
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
 
@@ -81,7 +82,7 @@ class Demo:
         page_values: dict[str, float] | None = None,
     ) -> None:
         self.config = config or DemoConfig()
-        page = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
+        page = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M], "lead_max_m": LeadConfig().max_m}
         self.server = ConsoleServer(self, server_config, page | (page_values or {}))
         self.commands: list[tuple[float, float]] = []
         self.look = Look()
@@ -101,6 +102,7 @@ class Demo:
         self._command = (0.0, 0.0)
         self._placing = threading.Lock()
         self._transitions = 0
+        self.lead = Lead(LeadConfig())
         self._views = ViewScheduler(self.config.view)
         self._slow_due = 0.0
         self._noise = np.random.default_rng(0)
@@ -182,7 +184,7 @@ class Demo:
             if now >= due and self.pictures:
                 due = now + 1.0 / self.config.panorama_hz
                 self._send_panorama()
-            if self._views.due(now, virtual=self.mode == "virtual"):
+            if self.pictures and self._views.due(now, virtual=self.mode == "virtual"):
                 self._send_view(self._views.asked(now))
 
     def place(self, x: float, y: float, yaw: float) -> None:
@@ -262,6 +264,7 @@ class Demo:
                 "at_ms": self.server.now_ms(),
                 "mode": self.mode,
                 "shown": "virtual" if self.mode == "virtual" else "real",
+                "lead": self.lead.step(now, self.mode == "virtual"),
                 "reason": self.reason,
                 "estop": self.estop or self.button,
                 "blocked": False,
@@ -308,13 +311,17 @@ class Demo:
             )
             mask = _mask(seen)
         picture = np.clip(picture * np.array(self.tint), 0, 255).astype(np.uint8)
+        depth, near_m = encode_depth(demo_world.distances(_position(camera), directions), shape.fov_rad)
         header = {
             "captured_ms": captured_ms,
             "q": quaternion_from_matrix(camera).tolist(),
             "p": camera[:3, 3].tolist(),
+            "mount": [0.0, 0.0, CAMERA_HEIGHT_M],
             "fov": shape.fov_rad,
             "confidence": 0.9,
             "mask": base64.b64encode(mask).decode("ascii"),
+            "depth": base64.b64encode(depth).decode("ascii"),
+            "depth_near_m": near_m,
             "render_ms": 20.0,
             "request_id": request_id,
         }

@@ -16,6 +16,8 @@ from ..ranges import NotNegative, Positive, Range, check_ranges
 MAX_FOV_RAD = math.radians(150)
 WATCHER_APART_RAD = math.radians(15)
 """Who looks elsewhere than the driver by less has enough of the driver's view."""
+ELSEWHERE_M = 1.0
+"""A view from farther off is no earlier look at the same place: it is shown as it was drawn."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,17 @@ class ViewConfig:
     )
     real_rate_hz: NotNegative = 1.0  # while the camera is shown, to keep the renderer warm; 0 = none
     response_timeout_s: Positive = 0.5  # a request without an answer counts as lost after this
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@dataclass(frozen=True)
+class LeadConfig:
+    """Rendered views shown from where the v-bot is now (``geometry.depth_picture``)."""
+
+    max_m: NotNegative = 0.3  # at most so far from where a view was drawn for; 0: each as it was drawn
+    seconds: NotNegative = 0.8  # after the switch until the v-bot's place is shown, and before the return back
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -84,6 +97,35 @@ def view_shape(look: Look, config: ViewConfig) -> ViewShape:
     # Where the aspect was clamped or rounded, the wider need decides.
     fov = 2 * math.atan(max(half_width, half_height * width / height))
     return ViewShape(fov, width, height)
+
+
+class Lead:
+    """How far a rendered view is shown on its way from the place that it was drawn for to the v-bot's place now.
+
+    0 at a switch, where every picture is shown from where it was made, so that nothing jumps; 1 while the v-bot drives.
+    """
+
+    def __init__(self, config: LeadConfig) -> None:
+        self.config = config
+        self.share = 0.0
+        self._at_s: float | None = None
+
+    def step(self, now_s: float, driven: bool) -> float:
+        """The share now, on the steady clock; ``driven``: the operator drives the v-bot."""
+        passed_s = 0.0 if self._at_s is None else now_s - self._at_s
+        self._at_s = now_s
+        step = passed_s / self.config.seconds if self.config.seconds > 0 else 1.0
+        self.share = min(self.share + step, 1.0) if driven else max(self.share - step, 0.0)
+        return self.share
+
+    def displayed(self, place: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where the page shows a view from that was drawn for ``place``, with the v-bot's camera at ``now``, (N,) m."""
+        way = now - place
+        far = float(np.linalg.norm(way))
+        if far > ELSEWHERE_M or far == 0.0:
+            return place
+        shown: NDArray[np.float64] = place + min(self.share, self.config.max_m / far) * way
+        return shown
 
 
 class ViewScheduler:

@@ -11,7 +11,17 @@ import numpy as np
 
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
-from instant_ic.console import ConsoleError, ConsoleServer, FrameKind, Look, ServerConfig, ViewConfig, ViewScheduler
+from instant_ic.console import (
+    ConsoleError,
+    ConsoleServer,
+    FrameKind,
+    Lead,
+    LeadConfig,
+    Look,
+    ServerConfig,
+    ViewConfig,
+    ViewScheduler,
+)
 from instant_ic.console.gridimage import grey_png, grid_image
 from instant_ic.console.recording import RecorderError, RecordingDesk
 from instant_ic.console.view import view_shape
@@ -60,6 +70,7 @@ class ConsoleConfig:
 
     server: ServerConfig = field(default_factory=ServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
+    lead: LeadConfig = field(default_factory=LeadConfig)
     state_rate_hz: Positive = 20.0
     map_rate_hz: Positive = 2.0
     dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0
@@ -107,7 +118,10 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.mode = self.shown = "none"
         self._picture_ns: int | None = None
         self._picture_stamp = 0
-        self._view = (0, 0, pose_message(np.eye(4)), 0.0)  # newest: request, when it came, its pose, its delay in s
+        self._view = (0, 0, 0.0)  # the driver's newest: request, when it came, its delay in s
+        self._drawn: tuple[Matrix, bool] | None = None  # its pose, and whether its depth came along
+        self._displayed = pose_message(np.eye(4))  # its pose as the page shows it
+        self.lead = Lead(config.lead)
         self._told_ns = 0
         self._lost_ns: int | None = None  # when the driver was lost last
         self._wanted: tuple[Matrix, Look] | None = None  # what the last view was asked for
@@ -121,6 +135,7 @@ class ConsoleNode(Node[ConsoleConfig]):
             "dissolve_ms": config.dissolve_ms,
             "ease_ms": config.ease_ms,
             "colour_release_s": config.colour_release_s,
+            "lead_max_m": config.lead.max_m,
             "footprint": [config.footprint_length_m, config.footprint_width_m],
             "camera": [0.0, 0.0, config.camera_height_m],
         }
@@ -230,13 +245,19 @@ class ConsoleNode(Node[ConsoleConfig]):
         if not (0 < message.fov_rad < math.pi):
             self.diagnose("view", ERROR, f"rendered view with a field of view of {message.fov_rad:.3g} rad: dropped")
             return
+        near_m = float(message.depth_near_m)
+        knows = math.isfinite(near_m) and near_m > 0
+        words = f"views whose depth picture has a range of {near_m:.3g} m: each is shown from where it was drawn"
+        self.check("depth", knows or not len(message.depth_png), words)
         came_ns = self.clock.steady_ns()
         self.views.answered(int(message.request_id), came_ns / 1e9)
         page = self.views.page_of(int(message.request_id))
         if page is None:
             number, asked_ns = self._asked
             delay_s = (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
-            self._view = int(message.request_id), came_ns, message.pose, delay_s
+            self._view = int(message.request_id), came_ns, delay_s
+            self._drawn = camera, knows and len(message.depth_png) > 0
+            self._displayed = self.displayed()
             self.tell_shown()
         self.server.send_frame(
             FrameKind.VIEW,
@@ -247,6 +268,9 @@ class ConsoleNode(Node[ConsoleConfig]):
                 "fov": float(message.fov_rad),
                 "confidence": _finite(message.confidence),
                 "mask": base64.b64encode(bytes(message.confidence_png)).decode("ascii"),
+                "depth": base64.b64encode(bytes(message.depth_png)).decode("ascii") if knows else "",
+                "depth_near_m": near_m if knows else 0.0,
+                "mount": self.camera_place()[:3, 3].tolist(),
                 "render_ms": _finite(message.render_ms),
                 "request_id": int(message.request_id),
             },
@@ -302,20 +326,31 @@ class ConsoleNode(Node[ConsoleConfig]):
     def tell_shown(self) -> None:
         """Tells the arbiter what there is to be shown, how old it is, and when the driver was lost. On any thread."""
         now_ns, stamp, lost_ns = self.clock.steady_ns(), self.clock.now_ns(), self._lost_ns
-        view_id, came_ns, pose, delay_s = self._view
+        view_id, came_ns, delay_s = self._view
         self.shown_out.publish(
             ShownPictures(
                 header=header("map", stamp),
                 picture_stamp=to_time(self._picture_stamp),
                 picture_age_s=math.inf if self._picture_ns is None else (now_ns - self._picture_ns) / 1e9,
                 view_id=view_id,
-                view_pose=pose,
+                view_pose=self._displayed,
                 view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
                 view_delay_s=delay_s,
                 # By the steady clock: after the machine's was set back, no command must look older than the loss.
                 operator_lost=to_time(0 if lost_ns is None else stamp - (now_ns - lost_ns)),
             )
         )
+
+    def displayed(self) -> Any:
+        """Pose, as a message, that the page shows the newest view from: on its way to where the v-bot is now."""
+        if self._drawn is None:
+            return self._displayed
+        camera, knows_depth = self._drawn
+        shown, vbot = camera.copy(), self.vbot_pose()
+        if knows_depth and vbot is not None and self.lead.share > 0:
+            now = (vbot @ self.camera_place())[:2, 3]
+            shown[:2, 3] = self.lead.displayed(camera[:2, 3], now)
+        return pose_message(shown)
 
     def with_vbot(self) -> bool:
         """Whether the v-bot's view is shown, or about to be."""
@@ -354,10 +389,13 @@ class ConsoleNode(Node[ConsoleConfig]):
             self.server.show(FrameKind.VIEW, FrameKind.PANORAMA)
         else:
             self.server.show(FrameKind.VIEW if virtual else FrameKind.PANORAMA)
+        lead = self.lead.step(self._told_ns / 1e9, self.mode == "virtual")
+        self._displayed = self.displayed()
         state: dict[str, Any] = {
             "at_ms": self.server.now_ms(),
             "mode": self.mode,
             "shown": self.shown,
+            "lead": round(lead, 3),
             "robot": _planar(self.robot_pose()),
             "vbot": _planar(self.vbot_pose()) if self.with_vbot() else None,
             "twist": [_finite(value) or 0.0 for value in self.shown_twist()],

@@ -289,8 +289,8 @@ class NerfNode(Node[NerfConfig]):
             quality = [cv2.IMWRITE_JPEG_QUALITY, self.config.jpeg_quality]
             _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], quality)
             depth_png, near_m = encode_depth(view.depth_m, request.fov_rad)
-            pictures = {"jpeg": jpeg.tobytes(), "mask_png": view.mask_png(), "depth_png": depth_png}
-            return Outcome(job, view=view, depth_near_m=near_m, **pictures)
+            mask_png = view.mask_png()
+            return Outcome(job, None, view, jpeg.tobytes(), None, mask_png, depth_png, near_m)
         return Outcome(job)
 
     def yield_to_others(self) -> None:

@@ -34,7 +34,7 @@ const pictures = new Pictures(viewer, link);
 const minimap = new MiniMap(byId("map-canvas"));
 const recording = new Recording(link, drive);
 
-let page = { footprint: [0.6, 0.5], camera: [0, 0, 1.2], dissolve_ms: 250, ease_ms: 400, colour_release_s: 6 };
+let page = { footprint: [0.6, 0.5], camera: [0, 0, 1.2], dissolve_ms: 250, ease_ms: 400, colour_release_s: 6, lead_max_m: 0 };
 let state = null, session = { driver: "none", clients: 0, estop: false };
 let plan = { trajectory: [], path: [], subgoal: null };
 let everConnected = false;
@@ -77,6 +77,7 @@ link.addEventListener("message", ({ detail: message }) => {
       document.body.dataset.mayDrive = mayDrive;
       pictures.dissolveMs = reducedMotion.matches ? 0 : page.dissolve_ms;
       pictures.motion.easeMs = reducedMotion.matches ? 0 : page.ease_ms;
+      pictures.leadMaxM = page.lead_max_m;
       pictures.colourReleaseMs = 1000 * page.colour_release_s;
       drive.limits = { linear: message.max_linear, angular: message.max_angular };
       break;
@@ -272,6 +273,7 @@ function sendLook(tanHalf, now) {
 
 function cameraPosition() {
   if (!pictures.motion.pose) return null;
+  if (pictures.blend > 0.5 && pictures.place) return [...pictures.place, page.camera[2]];
   const [x, y, yaw] = pictures.motion.pose, [cx, cy, cz] = page.camera;
   return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
 }
@@ -306,15 +308,17 @@ function frame(now) {
 
 /** Draws where a picture came, the direction changed by half a pixel, or the window by any. */
 function drawPicture(scene) {
-  const key = rounded([...scene.mapFromLook, look.yaw, look.vfov], 4);
+  const moved = scene.blend > 0 ? rounded(scene.moved, 3) : "";
+  const key = rounded([...scene.mapFromLook, look.yaw, look.vfov], 4) + moved;
   const resized = fit(picture, viewer.slow ? SLOW_PIXELS : 1);
   if (viewer.lost || !(resized || pictures.changed || key !== lastPicture)) return;
   lastPicture = key;
   pictures.changed = false;
   viewer.draw(scene);
   // For whoever measures: which picture was drawn, and from where.
-  const { motion, view, panorama } = pictures, shown = shows(state);
-  dispatchEvent(new CustomEvent("drawn", { detail: { shown, pose: motion.pose, blend: scene.blend, view, panorama } }));
+  const { motion, view, panorama, place } = pictures, shown = shows(state);
+  const detail = { shown, pose: motion.pose, blend: scene.blend, view, panorama, place };
+  dispatchEvent(new CustomEvent("drawn", { detail }));
 }
 
 function drawOverlay(scene, tanHalf) {

@@ -1,9 +1,10 @@
 // The feedback picture without WebGL: a crop of the panorama (cylinder in place of a plane, so lines bend
-// a little), and the rendered view moved and scaled. Aims right in the middle of the picture.
+// a little), and the rendered view moved and scaled, as a whole where the camera has moved on. Aims right in the middle
+// of the picture.
 
 import { plain } from "./colour.js";
 import { rotate } from "./math.js";
-import { cells, SAMPLE, SAMPLE_FINE } from "./viewer.js";
+import { cells, MOST_PARALLAX, SAMPLE, SAMPLE_FINE } from "./viewer.js";
 
 const SOFT_PIXELS = 16; // of the view, to one of its blurred copy
 
@@ -16,15 +17,17 @@ export class FlatViewer {
     this.lost = false;
     this._panorama = null; // {bitmap, mask, finished, colour}
     this._view = null;
+    this._inverse = 0; // mean of the view's depth, 1/m; 0: not known
   }
 
   setPanorama(bitmap) {
     this._panorama = renewed(this._panorama, bitmap, null);
   }
 
-  /** `mask`: small grey picture of where the view is sure; null: everywhere. */
-  setView(bitmap, mask = null) {
+  /** See GlViewer.setView; of the depth picture the mean counts. */
+  setView(bitmap, mask = null, depth = null) {
     this._view = renewed(this._view, bitmap, mask);
+    this._inverse = depth ? meanLevel(depth.picture) / depth.near_m : 0;
   }
 
   draw(scene) {
@@ -78,12 +81,26 @@ export class FlatViewer {
     // Where the rendered view's axis stands in the look frame (viewFromLook's first row).
     const axis = scene.viewFromLook.slice(0, 3);
     if (axis[0] <= 0.1) return;
-    const viewWidth = (width * scene.viewTanHalf[0]) / scene.tanHalf[0];
-    const viewHeight = (height * scene.viewTanHalf[1]) / scene.tanHalf[1];
-    const x = width / 2 - ((axis[1] / axis[0]) * width) / 2 / scene.tanHalf[0];
-    const y = height / 2 - ((axis[2] / axis[0]) * height) / 2 / scene.tanHalf[1];
+    const [forward, left, up] = scene.moved ?? [0, 0, 0];
+    const inverse = Math.min(this._inverse, MOST_PARALLAX / Math.max(Math.hypot(forward, left, up), 1e-9));
+    const nearer = 1 / (1 - forward * inverse);
+    const viewWidth = (nearer * width * scene.viewTanHalf[0]) / scene.tanHalf[0];
+    const viewHeight = (nearer * height * scene.viewTanHalf[1]) / scene.tanHalf[1];
+    const aside = (value, moved) => value / axis[0] - moved * inverse * nearer;
+    const x = width / 2 - (aside(axis[1], left) * width) / 2 / scene.tanHalf[0];
+    const y = height / 2 - (aside(axis[2], up) * height) / 2 / scene.tanHalf[1];
     context.drawImage(finished(this._view, scene.viewColour), x - viewWidth / 2, y - viewHeight / 2, viewWidth, viewHeight);
   }
+}
+
+/** Mean level of a grey picture, 0..1. */
+function meanLevel(picture) {
+  const context = new OffscreenCanvas(picture.width, picture.height).getContext("2d", { willReadFrequently: true });
+  context.drawImage(picture, 0, 0);
+  const { data } = context.getImageData(0, 0, picture.width, picture.height);
+  let total = 0;
+  for (let i = 0; i < data.length; i += 4) total += data[i];
+  return total / (255 * data.length / 4);
 }
 
 function renewed(old, bitmap, mask) {

@@ -3,7 +3,7 @@
 import { clamp, wrapAngle } from "./math.js";
 
 const EXTRAPOLATION_MS = 200;
-const SMOOTHING_MS = 50;
+export const SMOOTHING_MS = 50;
 const SNAP_RAD = 0.6, SNAP_M = 0.5; // a larger jump is a new pose, not a motion
 const EASED_RAD = 0.2, EASED_M = 0.3; // likewise from one robot to the other
 
@@ -21,6 +21,11 @@ export class Motion {
     return this.pose?.[2] ?? null;
   }
 
+  /** The shown robot's own pose, without what is left of the other's. */
+  get own() {
+    return this._followed;
+  }
+
   /**
    * Goes on by `elapsedMs`. `robot`: name of the robot that is shown; at another name the difference of the two poses
    * is eased out. `pose` was true `ageMs` ago, `twist` [m/s, rad/s] its velocity then.
@@ -35,9 +40,11 @@ export class Motion {
       this._followed = target;
     }
     this._robot = robot;
-    const left = this._followed ? difference(target, this._followed) : null;
+    // It goes on at its velocity, and only what that misses is smoothed: so a steady motion is shown without a lag.
+    const went = this._followed && moved(this._followed, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
+    const left = went ? difference(target, went) : null;
     if (left === null || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
-    else this._followed = sum(this._followed, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
+    else this._followed = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
     this._easedMs += elapsedMs; // not the time itself: a page that hangs for a moment goes on from where it was
     const t = this.easeMs > 0 ? clamp(this._easedMs / this.easeMs, 0, 1) : 1;
     this.pose = sum(this._followed, this._residual, 1 - t * t * (3 - 2 * t));

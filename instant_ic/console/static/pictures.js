@@ -2,13 +2,15 @@
 
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
 import { PANORAMA, VIEW } from "./link.js";
-import { fromQuaternion, identity, lookRotation, multiply, rotationZ, transpose } from "./math.js";
-import { Motion } from "./motion.js";
+import { fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
+import { Motion, SMOOTHING_MS } from "./motion.js";
 
 const STALE_MS = 2000;
 // For a picture made after the change of mode; then the best there is.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
 const RELEASE_STEP_MS = 100; // the colour is let go in steps too small to be seen
+const LEAST_M = 0.0005; // of a view's motion, to be drawn
+const ELSEWHERE_M = 1; // a view from farther off is no earlier look at the same place
 
 export class Pictures {
   constructor(viewer, link) {
@@ -21,6 +23,9 @@ export class Pictures {
     this.decodeErrors = 0;
     this.changed = true;
     this.motion = new Motion();
+    this.leadMaxM = 0; // a view is shown as from up to this far from where it was drawn for; 0: never moved
+    this.place = null; // [x, y] in the map of the camera that the view is shown from
+    this._lead = 0; // 0: from where it was drawn for, 1: from where the v-bot is now
     this._virtual = false;
     // Since when pictures of each kind have been made where the shown robot is; by the server's clock.
     this._since = { [PANORAMA]: 0, [VIEW]: 0 };
@@ -40,14 +45,17 @@ export class Pictures {
   /** Decodes a picture frame, puts it into the viewer, then acknowledges it. */
   async take(frame) {
     try {
-      const [bitmap, mask] = await Promise.all([decoded(frame.payload), decodedMask(frame.header.mask)]);
+      const { mask: maskText, depth: depthText, ...header } = frame.header;
+      const [bitmap, mask, depth] = await Promise.all([
+        decoded(frame.payload), decodedMask(maskText), decodedDepth(depthText, header.depth_near_m)]);
       if (frame.kind === PANORAMA) {
         this.viewer.setPanorama(bitmap);
-        this.panorama = frame.header;
+        this.panorama = header;
       } else {
-        this.viewer.setView(bitmap, mask);
-        this.view = { ...frame.header, aspect: bitmap.width / bitmap.height };
+        this.viewer.setView(bitmap, mask, depth);
+        this.view = { ...header, aspect: bitmap.width / bitmap.height };
       }
+      depth?.picture.close();
       if (this.viewer.name === "webgl") bitmap.close();
       this.changed = true;
       const arrivals = this._arrivals[frame.kind];
@@ -101,6 +109,7 @@ export class Pictures {
       panoramaFromLook: panoramaKnown ? relative(this.panorama) : lookTurn,
       viewFromLook: this.view ? relative(this.view) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
+      moved: this.view ? this._moved(state, elapsedMs) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
       panoramaColour: plain,
       viewColour: plain,
@@ -110,6 +119,26 @@ export class Pictures {
     scene.panoramaColour = this._colours[PANORAMA].at(now);
     scene.viewColour = this._colours[VIEW].at(now);
     return scene;
+  }
+
+  /**
+   * How the camera has moved since the view was drawn, in the view's frame; null: not to be seen. `state.lead` says how
+   * much of the way to the v-bot's place of now is shown: at a switch none, as then each picture is where it was made.
+   */
+  _moved(state, elapsedMs) {
+    const { p, q, mount } = this.view, own = this.motion.own;
+    this._lead += ((state?.lead ?? 0) - this._lead) * (1 - Math.exp(-elapsedMs / SMOOTHING_MS));
+    if (mount && own && this._virtual) {
+      const [x, y] = rotate(rotationZ(own[2]), mount);
+      this._now = [own[0] + x, own[1] + y];
+    }
+    this.place = p.slice(0, 2);
+    if (!mount || !this._now || this.leadMaxM <= 0) return null;
+    const way = [this._now[0] - p[0], this._now[1] - p[1]], far = Math.hypot(...way);
+    const share = far > ELSEWHERE_M ? 0 : Math.min(this._lead, this.leadMaxM / far);
+    if (share * far < LEAST_M) return null;
+    this.place = [p[0] + share * way[0], p[1] + share * way[1]];
+    return rotate(transpose(fromQuaternion(q)), [share * way[0], share * way[1], 0]);
   }
 
   /** Goes on with the dissolve; true when one starts from a picture that was shown alone. */
@@ -174,14 +203,27 @@ export const shows = (state) => state?.shown ?? (state?.mode === "virtual" ? "vi
 
 const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none" });
 
+const decodedPng = (text) =>
+  decoded(new Blob([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], { type: "image/png" }));
+
+/** The depth picture of a view, base64 of a PNG; null where there is none, or none that can be used. */
+async function decodedDepth(text, near_m) {
+  if (!text || !(near_m > 0)) return null;
+  try {
+    return { picture: await decodedPng(text), near_m };
+  } catch (error) {
+    console.warn(`the depth of a view cannot be read, it is shown from where it was drawn: ${error}`);
+    return null;
+  }
+}
+
 /**
  * The mask of a view, base64 of a PNG; null where all of it was seen. It is much coarser than the view: a place
  * counts as what the least seen place beside it is, so that none that was not seen shows at the edges.
  */
 async function decodedMask(text) {
   if (!text) return null;
-  const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-  const bitmap = await decoded(new Blob([bytes], { type: "image/png" }));
+  const bitmap = await decodedPng(text);
   const { width, height } = bitmap, canvas = new OffscreenCanvas(width, height);
   const context = canvas.getContext("2d", { willReadFrequently: true });
   context.drawImage(bitmap, 0, 0);

@@ -12,7 +12,7 @@ const FRAGMENT = `#version 300 es
 precision highp float;
 in vec2 screen;
 out vec4 colour;
-uniform sampler2D panorama, view, mask;
+uniform sampler2D panorama, view, mask, depth;
 uniform bool hasPanorama;
 uniform mat3 panoramaFromLook, viewFromLook;
 uniform vec2 tanHalf;      // of the shown field of view
@@ -20,6 +20,11 @@ uniform vec2 viewTanHalf;  // of the rendered view
 uniform vec2 viewSize;     // pixels
 uniform float blend;       // 0 camera, 1 virtual space
 uniform bool hasMask;
+uniform bool moved;        // the camera has moved since the view was drawn
+uniform vec2 aside;        // how far, right and up, over viewTanHalf, m
+uniform float along;       // and forward
+uniform float perInverse;  // inverse depth along the axis that 1 stands for in the depth picture, 1/m
+uniform float mostInverse; // nearest that counts: nearer things would be torn apart
 uniform int only;          // 0 the picture; for samples: 1 the panorama, 2 the view with its confidence as alpha
 uniform vec3 panoramaGain, panoramaOffset, viewGain, viewOffset;
 const float PI = 3.14159265358979;
@@ -52,6 +57,19 @@ vec3 smoothView(vec2 uv, float level) {
     mix(textureLod(view, vec2(a.x, b.y), level), textureLod(view, vec2(b.x, b.y), level), high.x), high.y).rgb;
 }
 
+// Where the view shows what is seen at this place of it now that the camera has moved: by steps against the depth,
+// from the nearest on, so that near things cover far ones. An even number: where the steps swing to and fro between
+// near and far, something opens up behind an edge, and the far side goes on. (geometry/depth_picture.py in Python.)
+vec2 before(vec2 at) {
+  vec2 perInverseDepth = aside - along * at;
+  float inverse = mostInverse;
+  for (int i = 0; i < 2; i++) {
+    vec2 there = at + inverse * perInverseDepth;
+    inverse = min(texture(depth, vec2(0.5 + 0.5 * there.x, 0.5 - 0.5 * there.y)).r * perInverse, mostInverse);
+  }
+  return at + inverse * perInverseDepth;
+}
+
 // What was seen is sharp; the rest is guessed from around it, so it is shown blurred and paler.
 vec3 fromView(vec2 uv) {
   float seen = hasMask ? smoothstep(0.0, 1.0, texture(mask, uv).r) : 1.0;
@@ -79,6 +97,7 @@ void main() {
     vec3 rendered = around;
     if (d.x > 0.0) {
       vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf);
+      if (moved) at = before(at);
       vec2 edge = smoothstep(1.0, 0.94, abs(at));
       vec2 uv = vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y);
       float inside = edge.x * edge.y;
@@ -95,6 +114,8 @@ void main() {
 
 /** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
 export const SAMPLE = [40, 24], SAMPLE_FINE = 4;
+/** Motion over depth: what is nearer is taken to be so far that it moves by no more. */
+export const MOST_PARALLAX = 0.5;
 
 /** Throws when WebGL 2 is missing. */
 export class GlViewer {
@@ -119,16 +140,19 @@ export class GlViewer {
     this._panorama = this._texture(0, gl.REPEAT);
     this._view = this._texture(1, gl.CLAMP_TO_EDGE);
     this._mask = this._texture(2, gl.CLAMP_TO_EDGE);
+    this._depth = this._texture(3, gl.CLAMP_TO_EDGE);
     gl.activeTexture(gl.TEXTURE1);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_NEAREST);
     gl.generateMipmap(gl.TEXTURE_2D);
     this._hasPanorama = false;
     this._hasMask = false;
+    this._perInverse = 0; // 1/m; 0: the depth is not known
     this._viewSize = [1, 1];
     gl.useProgram(this._program);
     gl.uniform1i(this._at("panorama"), 0);
     gl.uniform1i(this._at("view"), 1);
     gl.uniform1i(this._at("mask"), 2);
+    gl.uniform1i(this._at("depth"), 3);
   }
 
   setPanorama(bitmap) {
@@ -136,16 +160,24 @@ export class GlViewer {
     this._hasPanorama = true;
   }
 
-  /** `mask`: small grey picture of where the view is sure; null: everywhere. */
-  setView(bitmap, mask = null) {
+  /**
+   * `mask`: small grey picture of where the view is sure; null: everywhere.
+   * `depth`: {picture, near_m}: small grey picture, whose v is the depth near_m * 255 / v along the axis; null: not known.
+   */
+  setView(bitmap, mask = null, depth = null) {
     this._upload(1, this._view, bitmap);
     this._viewSize = [bitmap.width, bitmap.height];
     this.gl.generateMipmap(this.gl.TEXTURE_2D); // to blur it where nobody has seen
     this._hasMask = mask !== null;
     if (mask) this._upload(2, this._mask, mask);
+    this._perInverse = depth ? 1 / depth.near_m : 0;
+    if (depth) this._upload(3, this._depth, depth.picture);
   }
 
-  /** `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend, panoramaColour, viewColour. */
+  /**
+   * `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend, panoramaColour, viewColour; `moved`: of the
+   * camera since the view was drawn [forward, left, up] in the view's frame, m; null: not at all.
+   */
   draw(scene) {
     this._draw(scene, this.canvas.width, this.canvas.height, 0);
   }
@@ -185,6 +217,15 @@ export class GlViewer {
     gl.uniform2fv(this._at("tanHalf"), scene.tanHalf);
     gl.uniform2fv(this._at("viewTanHalf"), scene.viewTanHalf);
     gl.uniform2fv(this._at("viewSize"), this._viewSize);
+    const moved = this._perInverse > 0 ? scene.moved : null;
+    gl.uniform1i(this._at("moved"), moved ? 1 : 0);
+    if (moved) {
+      const [forward, left, up] = moved;
+      gl.uniform2f(this._at("aside"), -left / scene.viewTanHalf[0], up / scene.viewTanHalf[1]);
+      gl.uniform1f(this._at("along"), forward);
+      gl.uniform1f(this._at("perInverse"), this._perInverse);
+      gl.uniform1f(this._at("mostInverse"), Math.min(this._perInverse, MOST_PARALLAX / Math.hypot(...moved)));
+    }
     gl.uniform1f(this._at("blend"), scene.blend);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
