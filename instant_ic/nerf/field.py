@@ -213,9 +213,14 @@ class Rays:
 
 
 class Device(Protocol):
-    """One device's way to train and render; ``numba_device`` and ``torch_device`` have it."""
+    """One device's way to train and render; ``numba_device`` and ``torch_device`` have it.
+
+    Attributes:
+        canvas: what puts its pictures together, a ``canvas.Canvas``.
+    """
 
     name: str
+    canvas: Any
 
     def load(self, parameters: FieldParameters) -> None:
         """Takes parameters over and forgets the optimiser's moments."""
@@ -239,6 +244,9 @@ class Device(Protocol):
                 field's. With 1 the colour of surfaces without confidence is not worked out.
             depth_share: of the keyframe's depth in the signed distance; the rest is the field's.
         """
+
+    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Any, Any, Any]:
+        """As ``draw``, in arrays as ``canvas`` takes them."""
 
     def parameters(self) -> FieldParameters:
         """A copy of the present parameters."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import kernels, march, volume
+from .canvas import CpuCanvas
 from .config import FieldConfig, TrainConfig
 from .field import (
     BETA1,
@@ -48,6 +49,7 @@ class NumbaDevice:
 
     def __init__(self, field: FieldConfig, train: TrainConfig) -> None:
         self.first_stride = FIRST_STRIDE
+        self.canvas = CpuCanvas()
         self._train = train
         self._density = field.geometry == "density"
         self._losses = np.array([train.depth_weight, train.opacity_weight, train.distortion_weight], np.float32)
@@ -137,6 +139,8 @@ class NumbaDevice:
                 priors.band, rays.origin, rays.directions, guide, confidence, np.float32(panorama_share), colour,
             )  # fmt: skip
         return colour, depth, confidence
+
+    drawn = draw
 
     @staticmethod
     def _query(drawn: DrawnField, rays: Rays, depth: Floats, colour: Floats) -> None:

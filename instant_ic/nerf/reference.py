@@ -139,7 +139,7 @@ def _corners(u: Tensor, v: Tensor, width: int, height: int) -> tuple[Tensor, Ten
     return (left, (left + 1) % width, v0.long(), (v0.long() + 1).clamp(max=height - 1), u - u0, v - v0)
 
 
-def _bilinear(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
+def bilinear(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
     left, right, top, bottom, fu, fv = _corners(u, v, image.shape[1], image.shape[0])
     if image.ndim == 3:
         fu, fv = fu[:, None], fv[:, None]
@@ -153,7 +153,7 @@ def prior_inverse_depth(prior: TorchPrior, u: Tensor, v: Tensor) -> Tensor:
     inverse = prior.inverse_depth
     left, right, top, bottom, fu, fv = _corners(u, v, inverse.shape[1], inverse.shape[0])
     nearest = inverse[torch.where(fv >= 0.5, bottom, top), torch.where(fu >= 0.5, right, left)]
-    return torch.where(prior.torn[top, left], nearest, _bilinear(inverse, u, v))
+    return torch.where(prior.torn[top, left], nearest, bilinear(inverse, u, v))
 
 
 def sample_rays(
@@ -184,7 +184,7 @@ def _sample_rays(
     z = 1 - 2 * (row + uniform[:, 1]) / rows
     azimuth = math.pi * (1 - 2 * turn)
     fall = 0.5 - torch.asin(z) / math.pi
-    colour = _bilinear(prior.rgb, turn * width - 0.5, fall * height - 0.5) * prior.gain
+    colour = bilinear(prior.rgb, turn * width - 0.5, fall * height - 0.5) * prior.gain
     colour = (colour / 255).clamp(max=1) - 0.5
     depth = 1 / prior_inverse_depth(prior, turn * w - 0.5, fall * h - 0.5)
     offset = 2 * uniform[:, 2] - 1
@@ -278,7 +278,7 @@ def mix_panorama(
     for k, prior in enumerate(priors):
         points = _camera_frame(prior, origin + depth[at, None] * directions[at])
         here = prior_agrees(prior, points) > 0 if k < len(priors) - 1 else torch.ones_like(at, dtype=torch.bool)
-        seen = (_bilinear(prior.rgb, *_pixels(points[here], prior.rgb)) * prior.gain / 255).clamp(max=1)
+        seen = (bilinear(prior.rgb, *_pixels(points[here], prior.rgb)) * prior.gain / 255).clamp(max=1)
         colour[at[here]] += share * (seen - colour[at[here]])
         at = at[~here]
 

@@ -18,8 +18,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from .background import mixed_in
-from .compose import Layer, compose, exposure_gains, moved
+from .canvas import Drawing, Painted, Picture
+from .compose import exposure_gains, moved
 from .config import VirtualSpaceConfig
 from .devices import make_device
 from .field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
@@ -28,8 +28,7 @@ from .prior import KeyframeError, PanoramaPrior, prepare
 from .readiness import Texture, error_terms, expected_psnr_db
 from .saved import Progress, SavedSpace, read, write
 from .store import Keyframe, KeyframeSet, KeyframeStore, ready
-from .view import Drawn, View, checked_pose, continue_unseen, perspective_rays
-from .warp import dissolve
+from .view import Drawn, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
 _PROBE = (64, 36)  # pixels of the picture that readiness is judged by
@@ -92,16 +91,6 @@ class Prepared:
 
     scene: Scene
     keyframes: KeyframeSet
-
-
-@dataclass(frozen=True)
-class _Picture:
-    """A view (P, …) as it was drawn; ``guessed``: what nobody has seen, drawn from the background."""
-
-    colour: Floats
-    depth: Floats
-    confidence: Floats
-    guessed: NDArray[np.bool_]
 
 
 class VirtualSpace(Drawn):
@@ -358,11 +347,18 @@ class VirtualSpace(Drawn):
 
         From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
         """
-        if self._shown is None:
+        shown = self._shown
+        if shown is None:
             return -math.inf
         rays = perspective_rays(checked_pose(map_from_camera), *_PROBE, fov_rad)
-        picture = self._drawn(rays, self._shown, True, {})
-        return self._judge(rays, picture.depth, picture.confidence)
+        self._learn_what_is_drawn(around=False)
+
+        def draw(device: Device) -> Painted:
+            picture = self._drawn(device, rays, shown, self._can_warp, {})
+            return device.canvas.painted(picture, picture.colour)
+
+        _, depth, confidence = self._on_device(draw)
+        return self._judge(rays, depth, confidence)
 
     def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
         """Expected PSNR of a view as it was drawn, (P,) each; a few thousand pixels tell it."""
@@ -379,73 +375,42 @@ class VirtualSpace(Drawn):
     def _view(self, rays: Rays, projection: str) -> View:
         if self._shown is None:
             raise NotReadyError("no keyframe yet: call set_keyframe first")
-        height, width = rays.shape
-        warps = projection != "equirect"
-        layers: dict[int, tuple[Floats, Floats, Floats]] = {}  # a keyframe of both sets is drawn once
-        picture = self._drawn(rays, self._shown, warps, layers)
-        image = self._filled(picture, rays, projection)
+        self._learn_what_is_drawn(projection == "equirect")
+        rgb, depth, confidence = self._on_device(lambda device: self._painted(device, rays, projection == "equirect"))
         if self._before is not None:
-            old = self._filled(self._drawn(rays, self._before, warps, layers), rays, projection)
-            share = np.float32((self._pictures + 1) / self.config.picture.refresh_pictures)
-            image = share * image + (1 - share) * old
             self._pictures += 1
             self._let_go()
-        expected = self._judge(rays, picture.depth, picture.confidence)
-        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
-        shape = height, width
-        return View(rgb, picture.depth.reshape(shape), picture.confidence.reshape(shape), projection, expected)
+        expected = self._judge(rays, depth, confidence)
+        return View(rgb, depth.reshape(rays.shape), confidence.reshape(rays.shape), projection, expected)
 
-    @staticmethod
-    def _filled(picture: _Picture, rays: Rays, projection: str) -> Floats:
-        """The picture (H, W, 3) with what nobody knows continued from around it, and the guesses mixed in."""
-        shape = rays.shape
-        drawn = picture.colour.reshape(*shape, 3)
-        depth, confidence = picture.depth.reshape(shape), picture.confidence.reshape(shape)
-        image = continue_unseen(drawn, depth, confidence, wraps=projection == "equirect")
-        return mixed_in(image, drawn, picture.guessed.reshape(shape)) if picture.guessed.any() else image
+    def _learn_what_is_drawn(self, around: bool) -> None:
+        """Gives the field the keyframes that are shown where it is drawn too, and has none yet."""
+        if self._scene is None and (self._panorama_share < 1 or around or not self._can_warp):
+            assert self._shown is not None
+            self.learn(self.scene_of(self._shown))
+
+    def _painted(self, device: Device, rays: Rays, around: bool) -> Painted:
+        """A view of what is shown, passing over from what was shown before; ``around``: a panorama, not warped."""
+        assert self._shown is not None
+        canvas, warps = device.canvas, self._can_warp and not around
+        layers: dict[int, Drawing] = {}  # a keyframe of both sets is drawn once
+        picture = self._drawn(device, rays, self._shown, warps, layers)
+        image = canvas.continued(picture, rays.shape, around)
+        if self._before is not None:
+            before = self._drawn(device, rays, self._before, warps, layers)
+            share = (self._pictures + 1) / self.config.picture.refresh_pictures
+            image = share * image + (1 - share) * canvas.continued(before, rays.shape, around)
+        return canvas.painted(picture, image)
 
     def _drawn(
-        self, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, tuple[Floats, Floats, Floats]]
-    ) -> _Picture:
-        """A view by keyframes: their panoramas warped, then the field as it becomes better.
-
-        ``layers``: in and out, keyframes that have been drawn for this view.
-        """
+        self, device: Device, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, Drawing]
+    ) -> Picture:
+        """A view by keyframes: their panoramas warped (``warps``), then the field as it becomes better."""
         share, depth_share = self._panorama_share, self.config.picture.depth_share(self._psnr_db)
-        warps = warps and self._can_warp
-        if share == 1 and warps:
-            picture = self._warped(rays, shown, layers)
-        else:
-            if self._scene is None:
-                self.learn(self.scene_of(shown))
-            field = self._on_device(lambda device: device.draw(rays, 0.0 if warps else share, depth_share))
-            warped = self._warped(rays, shown, layers) if share > 0 and warps else None
-            picture = field if warped is None else dissolve(warped, field, share)
-        colour, depth, confidence = picture
-        guessed = np.zeros(len(depth), bool)
-        if warps:
-            for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
-                wanted = (confidence == 0) & ~guessed
-                if keyframe.background is None or not wanted.any():
-                    break
-                guessed |= keyframe.background.draw(rays, gain, wanted, picture)
-        return _Picture(colour, depth, confidence, guessed)
-
-    @staticmethod
-    def _warped(
-        rays: Rays, shown: KeyframeSet, layers: dict[int, tuple[Floats, Floats, Floats]]
-    ) -> tuple[Floats, Floats, Floats]:
-        """The keyframes' panoramas warped by their depth, put together."""
-        drawn = []
-        for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
-            assert keyframe.warp is not None
-            if id(keyframe.warp) not in layers:
-                layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
-            drawn.append(Layer(keyframe.prior, gain, *layers[id(keyframe.warp)]))
-        if len(drawn) > 1:
-            return compose(drawn, rays)
-        colour, depth, confidence = layers[id(shown.keyframes[0].warp)]
-        return colour.copy(), depth.copy(), confidence.copy()
+        field = None
+        if share < 1 or not warps:
+            field = device.drawn(rays, 0.0 if warps else share, depth_share)
+        return device.canvas.draw(rays, shown if warps else None, share, field, layers)
 
     @property
     def _panorama_share(self) -> float:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from . import reference, volume_reference
+from .canvas import Canvas, CpuCanvas
 from .config import FieldConfig, TrainConfig
 from .field import (
     BETA1,
@@ -26,6 +27,7 @@ from .field import (
     volume_rays,
 )
 from .reference import TorchField, TorchGrid, TorchPrior
+from .torch_canvas import TorchCanvas
 
 RAYS_AT_ONCE = 1 << 18
 
@@ -64,6 +66,8 @@ class TorchDevice:
         weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
         self._colour_weight, self._distance_weight = weights
         self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
+        # On the CPU numba's is faster by far.
+        self.canvas: Canvas = TorchCanvas(device) if device == "cuda" else CpuCanvas()
         self.load(FieldParameters.random(field, train.seed))
 
     def load(self, parameters: FieldParameters) -> None:
@@ -133,15 +137,23 @@ class TorchDevice:
         error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
         return error, losses[0] / share[0], losses[1] / share[1]
 
-    @torch.no_grad()
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        colour, depth, confidence = self._drawn(rays, panorama_share, depth_share)
+        return colour.cpu().numpy(), depth.cpu().numpy(), confidence.cpu().numpy()
+
+    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Any, Any, Any]:
+        draw = self._drawn if isinstance(self.canvas, TorchCanvas) else self.draw
+        return draw(rays, panorama_share, depth_share)
+
+    @torch.no_grad()
+    def _drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
         drawn = self._field, self._priors, self._grid
         origin = torch.from_numpy(rays.origin).to(self._device)
         directions = torch.from_numpy(rays.directions).to(self._device)
         shares = panorama_share, depth_share
         draw = self._draw_density if self._density else self._draw
         parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
-        colour, depth, confidence = (torch.cat(tensors).cpu().numpy() for tensors in zip(*parts, strict=True))
+        colour, depth, confidence = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
 
     @staticmethod

@@ -28,12 +28,14 @@ from .field import (
     ray_sources,
     sample_weights,
 )
+from .torch_canvas import TorchCanvas
 from .view import LensRays
 
 # Compiled kernels stay with what else the project keeps; has to be set before triton is imported.
 os.environ.setdefault("TRITON_CACHE_DIR", str(paths.cache_dir() / "triton"))
 
 from . import triton_kernels as kernels
+from . import triton_warp
 
 TRAIN_BLOCK = 64
 ENTRIES = 256
@@ -114,6 +116,7 @@ class TritonDevice:
         self._level_rates = level_rates(train, field.levels)
         self._scene: _GpuScene | None = None
         self._newest_lens: tuple[Floats, Tensor] | None = None
+        self.canvas = TorchCanvas(device, triton_warp.KERNELS)
         self._p = self._uploaded(FieldParameters.random(field, train.seed))
         self._buffers = self._new_buffers()
         self._steps = 0
@@ -177,6 +180,10 @@ class TritonDevice:
         )  # fmt: skip
 
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        colour, depth, confidence = self.drawn(rays, panorama_share, depth_share)
+        return colour.cpu().numpy(), depth.cpu().numpy(), confidence.cpu().numpy()
+
+    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
         assert self._scene is not None, "set_scene first"
         p, scene = self._p, self._scene
         q = scene.priors
@@ -197,9 +204,7 @@ class TritonDevice:
             *scene.grid.shape, scene.cell_m, float(panorama_share), float(depth_share), colour, depth, confidence,
             **self._shape, B=TILE,
         )  # fmt: skip
-        result = out.cpu().numpy()
-        seen = result[3 * room :].reshape(2, room)[:, :pixels]
-        return result[: 3 * pixels].reshape(pixels, 3), seen[0], seen[1]
+        return colour[: 3 * pixels].view(pixels, 3), depth[:pixels], confidence[:pixels]
 
     def _lens(self, rays: Rays) -> tuple[Tensor, Floats]:
         """Directions of a view on the GPU, and how they are turned into the map; a lens is uploaded once."""

@@ -84,6 +84,9 @@ class Pyramid:
 class PanoramaWarp:
     """A panorama with depth that can be seen from elsewhere.
 
+    Attributes:
+        inverse, torn, known: of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
+
     Example:
         >>> warp = PanoramaWarp(rgb, depth_m, map_from_camera)               # doctest: +SKIP
         >>> warp.render(pose, 320, 180, fov_rad=1.57).rgb
@@ -118,7 +121,7 @@ class PanoramaWarp:
         self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)
         height, width = prior.inverse_depth.shape
         # A row more above and below closes the mesh at the poles.
-        self._inverse, self._known = (
+        self.inverse, self.known = (
             np.ascontiguousarray(np.concatenate([a[:1], a, a[-1:]])) for a in (prior.inverse_depth, prior.known)
         )
         none = np.zeros((1, width), np.uint8)
@@ -129,11 +132,11 @@ class PanoramaWarp:
             right = np.roll(gone, -1, 1)
             torn[:-1] |= (gone | right)[:-1] | (gone | right)[1:]
             torn[-1] = 0
-            self._known[1:-1][gone] = 2
-            self._known[[0, -1]] = self._known[[1, -2]]
-            none = (self._known[[0]] == 2).astype(np.uint8)
-        below = (self._known[[-1]] == 2).astype(np.uint8)
-        self._torn = np.concatenate([none, torn[:-1], below, below])
+            self.known[1:-1][gone] = 2
+            self.known[[0, -1]] = self.known[[1, -2]]
+            none = (self.known[[0]] == 2).astype(np.uint8)
+        below = (self.known[[-1]] == 2).astype(np.uint8)
+        self.torn = np.concatenate([none, torn[:-1], below, below])
         self._halves = _half_step_directions(width, height)
         self._directions = np.ascontiguousarray(self._halves[::2, ::2])
         self._vertices = np.empty((height + 2, width, 3), np.float32)
@@ -167,10 +170,10 @@ class PanoramaWarp:
         marks = np.zeros(rays.shape, np.uint8)
         aspect = np.float32(rays.shape[0] / rays.shape[1])
         warp_kernels.place_vertices(
-            self._inverse, self._directions, view_from_camera, half, aspect, self._vertices, self._outside
+            self.inverse, self._directions, view_from_camera, half, aspect, self._vertices, self._outside
         )
         warp_kernels.draw_mesh(
-            self._vertices, self._outside, self._inverse, self._torn, self._known, self._halves,
+            self._vertices, self._outside, self.inverse, self.torn, self.known, self._halves,
             view_from_camera, half, nearness, marks,
         )  # fmt: skip
         depth = np.zeros(len(rays.axial), np.float32)
@@ -200,8 +203,8 @@ def dissolve(
 def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
     """Pose (4, 4) of a perspective view, and the tangent of half its horizontal field of view, from its rays."""
     height, width = rays.shape
-    flat = (rays.directions / rays.axial[:, None]).reshape(height, width, 3)[:: height - 1, :: width - 1]
-    corners = flat.astype(np.float64)
+    some = rays.some(np.array([0, width - 1, (height - 1) * width, height * width - 1]))
+    corners = (some.directions / some.axial[:, None]).reshape(2, 2, 3).astype(np.float64)
     ahead = corners.mean(axis=(0, 1))
     left, up = (corners[:, 0] - corners[:, 1]).mean(axis=0), (corners[0] - corners[1]).mean(axis=0)
     pose = np.eye(4)
