@@ -20,10 +20,11 @@ from torch import Tensor
 from . import torch_warp
 from .background import GUESS_REACH, GUESS_SHARE, Background
 from .canvas import Drawing, Painted, Picture
-from .compose import Layer, compose
+from .compose import disagreement
 from .field import Floats, Rays
 from .reference import bilinear
 from .store import Keyframe, KeyframeSet
+from .torch_compose import TorchLayer, compose, panorama_places, points
 from .torch_warp import KERNELS, Mesh, Patches, TorchPyramid, WarpKernels
 from .view import LensRays
 from .warp import PanoramaWarp, pinhole
@@ -31,11 +32,15 @@ from .warp import PanoramaWarp, pinhole
 
 @dataclass(frozen=True)
 class _Keyframe:
-    """A keyframe on the device; ``behind``: its background's mesh, guesses marked 1 and sky 2, with its colours."""
+    """A keyframe on the device; ``torn`` and ``sure`` as in ``TorchLayer``; ``behind``: its background's mesh, guesses
+    marked 1 and sky 2, with its colours.
+    """
 
     quads: Patches
     quarters: Patches
     pyramid: TorchPyramid
+    torn: Tensor
+    sure: Tensor
     behind: Patches | None
     behind_rgb: Tensor | None
 
@@ -87,12 +92,12 @@ class TorchCanvas:
             return Picture(colour, depth, confidence, torch.zeros_like(depth, dtype=torch.bool))
         eye = self._eye(rays)
         if field is None:
-            picture = self._warped(rays, eye, shown, layers)
+            picture = self._warped(eye, shown, layers)
         else:
             colour, depth, confidence = (self._tensor(array) for array in field)
             picture = colour, depth, confidence
             if panorama_share > 0:
-                picture = _dissolve(self._warped(rays, eye, shown, layers), picture, panorama_share)
+                picture = _dissolve(self._warped(eye, shown, layers), picture, panorama_share)
         colour, depth, confidence = picture
         guessed = torch.zeros_like(depth, dtype=torch.bool)
         for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
@@ -112,20 +117,25 @@ class TorchCanvas:
         rgb = (image.clamp(0, 1) * 255).round().to(torch.uint8)
         return rgb.cpu().numpy(), picture.depth.cpu().numpy(), picture.confidence.cpu().numpy()
 
-    def _warped(self, rays: Rays, eye: _Eye, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
-        """The keyframes' panoramas warped by their depth, put together: of several by the CPU."""
+    def _warped(self, eye: _Eye, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
+        """The keyframes' panoramas warped by their depth, put together."""
         for keyframe in shown.keyframes:
             if id(keyframe.warp) not in layers:
                 layers[id(keyframe.warp)] = self._warp(keyframe, eye)
-        drawn = [layers[id(keyframe.warp)] for keyframe in shown.keyframes]
-        if len(drawn) == 1:
-            return drawn[0]
-        parts = [
-            Layer(keyframe.prior, gain, *(tensor.cpu().numpy() for tensor in layer))
-            for keyframe, gain, layer in zip(shown.keyframes, shown.gains, drawn, strict=True)
-        ]
-        colour, depth, confidence = (self._tensor(array) for array in compose(parts, rays))
-        return colour, depth, confidence
+        if len(shown.keyframes) == 1:
+            return layers[id(shown.keyframes[0].warp)]
+        drawn = [self._layer(one, gain, eye, layers) for one, gain in zip(shown.keyframes, shown.gains, strict=True)]
+        room = [[disagreement(one, other) for other in shown.priors] for one in shown.priors]
+        return compose(drawn, room, eye.directions)
+
+    def _layer(self, keyframe: Keyframe, gain: Floats, eye: _Eye, layers: dict[int, Drawing]) -> TorchLayer:
+        own, prior = self._uploaded(keyframe), keyframe.prior
+        view_from_camera = self._view_from(prior.map_from_camera, eye)
+        return TorchLayer(
+            *(*layers[id(keyframe.warp)], self._tensor(gain), own.quads.mesh.inverse[1:-1], own.torn, own.sure),
+            camera_from_view=self._camera_from(prior.map_from_camera, eye),
+            camera=view_from_camera[:3, 3],
+        )
 
     def _warp(self, keyframe: Keyframe, eye: _Eye) -> Drawing:
         """One keyframe's panorama; as ``PanoramaWarp.draw``."""
@@ -136,7 +146,7 @@ class TorchCanvas:
         depth, marks = _read(buffer, eye)
         confidence = self._confidence[marks.long()]
         wanted = torch.where(confidence.any(), confidence, depth)
-        places = self._places(eye, pose, depth, own.pyramid.size)
+        places = torch.stack(self._places(eye, pose, depth, own.pyramid.size), dim=1)
         places = torch.where(depth[:, None] > 0, places, torch.full_like(places, torch_warp.NOWHERE))
         colour = self._kernels.look_up(own.pyramid, places.reshape(*eye.shape, 2), wanted.reshape(eye.shape))
         return colour.reshape(-1, 3), depth, confidence
@@ -154,8 +164,7 @@ class TorchCanvas:
         away, marks = _read(buffer, eye)
         drawn = (confidence == 0) & ~guessed & (away > 0)
         height, width = own.behind_rgb.shape[:2]
-        u, v = self._places(eye, pose, away, (height, width)).unbind(1)
-        behind = bilinear(own.behind_rgb, u, v) * (self._tensor(gain) / 255)
+        behind = bilinear(own.behind_rgb, *self._places(eye, pose, away, (height, width))) * (self._tensor(gain) / 255)
         colour = torch.where(drawn[:, None], behind, colour)
         depth = torch.where(drawn, away, depth)
         return colour, depth, torch.where(drawn & (marks == 2), 1.0, confidence), drawn
@@ -163,15 +172,14 @@ class TorchCanvas:
     def _view_from(self, map_from_camera: NDArray[np.float64], eye: _Eye) -> Tensor:
         return self._tensor((np.linalg.inv(eye.map_from_view) @ map_from_camera).astype(np.float32))
 
-    def _places(self, eye: _Eye, map_from_camera: NDArray[np.float64], depth: Tensor, size: tuple[int, int]) -> Tensor:
-        """Index coordinates (u, v) in a panorama of some ``size`` of places along the view's rays, (P, 2)."""
-        camera_from_view = self._tensor((np.linalg.inv(map_from_camera) @ eye.map_from_view).astype(np.float32))
-        points = depth[:, None] * eye.directions
-        # Not by matmul: a GPU may multiply with fewer bits.
-        x, y, z = (points * camera_from_view[:3, None, :3]).sum(dim=2) + camera_from_view[:3, 3:]
-        u = (math.pi - torch.atan2(y, x)) * (size[1] / (2 * math.pi)) - 0.5
-        v = (math.pi / 2 - torch.atan2(z, torch.hypot(x, y))) * (size[0] / math.pi) - 0.5
-        return torch.stack([u, v], dim=1)
+    def _camera_from(self, map_from_camera: NDArray[np.float64], eye: _Eye) -> Tensor:
+        return self._tensor((np.linalg.inv(map_from_camera) @ eye.map_from_view).astype(np.float32))
+
+    def _places(
+        self, eye: _Eye, map_from_camera: NDArray[np.float64], depth: Tensor, size: tuple[int, int]
+    ) -> tuple[Tensor, Tensor]:
+        """Index coordinates (u, v) in a panorama (height, width) of places along the view's rays."""
+        return panorama_places(points(self._camera_from(map_from_camera, eye), eye.directions, depth), size)
 
     def _eye(self, rays: Rays) -> _Eye:
         """A lens is uploaded once."""
@@ -195,6 +203,8 @@ class TorchCanvas:
                 self._patches(*quads, mesh, False),
                 self._patches(*quarters, mesh, True),
                 TorchPyramid(texels, start, sizes, (int(pyramid.sizes[0, 0]), int(pyramid.sizes[0, 1]))),
+                self._tensor(keyframe.prior.torn != 0),
+                self._tensor(keyframe.prior.known == 1),
                 *behind,
             )
         return self._keyframes[warp]
