@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from instant_ic.nerf import FieldConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room, devices
-from instant_ic.nerf.devices import DeviceError, check_device, make_device
+from instant_ic.nerf.canvas import CpuCanvas
+from instant_ic.nerf.devices import DeviceError, check_canvas, check_device, make_device
 from instant_ic.nerf.numba_device import NumbaDevice
+from instant_ic.nerf.torch_canvas import TorchCanvas
 from instant_ic.nerf.torch_device import TorchDevice
 
 CONFIG = VirtualSpaceConfig(
@@ -137,3 +139,19 @@ def test_the_check_compares_pictures_too():
     check_device(Broken, plain, CONFIG.field)
     with pytest.raises(DeviceError, match="of a picture's pixels"):
         check_device(WrongColours, plain, CONFIG.field)
+
+
+def test_the_check_compares_warped_pictures_too():
+    class WrongCanvas(TorchCanvas):
+        fault = "colour"
+
+        def draw(self, *arguments):
+            picture = super().draw(*arguments)
+            return dataclasses.replace(picture, **{self.fault: 0.5 * getattr(picture, self.fault)})
+
+    check_canvas(TorchCanvas("cpu"), CpuCanvas())  # plain torch's own are right
+    for fault in ("colour", "depth", "confidence"):
+        wrong = WrongCanvas("cpu")
+        wrong.fault = fault
+        with pytest.raises(DeviceError, match="of a warped picture's pixels"):
+            check_canvas(wrong, CpuCanvas(), (48, 27))
