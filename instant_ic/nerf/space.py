@@ -364,7 +364,8 @@ class VirtualSpace(Drawn):
         """Expected PSNR of a view as it was drawn, (P,) each; a few thousand pixels tell it."""
         step = max(1, rays.shape[1] // _PROBE[0])
         height, width = rays.shape
-        chosen = np.arange(height * width).reshape(height, width)[step // 2 :: step, step // 2 :: step].reshape(-1)
+        chosen = np.arange(step // 2, height, step)[:, None] * width + np.arange(step // 2, width, step)
+        chosen = chosen.reshape(-1)
         some = rays.some(chosen)
         priors = self.keyframes
         if self._texture is None or self._texture[0] is not priors[0]:

@@ -195,13 +195,13 @@ class TorchCanvas:
         warp = keyframe.warp
         assert warp is not None, "warping needs numba"
         if warp not in self._keyframes:
-            quads, quarters = _mesh_patches(warp.torn, warp.known)
-            mesh, pyramid = self._mesh(warp.inverse), warp.pyramid
+            quads, quarters = _mesh_patches(self._tensor(warp.torn), self._tensor(warp.known), self._mesh(warp.inverse))
+            pyramid = warp.pyramid
             behind = (None, None) if keyframe.background is None else self._background(keyframe.background)
             texels, start, sizes = (self._tensor(array) for array in (pyramid.texels, pyramid.start, pyramid.sizes))
             self._keyframes[warp] = _Keyframe(
-                self._patches(*quads, mesh, False),
-                self._patches(*quarters, mesh, True),
+                quads,
+                quarters,
                 TorchPyramid(texels, start, sizes, (int(pyramid.sizes[0, 0]), int(pyramid.sizes[0, 1]))),
                 self._tensor(keyframe.prior.torn != 0),
                 self._tensor(keyframe.prior.known == 1),
@@ -214,7 +214,8 @@ class TorchCanvas:
         width = inverse.shape[1]
         places = np.concatenate([background.guessed, background.sky])
         marks = np.repeat(np.array([1, 2], np.uint8), (len(background.guessed), len(background.sky)))
-        patches = self._patches((places[:, 0] + 1) * width + places[:, 1], marks, self._mesh(inverse), False)
+        items = ((places[:, 0] + 1) * width + places[:, 1]).astype(np.int32)
+        patches = Patches(self._tensor(items), self._tensor(marks), self._mesh(inverse), False)
         return patches, self._tensor(background.rgb).float()
 
     def _mesh(self, inverse: Floats) -> Mesh:
@@ -227,31 +228,33 @@ class TorchCanvas:
         )
         return Mesh(self._tensor(inverse), self._tensor(rows), self._tensor(columns))
 
-    def _patches(self, items: NDArray[Any], marks: NDArray[np.uint8], mesh: Mesh, quarters: bool) -> Patches:
-        return Patches(self._tensor(items.astype(np.int32)), self._tensor(marks), mesh, quarters)
-
     def _tensor(self, array: NDArray[Any] | Tensor) -> Tensor:
         if isinstance(array, Tensor):
             return array.to(self._device)
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
 
-def _mesh_patches(
-    torn: NDArray[np.uint8], known: NDArray[np.uint8]
-) -> tuple[tuple[NDArray[Any], NDArray[np.uint8]], tuple[NDArray[Any], NDArray[np.uint8]]]:
-    """Items and marks (see ``Patches``) of a mesh's whole quads, and of the quarters of the torn ones.
+def _mesh_patches(torn: Tensor, known: Tensor, mesh: Mesh) -> tuple[Patches, Patches]:
+    """A mesh's whole quads, and the quarters of the torn ones.
 
     Args:
         torn, known: with a row more above and below, (h + 2, w), as ``warp_kernels.draw_mesh`` takes them.
     """
-    corners = np.stack([known[:-1], np.roll(known, -1, 1)[:-1], known[1:], np.roll(known, -1, 1)[1:]], axis=-1)
-    corners, whole = corners.reshape(-1, 4), torn[:-1].reshape(-1) == 0
-    quads, quarters = np.flatnonzero(whole), np.flatnonzero(~whole)
-    marks = np.where((corners[quads] > 0).all(axis=1), torch_warp.KNOWN, torch_warp.FILLED).astype(np.uint8)
-    items = (4 * quarters[:, None] + np.arange(4)).reshape(-1)
+    right = known.roll(-1, 1)
+    corners = torch.stack([known[:-1], right[:-1], known[1:], right[1:]], dim=-1).reshape(-1, 4)
+    whole = torn[:-1].reshape(-1) == 0
+    quads, quarters = torch.nonzero(whole)[:, 0], torch.nonzero(~whole)[:, 0]
+    items = (4 * quarters[:, None] + torch.arange(4, device=torn.device)).reshape(-1)
     own = corners[quarters].reshape(-1)
-    items, own = items[own < 2], own[own < 2]
-    return (quads, marks), (items, np.where(own > 0, torch_warp.KNOWN, torch_warp.FILLED).astype(np.uint8))
+    there = own < 2
+    return (
+        Patches(quads.int(), _marks((corners[quads] > 0).all(dim=1)), mesh, False),
+        Patches(items[there].int(), _marks(own[there] > 0), mesh, True),
+    )
+
+
+def _marks(seen: Tensor) -> Tensor:
+    return torch.where(seen, torch_warp.KNOWN, torch_warp.FILLED).to(torch.uint8)
 
 
 def _read(buffer: Tensor, eye: _Eye) -> tuple[Tensor, Tensor]:

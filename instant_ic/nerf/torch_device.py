@@ -28,6 +28,7 @@ from .field import (
 )
 from .reference import TorchField, TorchGrid, TorchPrior
 from .torch_canvas import TorchCanvas
+from .view import LensRays
 
 RAYS_AT_ONCE = 1 << 18
 
@@ -66,6 +67,7 @@ class TorchDevice:
         weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
         self._colour_weight, self._distance_weight = weights
         self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
+        self._newest_lens: tuple[Floats, Tensor] | None = None
         # On the CPU numba's is faster by far.
         self.canvas: Canvas = TorchCanvas(device) if device == "cuda" else CpuCanvas()
         self.load(FieldParameters.random(field, train.seed))
@@ -148,13 +150,20 @@ class TorchDevice:
     @torch.no_grad()
     def _drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
         drawn = self._field, self._priors, self._grid
-        origin = torch.from_numpy(rays.origin).to(self._device)
-        directions = torch.from_numpy(rays.directions).to(self._device)
+        origin, directions = torch.from_numpy(rays.origin).to(self._device), self._directions(rays)
         shares = panorama_share, depth_share
         draw = self._draw_density if self._density else self._draw
         parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
         colour, depth, confidence = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
         return colour, depth, confidence
+
+    def _directions(self, rays: Rays) -> Tensor:
+        """Of a view, in the map, (P, 3); a lens is uploaded once, and turned on the device."""
+        if not isinstance(rays, LensRays):
+            return torch.from_numpy(rays.directions).to(self._device)
+        if self._newest_lens is None or self._newest_lens[0] is not rays.lens:
+            self._newest_lens = rays.lens, torch.from_numpy(rays.lens).to(self._device)
+        return self._newest_lens[1] @ torch.from_numpy(rays.turn).to(self._device).T
 
     @staticmethod
     def _draw(
