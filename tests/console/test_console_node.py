@@ -305,6 +305,52 @@ def test_the_mask_of_a_view_goes_to_the_page(setup):
     assert base64.b64decode(frame_header["mask"]) == b"MASK"
 
 
+@pytest.mark.parametrize(("near_m", "sent"), [(0.7, b"DEPTH"), (0.0, b""), (math.nan, b""), (-1.0, b"")])
+def test_the_depth_of_a_view_goes_to_the_page_where_it_can_be_used(setup, near_m, sent):
+    bus, node, server = setup
+    publish_tree(bus)
+    bus.publish("/vspace/view", view_message(bus, 1, near_m=near_m))
+    _, frame_header, payload = next(f for f in server.frames if f[0] is FrameKind.VIEW)
+    assert base64.b64decode(frame_header["depth"]) == sent
+    assert frame_header["depth_near_m"] == pytest.approx(near_m if sent else 0.0)
+    assert frame_header["mount"] == pytest.approx([0, 0, 1.5])
+    assert payload == b"VIEW"
+    level, words = node.diagnoses()["depth"][:2]
+    assert (level > 0) == (not sent)
+    assert ("depth picture" in words) == (not sent)
+
+
+def test_the_page_leads_with_the_vbot_and_the_arbiter_hears_what_is_displayed(setup):
+    """A view drawn 10 cm behind the v-bot: shown there at a switch, and with the v-bot from 0.8 s after it on."""
+    bus, _, server = setup
+    publish_tree(bus)
+    vbot = odometry_message(pose_matrix(x=1.1, y=2.0), 0.2, 0.0, "map", "vbot", 0)
+
+    def drive(mode, seconds, near_m=0.7):
+        for _ in range(round(seconds / 0.05)):
+            bus.publish("/ic/state", control(bus, mode, shown=int(mode != ControlState.REAL)), latched=True)
+            bus.publish("/vbot/odom", vbot)
+            bus.publish("/vspace/view", view_message(bus, 1, near_m=near_m))  # from x = 1, y = 2
+            bus.advance(0.05)
+        shown = matrix_of(bus.last("/view/shown").view_pose)
+        assert shown[:3, 0] == pytest.approx([math.cos(0.3), math.sin(0.3), 0])  # it is turned by the page alone
+        assert shown[1:3, 3] == pytest.approx([2, 1.5])
+        return server.texts["state"]["lead"], shown[0, 3] - 1.0
+
+    assert drive(ControlState.REAL, 0.5) == (0.0, pytest.approx(0.0))
+    assert drive(ControlState.ENTERING, 0.5) == (0.0, pytest.approx(0.0))
+    lead, ahead = drive(ControlState.VIRTUAL, 0.4)
+    assert lead == pytest.approx(0.5, abs=0.15)
+    assert ahead == pytest.approx(0.1 * lead, abs=1e-4)
+    assert drive(ControlState.VIRTUAL, 1.0) == (1.0, pytest.approx(0.1))
+    # Without depth the page cannot move it; with depth again it does.
+    assert drive(ControlState.VIRTUAL, 0.1, near_m=0.0) == (1.0, pytest.approx(0.0))
+    lead, ahead = drive(ControlState.RETURNING, 0.4)
+    assert lead == pytest.approx(0.5, abs=0.15)
+    assert ahead == pytest.approx(0.1 * lead, abs=1e-4)
+    assert drive(ControlState.RETURNING, 0.6) == (0.0, pytest.approx(0.0))
+
+
 @pytest.mark.parametrize(("vspace", "counts"), [(VspaceStatus.TRAINING, (3, 4)), (VspaceStatus.EMPTY, (0,))])
 def test_real_mode_keeps_the_renderer_warm_once_a_second(setup, vspace, counts):
     bus, _, _ = setup

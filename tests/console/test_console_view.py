@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from instant_ic.console.gridimage import grid_image
-from instant_ic.console.view import Look, ViewConfig, ViewScheduler, view_shape
+from instant_ic.console.view import Lead, LeadConfig, Look, ViewConfig, ViewScheduler, view_shape
 
 
 def test_look_left_and_up():
@@ -139,3 +139,28 @@ def test_unknown_grid_is_no_picture_and_same_grid_same_digest():
     grid = np.zeros((4, 4), np.int8)
     assert grid_image(grid, 0.1, (0, 0)).digest == grid_image(grid.copy(), 0.1, (0, 0)).digest
     assert grid_image(grid, 0.1, (0, 0)).digest != grid_image(grid, 0.1, (1, 0)).digest
+
+
+def test_the_lead_comes_and_goes_in_its_time():
+    lead = Lead(LeadConfig(seconds=0.8))
+    assert lead.step(10.0, True) == 0.0
+    assert lead.step(10.2, True) == pytest.approx(0.25)
+    assert lead.step(11.2, True) == 1.0
+    assert lead.step(11.4, False) == pytest.approx(0.75)
+    assert lead.step(13.0, False) == 0.0
+    at_once = Lead(LeadConfig(seconds=0.0))
+    assert [at_once.step(t, t < 2) for t in (0, 1, 2)] == [1.0, 1.0, 0.0]
+
+
+def test_the_displayed_place_goes_with_the_vbot_up_to_the_limit_and_no_other_place_counts():
+    lead = Lead(LeadConfig(max_m=0.3, seconds=0.0))
+    here = np.array([1.0, 2.0])
+    assert lead.displayed(here, here + [0.2, 0]) == pytest.approx(here)  # at the switch
+    lead.step(0.0, True)
+    assert lead.displayed(here, here + [0.2, 0]) == pytest.approx([1.2, 2.0])
+    assert lead.displayed(here, here + [0.3, -0.4]) == pytest.approx([1.18, 1.76])  # 0.3 of 0.5 m
+    assert lead.displayed(here, here) == pytest.approx(here)
+    assert lead.displayed(here, here + [1.2, 0]) == pytest.approx(here)
+    never = Lead(LeadConfig(max_m=0.0, seconds=0.0))
+    never.step(0.0, True)
+    assert never.displayed(here, here + [0.2, 0]) == pytest.approx(here)

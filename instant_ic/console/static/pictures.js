@@ -25,6 +25,7 @@ export class Pictures {
     this.motion = new Motion();
     this.leadMaxM = 0; // a view is shown as from up to this far from where it was drawn for; 0: never moved
     this.place = null; // [x, y] in the map of the camera that the view is shown from
+    this._now = null; // of the v-bot's camera
     this._lead = 0; // 0: from where it was drawn for, 1: from where the v-bot is now
     this._virtual = false;
     // Since when pictures of each kind have been made where the shown robot is; by the server's clock.
@@ -53,7 +54,7 @@ export class Pictures {
         this.panorama = header;
       } else {
         this.viewer.setView(bitmap, mask, depth);
-        this.view = { ...header, aspect: bitmap.width / bitmap.height };
+        this.view = { ...header, aspect: bitmap.width / bitmap.height, hasDepth: depth !== null };
       }
       depth?.picture.close();
       if (this.viewer.name === "webgl") bitmap.close();
@@ -126,14 +127,14 @@ export class Pictures {
    * much of the way to the v-bot's place of now is shown: at a switch none, as then each picture is where it was made.
    */
   _moved(state, elapsedMs) {
-    const { p, q, mount } = this.view, own = this.motion.own;
+    const { p, q, mount, hasDepth } = this.view, own = this.motion.own;
     this._lead += ((state?.lead ?? 0) - this._lead) * (1 - Math.exp(-elapsedMs / SMOOTHING_MS));
     if (mount && own && this._virtual) {
       const [x, y] = rotate(rotationZ(own[2]), mount);
       this._now = [own[0] + x, own[1] + y];
     }
     this.place = p.slice(0, 2);
-    if (!mount || !this._now || this.leadMaxM <= 0) return null;
+    if (!hasDepth || !this._now || this.leadMaxM <= 0) return null;
     const way = [this._now[0] - p[0], this._now[1] - p[1]], far = Math.hypot(...way);
     const share = far > ELSEWHERE_M ? 0 : Math.min(this._lead, this.leadMaxM / far);
     if (share * far < LEAST_M) return null;

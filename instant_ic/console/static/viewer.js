@@ -20,6 +20,7 @@ uniform vec2 viewTanHalf;  // of the rendered view
 uniform vec2 viewSize;     // pixels
 uniform float blend;       // 0 camera, 1 virtual space
 uniform bool hasMask;
+uniform bool slow;         // the CPU draws
 uniform bool moved;        // the camera has moved since the view was drawn
 uniform vec2 aside;        // how far, right and up, over viewTanHalf, m
 uniform float along;       // and forward
@@ -37,11 +38,12 @@ vec3 fromPanorama(vec3 direction) {
   vec3 d = panoramaFromLook * direction;
   float u = 0.5 - atan(d.y, d.x) / (2.0 * PI);
   float v = 0.5 - asin(clamp(d.z, -1.0, 1.0)) / PI;
-  return texture(panorama, vec2(u, v)).rgb;
+  return textureLod(panorama, vec2(u, v), 0.0).rgb;
 }
 
 // Cubic B-spline by four bilinear look-ups: a small view enlarged stays soft, without squares.
 vec3 smoothView(vec2 uv, float level) {
+  if (slow && level == 0.0) return textureLod(view, uv, 0.0).rgb; // four would be a third of the CPU's work
   vec2 viewSize = max(floor(viewSize / exp2(level)), 1.0);
   vec2 p = uv * viewSize - 0.5;
   vec2 i = floor(p), f = p - i;
@@ -65,14 +67,14 @@ vec2 before(vec2 at) {
   float inverse = mostInverse;
   for (int i = 0; i < 2; i++) {
     vec2 there = at + inverse * perInverseDepth;
-    inverse = min(texture(depth, vec2(0.5 + 0.5 * there.x, 0.5 - 0.5 * there.y)).r * perInverse, mostInverse);
+    inverse = min(textureLod(depth, vec2(0.5 + 0.5 * there.x, 0.5 - 0.5 * there.y), 0.0).r * perInverse, mostInverse);
   }
   return at + inverse * perInverseDepth;
 }
 
 // What was seen is sharp; the rest is guessed from around it, so it is shown blurred and paler.
 vec3 fromView(vec2 uv) {
-  float seen = hasMask ? smoothstep(0.0, 1.0, texture(mask, uv).r) : 1.0;
+  float seen = hasMask ? smoothstep(0.0, 1.0, textureLod(mask, uv, 0.0).r) : 1.0;
   vec3 result = seen > 0.004 ? smoothView(uv, 0.0) : vec3(0.0);
   if (seen < 0.996) {
     vec3 soft = smoothView(uv, SOFT_LEVEL);
@@ -83,33 +85,30 @@ vec3 fromView(vec2 uv) {
 
 void main() {
   vec3 direction = normalize(vec3(1.0, -screen.x * tanHalf.x, screen.y * tanHalf.y));
-  vec3 real = only == 2 ? NIGHT : fromPanorama(direction);
   if (only == 1) {
-    colour = vec4(real, 1.0);
+    colour = vec4(fromPanorama(direction), 1.0);
     return;
   }
-  real = real * panoramaGain + panoramaOffset;
-  vec3 result = real;
-  if (blend > 0.0) {
-    // Beyond the rendered view's edge the camera's picture goes on, dim and grey.
-    vec3 around = mix(NIGHT, vec3(dot(real, GREY)), 0.35);
-    vec3 d = viewFromLook * direction;
-    vec3 rendered = around;
-    if (d.x > 0.0) {
-      vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf);
-      if (moved) at = before(at);
-      vec2 edge = smoothstep(1.0, 0.94, abs(at));
-      vec2 uv = vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y);
-      float inside = edge.x * edge.y;
-      if (only == 2) {
-        colour = vec4(smoothView(uv, 0.0), inside * (hasMask ? texture(mask, uv).r : 1.0));
-        return;
-      }
-      rendered = mix(around, fromView(uv) * viewGain + viewOffset, inside);
-    }
-    result = mix(real, rendered, blend);
+  vec3 d = viewFromLook * direction;
+  vec2 uv = vec2(0.0);
+  float inside = 0.0; // of the rendered view, with a soft edge
+  if (blend > 0.0 && d.x > 0.0) {
+    vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf);
+    if (moved) at = before(at);
+    vec2 edge = smoothstep(1.0, 0.94, abs(at));
+    uv = vec2(0.5 + 0.5 * at.x, 0.5 - 0.5 * at.y);
+    inside = edge.x * edge.y;
   }
-  colour = vec4(result, only == 2 ? 0.0 : 1.0);
+  if (only == 2) {
+    colour = vec4(smoothView(uv, 0.0), inside * (hasMask ? textureLod(mask, uv, 0.0).r : 1.0));
+    return;
+  }
+  vec3 real = vec3(0.0), rendered = vec3(0.0);
+  if (blend < 1.0 || inside < 1.0) real = fromPanorama(direction) * panoramaGain + panoramaOffset;
+  if (inside > 0.0) rendered = fromView(uv) * viewGain + viewOffset;
+  // Beyond the rendered view's edge the camera's picture goes on, dim and grey.
+  vec3 around = mix(NIGHT, vec3(dot(real, GREY)), 0.35);
+  colour = vec4(mix(real, mix(around, rendered, inside), blend), 1.0);
 }`;
 
 /** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
@@ -206,6 +205,7 @@ export class GlViewer {
     gl.viewport(0, 0, width, height);
     gl.uniform1i(this._at("only"), only);
     gl.uniform1i(this._at("hasMask"), this._hasMask ? 1 : 0);
+    gl.uniform1i(this._at("slow"), this.slow ? 1 : 0);
     gl.uniform3fv(this._at("panoramaGain"), scene.panoramaColour.gain);
     gl.uniform3fv(this._at("panoramaOffset"), scene.panoramaColour.offset);
     gl.uniform3fv(this._at("viewGain"), scene.viewColour.gain);
