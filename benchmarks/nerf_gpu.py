@@ -92,7 +92,9 @@ def speed(config: VirtualSpaceConfig, world: str) -> dict[str, Any]:
         "first_picture_s": round(first, 3),
     }
     uniform = np.random.default_rng(0).random((config.train.ray_columns * config.train.ray_rows, 3), np.float32)
-    result["step_ms"] = round(1e3 * median_s(lambda: space._device.step(uniform, 1e-4, 1e-4), 50), 3)
+    step = median_s(lambda: space._device.step(uniform, 1e-4, 1e-4), 50)
+    result["step_ms"] = round(1e3 * step, 3)
+    result["step_ns_a_sample"] = round(1e9 * step / (2 * len(uniform)), 1)  # hash, network, loss, gradient, Adam
     for width, height in SIZES:
         rays = perspective_rays(poses[1], width, height, FOV)
 
