@@ -7,13 +7,13 @@ by shared control that goes round by itself. Figures are those of ``teleop_figur
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
-import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from ..geometry.poses import pose_matrix
 from . import teleop_figures as figures
 from .teleop_figures import Drive, Switch
 from .teleop_operator import Operator, Sight, make_operator, read_commands
+from .teleop_results import in_order
 from .teleop_stack import (
     CAMERA_HEIGHT_M,
     DEPTHS,
@@ -35,6 +36,9 @@ from .teleop_stack import (
     StackConfig,
 )
 from .teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
+
+if TYPE_CHECKING:
+    from concurrent.futures import ProcessPoolExecutor
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -75,13 +79,25 @@ class Settings:
                 raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
         StackConfig(overrides=self.overrides)  # raises ValueError on a word that is none
 
+    def course(self, index: int) -> Course:
+        """Course ``index``.
+
+        Raises:
+            ValueError: no such world, or nowhere to drive to in it.
+        """
+        return _course(self.world, self.seed, index, self.log is not None)
+
+
+_course = functools.lru_cache(maxsize=2)(make_course)
+"""Of one course all methods are driven."""
+
 
 class _Episode:
     """One drive in the making."""
 
-    def __init__(self, settings: Settings, course: Course, index: int, method: str) -> None:
-        seed = 1000 * settings.seed + index
-        config = StackConfig(method=method, depth=settings.depth, seed=seed, overrides=settings.overrides)
+    def __init__(self, settings: Settings, course: Course, index: int, method: str, filmed: bool = False) -> None:
+        seed, words = 1000 * settings.seed + index, settings.overrides
+        config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=words)
         self.settings, self.course = settings, course
         self.drive = Drive(index, method, way_m=course.way_m)
         log = read_commands(settings.log) if settings.log is not None else None
@@ -197,9 +213,10 @@ def run_episode(
     methods: tuple[str, ...] = (),
 ) -> list[Drive]:
     """One course driven by each method in turn; the same for the same settings and index, times apart."""
-    course = make_course(settings.world, settings.seed, index)
+    course = settings.course(index)
     with _quiet():
-        return [_Episode(settings, course, index, method).run(on_step) for method in methods or settings.methods]
+        filmed = on_step is not None
+        return [_Episode(settings, course, index, name, filmed).run(on_step) for name in methods or settings.methods]
 
 
 @contextlib.contextmanager
@@ -224,76 +241,95 @@ def prepare() -> None:
 def evaluate(
     settings: Settings,
     jobs: int = 1,
-    on_episode: Callable[[list[Drive]], None] | None = None,
+    on_drive: Callable[[Drive], None] | None = None,
     timeout_s: float = 7200.0,
+    done: Sequence[Drive] = (),
 ) -> list[Drive]:
-    """Drives all episodes, ``jobs`` at a time, each in a process of its own where more than one.
+    """Drives all courses by all methods, ``jobs`` drives at a time, each process one where more than one.
+
+    Args:
+        settings: what is driven.
+        jobs: drives at a time.
+        on_drive: called with each drive as it ends.
+        timeout_s: for all.
+        done: drives that need not be driven again.
 
     Raises:
         ValueError: nothing to do, no such world, no such log.
         TimeoutError: they took longer than ``timeout_s``.
         RuntimeError: a process died, or a robot never got ready.
     """
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
 
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
     if settings.log is not None:
         read_commands(settings.log)  # before anything is started
-    done: list[Drive] = []
-    tell = on_episode or (lambda drives: None)
-    if jobs == 1:
+    drives = list(done)
+    known = {(drive.index, drive.method) for drive in drives}
+    tasks = [(i, name) for i in range(settings.episodes) for name in settings.methods if (i, name) not in known]
+    began = time.monotonic()
+
+    def take(drive: Drive) -> None:
+        drives.append(drive)
+        if on_drive is not None:
+            on_drive(drive)
+
+    late = f"the drives took longer than {timeout_s:.0f} s"
+    if jobs == 1 or len(tasks) <= 1:
         prepare()
-        for index in range(settings.episodes):
-            drives = run_episode(settings, index)
-            done += drives
-            tell(drives)
-        return done
-    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"), initializer=prepare)
+        for index, name in tasks:
+            if time.monotonic() - began > timeout_s:
+                raise TimeoutError(late)
+            take(run_episode(settings, index, methods=(name,))[0])
+        return in_order(drives)
+    with _processes(min(jobs, len(tasks))) as pool:
+        try:
+            futures = [pool.submit(run_episode, settings, index, None, (name,)) for index, name in tasks]
+            for future in as_completed(futures, timeout=timeout_s):
+                take(future.result()[0])
+        except BrokenProcessPool as error:
+            raise RuntimeError("a process that drove a course died (out of memory?); try --jobs 1") from error
+        except TimeoutError as error:
+            raise TimeoutError(late) from error
+    return in_order(drives)
+
+
+@contextlib.contextmanager
+def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that drive; at the end of the block, however it comes, they are ended, too."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+
+    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_process)
     try:
-        futures = [pool.submit(run_episode, settings, index) for index in range(settings.episodes)]
-        for future in as_completed(futures, timeout=timeout_s):
-            drives = future.result()
-            done += drives
-            tell(drives)
-    except BrokenProcessPool as error:
-        raise RuntimeError("a process that drove an episode died (out of memory?); try --jobs 1") from error
-    except TimeoutError as error:
-        raise TimeoutError(f"the episodes took longer than {timeout_s:.0f} s; {len(done)} drives are done") from error
+        yield pool
     finally:
+        ours = list((pool._processes or {}).values())  # there is no public way to end one in the midst of a drive
         pool.shutdown(wait=False, cancel_futures=True)
-    return sorted(done, key=lambda drive: (drive.index, METHODS.index(drive.method)))
+        for process in ours:
+            process.terminate()
 
 
-def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
-    """Figures by method, the targets, and each drive without its tracks, as JSON takes it."""
-    by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
-    stop = by_method.get("stop")
-    methods = {name: figures.summary(of, stop if name != "stop" else None) for name, of in by_method.items() if of}
-    rows = []
-    for drive in drives:
-        row = {key: value for key, value in asdict(drive).items() if key != "tracks"}
-        rows.append(_finite(row))
-    return {
-        "seed": settings.seed,
-        "world": settings.world,
-        "operator": "scripted" if settings.log is None else "recorded",
-        "depth": settings.depth,
-        "parameters": list(settings.overrides),
-        "methods": _finite(methods),
-        "targets": figures.targets(methods["ic"]) if "ic" in methods else {},
-        "each": rows,
-    }
+def _begin_process() -> None:
+    import signal
+    import threading
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the one that collects ends the others
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    prepare()
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _end_with_parent() -> None:
+    """One that was killed ends nobody."""
+    import multiprocessing
+    import os
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
-__all__ = ["Drive", "Settings", "evaluate", "report", "run_episode"]
+__all__ = ["Drive", "Settings", "evaluate", "run_episode"]

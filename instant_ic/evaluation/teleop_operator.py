@@ -31,6 +31,7 @@ PASSED_M = 2.2
 """A detour is over so far from where he was held up."""
 GIVES_UP_AFTER = 4
 """Detours at one place."""
+_AFTER_S = 2.0
 HUMAN_SPARE_M = (0.10, 0.05)
 """Room that he keeps on a detour on every side; the second where the first does not fit."""
 
@@ -170,9 +171,10 @@ class RecordedOperator:
 
 
 def read_commands(path: Path) -> FloatArray:
-    """A log of commands (N, 3): seconds from the first, m/s, rad/s.
+    """A log of commands (N, 3): seconds from the first that moves the robot, m/s, rad/s.
 
-    From a bag's ``/operator/cmd_vel``, or a CSV file with the columns ``time_s, linear_m_s, angular_rad_s``.
+    From a bag's ``/operator/cmd_vel``, or a CSV file with the columns ``time_s, linear_m_s, angular_rad_s``. What is
+    before the first motion is left out, and what comes later than ``_AFTER_S`` after the last.
 
     Raises:
         ValueError: no such file, no commands in it, or rows that are none; names file and row.
@@ -181,10 +183,22 @@ def read_commands(path: Path) -> FloatArray:
         raise ValueError(f"{path}: there is no such bag or CSV file")
     log = _read_csv(path) if path.suffix.lower() == ".csv" else _read_bag(path)
     if len(log) == 0:
-        raise ValueError(f"{path}: no commands in it (/operator/cmd_vel of a bag, or rows of a CSV file)")
+        raise ValueError(f"{path}: no commands in it, only the names of the columns")
     table = np.array(log, dtype=np.float64)
-    if not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
-        raise ValueError(f"{path}: commands must be finite numbers in the order of their times")
+    bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
+    if bad.size:
+        raise ValueError(f"{path}: command {bad[0] + 1} of {len(table)} is not finite: {table[bad[0]].tolist()}")
+    back = np.flatnonzero(np.diff(table[:, 0]) < 0)
+    if back.size:
+        first, then = table[back[0] : back[0] + 2, 0]
+        raise ValueError(
+            f"{path}: time goes back by {first - then:.3f} s at command {back[0] + 2} of {len(table)}; "
+            "commands must be in the order of their times"
+        )
+    moves = np.flatnonzero(table[:, 1:].any(axis=1))
+    if moves.size == 0:
+        raise ValueError(f"{path}: all {len(table)} commands are zero: nobody drove")
+    table = table[moves[0] :][table[moves[0] :, 0] <= table[moves[-1], 0] + _AFTER_S]
     table[:, 0] -= table[0, 0]
     return table
 
@@ -210,14 +224,23 @@ def _read_bag(path: Path) -> list[Sequence[float]]:
     from ..bag.files import BagReader
     from ..msg import deserialize, twist_values
 
+    topic = "/operator/cmd_vel"
     rows: list[Sequence[float]] = []
     try:
         with BagReader(path) as reader:
-            for message in reader.messages(["/operator/cmd_vel"]):
+            types = {one.topic: one.type_name for one in reader.topics}
+            if topic not in types:
+                has = ", ".join(sorted(types)) or "none"
+                raise ValueError(f"{path}: {topic} is missing; it was recorded with these topics: {has}")
+            if types[topic].rpartition("/")[2] not in ("TwistStamped", "Twist"):
+                raise ValueError(f"{path}: {topic} is of {types[topic]}, not of geometry_msgs/TwistStamped")
+            for message in reader.messages([topic]):
                 twist = twist_values(deserialize(message.payload, message.type_name))
                 rows.append([message.stamp_ns / 1e9, *twist])
     except BagError as error:
         raise ValueError(str(error)) from error
+    if not rows:
+        raise ValueError(f"{path}: no message of {topic} in it")
     return rows
 
 

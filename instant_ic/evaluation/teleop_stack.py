@@ -5,11 +5,13 @@ LiDAR driver (packets in), SLAM, arbiter, v-bot, navigator, console, and for ill
 Simulated are the robot, its LiDAR and its camera (``sim``). A model are: how late a command reaches the base and a
 picture the page; how old depth is (its network takes no simulated time); and the page itself, which shows what the
 console sends it. The camera's pictures are drawn only where depth takes them: the console and the arbiter get a small
-stand-in at the camera's rate, as all they need of it is its stamp.
+stand-in at the camera's rate, as all they need of it is its stamp. Rendered views are drawn small, and at full size on
+either side of a switch, where they are compared.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import deque
 from collections.abc import Callable
@@ -41,6 +43,10 @@ START_NS = 1_700_000_000_000_000_000
 CAMERA_HEIGHT_M = 1.2
 _EVERY = 3
 """Steps between two of the operator's commands (20 Hz)."""
+_OVERDUE_S = 0.5
+"""Of a picture that depth has had for so long nothing comes any more."""
+_SMALLER = 4
+"""A view that nobody compares is drawn so much smaller each way."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +62,7 @@ class StackConfig:
         depth_latency_s: from the exposure to the keyframe.
         command_latency_s: from the arbiter to the base, the least and the most; drawn once.
         panorama: width of the pictures that depth and virtual space get, pixels.
+        whole_views: draw all rendered views at full size, for a film; else those on either side of a switch.
         overrides: further ``node.key:=value`` words.
     """
 
@@ -67,6 +74,7 @@ class StackConfig:
     depth_latency_s: float = 1.0
     command_latency_s: tuple[float, float] = (0.02, 0.08)
     panorama: int = 1024
+    whole_views: bool = False
     overrides: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -92,6 +100,7 @@ class Shown:
         place: (2,) the same, as the stack knows it.
         heading: yaw that it is shown at: the page turns the camera's picture to the newest heading.
         jpeg, fov_rad: of a rendered view.
+        draw: makes the JPEG of this view at full size.
     """
 
     time_s: float
@@ -102,6 +111,7 @@ class Shown:
     heading: float
     jpeg: bytes = b""
     fov_rad: float = math.pi / 2
+    draw: Callable[[], bytes] | None = None
 
 
 class _Port:
@@ -197,11 +207,12 @@ class SimulatedStack:
         self.command_delay_ns = round(1e9 * self.rng.uniform(*config.command_latency_s))
         self._commands: deque[tuple[int, Record]] = deque()
         self._steps = 0
-        self._next_exposure_s = 0.0
+        self._next_exposure_s = self._next_depth_s = 0.0
         self._exposed: deque[tuple[float, FloatArray]] = deque()  # on their way to the page
         self._for_depth: deque[tuple[float, float, bytes]] = deque()  # due, exposure, JPEG
         self._keyframe_at: FloatArray | None = None
-        self._drawn_at: FloatArray | None = None
+        self._drawn: dict[int, FloatArray] = {}  # pictures on their way to a keyframe: stamp, r-bot's true pose
+        self._whole: tuple[int, Callable[[], bytes]] | None = None  # newest view: its request, what draws it whole
         self._newest: dict[bool, Shown] = {}
         self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
         self._add_nodes()
@@ -246,7 +257,12 @@ class SimulatedStack:
             node_class: Any = node.node_class
             if name == "crawler_base":
                 node_class = type(node_class.__name__, (node_class,), {"open_port": staticmethod(lambda _: port)})
+            if name == "nerf" and not config.whole_views:
+                node_class = type(node_class.__name__, (node_class,), {"do": self._draw_small(node_class.do)})
             self.nodes[name] = self.bus.add(node_class, node.config, name, remaps=remaps.get(name))
+        if config.method == "ic":
+            looks = self.nodes["depth_estimator" if config.depth == "fused" else "depth_scaler"]
+            self._depth_hz = float(looks.config.max_rate_hz)
         camera = make_node("theta_camera", None, words).config
         mount = pose_matrix(*camera.mount_xyz, *np.radians(camera.mount_rpy_deg))
         self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
@@ -270,8 +286,22 @@ class SimulatedStack:
             self.yaw_gap_rad = wrap_angle(float(self.vbot[2] - truth[2]))
         elif topic == "/keyframe":
             self.log.keyframes += 1
-            pose = message_pose(deserialize(record.payload, record.type_name))
-            self._keyframe_at = self._in_world(pose2_from_matrix(pose))
+            of = stamp_ns(deserialize(record.payload, record.type_name))
+            self._keyframe_at = self._drawn.pop(of, self._keyframe_at)
+
+    def _draw_small(self, do: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """A virtual space's work, but views are drawn small, and it is kept what it takes to draw the newest whole."""
+
+        def small(node: Any, job: Any) -> Any:
+            if job.kind != "draw":
+                return do(node, job)
+            as_now = copy.copy(node)
+            as_now.space = copy.copy(node.space)  # drawing changes what it has; keyframes stay as they are
+            self._whole = int(job.message.id), lambda: bytes(do(as_now, job).jpeg)
+            width, height = (max(16, int(side) // _SMALLER) for side in (job.message.width, job.message.height))
+            return do(node, replace(job, message=replace(job.message, width=width, height=height)))
+
+        return small
 
     def _in_world(self, in_map: FloatArray) -> FloatArray:
         return np.asarray(compose2(self.start, in_map))
@@ -284,7 +314,9 @@ class SimulatedStack:
             map_from_camera = matrix_from_quaternion(np.array(header["q"]))
             map_from_camera[:3, 3] = header["p"]
             pose = self._in_world(pose2_from_matrix(map_from_camera))
-            shown = Shown(self.time_s, self.time_s, True, pose, pose[:2], float(pose[2]), payload, float(header["fov"]))
+            draw = self._whole[1] if self._whole is not None and self._whole[0] == header["request_id"] else None
+            now, fov = self.time_s, float(header["fov"])
+            shown = Shown(now, now, True, pose, pose[:2], float(pose[2]), payload, fov, draw)
         else:
             exposure_s, taken_from = self._exposed.popleft()
             stamp = START_NS + round(exposure_s * 1e9)
@@ -293,14 +325,23 @@ class SimulatedStack:
             shown = Shown(self.time_s, self.time_s, False, taken_from, place[:2], float(self.robot[2]))
         self._newest[virtual] = shown
         if virtual == self.page.virtual:
-            self.log.pictures.append(shown)
+            self._show(shown)
 
     def on_show(self) -> None:
         """The page changes to the other picture: the newest of it that there is, if it is fresh."""
         newest = self._newest.get(self.page.virtual)
         if newest is not None and self.time_s - newest.time_s < 0.5:
             heading = newest.heading if newest.virtual else float(self.robot[2])
-            self.log.pictures.append(replace(newest, time_s=self.time_s, heading=heading))
+            self._show(replace(newest, time_s=self.time_s, heading=heading))
+
+    def _show(self, shown: Shown) -> None:
+        """The picture comes up: at a switch it and the one before are drawn whole; what draws others is let go."""
+        pictures = self.log.pictures
+        if pictures:
+            switched = pictures[-1].virtual != shown.virtual
+            pictures[-1] = _settled(pictures[-1], switched)
+            shown = _settled(shown, True) if switched else shown
+        pictures.append(shown)
 
     def _photograph(self) -> None:
         now = self.time_s
@@ -308,7 +349,7 @@ class SimulatedStack:
             self._next_exposure_s += 1.0 / self.config.camera_hz
             self._exposed.append((now, self.robot))
             if self.config.method == "ic" and self._worth_drawing():
-                self._drawn_at = self.robot
+                self._drawn[START_NS + round(now * 1e9)] = self.robot
                 jpeg = self._draw()
                 self._for_depth.append((now + self.config.depth_latency_s, now, jpeg))
         # What is on its way: the console takes the first off the queue itself.
@@ -326,13 +367,19 @@ class SimulatedStack:
         self.bus.publish(topic, message)
 
     def _worth_drawing(self) -> bool:
-        """Whether depth could make a keyframe of a picture taken now (it needs 0.6 m or 45° of motion)."""
-        if self._drawn_at is None:
-            return True
-        waits = bool(self._for_depth)
-        if self._keyframe_at is None:
-            return not waits
-        return _moved(self.robot, self._drawn_at) and _moved(self.robot, self._keyframe_at)
+        """Whether depth looks at a picture taken now, and makes a keyframe of it: none is of a place near here."""
+        if self.time_s < self._next_depth_s - 1e-9:
+            return False
+        self._next_depth_s = self.time_s + 1.0 / self._depth_hz
+        now_ns = START_NS + round(self.time_s * 1e9)
+        wait_ns = (self.config.depth_latency_s + _OVERDUE_S) * 1e9
+        while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not taken
+            del self._drawn[next(iter(self._drawn))]
+        rule = self.nodes["depth_scaler"].config.keyframes
+        places = [*self._drawn.values(), *([] if self._keyframe_at is None else [self._keyframe_at])]
+        return all(
+            _moved(self.robot, place, rule.distance_m + 0.01, math.radians(rule.angle_deg + 0.5)) for place in places
+        )
 
     def _draw(self) -> bytes:
         import cv2
@@ -402,9 +449,15 @@ class SimulatedStack:
         log.reason.append(str(state.reason))
 
 
-def _moved(a: FloatArray, b: FloatArray) -> bool:
+def _settled(shown: Shown, whole: bool) -> Shown:
+    if shown.draw is None:
+        return shown
+    return replace(shown, jpeg=shown.draw() if whole else shown.jpeg, draw=None)
+
+
+def _moved(a: FloatArray, b: FloatArray, distance_m: float, angle_rad: float) -> bool:
     x, y, yaw = relative2(a, b)
-    return math.hypot(float(x), float(y)) > 0.5 or abs(float(yaw)) > math.radians(38)
+    return math.hypot(float(x), float(y)) >= distance_m or abs(wrap_angle(float(yaw))) >= angle_rad
 
 
 __all__ = ["DEPTHS", "METHODS", "Log", "Shown", "SimulatedStack", "StackConfig"]

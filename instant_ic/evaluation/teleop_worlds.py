@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -25,6 +27,14 @@ SPARE_M = 0.10
 FIRST_M, APART_M, LAST_M = 3.2, 3.8, 2.4
 """Metres from the start to the first obstacle, between two, and from the last to the goal, at least."""
 _TALLER_THAN_THINGS_M = (1.9, 2.2)
+_TALL_M = (1.5, 1.9)
+"""In furnished worlds, what stands in these heights is no hidden thing; a door's lintel is above."""
+_DRIVE_M = (3.5, 10.0)
+"""Of a drive across a furnished world: the shortest, the longest."""
+_ROOM_M = 0.45
+"""Distance from everything at its start and its goal."""
+_LONGEST_THING_M = 1.5
+"""Along the operator's line; v-bots pass no more than 3 m (config/control.yaml: max_pass_m)."""
 
 
 @dataclass(frozen=True)
@@ -60,17 +70,33 @@ class Course:
         return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def make_course(name: str, seed: int, index: int) -> Course:
-    """``corridors`` gives another random corridor for each index; any name of ``sim.worlds.make_world`` that world.
+def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> Course:
+    """Another random corridor for each index, a drive along the simulator's corridor, or one across any other world.
+
+    Args:
+        name: ``corridors``, or any name of ``sim.worlds.make_world``.
+        seed, index: which course; the same give the same.
+        from_spawn: start where the simulator starts robots, without goals; for recorded commands.
 
     Raises:
         ValueError: no such world, or nowhere to drive to in it.
     """
     if name == RANDOM_CORRIDORS:
         return random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
+    world = _world(name)
+    if name.partition(":")[0] in ("corridor", "corridor-free"):
+        return straight_ahead(world)
+    if from_spawn:
+        return Course(world, np.empty((0, 2)), ())
+    return across(world, np.random.default_rng([59, seed, index]))
+
+
+@functools.lru_cache(maxsize=1)
+def _world(name: str) -> World:
+    """Kept for the next course: a mesh with its textures takes seconds to load."""
     from ..sim.worlds import make_world
 
-    return straight_ahead(make_world(name))
+    return make_world(name)
 
 
 def random_corridor(rng: np.random.Generator, name: str, attempts: int = 50) -> Course:
@@ -178,16 +204,76 @@ def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.
             f"world {world.name!r}: a wall stands {reach + before_wall_m:.1f} m ahead of the start; "
             "the operator drives straight on and needs 3.2 m"
         )
+    goal = np.array([x, y]) + reach * heading
+    return Course(world, goal[None], things_between(floor_plan(world), np.array([x, y]), goal))
+
+
+def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> tuple[Obstacle, ...]:
+    """What stands on the straight way (2,) to (2,) of a robot 0.5 m wide, as boxes across it."""
+    length = float(np.linalg.norm(goal - start))
+    heading = (goal - start) / length
+    yaw = math.atan2(heading[1], heading[0])
+    steps = np.arange(0.0, length, 0.05)
+    line = start + steps[:, None] * heading
     across = np.linspace(-0.25, 0.25, 11)[:, None] * np.array([-heading[1], heading[0]])
-    plan = floor_plan(world)
-    strip = np.array([plan.at(point + across).any() for point in line[steps < reach]])
+    strip = np.array([plan.at(point + across).any() for point in line], bool)
     begins = np.flatnonzero(strip & ~np.concatenate([[False], strip[:-1]]))
     ends = np.flatnonzero(strip & ~np.concatenate([strip[1:], [False]]))
-    obstacles: list[Obstacle] = []
-    for first, last in zip(begins, ends, strict=True):
-        if obstacles and steps[first] - np.linalg.norm([obstacles[-1].x - x, obstacles[-1].y - y]) < 1.0:
-            continue  # the other side of a hollow one
-        centre = 0.5 * (line[first] + line[last])
-        length = float(steps[last] - steps[first]) + 0.05
-        obstacles.append(Obstacle(float(centre[0]), float(centre[1]), length, 0.5, yaw, BODY_M[1]))
-    return Course(world, (np.array([x, y]) + reach * heading)[None], tuple(obstacles))
+    found: list[list[float]] = []  # first and last metre of each
+    for first, last in zip(steps[begins], steps[ends], strict=True):
+        if found and first - 0.5 * sum(found[-1]) < 1.0:  # the other side of a hollow one
+            found[-1][1] = float(last)
+        else:
+            found.append([float(first), float(last)])
+    places = [start + 0.5 * (first + last) * heading for first, last in found]
+    sizes = [last - first + 0.05 for first, last in found]
+    return tuple(
+        Obstacle(float(at[0]), float(at[1]), size, 0.5, yaw, BODY_M[1]) for at, size in zip(places, sizes, strict=True)
+    )
+
+
+def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Course:
+    """A straight drive between two free places of a furnished world, over things in the way where there are any.
+
+    No wall and nothing taller than ``_TALL_M`` stands between, the goal can be reached round everything with
+    ``SPARE_M`` to spare, and things on the line leave the robot as much room before and behind them as in a corridor.
+
+    Raises:
+        ValueError: no such drive came up within ``attempts``.
+    """
+    plan, tall = floor_plan(world), world.occupied(*_TALL_M, 0.05)
+    away = plan.distance_m()
+    cells = plan.reachable(world.spawn[:2], 0.35)
+    cells = cells[away[cells[:, 0], cells[:, 1]] >= _ROOM_M] if len(cells) else cells
+    places = plan.centre(cells)
+    longest: Course | None = None
+    for start, goal in places[rng.integers(0, len(places), (attempts, 2))] if len(places) else ():
+        length = float(np.linalg.norm(goal - start))
+        if not _DRIVE_M[0] <= length <= _DRIVE_M[1] or things_between(tall, start, goal):
+            continue
+        things = things_between(plan, start, goal)
+        if any(not _passable(thing, start, goal) for thing in things):
+            continue
+        there = copy.copy(world)
+        there.spawn = (float(start[0]), float(start[1]), math.atan2(goal[1] - start[1], goal[0] - start[0]))
+        course = Course(there, goal[None], things)
+        if not things and longest is not None and longest.way_m >= course.way_m:
+            continue
+        if route(plan, np.array(there.spawn), course.goals, SPARE_M) is None:
+            continue
+        if things:
+            return course
+        longest = course
+    if longest is None:
+        raise ValueError(
+            f"world {world.name!r}: no straight drive of {_DRIVE_M[0]} m between two free places came up in {attempts} "
+            f"tries ({len(places) * plan.cell_m**2:.1f} m² are {_ROOM_M} m away from everything and can be reached)"
+        )
+    return longest
+
+
+def _passable(thing: Obstacle, start: FloatArray, goal: FloatArray) -> bool:
+    """Whether there is room before and behind it, and it is no longer than a v-bot passes."""
+    at, half = np.array([thing.x, thing.y]), 0.5 * thing.length
+    before, behind = (float(np.linalg.norm(end - at)) - half for end in (start, goal))
+    return thing.length <= _LONGEST_THING_M and before >= FIRST_M - 1.0 and behind >= LAST_M - 1.0

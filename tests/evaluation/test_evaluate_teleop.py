@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,13 +13,16 @@ import cv2
 import numpy as np
 import pytest
 
+from instant_ic.bag.writer import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.control.arbiter import Mode
-from instant_ic.evaluation import teleop, teleop_figures, teleop_worlds
+from instant_ic.evaluation import teleop, teleop_figures, teleop_results, teleop_worlds
 from instant_ic.evaluation.teleop_figures import Drive, Switch
 from instant_ic.evaluation.teleop_operator import RecordedOperator, ScriptedOperator, Sight, read_commands
 from instant_ic.evaluation.teleop_plot import Video, save_plot
 from instant_ic.evaluation.teleop_stack import Log, Shown, SimulatedStack, StackConfig
+from instant_ic.msg import message_type, serialize
+from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.contact import OccupancyMask
 
 
@@ -147,8 +151,104 @@ def test_summary_by_hand() -> None:
     assert standing["switches_per_obstacle"] == 0.0 and standing["switch_psnr_db"] is None
     assert not teleop_figures.targets(standing)["one switch each way an obstacle"]
     settings = teleop.Settings(episodes=2, methods=("ic", "stop"))
-    told = json.loads(json.dumps(teleop.report(ic + stop, settings), allow_nan=False))
+    assert teleop_figures.targets(standing)["switch_position_error_m <= 0.02"] is None  # there was no switch
+    told = json.loads(json.dumps(teleop_results.report(ic + stop, settings), allow_nan=False))
     assert set(told["methods"]) == {"ic", "stop"} and len(told["each"]) == 4 and "tracks" not in told["each"][0]
+
+
+def test_without_obstacles_nothing_is_divided_by_them() -> None:
+    figures = teleop_figures.summary([Drive(0, "ic", True, seconds=9.0, way_m=0.0, driven_m=3.0)])
+    assert figures["switches_per_obstacle"] is None and figures["path_ratio_mean"] is None
+    met = teleop_figures.targets(figures)
+    assert met["one switch each way an obstacle"] is None and met["contacts == 0"] is True
+
+
+class TestResults:
+    settings = teleop.Settings(episodes=2, methods=("ic", "stop"))
+    drives = (
+        Drive(
+            0, "ic", True, seconds=9.5, way_m=8.0, mode_seconds={"real": 9.5},
+            switches=[Switch(1.0, True, math.nan, 0.1, 0.02, 0.03, 0.0)],
+            tracks={"robot": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], "vbot": [], "modes": [[0.0, 0], [9.5, 0]]},
+        ),
+        Drive(1, "stop", False, reason="an obstacle ahead", tracks={"robot": [], "vbot": [], "modes": []}),
+    )  # fmt: skip
+
+    def test_what_was_saved_is_taken_up_again(self, tmp_path: Path) -> None:
+        file = tmp_path / "out.json"
+        teleop_results.save(file, self.drives, self.settings)
+        assert list(tmp_path.iterdir()) == [file]
+        again = teleop_results.load(file, self.settings)
+        # NaN is not equal to itself: by their words.
+        assert repr(again) == repr(list(self.drives))
+        told = json.loads(file.read_text())
+        assert told["drives"] == 2 and told["drives_planned"] == 4 and told["each"][0]["obedience"] is None
+
+    def test_only_what_is_asked_for_is_taken_up(self, tmp_path: Path) -> None:
+        teleop_results.save(tmp_path / "out.json", self.drives, self.settings)
+        fewer = teleop.Settings(episodes=1, methods=("ic", "shared"))
+        assert [d.method for d in teleop_results.load(tmp_path / "out.json", fewer)] == ["ic"]
+
+    def test_what_cannot_be_taken_up(self, tmp_path: Path) -> None:
+        file = tmp_path / "out.json"
+        teleop_results.save(file, self.drives, self.settings)
+        with pytest.raises(ValueError, match="driven with seed 0, not 3"):
+            teleop_results.load(file, teleop.Settings(episodes=2, methods=("ic", "stop"), seed=3))
+        for words in ("{}", "[1]", "no JSON", file.read_text()[:-20], file.read_text().replace("contacts", "bumps")):
+            file.write_text(words)
+            with pytest.raises(ValueError, match="no report of ic evaluate teleop"):
+                teleop_results.load(file, self.settings)
+
+
+def _instead(drives: list[Drive], ends: BaseException | None):
+    """In place of ``teleop.evaluate``: these are driven, then it ends so."""
+
+    def evaluate(settings, jobs, on_drive, timeout_s, done):
+        assert all((d.index, d.method) not in {(k.index, k.method) for k in done} for d in drives)
+        for drive in drives:
+            on_drive(drive)
+        if ends is not None:
+            raise ends
+
+    return evaluate
+
+
+@pytest.mark.parametrize(
+    ("ends", "status", "told"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted; 1 of 4 drives are done"),
+        (RuntimeError("a process died"), 1, "a process died; 1 of 4 drives are done"),
+    ],
+)
+def test_an_interrupted_run_keeps_what_was_driven_and_goes_on(
+    ends: BaseException,
+    status: int,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file, (first, last) = tmp_path / "out.json", TestResults.drives
+    words = ["evaluate", "teleop", "--episodes", "2", "--methods", "ic,stop", "--json", str(file)]
+    monkeypatch.setattr(teleop, "evaluate", _instead([first], ends))
+    assert main(words) == status
+    output = capsys.readouterr()
+    assert told in " ".join(output.err.split()) and "--resume" in output.err
+    assert json.loads(output.out)["methods"]["ic"]["completed_fraction"] == 1.0
+    assert [row["method"] for row in json.loads(file.read_text())["each"]] == ["ic"]
+    monkeypatch.setattr(teleop, "evaluate", _instead([last], None))
+    assert main([*words, "--resume"]) == 0
+    assert [row["method"] for row in json.loads(file.read_text())["each"]] == ["ic", "stop"]
+    assert set(json.loads(capsys.readouterr().out)["methods"]) == {"ic", "stop"}
+
+
+def furnished(thing: tuple[float, float] | None) -> teleop_worlds.World:
+    """A room of 6 x 2.4 m, in it a box of 0.4 x 0.5 x 0.5 m."""
+    building = Building()
+    building.add(Zone(-1.0, -1.2, 5.0, 1.2, 2.6))
+    if thing is not None:
+        building.builder.box(thing, (0.4, 0.5, 0.5))
+    return building.world("room", (0.0, 0.0, 0.0), light_cell_m=1.0, rays=1)
 
 
 class TestWorlds:
@@ -175,6 +275,33 @@ class TestWorlds:
         assert course.goals[0] == pytest.approx([9.9, 0.0], abs=0.2)
         (box,) = course.obstacles
         assert (box.x, box.y) == pytest.approx((4.25, 0.0), abs=0.06)
+
+    def test_across_a_furnished_room_he_drives_over_what_stands_there(self) -> None:
+        for seed in range(3):
+            course = teleop_worlds.across(furnished((2.0, 0.1)), np.random.default_rng(seed))
+            (box,) = course.obstacles
+            assert (box.x, box.y) == pytest.approx((2.0, 0.1), abs=0.45)
+            start, goal = np.array(course.world.spawn[:2]), course.goals[0]
+            assert 3.5 <= course.way_m <= 10.0
+            assert course.world.spawn[2] == pytest.approx(math.atan2(*(goal - start)[::-1]))
+            plan = teleop_worlds.floor_plan(course.world)
+            assert teleop_worlds.route(plan, np.array(course.world.spawn), course.goals, 0.05) is not None
+        again = teleop_worlds.across(furnished((2.0, 0.1)), np.random.default_rng(2))
+        assert again.world.spawn == course.world.spawn and np.array_equal(again.goals, course.goals)
+
+    def test_an_empty_room_has_no_obstacles_and_a_closet_no_drive(self) -> None:
+        assert teleop_worlds.across(furnished(None), np.random.default_rng(0), attempts=60).obstacles == ()
+        closet = Building()
+        closet.add(Zone(-1.0, -1.2, 2.0, 1.2, 2.6))
+        world = closet.world("closet", (0.0, 0.0, 0.0), light_cell_m=1.0, rays=1)
+        with pytest.raises(ValueError, match=r"'closet': no straight drive of 3.5 m .* can be reached"):
+            teleop_worlds.across(world, np.random.default_rng(0), attempts=100)
+
+    def test_recorded_commands_begin_where_the_simulator_starts_robots(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(teleop_worlds, "_world", lambda name: furnished(None))
+        course = teleop_worlds.make_course("random:1", 0, 0, from_spawn=True)
+        assert course.world.spawn == (0.0, 0.0, 0.0) and len(course.goals) == 0 and course.way_m == 0.0
+        assert teleop_worlds.make_course("random:1", 0, 0).way_m > 3.5
 
 
 def sight(time_s: float, pose: tuple[float, float, float], speed: float = 0.4, **given: bool) -> Sight:
@@ -229,8 +356,9 @@ class TestOperator:
             ("", "column time_s, linear_m_s, angular_rad_s is missing"),
             ("time_s,linear_m_s,angular_rad_s\n", "no commands"),
             ("time_s,linear_m_s,angular_rad_s\n1,x,0\n", "drive.csv:2: not a row of numbers"),
-            ("time_s,linear_m_s,angular_rad_s\n2,0,0\n1,0,0\n", "in the order of their times"),
-            ("time_s,linear_m_s,angular_rad_s\n1,nan,0\n", "finite"),
+            ("time_s,linear_m_s,angular_rad_s\n2,1,0\n1,0,0\n", "goes back by 1.000 s at command 2 of 2"),
+            ("time_s,linear_m_s,angular_rad_s\n1,0,0\n1,nan,0\n", "command 2 of 2 is not finite"),
+            ("time_s,linear_m_s,angular_rad_s\n1,0,0\n2,0,0\n", "nobody drove"),
         ],
     )
     def test_a_log_that_is_none(self, tmp_path: Path, text: str, words: str) -> None:
@@ -238,6 +366,43 @@ class TestOperator:
         file.write_text(text)
         with pytest.raises(ValueError, match=words):
             read_commands(file)
+
+
+def bag_of(path: Path, topic: str, message: str, commands: list[tuple[float, float]]) -> Path:
+    """A bag with a command each tenth of a second."""
+    kind, vector = message_type(message), message_type("Vector3")
+    with BagWriter(path) as writer:
+        for k, (linear, angular) in enumerate(commands):
+            twist = message_type("Twist")(vector(linear, 0.0, 0.0), vector(0.0, 0.0, angular))
+            one = (
+                kind(message_type("Header")(message_type("Time")(0, 0), ""), twist) if message != "Bool" else kind(True)
+            )
+            writer.write(topic, f"{kind.__msgtype__}", bytes(serialize(one)), 10**18 + k * 10**8)
+    return path
+
+
+class TestRecordedInABag:
+    def test_what_is_before_and_after_the_drive_is_left_out(self, tmp_path: Path) -> None:
+        commands = [(0.0, 0.0)] * 30 + [(0.3, -0.2)] * 5 + [(0.0, 0.0)] * 90
+        log = read_commands(bag_of(tmp_path / "bag", "/operator/cmd_vel", "TwistStamped", commands))
+        assert log[0] == pytest.approx([0.0, 0.3, -0.2]) and log[4] == pytest.approx([0.4, 0.3, -0.2])
+        assert log[-1] == pytest.approx([2.4, 0.0, 0.0]) and len(log) == 25
+
+    @pytest.mark.parametrize(
+        ("topic", "message", "told"),
+        [
+            ("/cmd_vel", "TwistStamped", "/operator/cmd_vel is missing; it was recorded with these topics: /cmd_vel"),
+            ("/operator/cmd_vel", "Bool", "is of std_msgs/msg/Bool, not of geometry_msgs/TwistStamped"),
+        ],
+    )
+    def test_another_bag(self, topic: str, message: str, told: str, tmp_path: Path) -> None:
+        with pytest.raises(ValueError, match=told):
+            read_commands(bag_of(tmp_path / "bag", topic, message, [(0.1, 0.0)]))
+
+    def test_no_bag(self, tmp_path: Path) -> None:
+        (tmp_path / "drive.mcap").write_bytes(b"no bag")
+        with pytest.raises(ValueError, match=r"drive\.mcap"):
+            read_commands(tmp_path / "drive.mcap")
 
 
 @pytest.mark.parametrize(
@@ -251,6 +416,7 @@ class TestOperator:
         (["--log", "x.csv"], "is for --operator recorded"),
         (["--operator", "recorded", "--log", "/no/such.csv"], "there is no such bag or CSV file"),
         (["--video", "film.avi"], "is an .mp4"),
+        (["--resume"], "--resume needs --json"),
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
         (["-p", "arbiter.no_key:=1"], "unknown parameter 'no_key'"),
         (["--json", "/no/such/folder/out.json"], "is no folder"),
@@ -281,7 +447,7 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
         picture, plan = np.hsplit(read.read()[1], [640])
         assert frames == video.pictures and plan.shape == (360, 360, 3)
         assert picture.std() > 20 and (plan > 240).mean() > 0.5  # a corridor, and a drawing on white
-        save_plot(tmp_path / "drive.png", [drive], teleop.report([drive], settings), settings)
+        save_plot(tmp_path / "drive.png", [drive], teleop_results.report([drive], settings), settings)
         assert cv2.imread(str(tmp_path / "drive.png")).std() > 10
     else:
         drive = episode.run()
@@ -291,6 +457,14 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
     assert drive.driven_m == pytest.approx(0.75, abs=0.15)
     assert drive.obedience > 0.9
     assert drive.longest_freeze_s < 0.35 and (drive.keyframes > 0) == (method == "ic")
+    if method == "ic":  # a view is drawn small, and as it was then at full size where that is wanted
+        newest = episode.stack._newest[True]
+        assert newest.draw is not None
+        whole, small = teleop.decode(newest.draw()), teleop.decode(newest.jpeg)
+        assert whole.shape[1] == 4 * small.shape[1] and whole.shape[0] // 4 == small.shape[0]
+        assert np.array_equal(whole, teleop.decode(newest.draw()))
+        shrunk = cv2.resize(whole, small.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(shrunk.astype(float) - small).mean() < 12 < small.std()
     nodes = set(episode.stack.nodes)
     assert {"crawler_base", "vlp16_driver", "grid_slam", "arbiter", "navigator", "console"} <= nodes
     assert ("nerf" in nodes) == (method == "ic")
@@ -315,8 +489,6 @@ def test_shared_control_goes_round_by_itself_and_gives_back() -> None:
     fresh = ArbiterInputs(robot_pose=np.zeros(3), costmap=costmap, ages=dict.fromkeys(names, 0.0))
 
     def step(k: int, command: tuple[float, float]) -> SimpleNamespace:
-        from dataclasses import replace
-
         decision = shared.step(replace(fresh, operator_command=command), 50_000_000 * k)
         return SimpleNamespace(command=decision.command, reason=decision.reason, mode=decision.mode)
 
@@ -337,6 +509,14 @@ def test_the_stack_refuses_what_it_cannot_run() -> None:
         StackConfig(method="magic")
     with pytest.raises(ValueError, match="depth must be one of"):
         StackConfig(depth="true")
+
+
+def test_at_a_switch_both_pictures_are_drawn_whole() -> None:
+    stack = SimpleNamespace(log=Log())
+    for k, virtual in enumerate([False, True, True, True, False]):
+        SimulatedStack._show(stack, replace(photo(float(k), 0.0, virtual), jpeg=b"small", draw=lambda: b"whole"))
+    assert [shown.jpeg for shown in stack.log.pictures[1:4]] == [b"whole", b"small", b"whole"]
+    assert all(shown.draw is None for shown in stack.log.pictures)
 
 
 def test_a_command_reaches_the_base_late(short_course: teleop_worlds.Course) -> None:

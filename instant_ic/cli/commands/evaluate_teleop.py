@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +35,8 @@ def add_kind(kinds: Any) -> None:
         "--world",
         default="corridors",
         metavar="W",
-        help="corridors (random ones); or one of the simulator's: corridor, random:SEED, a mesh file; there the "
-        "operator drives straight on (default: %(default)s)",
+        help="corridors (random ones); or one of the simulator's: corridor, where the operator drives straight on, "
+        "random:SEED or a mesh file, where he drives at random places that he can see (default: %(default)s)",
     )
     parser.add_argument(
         "--methods", default="ic,stop,shared", metavar="M,M", help="ic, stop, shared (default: %(default)s)"
@@ -61,9 +65,12 @@ def add_kind(kinds: Any) -> None:
         help="another parameter than the shipped one, as virtual_robot.vbot.ease_m_s:=0.05; may be repeated",
     )
     parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="courses at a time (default: all cores)"
+        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives at a time (default: all cores)"
     )
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here, anew after each drive")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with what --json has: only drives that it lacks are driven"
+    )
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write paths and bars by method here")
     parser.add_argument(
         "--video", type=Path, metavar="OUT.mp4", help="write the first course by the first method here, as a split view"
@@ -102,56 +109,35 @@ def _wrong_usage(args: argparse.Namespace) -> str:
         return "--operator recorded needs --log: a bag, or a CSV file"
     if args.operator == "scripted" and args.log is not None:
         return "--log is for --operator recorded"
+    if args.resume and args.json is None:
+        return "--resume needs --json: the file that the earlier run has written"
     return ""
 
 
 def _evaluate(args: argparse.Namespace, console: Any) -> int:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    from ...evaluation import teleop
+    from ...evaluation import teleop, teleop_results
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
     settings = teleop.Settings(
         args.episodes, args.seed, args.world, methods, args.depth, args.log, overrides=tuple(args.param)
     )
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    contacts = 0
-    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
-        task = progress.add_task("starting", total=settings.episodes)
-        so_far: list[teleop.Drive] = []
+    drives: list[teleop.Drive] = []
+    if args.resume and args.json.exists():
+        drives = teleop_results.load(args.json, settings)
+    status = _drive_all(args, console, settings, drives)
+    if not drives:
+        return status
+    drives = teleop_results.in_order(drives)
+    figures = teleop_results.report(drives, settings)
+    if args.plot:
+        from ...evaluation.teleop_plot import save_plot
 
-        def tell(drives: list[teleop.Drive]) -> None:
-            nonlocal contacts
-            so_far.extend(drives)
-            if args.json:  # a run that is cut short leaves what it has
-                args.json.write_text(json.dumps(teleop.report(so_far, settings), indent=2) + "\n")
-            contacts += sum(drive.contacts for drive in drives)
-            progress.update(task, advance=1, description=f"driving, {contacts} contacts")
-            if not console.is_terminal:
-                words = ", ".join(
-                    f"{d.method} {'completed' if d.completed else d.reason or 'given up'}" for d in drives
-                )
-                console.print(f"episode {drives[0].index}: {words}", markup=False)
+        save_plot(args.plot, drives, figures, settings)
+    if args.video and not status:
+        from ...evaluation.teleop_plot import Video
 
-        drives = teleop.evaluate(settings, args.jobs, tell, args.timeout)
-    figures = teleop.report(drives, settings)
-    if args.json:
-        args.json.write_text(json.dumps(figures, indent=2) + "\n")
-    if args.plot or args.video:
-        from ...evaluation.teleop_plot import Video, save_plot
-
-        if args.plot:
-            save_plot(args.plot, drives, figures, settings)
-        if args.video:
-            with Video(args.video) as video, console.status("drawing the video"):
-                teleop.run_episode(settings, 0, video.on_step, methods[:1])
+        with Video(args.video) as video, console.status("drawing the video"):
+            teleop.run_episode(settings, 0, video.on_step, methods[:1])
     each = figures.pop("each")
     sys.stdout.write(json.dumps(figures, indent=2) + "\n")
     for row in each:
@@ -161,4 +147,66 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
                 f"{'completed' if row['completed'] else 'not completed: ' + (row['reason'] or 'given up')}",
                 markup=False,
             )
-    return 0
+    return status
+
+
+def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: list[Any]) -> int:
+    """Adds the drives that are missing; what was driven is kept whatever ends it. Returns the exit status."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from ...evaluation import teleop, teleop_results
+
+    planned, known = settings.episodes * len(settings.methods), len(drives)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    status, words = 0, ""
+    # A drive takes minutes on a slow core: the time that remains is told from all of them, not from the last 30 s.
+    day_s = 86400.0
+    with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=day_s) as progress:
+        task = progress.add_task("driving", total=planned - known)
+
+        def tell(drive: teleop.Drive) -> None:
+            drives.append(drive)
+            if args.json:
+                teleop_results.save(args.json, teleop_results.in_order(drives), settings)
+            contacts = sum(drive.contacts for drive in drives)
+            progress.update(task, advance=1, description=f"driving, {contacts} contacts")
+            if not console.is_terminal:
+                how = "completed" if drive.completed else f"not completed: {drive.reason or 'given up'}"
+                console.print(f"episode {drive.index}, {drive.method}: {how}", markup=False)
+
+        try:
+            with _stopped_by_sigterm():
+                teleop.evaluate(settings, args.jobs, tell, args.timeout, tuple(drives))
+        except (RuntimeError, TimeoutError) as error:
+            status, words = 1, str(error)
+        except KeyboardInterrupt:
+            status, words = 130, "interrupted"
+    if status:
+        kept = f"; {args.json} has them, --resume drives the others" if args.json and drives else ""
+        words = f"ic evaluate teleop: {words}; {len(drives)} of {planned} drives are done{kept}"
+        console.print(words, style="red", markup=False)
+    return status
+
+
+@contextlib.contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """SIGTERM ends what is driven as Ctrl-C does."""
+
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
