@@ -323,30 +323,32 @@ def _double(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.f
     return np.ascontiguousarray(values[: shape[0], : shape[1]], np.float32)
 
 
+_ABRUPT = 0.75  # of the change over five pixels: a step that makes up less of it is a slope with noise on it
+_LARGE = 0.3  # a difference larger than this share is an edge also where others are near
+
+
 def torn_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
     """1 for each quad (v, u)-(v + 1, u + 1) that crosses a depth edge; columns wrap, the last row has no quad below.
 
     Two neighbours are an edge when their depths differ by more than ``ratio`` and neither side's slope of the inverse
-    depth leads to the other: inverse depth is linear along a plane, however much the plane leans away.
+    depth leads to the other: inverse depth is linear along a plane, however much the plane leans away. Where it leans
+    far, the noise of the depth is as large as what a pixel makes: there the step has to be most of the change around.
     """
     inverse = inverse_depth.astype(np.float32)
-    across = _torn_pairs(inverse, np.roll(inverse, -1, 1), np.roll(inverse, 1, 1), np.roll(inverse, -2, 1), ratio)
-    below = np.concatenate([inverse[1:], inverse[-1:]])
-    before = np.concatenate([inverse[:1], inverse[:-1]])
-    after = np.concatenate([inverse[2:], inverse[-1:], inverse[-1:]])[: inverse.shape[0]]
-    down = _torn_pairs(inverse, below, before, after, ratio)
+    width = inverse.shape[1]
+    columns = np.pad(inverse, ((0, 0), (2, 3)), "wrap")
+    rows = np.pad(inverse, ((2, 3), (0, 0)), "edge")
+    across = _torn_pairs([columns[:, k : k + width] for k in range(6)], ratio)
+    down = _torn_pairs([rows[k : k + len(inverse)] for k in range(6)], ratio)
     torn = across | np.concatenate([across[1:], across[-1:]]) | down | np.roll(down, -1, 1)
     return torn.astype(np.uint8)
 
 
-def _torn_pairs(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    before_a: NDArray[np.float32],
-    after_b: NDArray[np.float32],
-    ratio: float,
-) -> NDArray[np.bool_]:
-    jump = np.abs(a - b)
+def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.bool_]:
+    """Whether there is an edge between the third and the fourth of six pixels in a row."""
+    first, before, a, b, after, last = line
+    jump, nearest = np.abs(a - b), np.minimum(a, b)
     limit = 0.5 * jump
-    off = (np.abs(2 * a - before_a - b) > limit) & (np.abs(2 * b - after_b - a) > limit)
-    return (jump > ratio * np.minimum(a, b)) & off
+    off = (np.abs(2 * a - before - b) > limit) & (np.abs(2 * b - after - a) > limit)
+    abrupt = (jump > _ABRUPT * np.abs(last - first)) | (jump > _LARGE * nearest)
+    return (jump > ratio * nearest) & off & abrupt

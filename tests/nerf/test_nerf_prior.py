@@ -5,7 +5,7 @@ import pytest
 
 from instant_ic.nerf import KeyframeError, box_room
 from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.prior import prepare
+from instant_ic.nerf.prior import prepare, torn_quads
 
 CAMERA = np.eye(4)
 PICTURE = box_room.panorama(CAMERA, 64)
@@ -45,3 +45,17 @@ def test_the_median_of_what_is_known_counts_and_guesses_are_not_known() -> None:
 def test_a_sigma_that_is_none_is_refused(sigma, words) -> None:
     with pytest.raises(KeyframeError, match=words):
         prior(sigma)
+
+
+def test_a_slope_with_noise_is_no_edge_and_a_step_is():
+    """One row of a wall that leans away: 4 % a pixel, its steps 0, 8, 0, 8 % by noise; and a step of 8 %."""
+    slope = np.ones((4, 32), np.float32)
+    slope[:, 8:24] = 1.04 ** -np.repeat(np.arange(0, 16, 2), 2)
+    slope[:, 24:] = slope[:, 23:24]
+    assert not torn_quads(slope, 0.05)[:, 9:22].any()
+    step = np.ones((4, 32), np.float32)
+    step[:, 16:] = 1 / 1.08
+    assert np.array_equal(np.flatnonzero(torn_quads(step, 0.05)[1]), [15, 31])
+    # A large difference is an edge however much leans away around it.
+    slope[:, 16:24] /= 1.4
+    assert torn_quads(slope, 0.05)[1, 15]
