@@ -46,9 +46,13 @@ class SwitchConfig:
         position_m: m between the two robots below which they agree.
         yaw_deg: degrees, likewise.
         return_dwell_s: s that they must agree before the return begins.
+        return_near_m: m to which the r-bot, which closes up faster than the v-bot is drawn on, is let come before that.
+        return_patience_s: s of agreement after which the return begins with what is left.
         picture_position_m: m between the places of view and camera picture at a switch; what jumps is no more.
         picture_yaw_deg: degrees, likewise.
         return_picture_m: m, likewise at the return, where the v-bot is still being drawn on until it is seen and done.
+        return_picture_yaw_deg: degrees, likewise.
+        return_turn_rad_s: rad/s; the camera is not shown again while the r-bot turns faster: its heading is known late.
         enter_timeout_s: s that a fitting view is waited for, while the r-bot slows to a stand.
         return_timeout_s: s after which the return ends although view and picture do not meet: they come too rarely.
         min_virtual_s: s; shortest stay in the virtual space.
@@ -68,9 +72,13 @@ class SwitchConfig:
     position_m: Positive = 0.15
     yaw_deg: Positive = 10.0
     return_dwell_s: NotNegative = 0.5
+    return_near_m: Positive = 0.03
+    return_patience_s: NotNegative = 2.0
     picture_position_m: Positive = 0.02
     picture_yaw_deg: Positive = 0.5
     return_picture_m: Positive = 0.015
+    return_picture_yaw_deg: Positive = 0.3
+    return_turn_rad_s: Positive = 0.3
     enter_timeout_s: Positive = 2.0
     return_timeout_s: Positive = 8.0
     min_virtual_s: NotNegative = 1.0
@@ -186,7 +194,7 @@ class Decision:
     """As it counts: zero when it is old."""
     vbot_action: VbotAction
     vbot_target: NDArray[np.float64]
-    """(3,) to which the v-bot goes; not for DRIVEN and HELD."""
+    """(3,) to which the v-bot goes, if it does: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
 
 
 @dataclass
@@ -307,10 +315,9 @@ class Arbiter:
         robot = inputs.robot_pose
         target = inputs.shown_pose if inputs.shown_pose is not None else robot if robot is not None else np.zeros(3)
         vbot = self._vbot_pose(inputs, target, now_ns)
-        # While it is driven the v-bot is compared with the r-bot; while it is shown beside it, with its picture.
-        other = robot if self.mode == Mode.VIRTUAL and robot is not None else target
-        gap = float(np.linalg.norm(vbot[:2] - other[:2]))
-        yaw_gap = wrap_angle(float(vbot[2] - other[2]))
+        # Not with the r-bot itself: what must agree is what the operator sees of the one and of the other.
+        gap = float(np.linalg.norm(vbot[:2] - target[:2]))
+        yaw_gap = wrap_angle(float(vbot[2] - target[2]))
         prediction = None
         if self.mode == Mode.VIRTUAL:
             prediction = self.predictor.predict(vbot, inputs.vbot_velocity, command, inputs.costmap)
@@ -505,15 +512,16 @@ class Arbiter:
     def _view_fits(self, situation: _Situation) -> str:
         if self._hold_reason(situation) or not self._vbot_spoke(situation.inputs, situation.now_ns):
             return ""
-        agree = self._pictures_agree(situation, self.config.switch.picture_position_m)
+        switch = self.config.switch
+        agree = self._pictures_agree(situation, switch.picture_position_m, switch.picture_yaw_deg)
         return "you drive the virtual robot" if agree else ""
 
-    def _pictures_agree(self, situation: _Situation, within_m: float) -> bool:
+    def _pictures_agree(self, situation: _Situation, within_m: float, within_deg: float) -> bool:
         """Whether view and camera picture show the same place, so that nothing jumps when one follows the other."""
         inputs, switch = situation.inputs, self.config.switch
         if inputs.robot_pose is None:
             return False
-        if abs(situation.yaw_gap_rad) > math.radians(switch.picture_yaw_deg):
+        if abs(situation.yaw_gap_rad) > math.radians(within_deg):
             return False
         if not (switch.require_view and switch.require_camera):
             return True
@@ -530,6 +538,8 @@ class Arbiter:
         if since is None or now_ns - since < switch.return_dwell_s * 1e9:
             return ""
         if self._seconds_in_mode(now_ns) < switch.min_virtual_s:
+            return ""
+        if situation.gap_m > switch.return_near_m and now_ns - since < switch.return_patience_s * 1e9:
             return ""
         if self._lacking(inputs, Mode.REAL, now_ns) or self._hold_reason(situation):
             return ""
@@ -572,10 +582,13 @@ class Arbiter:
         waited = self._seconds_in_mode(situation.now_ns) / switch.return_timeout_s
         if waited >= 2.0:
             return words  # a pose that trembles by more than the thresholds; the page eases what is left
-        near = situation.gap_m <= switch.return_picture_m
-        if not near or abs(situation.yaw_gap_rad) > math.radians(switch.picture_yaw_deg):
+        within_m, within_deg = switch.return_picture_m, switch.return_picture_yaw_deg
+        if situation.gap_m > within_m or abs(situation.yaw_gap_rad) > math.radians(within_deg):
             return ""
-        return words if waited >= 1.0 or self._pictures_agree(situation, switch.return_picture_m) else ""
+        if waited >= 1.0:
+            return words
+        turns = abs(situation.inputs.robot_velocity[1]) > switch.return_turn_rad_s
+        return words if not turns and self._pictures_agree(situation, within_m, within_deg) else ""
 
     def _may_resume(self, situation: _Situation) -> str:
         inputs = situation.inputs

@@ -12,12 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.poses import relative2
+from ..geometry.poses import relative2, wrap_angle
 from ..ranges import Positive, check_ranges
 from .costmap import Costmap
 from .footprint import Footprint
 from .kinematics import MotionLimits, clip_twist, move
 from .planner import Plan
+
+_BESIDE_M = 0.3
+"""Nearer than this a goal that moves is tracked whatever the path to it."""
 
 CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
 """Of the lookahead: the carrot comes nearer where the arc to it would touch something."""
@@ -108,8 +111,16 @@ class PathFollower:
         distance = math.hypot(ahead, left)
         moving = plan.reached and max(abs(goal_velocity[0]), abs(goal_velocity[1])) > c.track_min_speed_m_s
         near = distance < c.track_distance_m and abs(turn) < 1.0
-        # Tracking drives straight at the goal: only where the path does so too, not round a corner.
-        if moving and near and _remaining(pose, plan.poses) <= 1.15 * distance + 0.1:
+        # Tracking drives straight at the goal: only where the path does so too, not round a corner. To a place so near
+        # that the robot does not point at, the path is a manoeuvre, which a goal that moves on is not worth.
+        if (
+            moving
+            and near
+            and (
+                _remaining(pose, plan.poses) <= 1.15 * distance + 0.1
+                or (distance < _BESIDE_M and self._straight_is_free(pose, goal, costmap))
+            )
+        ):
             self.reset()
             return FollowerCommand(self._track(ahead, left, turn, goal_velocity), "track")
         tolerance = c.xy_goal_tolerance * (2.0 if self._at_goal else 1.0)
@@ -191,6 +202,13 @@ class PathFollower:
         turn = curvature * (-1.0 if length_m < 0 else 1.0)
         poses = np.array([move(pose, math.copysign(1.0, length_m), turn, abs(s)) for s in along])
         return self._is_free(poses, costmap)
+
+    def _straight_is_free(self, pose: NDArray[np.float64], goal: NDArray[np.float64], costmap: Costmap | None) -> bool:
+        if costmap is None:
+            return True
+        turn = wrap_angle(float(goal[2] - pose[2]))
+        share = np.linspace(0.0, 1.0, 6)[:, None]
+        return self._is_free(pose + share * np.array([*(goal[:2] - pose[:2]), turn]), costmap)
 
     def _is_free(self, poses: NDArray[np.float64], costmap: Costmap) -> bool:
         """Whether no pose lies on more obstacle than the first one, on which the robot stands."""

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.poses import relative2
 from ..ranges import NotNegative, Positive, check_ranges
 from .costmap import Costmap
 from .follower import FollowerCommand, PathFollower
+from .kinematics import move
 from .planner import HybridPlanner, Plan, no_plan
 
 
@@ -132,6 +134,22 @@ class Navigator:
             return False
         self._recovering_ns = now_ns
         return True
+
+
+_MOST_AHEAD_M = 0.2
+"""A camera that is later than this at full speed is not made up for."""
+
+
+def meeting_pose(
+    vbot_pose: NDArray[np.float64], shown_pose: NDArray[np.float64], robot_pose: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Where the r-bot has to be (3,) for the camera's picture, which is late, to be taken from where the v-bot is.
+
+    Ahead of the v-bot by as much as the r-bot, at ``robot_pose``, has driven on from ``shown_pose``, where the picture
+    was taken that comes with the next view. So nothing is left to be eased when the two meet.
+    """
+    ahead = float(relative2(shown_pose, robot_pose)[0])
+    return move(vbot_pose, min(max(ahead, -_MOST_AHEAD_M), _MOST_AHEAD_M), 0.0, 1.0)
 
 
 def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:

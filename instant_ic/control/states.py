@@ -97,11 +97,13 @@ GUARDS: dict[str, str] = {
     "operator's command is safe for the r-bot over the way that `rejoined` looks at",
     "view_fits": "the newest rendered view and the newest camera picture were taken within picture_position_m and "
     "picture_yaw_deg of each other",
-    "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, and the operator's command is safe for "
-    "the r-bot over the way that switches in and over a longer and wider one",
+    "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, within return_near_m or for "
+    "return_patience_s, and the operator's command is safe for the r-bot over the way that switches in and over a "
+    "longer and wider one",
     "unsafe_again": "the operator's command leads the r-bot into an obstacle again, or the camera is silent",
-    "picture_fits": "the v-bot has been eased onto the r-bot, and view and picture agree as in `view_fits`, within "
-    "return_picture_m (after return_timeout_s the first is enough, after twice that it goes on with what is left)",
+    "picture_fits": "the v-bot has been eased onto the r-bot, the r-bot turns no faster than return_turn_rad_s, and "
+    "view and picture agree as in `view_fits`, within return_picture_m and return_picture_yaw_deg (after "
+    "return_timeout_s the first is enough, after twice that it goes on with what is left)",
     "may_resume": "the emergency stop is released, every source is fresh for recover_s, the operator's command is zero "
     "(silence counts as zero), and the operator's link is back where its loss was the reason",
 }

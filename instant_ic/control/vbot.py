@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.poses import wrap_angle
-from ..ranges import NotNegative, Positive, check_ranges
+from ..ranges import NotNegative, Positive, Range, check_ranges
 from .footprint import Footprint
 from .kinematics import MotionLimits, accelerate, clip_twist, move
 from .walls import WallMap
@@ -24,6 +25,9 @@ class VbotConfig:
     Attributes:
         max_lead_m: m; it is never driven farther ahead of the r-bot.
         slow_lead_m: m; from here on it is slowed.
+        trail_slow: share of its speed that it loses while the r-bot trails it: too little to be felt, and the two meet
+            again metres sooner.
+        trail_m: m of lead at which that is reached.
         wall_clearance_m: m between its outline and a wall: room for the r-bot at the same place.
         ease_m_s: m/s, at most, by which it is drawn onto the r-bot at the return, beside the motion of both.
         ease_deg_s: degrees/s, likewise.
@@ -34,6 +38,8 @@ class VbotConfig:
 
     max_lead_m: Positive = 3.0
     slow_lead_m: NotNegative = 1.0
+    trail_slow: Annotated[float, Range(0, 0.5)] = 0.1
+    trail_m: Positive = 0.15
     wall_clearance_m: NotNegative = 0.12
     ease_m_s: Positive = 0.035
     ease_deg_s: Positive = 6.0
@@ -78,7 +84,7 @@ class VirtualRobot:
         """Moves by ``dt_s`` under the operator's command; returns the new pose (3,) in the map frame."""
         linear, angular = clip_twist(*command, self.limits)
         factor = self.lead_factor(linear, robot_pose)
-        self.slowed_by = "lead" if factor < 1.0 else ""
+        self.slowed_by = "lead" if factor < 1.0 - self.config.trail_slow else ""
         # Curvature is kept, as far as the v-bot moves: the operator's line stays the same line.
         target = (linear * factor, angular * factor if linear != 0.0 else angular)
         if factor == 0.0:
@@ -124,17 +130,18 @@ class VirtualRobot:
         return self.pose
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
-        """Share of the linear speed that is left: 1 up to ``slow_lead_m``, 0 at ``max_lead_m``.
+        """Share of the linear speed that is left: a little less than 1 with a lead, 0 at ``max_lead_m``.
 
         Only what draws the two apart is slowed; back towards the r-bot the v-bot drives freely.
         """
         gap = self.pose[:2] - np.asarray(robot_pose)[:2]
         lead = float(math.hypot(gap[0], gap[1]))
         heading = np.array([math.cos(self.pose[2]), math.sin(self.pose[2])])
-        if lead <= self.config.slow_lead_m or linear * float(heading @ gap) <= 0.0:
+        if linear * float(heading @ gap) <= 0.0:
             return 1.0
-        left = (self.config.max_lead_m - lead) / (self.config.max_lead_m - self.config.slow_lead_m)
-        return max(0.0, left)
+        config = self.config
+        left = (config.max_lead_m - lead) / (config.max_lead_m - config.slow_lead_m)
+        return min(1.0, max(0.0, left)) * (1.0 - config.trail_slow * min(1.0, lead / config.trail_m))
 
     def _into_wall(self, pose: NDArray[np.float64], walls: WallMap) -> bool:
         now = float(walls.distance(_placed(self._body, self.pose)).min())

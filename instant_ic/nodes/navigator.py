@@ -13,7 +13,7 @@ from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
-from instant_ic.control.navigator import Navigator, RecoveryConfig
+from instant_ic.control.navigator import Navigator, RecoveryConfig, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import pose2_from_matrix
@@ -90,11 +90,11 @@ class NavigatorNode(Node[NavigatorConfig]):
             self.speed = 0.0
             self.diagnose("follow", OK, "waiting: the operator drives the robot")
             return
-        command = self.command()
+        command = self.command(state)
         self.speed = command[0]
         self.cmd_vel.publish(twist_stamped(*command, self.clock.now_ns()))
 
-    def command(self) -> tuple[float, float]:
+    def command(self, state: ControlState) -> tuple[float, float]:
         """Twist for the r-bot; zero, with a diagnosis, when something is missing."""
         grid, goal = self.costmap.message, self.subgoal.message
         if grid is None or goal is None:
@@ -106,20 +106,23 @@ class NavigatorNode(Node[NavigatorConfig]):
             return self.stand(str(error))
         occupancy, resolution, origin = grid_array(grid)
         costmap = Costmap.from_occupancy(occupancy, resolution, np.array(origin))
-        subgoal, velocity = self.moving(pose2_from_matrix(pose_matrix(goal)))
+        subgoal, velocity = self.moving(pose2_from_matrix(pose_matrix(goal)), state)
         step = self.navigator.step(pose, self.speed, subgoal, costmap, self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
             self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
         self.diagnose("follow", OK if step.plan.reached else WARN, step.plan.reason or step.state, state=step.state)
         return step.command
 
-    def moving(self, subgoal: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    def moving(
+        self, subgoal: NDArray[np.float64], state: ControlState
+    ) -> tuple[NDArray[np.float64], tuple[float, float]]:
         """Subgoal and its velocity: where it is the v-bot, the v-bot's own newer pose and twist."""
         vbot = self.vbot.message
         if vbot is not None:
             pose = pose2_from_matrix(pose_matrix(vbot))
             if float(np.linalg.norm(pose[:2] - subgoal[:2])) < 0.15:
-                return pose, twist_values(vbot)
+                shown, robot = (pose2_from_matrix(pose_matrix(one)) for one in (state.vbot_target, state.robot_pose))
+                return meeting_pose(pose, shown, robot), twist_values(vbot)
         return subgoal, (0.0, 0.0)
 
     def stand(self, reason: str) -> tuple[float, float]:

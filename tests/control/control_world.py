@@ -16,7 +16,7 @@ from instant_ic.control.costmap import CostmapConfig, RollingCostmap, StaticMap,
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
-from instant_ic.control.navigator import Navigator
+from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.states import VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
@@ -140,7 +140,7 @@ class Loop:
     """
 
     dt = 0.05
-    camera_delay, view_delay, picture_period = 3, 2, 2  # steps
+    camera_delay, view_delay, picture_period = 5, 2, 2  # steps
 
     def __init__(
         self,
@@ -218,8 +218,10 @@ class Loop:
             self.navigator.reset()
         if self.decision.mode == Mode.VIRTUAL and self.decision.subgoal is not None:
             subgoal = self.decision.subgoal
-            velocity = self.vbot.velocity if subgoal.rule == "vbot" else (0.0, 0.0)
-            step = self.navigator.step(robot, self.base.v, subgoal.pose, self.costmap, now_ns, velocity)
+            goal, velocity = subgoal.pose, (0.0, 0.0)
+            if subgoal.rule == "vbot":
+                goal, velocity = meeting_pose(goal, self.decision.vbot_target, robot), self.vbot.velocity
+            step = self.navigator.step(robot, self.base.v, goal, self.costmap, now_ns, velocity)
             self.nav, self.nav_state = step.command, step.state
         self.base.step(self.decision.command, self.dt)
         frame = Frame(
@@ -252,8 +254,11 @@ class Loop:
             self.vbot.step(operator if free else (0.0, 0.0), robot, self.dt, self.walls)
 
     def shown_pose(self, robot: np.ndarray) -> np.ndarray:
-        """Where the r-bot was when the picture was taken that a view asked for now should look like."""
-        place = self.cameras[max(0, self.k - self.camera_delay + self.view_delay)]
+        """Where the r-bot was when the picture was taken that a view asked for now should look like.
+
+        A picture comes at each odd step; the newest view then was asked for a step before the one that came last.
+        """
+        place = self.cameras[max(0, self.k - self.camera_delay + self.view_delay + 1)]
         return np.array([place[0], place[1], robot[2]])
 
     def pictures(self) -> tuple[np.ndarray, np.ndarray | None]:

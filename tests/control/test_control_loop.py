@@ -62,7 +62,7 @@ def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped
             assert abs(after.vbot[2] - after.robot[2]) <= math.radians(0.5)
     assert min(made.vbot.limits.max_linear_m_s, 0.4) == pytest.approx(made.frames[-1].command[0])
     moved = np.linalg.norm(np.diff([f.decision.vbot_pose[:2] for f in virtual], axis=0), axis=1)
-    assert np.mean(moved[20:]) / 0.05 == pytest.approx(0.4, abs=0.02)
+    assert 0.355 < np.mean(moved[20:]) / 0.05 <= 0.4  # a tenth slower while the r-bot trails it
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from control_world import corridor, draw_map, rectangle
 from instant_ic.control.costmap import LETHAL, Costmap, StaticMap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
+from instant_ic.control.navigator import meeting_pose
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
@@ -161,7 +162,7 @@ class TestWalls:
 class TestVirtualRobot:
     @staticmethod
     def robot() -> VirtualRobot:
-        return VirtualRobot(VbotConfig(max_lead_m=3.0, slow_lead_m=1.0), LIMITS)
+        return VirtualRobot(VbotConfig(max_lead_m=3.0, slow_lead_m=1.0, trail_slow=0.1, trail_m=0.15), LIMITS)
 
     def test_it_accelerates_like_the_robot(self) -> None:
         vbot = self.robot()
@@ -170,7 +171,9 @@ class TestVirtualRobot:
         assert vbot.velocity[0] == pytest.approx(5 * 0.05 * 0.8)
 
     @pytest.mark.parametrize(
-        ("lead", "factor"), [(0.5, 1.0), (1.0, 1.0), (2.0, 0.5), (2.5, 0.25), (3.0, 0.0), (4.0, 0.0)]
+        ("lead", "factor"),
+        # A tenth slower from 0.15 m on, and less the farther it is ahead from 1 m to 3 m.
+        [(0.0, 1.0), (0.03, 0.98), (0.15, 0.9), (1.0, 0.9), (2.0, 0.45), (2.5, 0.225), (3.0, 0.0), (4.0, 0.0)],
     )
     def test_it_is_slowed_as_it_draws_ahead(self, lead: float, factor: float) -> None:
         vbot = self.robot()
@@ -180,7 +183,7 @@ class TestVirtualRobot:
         for _ in range(40):
             vbot.step((0.4, 0.0), np.array([vbot.pose[0] - lead, 0.0, 0.0]), 0.05)
         assert vbot.velocity[0] == pytest.approx(0.4 * factor)
-        assert vbot.slowed_by == ("lead" if factor < 1 else "")
+        assert vbot.slowed_by == ("lead" if factor < 0.9 else "")
 
     def test_it_never_draws_farther_ahead_than_the_limit(self) -> None:
         vbot = self.robot()
@@ -224,3 +227,13 @@ class TestVirtualRobot:
 def test_bad_parameters_are_named(make: object, key: str) -> None:
     with pytest.raises(ValueError, match=key):
         make()  # type: ignore[operator]
+
+
+def test_the_robot_meets_the_vbot_with_the_picture_that_is_late() -> None:
+    """The r-bot has driven 0.08 m on since the picture was taken, so it has to be that much ahead of the v-bot."""
+    shown, robot = np.array([1.0, 2.0, math.pi / 2]), np.array([1.0, 2.08, math.pi / 2])
+    vbot = np.array([3.0, 0.0, math.pi])
+    np.testing.assert_allclose(meeting_pose(vbot, shown, robot), [2.92, 0.0, math.pi], atol=1e-12)
+    np.testing.assert_allclose(meeting_pose(vbot, robot, robot), vbot, atol=1e-12)  # it stands
+    far = meeting_pose(vbot, np.array([1.0, 0.0, math.pi / 2]), robot)
+    np.testing.assert_allclose(far, [2.8, 0.0, math.pi], atol=1e-12)  # a camera that is so late is not made up for

@@ -222,6 +222,39 @@ def test_at_the_return_the_vbot_is_eased_onto_the_robot_gently_and_the_operator_
     assert 0.5 < len(returning) * DT < SwitchConfig().return_timeout_s
 
 
+def test_the_robot_is_let_close_up_before_the_return_but_not_waited_for_when_it_does_not() -> None:
+    switch = SwitchConfig()
+    for gap_m, seconds in ((0.02, switch.return_dwell_s), (0.10, switch.return_patience_s)):
+        made = before_box()
+        made.until(Mode.VIRTUAL, FORWARD)
+        made.drive(switch.min_virtual_s, FORWARD)
+        made.map, waited = costmap([]), 0
+        for away_m in (0.5, *[gap_m] * 100):  # it stays so far off, whatever it is told
+            made.robot = made.vbot.pose - [away_m, 0.0, 0.0]
+            if made.step(NOTHING).mode == Mode.RETURNING:
+                break
+            agreed = made.steps[-1].pose_gap_m < 0.15
+            waited = waited + 1 if agreed else 0
+        assert made.steps[-1].mode == Mode.RETURNING
+        assert seconds <= waited * DT <= seconds + 0.3
+
+
+def test_the_camera_is_not_shown_again_while_the_robot_turns_fast() -> None:
+    made = before_box()
+    made.until(Mode.VIRTUAL, FORWARD)
+    made.map = costmap([])
+    made.until(Mode.RETURNING, (0.0, 0.8))
+    made.drive(2.0, (0.0, 0.8))
+    assert made.steps[-1].mode == Mode.RETURNING
+    made.until(Mode.REAL, (0.0, 0.2), 1.0)
+    # Not for ever: after return_timeout_s it goes on.
+    made = before_box()
+    made.until(Mode.VIRTUAL, FORWARD)
+    made.map = costmap([])
+    made.until(Mode.RETURNING, (0.0, 0.8))
+    made.until(Mode.REAL, (0.0, 0.8), SwitchConfig().return_timeout_s + 0.1)
+
+
 def test_a_return_is_broken_off_when_the_command_is_no_longer_safe_or_the_camera_is_lost() -> None:
     for reason in ("obstacle", "camera"):
         made = before_box()
