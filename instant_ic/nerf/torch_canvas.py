@@ -68,7 +68,7 @@ class TorchCanvas:
 
     Args:
         device: torch's name of it.
-        kernels: that do most of the work; plain torch's where None are given.
+        kernels: that do most of the work: ``torch_warp``'s or ``triton_warp``'s.
     """
 
     def __init__(self, device: str, kernels: WarpKernels = KERNELS) -> None:

@@ -14,6 +14,7 @@ from instant_ic.nerf import FieldConfig, PictureConfig, TrainConfig, VirtualSpac
 from instant_ic.nerf import torch_warp as kernels
 from instant_ic.nerf.canvas import CpuCanvas
 from instant_ic.nerf.config import GeometryConfig
+from instant_ic.nerf.field import Rays
 from instant_ic.nerf.prior import SKY, prepare
 from instant_ic.nerf.store import KeyframeSet, ready
 from instant_ic.nerf.torch_canvas import TorchCanvas
@@ -192,6 +193,14 @@ def test_a_triangle_by_hand():
     inner[1:3, 1:3] = 1
     assert np.array_equal(buffer & kernels.MARKS, kernels.BEHIND * inner)
     assert (buffer & ~kernels.MARKS).view(torch.float32).numpy() == pytest.approx(0.5 * inner, abs=1e-6)
+
+
+def test_rays_that_are_no_lens_are_drawn_alike(one):
+    lens = perspective_rays(CAMERA @ pose_matrix(0.6, 0.4, 0, -0.3, 0.1, 0.2), *SIZE, 1.57)
+    plain = Rays(lens.origin, lens.directions, lens.axial, lens.shape)
+    first, second = (TorchCanvas("cpu").draw(rays, one, 1.0, None, {}) for rays in (lens, plain))
+    assert (first.confidence == second.confidence).float().mean() > 0.998
+    assert torch.isclose(first.colour, second.colour, atol=5e-3).float().mean() > 0.998
 
 
 def test_work_in_small_parts_gives_the_same_bits(one, monkeypatch):
