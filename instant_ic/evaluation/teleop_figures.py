@@ -38,13 +38,14 @@ class Switch:
         to_virtual: into the virtual space, else back.
         position_error_m: between the places of the last picture before and the first after, as the stack knows them,
             less what the shown robot drove from when the one came to when the other did.
-        yaw_error_deg: between the headings of v-bot and r-bot (in truth), to which the page turns the pictures, just
-            before it.
+        yaw_error_deg: between the headings of v-bot and r-bot just before it, as the stack knows them, to which the
+            page turns the pictures.
         true_position_error_m: the same, of the camera's picture where it was truly taken.
         jump_m: the same, less what the shown robot drove from when the one came up to when the other did: with how
             long a camera's picture had been there already. What the eye sees, before the page eases it.
         gap_m: between r-bot and v-bot in that step: the camera's picture is older than the r-bot's pose.
         psnr_db: between those two pictures; None where they were not drawn.
+        true_yaw_error_deg: with the r-bot's true heading in place of the known one.
     """
 
     time_s: float
@@ -55,6 +56,7 @@ class Switch:
     jump_m: float
     gap_m: float
     psnr_db: float | None = None
+    true_yaw_error_deg: float = math.nan
 
 
 @dataclass
@@ -80,6 +82,8 @@ class Drive:
     mode_seconds: dict[str, float] = field(default_factory=dict)
     disobeyed_seconds: dict[str, float] = field(default_factory=dict)
     """By mode."""
+    virtual_m: float = 0.0
+    """Driven by the v-bot while it was shown."""
     gap_mean_m: float = math.nan
     gap_max_m: float = math.nan
     longest_freeze_s: float = 0.0
@@ -178,10 +182,11 @@ def find_switches(log: Log) -> list[Switch]:
                 log.time_s[k],
                 bool(log.virtual[k]),
                 error,
-                abs(math.degrees(log.yaw_gap_rad[k - 1])),
+                abs(math.degrees(log.known_yaw_gap_rad[k - 1])),
                 true,
                 jump,
                 math.hypot(float(gap[0]), float(gap[1])),
+                true_yaw_error_deg=abs(math.degrees(log.yaw_gap_rad[k - 1])),
             )
         )
     return found
@@ -244,6 +249,8 @@ def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
     if virtual.any():
         gaps = np.linalg.norm(robot[virtual, :2] - vbot[virtual, :2], axis=1)
         drive.gap_mean_m, drive.gap_max_m = float(gaps.mean()), float(gaps.max())
+        steps_m = np.linalg.norm(np.diff(vbot[:, :2], axis=0), axis=1)
+        drive.virtual_m = float(steps_m[virtual[1:] & virtual[:-1]].sum())
     drive.longest_freeze_s = longest_freeze_s(log.pictures, log.time_s[-1])
     drive.longest_stall_s = longest_stall_s(log)
     drive.obstacles = obstacles_met(log, centres)
@@ -278,6 +285,8 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
         "longest_stall_s": _most([drive.longest_stall_s for drive in drives]),
         "switch_position_error_mean_m": _mean([s.position_error_m for s in switches]),
         "switch_yaw_error_mean_deg": _mean([s.yaw_error_deg for s in switches]),
+        "switch_true_yaw_error_deg": _most([s.true_yaw_error_deg for s in switches]),
+        "switch_true_yaw_error_mean_deg": _mean([s.true_yaw_error_deg for s in switches]),
         "switch_true_position_error_m": _most([s.true_position_error_m for s in switches]),
         "switch_true_position_error_mean_m": _mean([s.true_position_error_m for s in switches]),
         "switch_jump_m": _most([s.jump_m for s in switches]),
@@ -298,6 +307,9 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
             name: round(sum(d.disobeyed_seconds.get(name, 0.0) for d in drives), 2)
             for name in drives[0].disobeyed_seconds
         },
+        "virtual_m_per_obstacle": sum(drive.virtual_m for drive in drives) / obstacles if obstacles else None,
+        "virtual_share": sum(drive.mode_seconds.get(name, 0.0) for drive in drives for name in ("virtual", "returning"))
+        / max(sum(drive.seconds for drive in drives), 1e-9),
         "gap_mean_m": _mean([drive.gap_mean_m for drive in drives]),
         "gap_max_m": _most([drive.gap_max_m for drive in drives]),
         "seconds_mean": _mean([drive.seconds for drive in drives if drive.completed]),

@@ -182,6 +182,8 @@ class Log:
     vbot: list[FloatArray] = field(default_factory=list)
     yaw_gap_rad: list[float] = field(default_factory=list)
     """v-bot's heading less the r-bot's true one when the v-bot told it."""
+    known_yaw_gap_rad: list[float] = field(default_factory=list)
+    """The same as the arbiter knows it: to these headings the page turns the pictures."""
     command: list[tuple[float, float]] = field(default_factory=list)
     blocked: list[bool] = field(default_factory=list)
     reason: list[str] = field(default_factory=list)
@@ -444,6 +446,7 @@ class SimulatedStack:
         log.estimate.append(self._in_world(pose2_from_matrix(message_pose(state.robot_pose))))
         log.vbot.append(self.vbot.copy())
         log.yaw_gap_rad.append(self.yaw_gap_rad)
+        log.known_yaw_gap_rad.append(float(state.yaw_gap_rad))
         log.command.append(command)
         log.blocked.append(bool(state.blocked))
         log.reason.append(str(state.reason))

@@ -39,6 +39,7 @@ def log_of(speeds: list[float], commands: list[float], virtual: list[bool] | Non
         for track in (log.robot, log.estimate, log.vbot):
             track.append(pose.copy())
         log.yaw_gap_rad.append(0.0)
+        log.known_yaw_gap_rad.append(0.0)
         log.command.append((commands[k], 0.0))
         log.blocked.append(False)
         log.reason.append("")
@@ -104,8 +105,22 @@ class TestSwitches:
 
     def test_yaw_error_is_that_between_the_robots(self) -> None:
         log = log_of([0.0] * 4, [0.0] * 4, [False, False, True, True])
-        log.yaw_gap_rad[1] = math.radians(-3.0)  # afterwards the v-bot is another's: driven, or set beside the r-bot
-        assert teleop_figures.find_switches(log)[0].yaw_error_deg == pytest.approx(3.0)
+        log.known_yaw_gap_rad[1] = math.radians(
+            -3.0
+        )  # afterwards the v-bot is another's: driven, or set beside the r-bot
+        log.yaw_gap_rad[1] = math.radians(-3.4)  # SLAM is 0.4 degrees off
+        (switch,) = teleop_figures.find_switches(log)
+        assert switch.yaw_error_deg == pytest.approx(3.0)
+        assert switch.true_yaw_error_deg == pytest.approx(3.4)
+
+    def test_the_virtual_way_is_that_of_the_vbot_while_it_is_shown(self) -> None:
+        log = log_of([0.4] * 8, [0.4] * 8, [False, False, True, True, True, False, False, False])
+        drive = Drive(0, "ic", seconds=0.4)
+        teleop_figures.judge(drive, log, np.zeros((1, 2)))
+        assert drive.virtual_m == pytest.approx(2 * 0.02)  # two steps of 0.05 s between the three shown places
+        figures = teleop_figures.summary([drive])
+        assert figures["virtual_m_per_obstacle"] == pytest.approx(0.04)
+        assert figures["virtual_share"] == pytest.approx(0.15 / 0.4)
 
     def test_flicker_is_what_is_taken_back_at_once(self) -> None:
         def at(time_s: float, to_virtual: bool) -> Switch:
