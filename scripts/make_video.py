@@ -86,6 +86,9 @@ class Operator:
     def on_drive(self, linear: float, angular: float) -> None:
         self.command = (linear, angular)
 
+    def on_operator(self, there: bool) -> None:
+        """The page is there all the time: its beats are not in the film's time."""
+
     def on_look(self, look: Look) -> None:
         self.stack.nodes["console"].on_look(look)
 
@@ -115,7 +118,8 @@ def film(args: argparse.Namespace) -> list[bytes]:
     with SimulatedStack(course.world, config) as stack:
         operator = Operator(stack)
         patient = DriveConfig(watchdog_s=60.0, lease_timeout_s=600.0, max_command_age_s=60.0, beat_timeout_s=60.0)
-        page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M]}
+        lead_max_m = stack.nodes["console"].config.lead.max_m
+        page_values = {"footprint": [0.6, 0.5], "camera": [0.0, 0.0, CAMERA_HEIGHT_M], "lead_max_m": lead_max_m}
         server = ConsoleServer(operator, ServerConfig(port=0, drive=patient), page_values)
         stack.page = stack.nodes["console"].server = page_in = Page(stack, server)
         server.start()
