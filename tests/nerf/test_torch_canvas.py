@@ -22,6 +22,7 @@ from instant_ic.nerf.torch_device import TorchDevice
 from instant_ic.nerf.view import equirect_rays, perspective_rays
 from instant_ic.nerf.warp import Pyramid
 
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 CAMERA = pose_matrix(0.3, -0.2, 0.1, 0.4)
 SIZE = 80, 45
 
@@ -58,11 +59,11 @@ def three():
 def both(rays, shown, share=1.0, field=None):
     """The picture by the CPU's kernels and by torch: (rgb, depth, confidence, guessed) each."""
     pictures = []
-    for canvas in (CpuCanvas(), TorchCanvas("cpu")):
+    for canvas in (CpuCanvas(), TorchCanvas(DEVICE)):
         own = None if field is None else tuple(array.copy() for array in field)
         picture = canvas.draw(rays, shown, share, own, {})
         image = canvas.continued(picture, rays.shape, shown is None)
-        pictures.append((*canvas.painted(picture, image), np.asarray(picture.guessed)))
+        pictures.append((*canvas.painted(picture, image), torch.as_tensor(picture.guessed).cpu().numpy()))
     return pictures
 
 
@@ -149,7 +150,7 @@ def test_a_sphere_by_hand():
     rgb[:, :64] = 200
     prior = prepare(rgb, np.full((64, 128), 2.0, np.float32), np.eye(4), 0.0, GeometryConfig(), 128)
     shown = KeyframeSet((ready(0, prior, Pyramid.of(rgb)),), np.ones((1, 3), np.float32))
-    canvas = TorchCanvas("cpu")
+    canvas = TorchCanvas(DEVICE)
     for yaw, metres in ((0.0, 1.0), (math.pi, 3.0), (math.pi / 2, math.sqrt(3))):
         rays = perspective_rays(pose_matrix(1.0, yaw=yaw), 33, 33, math.pi / 2)
         picture = canvas.draw(rays, shown, 1.0, None, {})
@@ -198,22 +199,22 @@ def test_a_triangle_by_hand():
 def test_rays_that_are_no_lens_are_drawn_alike(one):
     lens = perspective_rays(CAMERA @ pose_matrix(0.6, 0.4, 0, -0.3, 0.1, 0.2), *SIZE, 1.57)
     plain = Rays(lens.origin, lens.directions, lens.axial, lens.shape)
-    first, second = (TorchCanvas("cpu").draw(rays, one, 1.0, None, {}) for rays in (lens, plain))
+    first, second = (TorchCanvas(DEVICE).draw(rays, one, 1.0, None, {}) for rays in (lens, plain))
     assert (first.confidence == second.confidence).float().mean() > 0.998
     assert torch.isclose(first.colour, second.colour, atol=5e-3).float().mean() > 0.998
 
 
 def test_work_in_small_parts_gives_the_same_bits(one, monkeypatch):
     rays = perspective_rays(CAMERA @ pose_matrix(0.6, 0.4, 0, -0.3), *SIZE, 1.57)
-    whole = TorchCanvas("cpu").draw(rays, one, 1.0, None, {})
+    whole = TorchCanvas(DEVICE).draw(rays, one, 1.0, None, {})
     monkeypatch.setattr(kernels, "FRAGMENTS", 1000)
-    parts = TorchCanvas("cpu").draw(rays, one, 1.0, None, {})
+    parts = TorchCanvas(DEVICE).draw(rays, one, 1.0, None, {})
     assert torch.equal(whole.depth, parts.depth)
     assert torch.equal(whole.colour, parts.colour)
 
 
 def test_keyframes_are_let_go():
-    canvas = TorchCanvas("cpu")
+    canvas = TorchCanvas(DEVICE)
     shown = KeyframeSet((keyframe(CAMERA, 32),), np.ones((1, 3), np.float32))
     canvas.draw(perspective_rays(CAMERA, 16, 16, 1.0), shown, 1.0, None, {})
     assert len(canvas._keyframes) == 1
@@ -251,7 +252,7 @@ def space_on(canvas, picture=WARP):
 def test_a_space_shows_the_same_by_either(picture):
     """The first pictures of a keyframe that passes in, a cube and a panorama."""
     pose = CAMERA @ pose_matrix(0.4, 0.2)
-    spaces = space_on(None, picture), space_on(TorchCanvas("cpu"), picture)
+    spaces = space_on(None, picture), space_on(TorchCanvas(DEVICE), picture)
     for _ in range(2):
         views = [space.render(pose, 48, 32, 1.5) for space in spaces]
         assert psnr_db(views[1].rgb, views[0].rgb) > 35
@@ -268,7 +269,7 @@ def test_a_space_shows_the_same_by_either(picture):
 
 def test_a_gpu_without_memory_for_a_picture_is_left_for_the_cpu(monkeypatch):
     monkeypatch.setattr("instant_ic.nerf.devices._may_have_cuda", lambda: False)
-    space = space_on(TorchCanvas("cpu"))
+    space = space_on(TorchCanvas(DEVICE))
     space.config = dataclasses.replace(space.config, device="auto")
     pose = CAMERA @ pose_matrix(0.4, 0.2)
     first = space.render(pose, 48, 32, 1.5)
