@@ -1,5 +1,6 @@
 """The Triton kernels against their torch references, gradients included: on a GPU, else in Triton's interpreter."""
 
+import functools
 import math
 import os
 
@@ -15,7 +16,7 @@ triton = pytest.importorskip("triton", reason="triton is not installed: pip inst
 import triton.language as tl  # noqa: E402
 
 from instant_ic.geometry.poses import pose_matrix  # noqa: E402
-from instant_ic.nerf import FieldConfig, TrainConfig, box_room, reference, torch_warp, triton_warp  # noqa: E402
+from instant_ic.nerf import FieldConfig, TrainConfig, box_room, devices, reference, torch_warp, triton_warp  # noqa: E402
 from instant_ic.nerf import triton_kernels as kernels  # noqa: E402
 from instant_ic.nerf.canvas import CpuCanvas  # noqa: E402
 from instant_ic.nerf.config import GeometryConfig  # noqa: E402
@@ -271,8 +272,9 @@ def shown():
 
 @pytest.fixture
 def large_programs(monkeypatch):
-    """The interpreter's time is by the program."""
+    """The interpreter's time is by the program, and by the pixel."""
     if not CUDA:
+        monkeypatch.setattr(devices, "check_canvas", functools.partial(devices.check_canvas, size=(32, 18)))
         monkeypatch.setattr(triton_warp, "PATCHES", 1024)
         monkeypatch.setattr(triton_warp, "PIXELS", 1024)
 
