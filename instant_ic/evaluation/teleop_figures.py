@@ -19,6 +19,8 @@ FloatArray: TypeAlias = NDArray[np.float64]
 
 STEP_S = 0.05
 """Between two rows of a log."""
+TRACK_S = 0.2
+"""Between two places of a track."""
 LATENCY_S = 0.35
 """A robot obeys where it does what was commanded at any time of the last so long (and its ramps since)."""
 TOLERANCE_M_S, TOLERANCE_RAD_S = 0.05, 0.15
@@ -256,10 +258,11 @@ def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
     drive.obstacles = obstacles_met(log, centres)
     drive.keyframes = log.keyframes
     shown = np.where(virtual[:, None], vbot, math.nan)
+    every = round(TRACK_S / STEP_S)
     begins = [0, *(np.flatnonzero(np.diff(modes)) + 1).tolist()]
     drive.tracks = {
-        "robot": np.round(robot[::4], 3).tolist(),
-        "vbot": [row for row in np.round(shown[::4], 3).tolist() if not math.isnan(row[0])],
+        "robot": np.round(robot[::every], 3).tolist(),
+        "vbot": [row for row in np.round(shown[::every], 3).tolist() if not math.isnan(row[0])],
         "modes": [[round(log.time_s[k], 2), int(modes[k])] for k in (*begins, len(modes) - 1)],
     }
 

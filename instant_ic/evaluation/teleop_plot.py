@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeAlias
@@ -14,15 +15,20 @@ from numpy.typing import NDArray
 from ..control.arbiter import Mode
 from ..control.footprint import Footprint
 from ..sim.contact import OccupancyMask
-from .pictures import new_figure, save_figure
+from .pictures import save_figure
 from .teleop import Settings, decode, photograph
-from .teleop_figures import Drive
+from .teleop_figures import TRACK_S, Drive
 from .teleop_stack import METHODS, SimulatedStack
-from .teleop_worlds import Course, floor_plan, make_course
+from .teleop_worlds import Course, floor_plan
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
-_COLOURS = {"ic": "tab:blue", "stop": "tab:orange", "shared": "tab:green"}
+# Of Okabe and Ito, which also the colour-blind can tell apart.
+_COLOURS = {"ic": "#0072B2", "stop": "#E69F00", "shared": "#009E73"}
+_MODE_COLOURS = {
+    Mode.REAL: "#BBBBBB", Mode.ENTERING: "#F0E442", Mode.VIRTUAL: "#56B4E9", Mode.RETURNING: "#CC79A7",
+    Mode.STOPPED: "#D55E00",
+}  # fmt: skip
 _BARS = (
     ("completed_fraction", "completed"),
     ("obedience", "obedience"),
@@ -31,51 +37,165 @@ _BARS = (
     ("seconds_mean", "seconds a drive"),
     ("longest_stall_s", "longest stall, s"),
 )
+_COURSES = (("seconds", "seconds"), ("obedience", "obedience"))
+_MARGIN_M = 1.4
 _PICTURE, _MAP = (640, 360), 360
 FPS = 10
 
 
-def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: Settings, most: int = 6) -> None:
-    """Paths of some episodes, the least completed first, and bars by method."""
-    indices = sorted({d.index for d in drives}, key=lambda i: (min(d.completed for d in drives if d.index == i), i))
-    shown = indices[:most]
-    rows = math.ceil(len(shown) / 2) + math.ceil(len(_BARS) / 2)
-    figure, axes = new_figure(rows, 2, (11.0, 2.4 * rows))
-    flat = list(axes.ravel())
-    for index, axis in zip(shown, flat, strict=False):
-        _draw_episode(axis, make_course(settings.world, settings.seed, index), [d for d in drives if d.index == index])
-    for axis in flat[len(shown) : 2 * math.ceil(len(shown) / 2)]:
-        axis.set_axis_off()
-    for (key, label), axis in zip(_BARS, flat[2 * math.ceil(len(shown) / 2) :], strict=False):
-        names = [name for name in METHODS if name in report["methods"]]
-        values = [report["methods"][name][key] for name in names]
-        axis.bar(names, [v or 0.0 for v in values], color=[_COLOURS[name] for name in names])
-        axis.set_ylim(0, 1.2 * max([v or 0.0 for v in values]) or 1.0)
-        for k, value in enumerate(values):
-            words = "none" if value is None else f"{value:.3g}"
-            axis.annotate(words, (k, value or 0.0), ha="center", va="bottom", fontsize=8)
-        axis.set_title(label, fontsize=9)
-    figure.suptitle(f"{settings.world}, seed {settings.seed}: dashed is the v-bot, grey what the robot may run into")
+def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: Settings, most: int = 4) -> None:
+    """Figures by method, every course's time and obedience, and maps of the courses that went worst.
+
+    Under each map the arbiter's modes over time, a bar a method.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    indices = sorted({d.index for d in drives})
+    shown = sorted(indices, key=lambda index: _how_well([d for d in drives if d.index == index]))[:most]
+    courses = [(settings.course(index), [d for d in drives if d.index == index]) for index in shown]
+    columns = min(2, len(shown))
+    rows = [courses[k : k + columns] for k in range(0, len(courses), columns)]
+    heights = [1.7, 1.9, *(h for row in rows for h in (max(_map_height(course, of) for course, of in row), 0.75))]
+    figure = Figure(figsize=(13.0, 1.1 * sum(heights) + 0.6 * len(rows) + 1.0), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
+    names = [name for name in METHODS if name in report["methods"]]
+    bars = grid[0].subgridspec(1, len(_BARS))
+    for k, (key, label) in enumerate(_BARS):
+        _draw_bars(figure.add_subplot(bars[k]), label, {name: report["methods"][name][key] for name in names})
+    strips = grid[1].subgridspec(1, len(_COURSES))
+    for k, (key, label) in enumerate(_COURSES):
+        _draw_courses(figure.add_subplot(strips[k]), key, label, drives, names)
+    for number, row in enumerate(rows):
+        maps, modes = (grid[2 + 2 * number + k].subgridspec(1, columns) for k in range(2))
+        for k, (course, of) in enumerate(row):
+            _draw_course(figure.add_subplot(maps[k]), course, of)
+            _draw_modes(figure.add_subplot(modes[k]), of)
+    figure.legend(handles=_legend(names), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    figure.suptitle(
+        f"{settings.world}, seed {settings.seed}: {len(indices)} courses; the maps are of those that went worst"
+    )
     save_figure(figure, path)
 
 
-def _draw_episode(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
+def _how_well(drives: Sequence[Drive]) -> tuple[float, ...]:
+    """Sorts courses: not completed first, then contacts, flicker, disobedience of the first method."""
+    contacts, flicker = (sum(getattr(d, name) for d in drives) for name in ("contacts", "flicker"))
+    obedience = drives[0].obedience
+    missing = sum(not d.completed for d in drives)
+    return -missing, -contacts, -flicker, 0.0 if math.isnan(obedience) else obedience
+
+
+def _draw_bars(axis: Any, label: str, values: dict[str, float | None]) -> None:
+    heights = [value or 0.0 for value in values.values()]
+    axis.bar(list(values), heights, color=[_COLOURS[name] for name in values])
+    axis.set_ylim(0, 1.2 * max(heights) or 1.0)
+    for k, value in enumerate(values.values()):
+        words = "none" if value is None else f"{value:.3g}"
+        axis.annotate(words, (k, value or 0.0), ha="center", va="bottom", fontsize=8)
+    axis.set_title(label, fontsize=9)
+    axis.tick_params(labelsize=7)
+
+
+def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[Drive], names: Sequence[str]) -> None:
+    """A dot for every drive, by course; a ring where it was not completed, a cross where something was touched."""
+    for name in names:
+        of = [d for d in drives if d.method == name]
+        at, values = np.array([d.index for d in of]), np.array([getattr(d, key) for d in of])
+        done, touched = (np.array([getattr(d, what) for d in of]) > 0 for what in ("completed", "contacts"))
+        colour = _COLOURS[name]
+        axis.scatter(at[done], values[done], s=12, color=colour)
+        axis.scatter(at[~done], values[~done], s=22, facecolors="none", edgecolors=colour)
+        axis.scatter(at[touched], values[touched], s=40, marker="x", color="black", lw=1)
+    axis.set_title(f"{label} of each course", fontsize=9)
+    axis.set_xlabel("course", fontsize=7)
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis.tick_params(labelsize=7)
+    axis.grid(alpha=0.3)
+
+
+def _tracks(drives: Sequence[Drive]) -> FloatArray:
+    """(N, 2) all places that robots of these drives have been to."""
+    return np.concatenate(
+        [np.array(t).reshape(-1, 3)[:, :2] for d in drives for n, t in d.tracks.items() if n != "modes"]
+    )
+
+
+def _extent(course: Course, drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest corner (2,) of what a map of these drives shows."""
+    things = [(one.x, one.y) for one in course.obstacles]
+    places = np.concatenate([_tracks(drives), course.goals, np.array(things).reshape(-1, 2), [course.world.spawn[:2]]])
+    return places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
+
+
+def _map_height(course: Course, drives: Sequence[Drive]) -> float:
+    low, high = _extent(course, drives)
+    return float(np.clip(5.8 * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 4.0))
+
+
+def _draw_course(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
     plan = floor_plan(course.world)
     rows, columns = plan.cells.shape
     x, y = plan.origin
     extent = (x, x + columns * plan.cell_m, y, y + rows * plan.cell_m)
-    axis.imshow(np.where(plan.cells, 0.6, 1.0), origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
+    axis.imshow(np.where(plan.cells, 0.55, 1.0), origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
     for drive in drives:
+        colour = _COLOURS[drive.method]
         for name, style in (("robot", "-"), ("vbot", "--")):
             track = np.array(drive.tracks.get(name, [])).reshape(-1, 3)
-            axis.plot(track[:, 0], track[:, 1], style, color=_COLOURS[drive.method], lw=1.0, label=drive.method)
+            steps = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1)
+            parts = np.split(track, np.flatnonzero(steps > 0.5) + 1)  # another visit to the virtual space
+            for part in parts:
+                axis.plot(part[:, 0], part[:, 1], style, color=colour, lw=1.2)
         for switch in drive.switches:
-            at = np.array(drive.tracks["robot"])[min(int(switch.time_s / 0.2), len(drive.tracks["robot"]) - 1)]
-            axis.plot(at[0], at[1], ">" if switch.to_virtual else "<", color=_COLOURS[drive.method], ms=5)
-    axis.plot(course.goals[:, 0], course.goals[:, 1], "k*", ms=7)
-    words = [f"{d.method} {'completed' if d.completed else 'not completed'} {d.seconds:.0f} s" for d in drives]
-    axis.set_title(f"{drives[0].index}: " + ", ".join(words), fontsize=7)
+            at = _where(drive, switch.time_s)
+            mark = ">" if switch.to_virtual else "<"
+            axis.plot(*at, mark, color=colour, ms=7, mec="black", mew=0.6)
+    axis.plot(*course.world.spawn[:2], "ko", ms=4)
+    axis.plot(course.goals[:, 0], course.goals[:, 1], "k*", ms=9)
+    (x0, y0), (x1, y1) = _extent(course, drives)
+    axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    words = [f"{d.method} {d.seconds:.0f} s{'' if d.completed else ' NOT COMPLETED'}" for d in drives]
+    axis.set_title(f"course {drives[0].index}: " + ", ".join(words), fontsize=8)
     axis.tick_params(labelsize=6)
+
+
+def _where(drive: Drive, time_s: float) -> FloatArray:
+    """Place (2,) of the r-bot."""
+    track, modes = drive.tracks["robot"], drive.tracks["modes"]
+    return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
+
+
+def _draw_modes(axis: Any, drives: Sequence[Drive]) -> None:
+    """What the arbiter's mode was, a bar for each method."""
+    for k, drive in enumerate(drives):
+        modes = drive.tracks["modes"]
+        for (begins, mode), (ends, _) in pairwise(modes):
+            axis.barh(k, ends - begins, left=begins - modes[0][0], height=0.8, color=_MODE_COLOURS[Mode(int(mode))])
+    axis.set_yticks(range(len(drives)), [d.method for d in drives], fontsize=7)
+    axis.invert_yaxis()
+    axis.set_xlabel("s", fontsize=7, labelpad=0)
+    axis.tick_params(labelsize=6)
+
+
+def _legend(names: Sequence[str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    def dot(marker: str, label: str, **look: Any) -> Line2D:
+        return Line2D([], [], color="black", marker=marker, ls="none", ms=6, label=label, **look)
+
+    return [
+        *(Patch(color=_COLOURS[name], label=name) for name in names),
+        Line2D([], [], color="black", label="r-bot"),
+        Line2D([], [], color="black", ls="--", label="v-bot"),
+        dot(">", "into the virtual space", mfc="none"),
+        dot("<", "back", mfc="none"),
+        dot("o", "not completed", mfc="none"),
+        dot("x", "contact"),
+        *(Patch(color=colour, label=mode.name) for mode, colour in _MODE_COLOURS.items()),
+    ]
 
 
 class Video:

@@ -43,6 +43,8 @@ START_NS = 1_700_000_000_000_000_000
 CAMERA_HEIGHT_M = 1.2
 _EVERY = 3
 """Steps between two of the operator's commands (20 Hz)."""
+_FIRST_CUT_S = 0.05
+"""The driver ends revolutions at 180°."""
 _OVERDUE_S = 0.5
 """Of a picture that depth has had for so long nothing comes any more."""
 _SMALLER = 4
@@ -199,6 +201,8 @@ class SimulatedStack:
 
         self.config = config
         self.simulation: Simulation = Simulation(SimulationConfig(seed=config.seed), START_NS, world)
+        # From the driver's first cut on: of the half revolution before it a map is begun that the next fits nowhere in.
+        self.simulation.scanner.skip_to(_FIRST_CUT_S)
         self.rng = np.random.default_rng([53, config.seed])
         self.start = np.array(world.spawn)
         self.log = Log()
@@ -416,7 +420,7 @@ class SimulatedStack:
         simulation.step(STEP_S)
         now_ns = START_NS + round(simulation.time_s * 1e9)
         self.bus.advance_to(now_ns)
-        # Just after the driver's cut (180°: 0.05 s into each revolution), so that no scan is late for it.
+        # Just after the driver's cut, so that no scan is late for it.
         packets = simulation.scan_packets() if self._steps % 6 == 3 else []
         if packets:
             scan = VelodyneScan(
