@@ -184,7 +184,9 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
         try:
             with _stopped_by_sigterm():
                 teleop.evaluate(settings, args.jobs, tell, args.timeout, tuple(drives))
-        except (RuntimeError, TimeoutError) as error:
+        except (ValueError, RuntimeError, TimeoutError) as error:
+            if not drives:
+                raise
             status, words = 1, str(error)
         except KeyboardInterrupt:
             status, words = 130, "interrupted"
