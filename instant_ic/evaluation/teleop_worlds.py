@@ -216,7 +216,8 @@ def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> 
     steps = np.arange(0.0, length, 0.05)
     line = start + steps[:, None] * heading
     across = np.linspace(-0.25, 0.25, 11)[:, None] * np.array([-heading[1], heading[0]])
-    strip = np.array([plan.at(point + across).any() for point in line], bool)
+    places = (line[:, None] + across).reshape(-1, 2)
+    strip: NDArray[np.bool_] = np.asarray(plan.at(places).reshape(len(steps), -1).any(axis=1))
     begins = np.flatnonzero(strip & ~np.concatenate([[False], strip[:-1]]))
     ends = np.flatnonzero(strip & ~np.concatenate([strip[1:], [False]]))
     found: list[list[float]] = []  # first and last metre of each

@@ -323,7 +323,7 @@ class TestWorlds:
             teleop_worlds.across(world, np.random.default_rng(0), attempts=100)
 
     def test_recorded_commands_begin_where_the_simulator_starts_robots(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(teleop_worlds, "_world", lambda name: furnished(None))
+        monkeypatch.setattr(teleop_worlds, "_world", lambda name: furnished((2.0, 0.1)))
         course = teleop_worlds.make_course("random:1", 0, 0, from_spawn=True)
         assert course.world.spawn == (0.0, 0.0, 0.0) and len(course.goals) == 0 and course.way_m == 0.0
         assert teleop_worlds.make_course("random:1", 0, 0).way_m > 3.5
