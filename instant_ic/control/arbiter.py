@@ -72,8 +72,8 @@ class SwitchConfig:
     position_m: Positive = 0.15
     yaw_deg: Positive = 10.0
     return_dwell_s: NotNegative = 0.5
-    return_near_m: Positive = 0.03
-    return_patience_s: NotNegative = 2.0
+    return_near_m: Positive = 0.05
+    return_patience_s: NotNegative = 1.5
     picture_position_m: Positive = 0.02
     picture_yaw_deg: Positive = 0.5
     return_picture_m: Positive = 0.015
@@ -85,7 +85,7 @@ class SwitchConfig:
     min_real_s: NotNegative = 1.0
     return_margin_m: Positive = 0.5
     return_side_m: Positive = 0.12
-    neutral_return_s: NotNegative = 5.0
+    neutral_return_s: NotNegative = 3.0
     lead_back_after_s: NotNegative = 6.0
     stop_margin_m: NotNegative = 0.15
     min_switch_speed_m_s: NotNegative = 0.03
@@ -157,6 +157,8 @@ class ArbiterInputs:
     """(2,) of the camera in the map frame when it took the newest picture that the operator has."""
     view_position: NDArray[np.float64] | None = None
     """(2,) of the camera in the map frame for the newest rendered view that the operator has."""
+    view_after_picture_s: float = 0.0
+    """Seconds from when that picture came to when that view did."""
     ages: dict[str, float] = field(default_factory=dict)
     """Seconds since the last of: scan, odometry, pose, camera, view, vbot, nav, command, vspace; points and
     estop_input once they came."""
@@ -231,6 +233,7 @@ class Arbiter:
         self._agree_since_ns: int | None = None
         self._driven: _Driven | None = None  # the last command that was not zero
         self._leading_back = False
+        self._yaw_gap_before = 0.0  # of the last step
         self._slow_since_ns: int | None = None  # the v-bot drives more slowly than it is told to
         self._stop_reason = "waiting for the sensors"
         self._await_operator = False  # STOPPED because the operator's link was lost
@@ -275,6 +278,7 @@ class Arbiter:
         if changed:
             # The robot driven is another one now: its prediction, its gap.
             situation = self._assess(inputs, now_ns)
+        self._yaw_gap_before = situation.yaw_gap_rad
         command, blocked, reason = self._command(situation)
         prediction = situation.prediction
         return Decision(
@@ -517,7 +521,11 @@ class Arbiter:
         return "you drive the virtual robot" if agree else ""
 
     def _pictures_agree(self, situation: _Situation, within_m: float, within_deg: float) -> bool:
-        """Whether view and camera picture show the same place, so that nothing jumps when one follows the other."""
+        """Whether view and camera picture show the same place, so that nothing jumps when one follows the other.
+
+        Neither waits for the other: what the robot drove from when the one came to when the other did is motion, and
+        no jump. But the eye sees it as one where it is much.
+        """
         inputs, switch = situation.inputs, self.config.switch
         if inputs.robot_pose is None:
             return False
@@ -530,7 +538,9 @@ class Arbiter:
         if inputs.view_position is None or inputs.picture_position is None:
             return False
         apart = inputs.view_position[:2] - inputs.picture_position[:2]
-        return float(np.linalg.norm(apart)) <= within_m
+        yaw = float(inputs.robot_pose[2])
+        driven = inputs.robot_velocity[0] * inputs.view_after_picture_s * np.array([math.cos(yaw), math.sin(yaw)])
+        return bool(np.linalg.norm(apart - driven) <= within_m and np.linalg.norm(apart) <= 2.0 * within_m)
 
     def _rejoined(self, situation: _Situation) -> str:
         now_ns, switch, inputs = situation.now_ns, self.config.switch, situation.inputs
@@ -583,7 +593,9 @@ class Arbiter:
         if waited >= 2.0:
             return words  # a pose that trembles by more than the thresholds; the page eases what is left
         within_m, within_deg = switch.return_picture_m, switch.return_picture_yaw_deg
-        if situation.gap_m > within_m or abs(situation.yaw_gap_rad) > math.radians(within_deg):
+        # In two steps: SLAM's heading trembles, and the last that was shown counts as well.
+        yaw_gap = max(abs(situation.yaw_gap_rad), abs(self._yaw_gap_before))
+        if situation.gap_m > within_m or yaw_gap > math.radians(within_deg):
             return ""
         if waited >= 1.0:
             return words

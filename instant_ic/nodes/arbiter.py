@@ -104,7 +104,6 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.page: tuple[int, int] = (-1, 0)  # newest camera picture there: its stamp, when it was told
         self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: its request, when it was told
         self.picture_delay_s: float | None = None  # from the camera to the operator
-        self.view_lag_s: float | None = None  # how long ago the newest view was asked for when a picture comes
         self.estop = False
         self.stopped_by: tuple[str, int] = ("", 0)  # who asked last for the emergency stop, and when
         self.button: tuple[bool, int] | None = None  # the robot's own emergency stop: pressed, when it was told
@@ -250,7 +249,6 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 self.page_rhythm.heard((now_ns - self.page[1]) / 1e9)
             self.page = stamp, now_ns
             self.picture_delay_s = min(max((self.clock.now_ns() - stamp) / 1e9, 0.0), 1.0)
-            self.learn_view_lag(float(message.view_age_s) + float(message.view_delay_s))
         if view != self.view[0]:
             if self.arbiter.mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING):
                 self.rhythms["view"].heard((now_ns - self.view[1]) / 1e9)
@@ -262,19 +260,6 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if (new and self.arbiter.mode in (Mode.ENTERING, Mode.RETURNING)) or (gone and not told):
             # Whether view and picture agree is true of now, not of the next timer; a lost driver is not waited with.
             self.tick()
-
-    def learn_view_lag(self, lag_s: float) -> None:
-        """Notes how old (s, since it was asked for) the newest view is when a camera picture comes.
-
-        Views come twice as often as pictures, and neither waits for the other: how old the one is when the other comes
-        is what decides whether they can be of the same place.
-        """
-        if self.arbiter.mode in (Mode.REAL, Mode.STOPPED) or lag_s > 0.5:
-            self.view_lag_s = None  # asked for rarely, or lost
-        elif self.view_lag_s is None:
-            self.view_lag_s = lag_s
-        else:
-            self.view_lag_s += 0.3 * (lag_s - self.view_lag_s)
 
     def ages(self) -> dict[str, float]:
         shown, steady_ns = self.shown.message, self.clock.steady_ns()
@@ -312,8 +297,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def shown_pose(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> NDArray[np.float64] | None:
         """Where the r-bot (3,) was when the picture now shown was taken, but heading as it does now.
 
-        A view of this place will be shown when the next pictures have come, so it is taken as far ahead as the newest
-        view then is old. None without a page.
+        A view of this place will be shown when the next pictures have come, so it is taken as far ahead as a view
+        takes. None without a page.
         """
         shown = self.shown.message
         if shown is None or self.picture_delay_s is None:
@@ -321,8 +306,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         now_ns = self.clock.now_ns()
         newest_ns = self.tf.newest_ns("base_link") or now_ns
         now = move(pose, *velocity, min(max((now_ns - newest_ns) / 1e9, 0.0), 0.1))
-        lag_s = float(shown.view_delay_s) if self.view_lag_s is None else self.view_lag_s
-        behind_s = self.picture_delay_s - min(lag_s, 0.5)
+        behind_s = self.picture_delay_s - min(float(shown.view_delay_s), 0.5)
         if behind_s <= (now_ns - newest_ns) / 1e9:
             place = move(now, *velocity, -behind_s)
         else:
@@ -498,6 +482,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             shown_pose=None if pose is None else self.shown_pose(pose, velocity),
             picture_position=None if shown is None else self.picture_position(),
             view_position=None if shown is None else pose_matrix(shown.view_pose)[:2, 3],
+            view_after_picture_s=0.0 if shown is None else _between_s(shown),
             ages=ages,
             usual=self.usual(),
         )
@@ -557,6 +542,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
 def _twist(latest: Latest) -> tuple[float, float]:
     return (0.0, 0.0) if latest.message is None else twist_values(latest.message)
+
+
+def _between_s(shown: ShownPictures) -> float:
+    """Seconds from the newest camera picture's coming to the page to the newest view's; 0 while one is missing."""
+    between_s = float(shown.picture_age_s) - float(shown.view_age_s)
+    return between_s if math.isfinite(between_s) else 0.0
 
 
 def _vspace(status: VspaceStatus) -> Vspace:

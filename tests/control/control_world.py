@@ -210,6 +210,7 @@ class Loop:
             shown_pose=self.shown_pose(robot),
             picture_position=picture[:2],
             view_position=None if view is None else view[:2],
+            view_after_picture_s=self.view_after_picture_s(),
             ages=dict(self.ages),
         )
         self.decision = self.arbiter.step(inputs, now_ns)
@@ -254,11 +255,8 @@ class Loop:
             self.vbot.step(operator if free else (0.0, 0.0), robot, self.dt, self.walls)
 
     def shown_pose(self, robot: np.ndarray) -> np.ndarray:
-        """Where the r-bot was when the picture was taken that a view asked for now should look like.
-
-        A picture comes at each odd step; the newest view then was asked for a step before the one that came last.
-        """
-        place = self.cameras[max(0, self.k - self.camera_delay + self.view_delay + 1)]
+        """Where the r-bot was when the picture was taken that a view asked for now should look like."""
+        place = self.cameras[max(0, self.k - self.camera_delay + self.view_delay)]
         return np.array([place[0], place[1], robot[2]])
 
     def pictures(self) -> tuple[np.ndarray, np.ndarray | None]:
@@ -268,6 +266,14 @@ class Loop:
         if asked * self.dt > self.views_stop_at:
             return self.cameras[taken], None
         return self.cameras[taken], self.views[asked]
+
+    def view_after_picture_s(self) -> float:
+        """From when the newest camera picture came to when the newest view did."""
+        came = [
+            (self.k - late) // self.picture_period * self.picture_period + late
+            for late in (self.camera_delay, self.view_delay)
+        ]
+        return (came[1] - came[0]) * self.dt
 
     def measured(self, truth: np.ndarray) -> np.ndarray:
         """What SLAM says: the truth, or with noise an error that wanders by centimetres."""
