@@ -85,7 +85,8 @@ def test_a_view_drawn_at_one_place_is_shown_from_the_vbots_place_now(open_page, 
 
 
 # A v-bot at 0.3 m/s, from which the page hears 20 times a second; each tenth of a second a view, 0.15 s old. The switch
-# is at 1 s, and from 3 s on the robots are about to be the same again.
+# is at 1 s, from 3 s on the robots are about to be the same again, and at 4.5 s the camera is shown: by then the newest
+# picture, 0.15 s old, is of the same place as the view.
 DRIVE = """async () => {
     const {Pictures} = await import("/static/pictures.js");
     const viewer = {name: "none", setView() {}, setPanorama() {}, sample() {}}, frames = [];
@@ -94,9 +95,9 @@ DRIVE = """async () => {
     pictures.colourReleaseMs = 0;
     pictures.leadMaxM = 0.3;
     const at = (ms) => 0.0003 * Math.max(ms, 0), q = [0, 0, 0, 1], lead = (ms) => Math.min(Math.max(ms / 800, 0), 1);
-    for (; now < 4500; now += 10) {
-        const mode = now < 1000 ? "real" : now < 3000 ? "virtual" : "returning";
-        const shown = now < 1000 ? "real" : "virtual";
+    for (; now < 5000; now += 10) {
+        const mode = now < 1000 || now >= 4500 ? "real" : now < 3000 ? "virtual" : "returning";
+        const shown = mode === "real" ? "real" : "virtual";
         if (now % 50 === 0) {
             const pose = [at(now), 0, 0], share = now < 3000 ? lead(now - 1000) : 1 - lead(now - 3000);
             state = {at_ms: now, mode, shown, robot: pose, vbot: pose, twist: [0.3, 0], lead: share};
@@ -104,9 +105,9 @@ DRIVE = """async () => {
         if (now % 100 === 0)
             pictures.view = {p: [at(now - 150), 0, 1.2], q, mount: [0, 0, 1.2], fov: 1.5, aspect: 1.6, hasDepth: true,
                 captured_ms: now};
-        pictures.panorama = {q, captured_ms: now};
-        const {moved} = pictures.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
-        frames.push({now, mode, vbot: at(now), view: pictures.view.p[0], place: pictures.place[0], moved});
+        pictures.panorama = {q, captured_ms: now - 150};
+        const {moved, blend} = pictures.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
+        frames.push({now, mode, vbot: at(now), view: pictures.view.p[0], place: pictures.place[0], moved, blend});
     }
     return frames;
 }"""
@@ -123,11 +124,14 @@ def test_the_shown_place_keeps_up_with_the_vbot_and_goes_gently_to_and_from_the_
         assert frame["moved"] == pytest.approx([frame["place"] - frame["view"], 0, 0], abs=1e-9)
     steps = np.diff([frame["place"] for frame in driven])
     assert steps == pytest.approx(0.003, abs=0.0005)  # 10 ms at 0.3 m/s, whenever the views come
-    last = frames[-1]
+    last = next(frame for frame in frames if frame["now"] == 4490)
     assert abs(last["place"] - last["view"]) < 1e-4  # before the return too
+    blends = {frame["now"]: frame["blend"] for frame in frames}
+    assert [blends[now] for now in (900, 1400, 2900, 4490, 4900)] == [0, 1, 1, 1, 0]
+    assert 0 < blends[4600] < 0.9  # at once: a picture taken later would be of another place
     # On the way from one to the other the picture is at most 0.06 m/s faster or slower than the robot, seen over 0.2 s,
     # and goes on with the steps of the views (3 cm each 0.1 s) by what is left of them.
-    place = np.array([frame["place"] for frame in frames if frame["now"] >= 1000])
+    place = np.array([frame["place"] for frame in frames if 1000 <= frame["now"] < 4500])
     speed = (place[20:] - place[:-20]) / 0.2
     assert 0.15 < speed.min() < 0.27
     assert 0.33 < speed.max() < 0.45

@@ -31,6 +31,7 @@ export class Pictures {
     // Since when pictures of each kind have been made where the shown robot is; by the server's clock.
     this._since = { [PANORAMA]: 0, [VIEW]: 0 };
     this._nearVbot = false;
+    this._nearRobot = true;
     this._changedAt = 0;
     this._toward = 0;
     this._colours = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
@@ -146,13 +147,15 @@ export class Pictures {
   _step(state, elapsedMs) {
     const virtual = shows(state) === "virtual";
     const at = state?.at_ms ?? 0;
-    if (!virtual && this._virtual) this._since[PANORAMA] = this._changedAt = at;
-    if (virtual && !this._virtual) this._changedAt = at;
+    if (virtual !== this._virtual) this._changedAt = at;
     this._virtual = virtual;
-    // While the virtual space is entered, views are made at the v-bot's pose already.
-    const nearVbot = virtual || state?.mode === "entering";
+    // While the virtual space is entered, views are made at the v-bot's pose already; while it is left, the camera is
+    // there already, and the switch is made when its newest picture is of the same place as the view.
+    const nearVbot = virtual || state?.mode === "entering", nearRobot = !virtual || state?.mode === "returning";
     if (nearVbot && !this._nearVbot) this._since[VIEW] = at;
+    if (nearRobot && !this._nearRobot) this._since[PANORAMA] = at;
     this._nearVbot = nearVbot;
+    this._nearRobot = nearRobot;
     // A stop shows the real view, however old; so does the loss of the controller.
     const waits = virtual || state?.mode === "real";
     const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
