@@ -45,7 +45,7 @@ class Drive:
         self.vbot = VirtualRobot(VbotConfig(), self.arbiter.config.limits)
         self.vspace = Vspace(ready=True, ready_radius_m=100.0)
         self.ages = dict.fromkeys(KEYS, 0.0)
-        self.apart_m = 0.0
+        self.apart_m = self.view_after_picture_s = 0.0
         self.estop = False
         self.steps: list[Decision] = []
         self.obey: Decision | None = None
@@ -71,6 +71,7 @@ class Drive:
             vbot_velocity=self.vbot.velocity,
             picture_position=robot[:2],
             view_position=self.vbot.pose[:2] + [self.apart_m, 0.0],
+            view_after_picture_s=self.view_after_picture_s,
             ages=dict(self.ages),
         )
         self.obey = decision = self.arbiter.step(inputs, round(len(self.steps) * DT * 1e9))
@@ -175,6 +176,26 @@ def test_the_virtual_space_is_shown_only_once_a_view_of_the_same_place_has_come(
     assert speeds[-1] < 0.2
     made.apart_m = 0.015
     assert made.step(FORWARD).mode == Mode.VIRTUAL
+
+
+@pytest.mark.parametrize(
+    ("apart_m", "view_after_picture_s", "enters"),
+    [
+        (0.03, 0.0, False),  # another place
+        (0.03, 0.075, True),  # the robot has driven 3 cm in between, at 0.4 m/s
+        (0.015, -0.075, False),  # the view is the older one, and yet ahead: 4.5 cm
+        (0.05, 0.125, False),  # of one drive, but the eye would see 5 cm
+    ],
+)
+def test_what_the_robot_drives_between_view_and_picture_is_no_jump(
+    apart_m: float, view_after_picture_s: float, enters: bool
+) -> None:
+    made = before_box()
+    made.apart_m, made.view_after_picture_s = apart_m, view_after_picture_s
+    made.until(Mode.ENTERING, FORWARD)
+    assert made.speed[0] == pytest.approx(0.4)
+    made.drive(2 * DT, FORWARD)  # it slows later
+    assert (made.steps[-1].mode == Mode.VIRTUAL) == enters
 
 
 @pytest.mark.parametrize("lost", ["view", "apart"])
