@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,13 +82,14 @@ def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> C
         ValueError: no such world, or nowhere to drive to in it.
     """
     if name == RANDOM_CORRIDORS:
-        return random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
-    world = _world(name)
-    if name.partition(":")[0] in ("corridor", "corridor-free"):
-        return straight_ahead(world)
-    if from_spawn:
-        return Course(world, np.empty((0, 2)), ())
-    return across(world, np.random.default_rng([59, seed, index]))
+        course = random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
+    elif name.partition(":")[0] in ("corridor", "corridor-free"):
+        course = straight_ahead(_world(name))
+    elif not from_spawn:
+        return across(_world(name), np.random.default_rng([59, seed, index]))
+    else:
+        course = Course(_world(name), np.empty((0, 2)), ())
+    return replace(course, goals=np.empty((0, 2))) if from_spawn else course
 
 
 @functools.lru_cache(maxsize=1)

@@ -327,6 +327,8 @@ class TestWorlds:
         course = teleop_worlds.make_course("random:1", 0, 0, from_spawn=True)
         assert course.world.spawn == (0.0, 0.0, 0.0) and len(course.goals) == 0 and course.way_m == 0.0
         assert teleop_worlds.make_course("random:1", 0, 0).way_m > 3.5
+        along = teleop_worlds.make_course("corridor", 0, 0, from_spawn=True)
+        assert len(along.goals) == 0 and len(along.obstacles) == 1
 
 
 def sight(time_s: float, pose: tuple[float, float, float], speed: float = 0.4, **given: bool) -> Sight:
