@@ -28,6 +28,8 @@ ASIDE_RAD = 0.02
 """Less is the keyframe's own view, whose edges are right."""
 EDGE = 0.25
 """Less confidence at an edge."""
+SAME_COLOUR = 30.0
+"""Grey levels in which two keyframes' pictures of a place that stands still may differ."""
 _VOTE_ROWS = 256  # of the pixels that are asked whether they have moved
 _STEP_ROWS = 128  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
@@ -52,9 +54,10 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     """Colours (P, 3), depth (P,) and confidence (P,) of the layers together, newest first.
 
     Of surfaces at different depths the nearest counts, of those that depths only disagree about the one that is seen
-    most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two surfaces mix, only where
-    no keyframe has a plain one. What a newer keyframe has looked through is left out of an older one: it has moved, or
-    is an error of its depth. What nobody has seen is as the newest has it. Needs numba.
+    most alike (``SAME_PLACE``); one at an edge of the newest's depth, where colours of two surfaces mix, only where
+    no keyframe has a plain one. An older keyframe shows nothing beside its own edges, where its depth may be of either
+    side, and nothing that a newer one has looked through (it has moved, or is an error of its depth) or has seen itself
+    and draws elsewhere: that would stand there twice. What nobody has seen is as the newest has it. Needs numba.
     """
     from .compose_kernels import blend
 
@@ -64,7 +67,8 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     depth, confidence = np.empty_like(layers[0].depth), np.empty_like(layers[0].confidence)
     blend(
         *(np.stack([getattr(layer, key) for layer in layers]) for key in ("colour", "depth", "confidence", "gain")),
-        *(np.stack([getattr(layer.prior, key) for layer in layers]) for key in ("torn", "inverse_depth")),
+        np.stack([layer.prior.beside_edge if older else layer.prior.torn for older, layer in enumerate(layers)]),
+        np.stack([layer.prior.inverse_depth for layer in layers]),
         np.stack([layer.prior.known == 1 for layer in layers]), room, np.linalg.inv(poses).astype(np.float32),
         np.ascontiguousarray(poses[:, :3, 3], np.float32), rays.origin, rays.directions,
         *(np.float32(value) for value in (EDGE, ASIDE_RAD, SAME_PLACE, SAME_SURFACE, LEAST_PENALTY, SHARPNESS)),
@@ -77,8 +81,9 @@ def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
     """What of each keyframe (newest first, all of one size) is not there any more or never stood still, (h, w) each.
 
     Each keyframe that knows says whether there is a surface at a pixel's place or whether it has looked through it; the
-    majority counts, and where there is none the newest: of two keyframes the newer wins. Single pixels, which are
-    errors of the depth, are left in. Needs numba.
+    majority counts, and where there is none the newest: of two keyframes the newer wins. What of the newest another's
+    picture shows in the same colour at that place still stands there, and only the depths disagree: it is left in, and
+    so are single pixels. Needs numba.
     """
     from .compose_kernels import outvoted
 
@@ -93,8 +98,24 @@ def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
         room = np.array([disagreement(prior, other) for other in priors], np.float32)
         out = np.zeros((height, width), np.uint8)
         outvoted(equirect_directions(width, height), inverse, sure, *matrices, room, own, step, out)
-        found.append(_opened(out > 0, step))
+        gone = out > 0 if own else _looks_different(out > 0, prior, priors[1:])
+        found.append(_opened(gone, step))
     return found
+
+
+def _looks_different(
+    mask: NDArray[np.bool_], prior: PanoramaPrior, others: Sequence[PanoramaPrior]
+) -> NDArray[np.bool_]:
+    """Of pixels (h, w) of a keyframe those whose places no other keyframe's picture shows in the same colour."""
+    left = mask.copy()
+    directions = equirect_directions(mask.shape[1], mask.shape[0])[mask]
+    own, pose = _colours(prior, directions), prior.map_from_camera.astype(np.float32)
+    points = np.einsum("ij,kj->ik", directions / prior.inverse_depth[mask][:, None], pose[:3, :3]) + pose[:3, 3]
+    for other in others:
+        pose = other.map_from_camera.astype(np.float32)
+        theirs = _colours(other, np.einsum("ij,jk->ik", points - pose[:3, 3], pose[:3, :3]))
+        left[mask] &= np.abs(theirs - own).max(axis=1) > SAME_COLOUR
+    return left
 
 
 def _opened(mask: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:

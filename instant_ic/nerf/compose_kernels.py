@@ -25,21 +25,21 @@ def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def blend(  # type: ignore[no-untyped-def]
-    colours, depths, confidences, gains, torn, inverse, known, room, camera_from_map, places, origin, directions,
+    colours, depths, confidences, gains, edges, inverse, known, room, camera_from_map, places, origin, directions,
     edge, aside_rad, same_place, same_surface, least_penalty, sharpness, colour, depth, confidence,
 ):  # fmt: skip
     """The layers of a view into one, by the rules of ``compose``.
 
     Args:
         colours: (K, P, 3); depths, confidences: (K, P); newest keyframe first.
-        gains: (K, 3); torn, inverse, known: of the keyframes' depth, (K, h, w); room: as ``opinion`` takes it, (K, K).
+        gains: (K, 3); edges, inverse, known: of the keyframes' depth, (K, h, w); room: as ``opinion`` takes it, (K, K).
         camera_from_map: (K, 4, 4); places: of the cameras, (K, 3).
         origin: (3,); directions: (P, 3).
         edge … sharpness: the constants of ``compose``.
         colour: out, (P, 3); depth, confidence: out, (P,).
     """
     count = depths.shape[0]
-    height, width = torn.shape[1:]
+    height, width = edges.shape[1:]
     one = np.float32(1)
     rank = np.zeros(count, np.float32)
     penalty = np.zeros(count, np.float32)
@@ -56,11 +56,13 @@ def blend(  # type: ignore[no-untyped-def]
             # Angle at the point between the ways to the view and to the keyframe, from the triangle's three sides.
             if _angle(places[k], origin, directions[n], t, away) > aside_rad:
                 row, column, _ = panorama_pixel(px, py, pz, height, width)
-                if torn[k, row, column]:
-                    rank[k] -= edge
+                if edges[k, row, column]:
+                    rank[k] = rank[k] - edge if k == 0 else np.float32(0)
             for newer in range(k):
                 x, y, z = along(camera_from_map[newer], origin, directions[n], t)
-                if opinion(x, y, z, inverse[newer], known[newer], room[newer, k]) == AGAINST:
+                says = opinion(x, y, z, inverse[newer], known[newer], room[newer, k])
+                drawn = confidences[newer, n] > 0 and abs(depths[newer, n] - t) <= same_place * t
+                if says == AGAINST or (says == FOR and not drawn):
                     rank[k] = 0
             best = max(best, rank[k])
         if best <= 0:  # nobody has seen it: as the newest has it

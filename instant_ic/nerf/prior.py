@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,9 @@ from .config import GeometryConfig
 MOST_SIGMA = 0.5
 """Depth that is more uncertain than this, relative to it, is as good as filled in: views of it are less confident."""
 
+
+EDGE_RAD = 0.05
+"""So far to each side of an edge its depth may be of the one or the other."""
 
 ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
 """What a pixel shows: a part of the place; the robot itself; the sky, endlessly far; what has moved away."""
@@ -58,6 +62,15 @@ class PanoramaPrior:
 
     def _with(self, content: NDArray[np.uint8]) -> PanoramaPrior:
         return replace(self, content=content, usable=(content == ROOM).astype(np.uint8))
+
+    @functools.cached_property
+    def beside_edge(self) -> NDArray[np.uint8]:
+        """1 within ``EDGE_RAD`` of a torn quad, (h, w) uint8."""
+        pixels = max(1, round(EDGE_RAD / np.pi * self.torn.shape[0]))
+        near = np.pad(self.torn, ((pixels, pixels), (0, 0)))
+        for axis in (0, 1):  # columns wrap
+            near = np.maximum.reduce([np.roll(near, k, axis) for k in range(-pixels, pixels + 1)])
+        return np.ascontiguousarray(near[pixels:-pixels])
 
     @property
     def median_depth_m(self) -> float:

@@ -32,14 +32,15 @@ from .warp import PanoramaWarp, pinhole
 
 @dataclass(frozen=True)
 class _Keyframe:
-    """A keyframe on the device; ``torn`` and ``sure`` as in ``TorchLayer``; ``behind``: its background's mesh, guesses
-    marked 1 and sky 2, with its colours.
+    """A keyframe on the device; ``torn``, ``beside``, ``sure`` as in ``TorchLayer``; ``behind``: its background's mesh,
+    guesses marked 1 and sky 2, with its colours.
     """
 
     quads: Patches
     quarters: Patches
     pyramid: TorchPyramid
     torn: Tensor
+    beside: Tensor
     sure: Tensor
     behind: Patches | None
     behind_rgb: Tensor | None
@@ -132,7 +133,14 @@ class TorchCanvas:
         own, prior = self._uploaded(keyframe), keyframe.prior
         view_from_camera = self._view_from(prior.map_from_camera, eye)
         return TorchLayer(
-            *(*layers[id(keyframe.warp)], self._tensor(gain), own.quads.mesh.inverse[1:-1], own.torn, own.sure),
+            *(
+                *layers[id(keyframe.warp)],
+                self._tensor(gain),
+                own.quads.mesh.inverse[1:-1],
+                own.torn,
+                own.beside,
+                own.sure,
+            ),
             camera_from_view=self._camera_from(prior.map_from_camera, eye),
             camera=view_from_camera[:3, 3],
         )
@@ -204,6 +212,7 @@ class TorchCanvas:
                 quarters,
                 TorchPyramid(texels, start, sizes, (int(pyramid.sizes[0, 0]), int(pyramid.sizes[0, 1]))),
                 self._tensor(keyframe.prior.torn != 0),
+                self._tensor(keyframe.prior.beside_edge != 0),
                 self._tensor(keyframe.prior.known == 1),
                 *behind,
             )

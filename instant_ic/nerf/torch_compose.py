@@ -20,7 +20,8 @@ class TorchLayer:
 
     Attributes:
         colour, depth, confidence: of the view, (P, 3), (P,), (P,); gain: (3,).
-        inverse, torn, sure: of the ``PanoramaPrior``, (h, w); ``sure``: where the depth is known.
+        inverse, torn, beside, sure: of the ``PanoramaPrior``, (h, w); ``beside``: near an edge of its depth; ``sure``:
+            where the depth is known.
         camera_from_view: (4, 4).
         camera: the keyframe's place in the view's frame, (3,).
     """
@@ -31,6 +32,7 @@ class TorchLayer:
     gain: Tensor
     inverse: Tensor
     torn: Tensor
+    beside: Tensor
     sure: Tensor
     camera_from_view: Tensor
     camera: Tensor
@@ -96,14 +98,21 @@ def panorama_places(local: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tenso
 
 
 def _rank(k: int, layers: Sequence[TorchLayer], room: Sequence[Sequence[float]], directions: Tensor) -> Tensor:
-    """Confidence of layer ``k``, less at an edge of its depth, 0 where a newer one has looked through it."""
+    """Confidence of layer ``k``, less at an edge of the newest's depth; of an older one 0 beside its own edges, and
+    where a newer one has looked through it, or has seen it and draws it elsewhere.
+    """
     own = layers[k]
     local = points(own.camera_from_view, directions, own.depth)
     row, column = _upper_left(local, own.inverse)
     aside = _angle(own, directions, own.depth, local.norm(dim=1)) > ASIDE_RAD
-    rank = own.confidence - torch.where(aside & own.torn[row, column] & (own.confidence > 0), EDGE, 0.0)
+    if k == 0:
+        return own.confidence - torch.where(aside & own.torn[row, column] & (own.confidence > 0), EDGE, 0.0)
+    rank = torch.where(aside & own.beside[row, column], 0.0, own.confidence)
     for newer in range(k):
-        rank = torch.where(_looked_through(layers[newer], own.depth, room[newer][k], directions), 0.0, rank)
+        one = layers[newer]
+        through, seen = _opinion(one, own.depth, room[newer][k], directions)
+        drawn = (one.confidence > 0) & ((one.depth - own.depth).abs() <= SAME_PLACE * own.depth)
+        rank = torch.where(through | (seen & ~drawn), 0.0, rank)
     return rank
 
 
@@ -113,16 +122,19 @@ def _angle(layer: TorchLayer, directions: Tensor, t: Tensor, away: Tensor) -> Te
     return (toward / away.clamp(min=1e-6)).clamp(-1, 1).acos()
 
 
-def _looked_through(layer: TorchLayer, depth: Tensor, room: float, directions: Tensor) -> Tensor:
-    """Whether a keyframe has looked through places along the rays; ``compose_kernels.opinion`` is AGAINST."""
+def _opinion(layer: TorchLayer, depth: Tensor, room: float, directions: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a keyframe has looked through places along the rays, and where it has seen a surface there, (P,) each;
+    ``compose_kernels.opinion`` is AGAINST, and FOR.
+    """
     local = points(layer.camera_from_view, directions, depth)
     row, column = _upper_left(local, layer.inverse)
     height, width = layer.inverse.shape
     below, right = (row + 1).clamp(max=height - 1), (column + 1) % width
     corners = [(row, column), (row, right), (below, column), (below, right)]
     sure = torch.stack([layer.sure[at] for at in corners]).all(dim=0)
-    nearest = torch.stack([layer.inverse[at] for at in corners]).amax(dim=0)
-    return sure & (nearest * local.norm(dim=1) * (1 + room) < 1)
+    ratios = torch.stack([layer.inverse[at] for at in corners]) * local.norm(dim=1)
+    through = sure & (ratios.amax(dim=0) * (1 + room) < 1)
+    return through, sure & ~through & (ratios.amin(dim=0) <= 1 + room)
 
 
 def _upper_left(local: Tensor, image: Tensor) -> tuple[Tensor, Tensor]:

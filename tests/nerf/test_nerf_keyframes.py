@@ -148,10 +148,11 @@ def sphere(radius_m, x, content=0):
 
 
 def with_person(prior, depth_m=1.5):
-    """The same with somebody in the middle of the picture, 16 × 16 pixels."""
-    inverse = prior.inverse_depth.copy()
+    """The same with somebody in the middle of the picture, 16 × 16 pixels, in colours of their own."""
+    inverse, rgb = prior.inverse_depth.copy(), prior.rgb.copy()
     inverse[8:24, 24:40] = 1 / depth_m
-    return dataclasses.replace(prior, inverse_depth=inverse)
+    rgb[8:24, 24:40] ^= 128
+    return dataclasses.replace(prior, inverse_depth=inverse, rgb=rgb)
 
 
 def test_what_has_moved_by_majority():
@@ -173,6 +174,8 @@ def test_what_has_moved_by_majority():
         assert gone(*three)[0] == [number == order for number in range(3)]
         assert gone(*three)[1][(order + 1) % 3] == 0
     assert gone(empty, busy, busy)[0] == [False, False, False]
+    # What the others' pictures show in the newest's colours stands there, whatever their depths say.
+    assert gone(dataclasses.replace(busy, rgb=empty.rgb), empty, empty)[1] == [0, 0, 0]
     # Errors of the depth within three sigmas are no movement, nor is what the others do not know.
     assert gone(empty, with_person(empty, 3.7), empty)[1] == [0, 0, 0]
     blind = dataclasses.replace(empty, known=np.zeros_like(empty.known))
@@ -294,10 +297,25 @@ def composed_plainly(layers, rays):
         at = np.flatnonzero(confidence[number])
         points = rays.origin + depth[number, at, None] * rays.directions[at]
         local = (points - one.prior.map_from_camera[:3, 3]) @ one.prior.map_from_camera[:3, :3]
-        u, v = composing.equirect_pixels(local, *one.prior.torn.shape[::-1])
-        row = np.clip(np.floor(v), 0, one.prior.torn.shape[0] - 1).astype(int)
-        torn = one.prior.torn[row, np.floor(u).astype(int) % one.prior.torn.shape[1]] > 0
-        rank[number, at] -= composing.EDGE * (torn & (angle(one.prior, points, rays.directions[at]) > 0.02))
+        height, width = one.prior.torn.shape
+        u, v = composing.equirect_pixels(local, width, height)
+        row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
+        torn = (one.prior.beside_edge if number else one.prior.torn)[row, column] > 0
+        torn &= angle(one.prior, points, rays.directions[at]) > 0.02
+        rank[number, at] -= np.where(torn, rank[number, at] if number else composing.EDGE, 0)
+        for newer, other in enumerate(layers[:number]):
+            room = 1 + composing.disagreement(other.prior, one.prior)
+            local = (points - other.prior.map_from_camera[:3, 3]) @ other.prior.map_from_camera[:3, :3]
+            u, v = composing.equirect_pixels(local, width, height)
+            row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
+            rows, columns = np.stack([row, np.minimum(row + 1, height - 1)]), np.stack([column, (column + 1) % width])
+            corners = rows[:, None], columns[None]
+            ratios = other.prior.inverse_depth[corners] * np.linalg.norm(local, axis=1)
+            sure = (other.prior.known[corners] == 1).all(axis=(0, 1)) & (ratios.min(axis=(0, 1)) <= room)
+            t = depth[number, at]
+            drawn = (confidence[newer, at] > 0) & (np.abs(depth[newer, at] - t) <= composing.SAME_PLACE * t)
+            through = ratios.max(axis=(0, 1)) * room < 1
+            rank[number, at] = np.where(sure & (through | ~drawn), 0, rank[number, at])
     met = rank.max(axis=0) > 0
     candidate = (rank > 0) & (rank == rank.max(axis=0))
     nearest = np.where(candidate, depth, np.inf).min(axis=0)
