@@ -78,7 +78,7 @@ class SwitchConfig:
     picture_yaw_deg: Positive = 0.5
     return_picture_m: Positive = 0.015
     return_picture_yaw_deg: Positive = 0.3
-    return_turn_rad_s: Positive = 0.3
+    return_turn_rad_s: Positive = 0.2
     enter_timeout_s: Positive = 2.0
     return_timeout_s: Positive = 8.0
     min_virtual_s: NotNegative = 1.0

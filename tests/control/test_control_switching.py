@@ -267,7 +267,7 @@ def test_the_camera_is_not_shown_again_while_the_robot_turns_fast() -> None:
     made.until(Mode.RETURNING, (0.0, 0.8))
     made.drive(2.0, (0.0, 0.8))
     assert made.steps[-1].mode == Mode.RETURNING
-    made.until(Mode.REAL, (0.0, 0.2), 1.0)
+    made.until(Mode.REAL, (0.0, 0.1), 1.0)
     # Not for ever: after return_timeout_s it goes on.
     made = before_box()
     made.until(Mode.VIRTUAL, FORWARD)
