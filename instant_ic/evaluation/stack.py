@@ -18,6 +18,7 @@ from typing import Any, Self, TypeVar
 from ..bus import SENSOR, Node, QoS
 from ..bus.clock import SystemClock
 from ..bus.local_transport import LocalTransport
+from ..launch.process import dies_with_us
 
 T = TypeVar("T")
 _ENOUGH_PER_S = 33e6
@@ -132,7 +133,7 @@ class Stack:
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)}
         with self.log_path.open("wb") as log:
             self.process = subprocess.Popen(
-                [*self.prefix, sys.executable, "-m", "instant_ic.cli.main", "launch", *launch],
+                [*dies_with_us(), *self.prefix, sys.executable, "-m", "instant_ic.cli.main", "launch", *launch],
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,

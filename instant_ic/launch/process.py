@@ -36,6 +36,11 @@ _BURST_BYTES = 4.0 * OUTPUT_BYTES_PER_S
 _PIPE_BYTES = 1 << 20  # a launcher that is held up for a moment must not hold up the nodes
 
 
+def dies_with_us() -> tuple[str, ...]:
+    """What goes before a command so that the kernel kills its process when this thread is gone, however it went."""
+    return sys.executable, "-I", "-S", str(_CHILD), str(os.getpid())
+
+
 class State(enum.Enum):
     """What a supervised process is doing."""
 
@@ -164,7 +169,7 @@ class ManagedProcess:
         Raises:
             OSError: the kernel does not let it.
         """
-        guard = (sys.executable, "-I", "-S", str(_CHILD), str(os.getpid()))
+        guard = dies_with_us()
         # A stack inside a node of another stack carries both marks, so that it goes with the outer one.
         marks = [mark for mark in (os.environ.get(VARIABLE), self.mark) if mark]
         environment: dict[str, str | None] = {

@@ -15,6 +15,7 @@ import pytest
 
 from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.local_transport import LocalTransport
+from instant_ic.evaluation.stack import processes_of
 from instant_ic.msg import deserialize
 
 pytestmark = pytest.mark.system
@@ -103,3 +104,40 @@ def test_hang_respawn_groups_and_the_end_by_a_required_node(launched: Launched) 
     assert "vital ended (killed by SIGKILL); it is required, so the stack ends" in launched.text()
     assert not psutil.pid_exists(second)
     assert registry.list_nodes(launched.run_dir) == [] == registry.list_nodes(launched.run_dir / "left")
+
+
+PROGRAM = """
+import signal, sys
+from pathlib import Path
+from instant_ic.evaluation.stack import Stack
+with Stack("stack.yaml", Path(sys.argv[1]), {}):
+    print("started", flush=True)
+    signal.pause()
+"""
+
+
+def test_a_stack_goes_with_the_program_that_started_it_also_when_that_is_killed(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    folder = tmp_path_factory.mktemp("r")
+    shutil.copy(Path(__file__).with_name("ticker_node.py"), folder)
+    (folder / "stack.yaml").write_text("launch:\n- node: {exec: ticker_node.py, name: ticker}\n")
+    run_dir = folder / "r"
+    # By file: a pipe would be held open by what is left, and reading it to its end would hang.
+    with (folder / "out").open("wb") as out:
+        program = subprocess.Popen([sys.executable, "-c", PROGRAM, str(run_dir)], cwd=folder, stdout=out, stderr=out)
+    deadline = time.monotonic() + 90
+    try:
+        while not registry.list_nodes(run_dir):
+            assert program.poll() is None and time.monotonic() < deadline, (folder / "out").read_text()
+            time.sleep(0.05)
+        assert len(processes_of(run_dir)) >= 2  # launcher and node
+        program.kill()
+        program.wait(30)
+        while left := processes_of(run_dir):
+            assert time.monotonic() < deadline, [process.cmdline() for process in left]
+            time.sleep(0.05)
+    finally:
+        program.kill()
+        for process in processes_of(run_dir):
+            process.kill()
