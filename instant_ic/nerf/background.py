@@ -1,6 +1,7 @@
 """What lies behind a keyframe's surfaces, as far as it can be guessed: shown where nobody has seen anything.
 
-Behind each depth edge the farther surface is continued, in depth and in colour, once for each keyframe: it lies fixed
+Behind each depth edge the farther surface is continued, in depth and in colour, once for each keyframe: floor and
+ceiling as the level planes they are, all else upright, each in the colours of its own kind. It lies fixed
 in the map, so that pictures of a moving camera agree with each other. The place under the robot is a continuation of
 the ground round it. The sky is drawn here too, endlessly far.
 """
@@ -21,10 +22,13 @@ from .warp import pinhole
 
 REACH_RAD = 0.3
 """So far behind an edge the background is continued, as seen from the keyframe."""
-GUESS_SHARE, GUESS_REACH = 0.6, 0.02
+GUESS_SHARE, GUESS_REACH = 0.6, 0.04
 """Of the guess in the picture, reached so far (share of its width) inside of what is unseen: near what is seen the
 picture's own continuation is the better guess. Measured: benchmarks/keyframes.py."""
 _NEARER = 0.12  # a surface is in front of another where its inverse depth is greater by this share
+_ON_LEVEL = 0.1  # inverse depths within this share of the floor's or the ceiling's are on it
+_BEHIND = 1.05  # a guess lies farther than what hides it by this factor
+_STEEP, _ALIKE, _LEVEL_SHARE = 0.6, 0.04, 0.6  # beyond this sine of the elevation so many heights agree so far
 _SKY_M = 1e4
 _ROWS = 256  # of the pictures that the background is made in: it is smooth
 
@@ -57,10 +61,16 @@ class Background:
         height, width = inverse.shape
         sky = content == SKY
         inverse[sky] = 1 / _SKY_M
+        directions = equirect_directions(width, height)
+        rise = np.einsum("ijk,k->ij", directions, prior.map_from_camera[2, :3]).astype(np.float32)
+        levels = level_planes(inverse, rise, content == ROOM)
+        kind = np.zeros(inverse.shape, np.uint8)  # 1 floor, 2 ceiling, 0 all else
+        for number, level in enumerate(levels, 1):
+            kind[(level > 0) & (np.abs(inverse - level) < _ON_LEVEL * level)] = number
         reach = max(1, round(REACH_RAD / (2 * math.pi / width)))
         steps = np.zeros(inverse.shape, np.int32)
         # Beyond the reach as much again of the near surface is no source of what is behind it.
-        in_front(inverse, torn_quads(inverse, _NEARER), 2 * reach, steps)
+        in_front(inverse, torn_quads(inverse, _NEARER), kind, 2 * reach, steps)
         removed = (content != ROOM) & ~sky
         hole = ((steps > 0) & (steps <= reach)) | removed
         # Nor is the far side's first pixel, which has a part of the near surface's colour.
@@ -68,15 +78,27 @@ class Background:
         if not source.any():
             source = ~hole
         keep = source | (content == ROBOT)  # the ground under the robot is known, or filled in already
-        filled = fill_holes(np.where(keep, inverse, 0).astype(np.float32), keep)
-        rgb = area_average(prior.rgb, height, width) if prior.rgb.shape[:2] != inverse.shape else prior.rgb
-        colours = np.where(source[..., None], rgb, 0).astype(np.float32)
-        rgb = np.where(hole[..., None], np.rint(fill_holes(colours, source)), rgb).astype(np.uint8)
+        weight = 1 / (inverse * inverse)  # what is far goes on behind what is near, not the other way round
+        # In a room with a floor or a ceiling walls stand upright: their distance along it is the same up and down.
+        flat = np.sqrt(np.maximum(1 - rise * rise, np.float32(1e-4))) if np.any(levels) else np.ones_like(rise)
+        wall = keep & (kind == 0)
+        upright = fill_holes(np.where(wall, inverse / flat, 0).astype(np.float32), wall, weight) * flat
+        planes = np.stack([upright, *levels])
+        filled, own = planes.max(axis=0), planes.argmax(axis=0)
+        rgb = area_average(prior.rgb, height, width) if prior.rgb.shape[:2] != inverse.shape else prior.rgb.copy()
+        painted = rgb.copy()
+        for number in range(3):  # each from its own kind
+            here, there = hole & (own == number), source & (kind == number)
+            if here.any():
+                there = there if there.any() else source
+                colours = fill_holes(np.where(there[..., None], rgb, 0).astype(np.float32), there, weight)
+                painted[here] = np.rint(colours[here])
+        behind = hole & ((filled < inverse / _BEHIND) | removed)
         inverse = np.where(hole, filled, inverse).astype(np.float32)
         whole = torn_quads(inverse, _NEARER)[:-1] == 0
-        guessed = _any_corner(hole) & whole
+        guessed = _any_corner(behind) & whole
         return cls(
-            np.maximum(inverse, 1 / _SKY_M), rgb, _places(guessed), _places(_any_corner(sky) & ~guessed & whole),
+            np.maximum(inverse, 1 / _SKY_M), painted, _places(guessed), _places(_any_corner(sky) & ~guessed & whole),
             prior.map_from_camera,
         )  # fmt: skip
 
@@ -118,6 +140,23 @@ def mixed_in(image: Floats, guess: Floats, guessed: NDArray[np.bool_]) -> Floats
     mixed = image.copy()
     mix_guess(guess, guessed, max(1, round(GUESS_REACH * guessed.shape[1])), GUESS_SHARE, mixed)
     return mixed
+
+
+def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list[Floats]:
+    """Inverse depth of the floor and of the ceiling at each pixel, (h, w) each, 0 where it is not met or there is none.
+
+    Args:
+        inverse: inverse depth, (h, w); rise: sine of the pixels' elevation in the map, (h, w).
+        room: (h, w) where the depth is of the place.
+    """
+    planes = []
+    for side in (-1, 1):
+        steep = (side * rise > _STEEP) & room
+        heights = rise[steep] / inverse[steep]
+        height = float(np.median(heights)) if len(heights) else 0.0
+        flat = len(heights) > 0 and np.mean(np.abs(heights - height) < _ALIKE * abs(height)) > _LEVEL_SHARE
+        planes.append(np.maximum(rise / height, 0).astype(np.float32) if flat else np.zeros_like(inverse))
+    return planes
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -11,12 +11,12 @@ from .kernels import _OPTIONS
 from .march import along, panorama_pixels
 from .warp_kernels import NEAR_M, beyond, draw_triangle
 
-SAME_THING = np.float32(1.15)
+SAME_THING = np.float32(2)
 """What is nearer than an edge of a thing by more than this factor is not the thing, but what it stands on."""
 
 
 @njit(**_OPTIONS)
-def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
+def in_front(inverse, torn, level, reach, steps):  # type: ignore[no-untyped-def]
     """How far pixels of nearer surfaces lie from a depth edge.
 
     From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
@@ -24,6 +24,7 @@ def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
 
     Args:
         inverse, torn: of the ``PanoramaPrior``, (h, w).
+        level: (h, w) over 0 on the floor and the ceiling, which hide nothing.
         reach: pixels at most.
         steps: out, (h, w) int32: pixels from the edge, from 1; 0 where no edge is near, or on the far side.
     """
@@ -41,7 +42,7 @@ def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
             middle = math.sqrt(min(min(a, b), min(c, d)) * max(max(a, b), max(c, d)))
             for corner in range(4):
                 y, x = v + corner // 2, right if corner % 2 else u
-                if inverse[y, x] > middle and steps[y, x] == 0:
+                if inverse[y, x] > middle and steps[y, x] == 0 and level[y, x] == 0:
                     steps[y, x], limit[y, x], near[y, x] = 1, middle, inverse[y, x]
                     queue[size] = y * width + x
                     size += 1
@@ -54,7 +55,9 @@ def in_front(inverse, torn, reach, steps):  # type: ignore[no-untyped-def]
         for way in range(4):
             ny = y + (1 if way == 0 else -1 if way == 1 else 0)
             nx = (x + (1 if way == 2 else -1 if way == 3 else 0)) % width
-            if 0 <= ny < height and steps[ny, nx] == 0 and limit[y, x] < inverse[ny, nx] < SAME_THING * near[y, x]:
+            if not 0 <= ny < height or steps[ny, nx] > 0 or level[ny, nx] > 0:
+                continue
+            if limit[y, x] < inverse[ny, nx] < SAME_THING * near[y, x]:
                 steps[ny, nx], limit[ny, nx], near[ny, nx] = steps[y, x] + 1, limit[y, x], near[y, x]
                 queue[size] = ny * width + nx
                 size += 1

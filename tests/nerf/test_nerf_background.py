@@ -7,7 +7,7 @@ import pytest
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.nerf import KeyframeError, VirtualSpace, VirtualSpaceConfig
-from instant_ic.nerf.background import Background, mixed_in
+from instant_ic.nerf.background import Background, level_planes, mixed_in
 from instant_ic.nerf.background_kernels import in_front
 from instant_ic.nerf.config import GeometryConfig
 from instant_ic.nerf.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
@@ -45,12 +45,16 @@ def test_the_near_side_of_an_edge_by_hand():
     torn[2:6, 3] = torn[2:6, 8] = 1
     torn[1, 3:9] = torn[5, 3:9] = 1
     steps = np.zeros((8, 16), np.int32)
-    in_front(inverse, torn, 9, steps)
+    level = np.zeros((8, 16), np.uint8)
+    in_front(inverse, torn, level, 9, steps)
     assert steps[2:6, 4:9].tolist() == [[1, 1, 1, 1, 1], [1, 2, 2, 2, 1], [1, 2, 2, 2, 1], [1, 1, 1, 1, 1]]
     assert np.count_nonzero(steps) == 20  # nothing on the far side
     steps[...] = 0
-    in_front(inverse, torn, 1, steps)
+    in_front(inverse, torn, level, 1, steps)
     assert steps.max() == 1
+    steps[...], level[5] = 0, 1  # its last row is floor
+    in_front(inverse, torn, level, 9, steps)
+    assert np.count_nonzero(steps) == 15
 
 
 def test_behind_a_thing_its_background_goes_on():
@@ -60,6 +64,29 @@ def test_behind_a_thing_its_background_goes_on():
     assert background.rgb[THING][..., 0].max() < 60
     assert np.array_equal(background.rgb[:20], keyframe().rgb[:20])
     assert len(background.sky) == 0
+
+
+def test_floor_and_ceiling_are_found_and_go_on_behind_a_thing():
+    """A hall of 1.2 m below and 1.5 m above the camera, walls 4 m off all round, and a thing at 2 m on its floor."""
+    elevation = np.pi / 2 - (np.arange(H) + 0.5) * (np.pi / H)
+    rise = np.repeat(np.sin(elevation)[:, None], W, 1).astype(np.float32)
+    flat = np.cos(elevation)[:, None]
+    inverse = np.maximum(np.maximum(flat / 4, -rise / 1.2), rise / 1.5).astype(np.float32)
+    floor, ceiling = level_planes(inverse, rise, np.ones((H, W), bool))
+    assert floor == pytest.approx(np.maximum(-rise / 1.2, 0), rel=1e-5)
+    assert ceiling == pytest.approx(np.maximum(rise / 1.5, 0), rel=1e-5)
+    rough = inverse * np.random.default_rng(0).uniform(0.5, 2, inverse.shape).astype(np.float32)
+    assert not np.any(level_planes(rough, rise, np.ones((H, W), bool)))
+    rgb = np.full((H, W, 3), (40, 90, 160), np.uint8)
+    rgb[inverse == -rise / np.float32(1.2)] = 20, 150, 20
+    thing = np.s_[26:42, 59:69]  # down to 27 degrees below the horizon, where the floor is 2.6 m off
+    rgb[thing] = 200, 30, 30
+    seen = inverse.copy()
+    seen[thing] = np.maximum(np.repeat(flat / 2, W, 1)[thing], inverse[thing])
+    background = Background.of(prepare(rgb, 1 / seen, np.eye(4), 0.02, GeometryConfig(), 2048))
+    assert background.inverse[thing] == pytest.approx(inverse[thing], rel=0.03)
+    assert background.rgb[40, 60:68, 1].min() > 140  # floor, green
+    assert background.rgb[28, 60:68, 2].min() > 140  # wall, blue
 
 
 def test_what_opens_behind_a_thing_is_guessed_and_marked():
@@ -98,8 +125,8 @@ def test_guesses_are_mixed_in_by_hand():
     mixed = mixed_in(image, guess, guessed)  # a reach of one pixel
     assert mixed[..., 0] == pytest.approx(np.where(guessed, 0.6, 0.0))
     wide = mixed_in(np.zeros((1, 200, 3), np.float32), np.ones((1, 200, 3), np.float32), np.arange(200)[None] >= 100)
-    # 0.02 · 200 = 4 pixels: a quarter of 0.6 more at each.
-    assert wide[0, 98:106, 0] == pytest.approx([0, 0, 0.15, 0.3, 0.45, 0.6, 0.6, 0.6])
+    # 0.04 · 200 = 8 pixels: an eighth of 0.6 more at each.
+    assert wide[0, 98:106, 0] == pytest.approx([0, 0, 0.075, 0.15, 0.225, 0.3, 0.375, 0.45])
     assert not image.any()
 
 
