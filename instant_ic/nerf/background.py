@@ -78,7 +78,9 @@ class Background:
         if not source.any():
             source = ~hole
         keep = source | (content == ROBOT)  # the ground under the robot is known, or filled in already
-        weight = 1 / (inverse * inverse)  # what is far goes on behind what is near, not the other way round
+        weight = (1 / (inverse * inverse)).astype(
+            np.float32
+        )  # what is far goes on behind what is near, not the other way round
         # In a room with a floor or a ceiling walls stand upright: their distance along it is the same up and down.
         flat = np.sqrt(np.maximum(1 - rise * rise, np.float32(1e-4))) if np.any(levels) else np.ones_like(rise)
         wall = keep & (kind == 0)
