@@ -46,7 +46,7 @@ class FlatScanConfig:
     beams: Annotated[int, Range(4, 7200)] = 720
     range_min: NotNegative = 0.4
     range_max: Positive = 100.0
-    min_coverage: Share = 0.5
+    min_coverage: Share = 0.75
 
     def __post_init__(self) -> None:
         """Check the values."""
