@@ -179,7 +179,7 @@ class Robot:
                     due = max(due + 0.05, time.monotonic() - 0.2)
                     self.tell(step)
                     step += 1
-                time.sleep(0.0005)
+                self.stack.observer.rest(due - time.monotonic())
         except Exception as error:  # noqa: BLE001 - told by whoever waits
             self.error = f"{type(error).__name__}: {error}"
 

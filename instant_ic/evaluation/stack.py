@@ -58,6 +58,13 @@ class Observer(Node[_NoParameters]):
 
     name = "observer"
 
+    def rest(self, timeout_s: float) -> None:
+        """Sleeps until something has come or is due; for a program that calls :meth:`spin_once` itself."""
+        if self._timers:
+            timeout_s = min(timeout_s, (self._timers[0][0] - self.clock.steady_ns()) / 1e9)
+        self._wake.wait(max(0.0, timeout_s))
+        self._wake.clear()
+
 
 def _observer(run_dir: Path) -> Observer:
     clock = SystemClock()

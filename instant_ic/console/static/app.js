@@ -284,7 +284,7 @@ const rounded = (values, digits) => (values ? values.map((value) => value.toFixe
 
 function frame(now) {
   requestAnimationFrame(frame);
-  if (viewer.slow && now - lastFrame < (pictures.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS)) return;
+  if (viewer.slow && (viewer.busy || now - lastFrame < (pictures.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS))) return;
   const elapsed = Math.min(now - lastFrame, 200);
   lastFrame = now;
   look.step(elapsed / 1000);

@@ -14,6 +14,7 @@ export class FlatViewer {
     this.context = canvas.getContext("2d", { alpha: false });
     this.name = "canvas";
     this.slow = true;
+    this.busy = false; // it draws at once
     this.lost = false;
     this._panorama = null; // {bitmap, mask, finished, colour}
     this._view = null;

@@ -115,6 +115,7 @@ void main() {
 export const SAMPLE = [40, 24], SAMPLE_FINE = 4;
 /** Motion over depth: what is nearer is taken to be so far that it moves by no more. */
 export const MOST_PARALLAX = 0.5;
+const MOST_REST_MS = 100; // between two pictures that the CPU draws
 
 /** Throws when WebGL 2 is missing. */
 export class GlViewer {
@@ -147,6 +148,9 @@ export class GlViewer {
     this._hasMask = false;
     this._perInverse = 0; // 1/m; 0: the depth is not known
     this._viewSize = [1, 1];
+    this._fence = null; // signalled when the CPU has drawn the last picture
+    this._drawnAt = 0;
+    this._restUntil = 0;
     gl.useProgram(this._program);
     gl.uniform1i(this._at("panorama"), 0);
     gl.uniform1i(this._at("view"), 1);
@@ -178,7 +182,29 @@ export class GlViewer {
    * camera since the view was drawn [forward, left, up] in the view's frame, m; null: not at all.
    */
   draw(scene) {
+    const gl = this.gl;
     this._draw(scene, this.canvas.width, this.canvas.height, 0);
+    if (!this.slow) return;
+    if (this._fence) gl.deleteSync(this._fence);
+    this._fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this._drawnAt = performance.now();
+    gl.flush();
+  }
+
+  /**
+   * Whether the CPU still draws the last picture, or has not been left alone for as long as that took: what waits
+   * behind such drawings is late, a new view of the virtual space as much as a message.
+   */
+  get busy() {
+    const gl = this.gl;
+    if (this._fence && !this.lost) {
+      if (gl.getSyncParameter(this._fence, gl.SYNC_STATUS) !== gl.SIGNALED) return true;
+      gl.deleteSync(this._fence);
+      this._fence = null;
+      const now = performance.now();
+      this._restUntil = now + Math.min(now - this._drawnAt, MOST_REST_MS);
+    }
+    return performance.now() < this._restUntil;
   }
 
   /**
