@@ -28,6 +28,10 @@ ASIDE_RAD = 0.02
 """Less is the keyframe's own view, whose edges are right."""
 EDGE = 0.25
 """Less confidence at an edge."""
+NEARER = 0.9
+"""An older keyframe that is at less than this share of the newest's distance from a surface shows it better,"""
+OTHER_SIDE_RAD = 0.8
+"""and one that looks at it from so far beside the newest another side of it."""
 SAME_COLOUR = 30.0
 """Grey levels in which two keyframes' pictures of a place that stands still may differ."""
 _VOTE_ROWS = 256  # of the pixels that are asked whether they have moved
@@ -54,10 +58,12 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     """Colours (P, 3), depth (P,) and confidence (P,) of the layers together, newest first.
 
     Of surfaces at different depths the nearest counts, of those that depths only disagree about the one that is seen
-    most alike (``SAME_PLACE``); one at an edge of the newest's depth, where colours of two surfaces mix, only where
-    no keyframe has a plain one. An older keyframe shows nothing beside its own edges, where its depth may be of either
-    side, and nothing that a newer one has looked through (it has moved, or is an error of its depth) or has seen itself
-    and draws elsewhere: that would stand there twice. What nobody has seen is as the newest has it. Needs numba.
+    most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two surfaces mix, only where
+    no keyframe has a plain one. An older keyframe shows nothing that a newer one has looked through: it has moved, or
+    is an error of its depth. Nor does it show what is beside its own edges, where its depth may be of either side, or
+    what a newer one has seen itself and draws elsewhere: that would stand there twice. These two do not hold for what
+    it sees from nearer than the newest (``NEARER``) or from another side (``OTHER_SIDE_RAD``): its edges count there as
+    the newest's do. What nobody has seen is as the newest has it. Needs numba.
     """
     from .compose_kernels import blend
 
@@ -67,11 +73,13 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     depth, confidence = np.empty_like(layers[0].depth), np.empty_like(layers[0].confidence)
     blend(
         *(np.stack([getattr(layer, key) for layer in layers]) for key in ("colour", "depth", "confidence", "gain")),
+        *(np.stack([getattr(layer.prior, key) for layer in layers]) for key in ("torn", "inverse_depth")),
+        # Of the newest it is never asked.
         np.stack([layer.prior.beside_edge if older else layer.prior.torn for older, layer in enumerate(layers)]),
-        np.stack([layer.prior.inverse_depth for layer in layers]),
         np.stack([layer.prior.known == 1 for layer in layers]), room, np.linalg.inv(poses).astype(np.float32),
         np.ascontiguousarray(poses[:, :3, 3], np.float32), rays.origin, rays.directions,
-        *(np.float32(value) for value in (EDGE, ASIDE_RAD, SAME_PLACE, SAME_SURFACE, LEAST_PENALTY, SHARPNESS)),
+        *(np.float32(value) for value in (EDGE, ASIDE_RAD, NEARER, OTHER_SIDE_RAD)),
+        *(np.float32(value) for value in (SAME_PLACE, SAME_SURFACE, LEAST_PENALTY, SHARPNESS)),
         colour, depth, confidence,
     )  # fmt: skip
     return colour, depth, confidence

@@ -25,21 +25,23 @@ def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def blend(  # type: ignore[no-untyped-def]
-    colours, depths, confidences, gains, edges, inverse, known, room, camera_from_map, places, origin, directions,
-    edge, aside_rad, same_place, same_surface, least_penalty, sharpness, colour, depth, confidence,
+    colours, depths, confidences, gains, torn, inverse, beside, known, room, camera_from_map, places, origin,
+    directions, edge, aside_rad, nearer, other_side_rad, same_place, same_surface, least_penalty, sharpness,
+    colour, depth, confidence,
 ):  # fmt: skip
     """The layers of a view into one, by the rules of ``compose``.
 
     Args:
         colours: (K, P, 3); depths, confidences: (K, P); newest keyframe first.
-        gains: (K, 3); edges, inverse, known: of the keyframes' depth, (K, h, w); room: as ``opinion`` takes it, (K, K).
+        gains: (K, 3); torn, inverse, known: of the keyframes' depth, (K, h, w); beside: near an edge of it, (K, h, w);
+            room: as ``opinion`` takes it, (K, K).
         camera_from_map: (K, 4, 4); places: of the cameras, (K, 3).
         origin: (3,); directions: (P, 3).
         edge … sharpness: the constants of ``compose``.
         colour: out, (P, 3); depth, confidence: out, (P,).
     """
     count = depths.shape[0]
-    height, width = edges.shape[1:]
+    height, width = torn.shape[1:]
     one = np.float32(1)
     rank = np.zeros(count, np.float32)
     penalty = np.zeros(count, np.float32)
@@ -53,16 +55,18 @@ def blend(  # type: ignore[no-untyped-def]
             t = depths[k, n]
             px, py, pz = along(camera_from_map[k], origin, directions[n], t)
             away = math.sqrt(px * px + py * py + pz * pz)
-            # Angle at the point between the ways to the view and to the keyframe, from the triangle's three sides.
+            anew = k > 0 and _anew(places[k], places[0], origin, directions[n], t, nearer, other_side_rad)
             if _angle(places[k], origin, directions[n], t, away) > aside_rad:
                 row, column, _ = panorama_pixel(px, py, pz, height, width)
-                if edges[k, row, column]:
-                    rank[k] = rank[k] - edge if k == 0 else np.float32(0)
+                if (k == 0 or anew) and torn[k, row, column]:
+                    rank[k] -= edge
+                elif k > 0 and not anew and beside[k, row, column]:
+                    rank[k] = 0
             for newer in range(k):
                 x, y, z = along(camera_from_map[newer], origin, directions[n], t)
                 says = opinion(x, y, z, inverse[newer], known[newer], room[newer, k])
                 drawn = confidences[newer, n] > 0 and abs(depths[newer, n] - t) <= same_place * t
-                if says == AGAINST or (says == FOR and not drawn):
+                if says == AGAINST or (says == FOR and not drawn and not anew):
                     rank[k] = 0
             best = max(best, rank[k])
         if best <= 0:  # nobody has seen it: as the newest has it
@@ -112,6 +116,18 @@ def _angle(place, origin, direction, t, away):  # type: ignore[no-untyped-def]
     for c in range(3):
         toward += (origin[c] - place[c]) * direction[c]
     return math.acos(min(max(toward / max(away, 1e-6), -1.0), 1.0))
+
+
+@njit(**_OPTIONS)
+def _anew(place, newest, origin, direction, t, nearer, other_side_rad):  # type: ignore[no-untyped-def]
+    """Whether a place sees a point ``t`` along a ray from nearer than the newest's place does, or from another side."""
+    own, other, both = np.float32(0), np.float32(0), np.float32(0)
+    for c in range(3):
+        point = origin[c] + t * direction[c]
+        own += (point - place[c]) ** 2
+        other += (point - newest[c]) ** 2
+        both += (point - place[c]) * (point - newest[c])
+    return own < nearer * nearer * other or both < math.cos(other_side_rad) * math.sqrt(own * other)
 
 
 @njit(**_OPTIONS)

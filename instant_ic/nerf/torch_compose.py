@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .compose import ASIDE_RAD, EDGE, LEAST_PENALTY, SAME_PLACE, SAME_SURFACE, SHARPNESS
+from .compose import ASIDE_RAD, EDGE, LEAST_PENALTY, NEARER, OTHER_SIDE_RAD, SAME_PLACE, SAME_SURFACE, SHARPNESS
 
 _FAR = 1e9
 
@@ -98,21 +98,24 @@ def panorama_places(local: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tenso
 
 
 def _rank(k: int, layers: Sequence[TorchLayer], room: Sequence[Sequence[float]], directions: Tensor) -> Tensor:
-    """Confidence of layer ``k``, less at an edge of the newest's depth; of an older one 0 beside its own edges, and
-    where a newer one has looked through it, or has seen it and draws it elsewhere.
+    """Confidence of layer ``k``, less at an edge of its depth; of an older one 0 where a newer one has looked through
+    it and, unless it sees the place anew, beside its own edges and where a newer one has seen it and draws it
+    elsewhere.
     """
     own = layers[k]
     local = points(own.camera_from_view, directions, own.depth)
     row, column = _upper_left(local, own.inverse)
     aside = _angle(own, directions, own.depth, local.norm(dim=1)) > ASIDE_RAD
+    rank = own.confidence - torch.where(aside & own.torn[row, column] & (own.confidence > 0), EDGE, 0.0)
     if k == 0:
-        return own.confidence - torch.where(aside & own.torn[row, column] & (own.confidence > 0), EDGE, 0.0)
-    rank = torch.where(aside & own.beside[row, column], 0.0, own.confidence)
+        return rank
+    anew = _anew(own, layers[0], directions)
+    rank = torch.where(anew, rank, torch.where(aside & own.beside[row, column], 0.0, own.confidence))
     for newer in range(k):
         one = layers[newer]
         through, seen = _opinion(one, own.depth, room[newer][k], directions)
         drawn = (one.confidence > 0) & ((one.depth - own.depth).abs() <= SAME_PLACE * own.depth)
-        rank = torch.where(through | (seen & ~drawn), 0.0, rank)
+        rank = torch.where(through | (seen & ~drawn & ~anew), 0.0, rank)
     return rank
 
 
@@ -120,6 +123,14 @@ def _angle(layer: TorchLayer, directions: Tensor, t: Tensor, away: Tensor) -> Te
     """Radians at places ``t`` along the rays between the ways to the view and to the keyframe, ``away`` from it."""
     toward = t - (directions * layer.camera).sum(dim=1)
     return (toward / away.clamp(min=1e-6)).clamp(-1, 1).acos()
+
+
+def _anew(layer: TorchLayer, newest: TorchLayer, directions: Tensor) -> Tensor:
+    """Whether a keyframe sees what it draws from nearer than the newest does, or from another side, (P,)."""
+    ends = layer.depth[:, None] * directions
+    own, other = ends - layer.camera, ends - newest.camera
+    near, far = own.norm(dim=1), other.norm(dim=1)
+    return (near < NEARER * far) | ((own * other).sum(dim=1) < math.cos(OTHER_SIDE_RAD) * near * far)
 
 
 def _opinion(layer: TorchLayer, depth: Tensor, room: float, directions: Tensor) -> tuple[Tensor, Tensor]:

@@ -238,6 +238,22 @@ def test_composing_by_hand():
     assert confidence.tolist() == [1, 1, 1, 1, 0]
 
 
+def test_an_older_keyframe_shows_its_edges_only_where_it_sees_more_than_the_newest():
+    # A surface 5 m ahead, which the newest only guesses; all of the older one's depth is edges.
+    rays = perspective_rays(np.eye(4), 16, 16, 0.01)
+    rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
+
+    def confidence(x, y):
+        newest = prior_of(np.eye(4))
+        older = dataclasses.replace(newest, map_from_camera=pose_matrix(x=x, y=y), torn=np.ones_like(newest.torn))
+        layers = [layer(newest, [5], [0], [0.2]), layer(older, [5], [1], [0.9])]
+        return float(compose(layers, rays)[2][0])
+
+    assert confidence(-0.3, 0.5) == confidence(0.3, 0.5) == 0  # 5.32 m and 4.73 m off, 5 and 6 degrees beside
+    assert confidence(0.8, 0.5) == 1  # 4.23 m off: nearer than 4.5 m
+    assert confidence(2.0, 4.0) == 1  # 5 m off, 53 degrees beside
+
+
 def test_what_a_newer_keyframe_has_looked_through_is_left_out_of_an_older_one():
     newest, rays = prior_of(np.eye(4)), perspective_rays(np.eye(4), 16, 16, 0.01)
     rays = Rays(rays.origin, np.array([[1.0, 0, 0]], np.float32), rays.axial, rays.shape)
@@ -300,9 +316,14 @@ def composed_plainly(layers, rays):
         height, width = one.prior.torn.shape
         u, v = composing.equirect_pixels(local, width, height)
         row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
-        torn = (one.prior.beside_edge if number else one.prior.torn)[row, column] > 0
-        torn &= angle(one.prior, points, rays.directions[at]) > 0.02
-        rank[number, at] -= np.where(torn, rank[number, at] if number else composing.EDGE, 0)
+        own, first = (points - prior.map_from_camera[:3, 3] for prior in (one.prior, layers[0].prior))
+        near, far = np.linalg.norm(own, axis=1), np.linalg.norm(first, axis=1)
+        between = np.arccos(np.clip(np.einsum("ij,ij->i", own, first) / (near * far), -1, 1))
+        anew = (near < composing.NEARER * far) | (between > composing.OTHER_SIDE_RAD)
+        lax = anew | (number == 0)
+        edge = np.where(lax, one.prior.torn[row, column], one.prior.beside_edge[row, column]) > 0
+        edge &= angle(one.prior, points, rays.directions[at]) > 0.02
+        rank[number, at] -= np.where(edge, np.where(lax, composing.EDGE, rank[number, at]), 0)
         for newer, other in enumerate(layers[:number]):
             room = 1 + composing.disagreement(other.prior, one.prior)
             local = (points - other.prior.map_from_camera[:3, 3]) @ other.prior.map_from_camera[:3, :3]
@@ -315,7 +336,7 @@ def composed_plainly(layers, rays):
             t = depth[number, at]
             drawn = (confidence[newer, at] > 0) & (np.abs(depth[newer, at] - t) <= composing.SAME_PLACE * t)
             through = ratios.max(axis=(0, 1)) * room < 1
-            rank[number, at] = np.where(sure & (through | ~drawn), 0, rank[number, at])
+            rank[number, at] = np.where(sure & (through | ~(drawn | anew)), 0, rank[number, at])
     met = rank.max(axis=0) > 0
     candidate = (rank > 0) & (rank == rank.max(axis=0))
     nearest = np.where(candidate, depth, np.inf).min(axis=0)
