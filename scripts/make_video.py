@@ -114,7 +114,7 @@ def film(args: argparse.Namespace) -> list[bytes]:
 
     course = make_course(args.world, args.seed, 0)
     words = ("console.view.width:=480", "console.view.height:=270", "console.map_rate_hz:=2.0")
-    config = StackConfig(depth=args.depth, seed=args.seed, overrides=words)
+    config = StackConfig(depth=args.depth, seed=args.seed, whole_views=True, overrides=words)
     with SimulatedStack(course.world, config) as stack:
         operator = Operator(stack)
         patient = DriveConfig(watchdog_s=60.0, lease_timeout_s=600.0, max_command_age_s=60.0, beat_timeout_s=60.0)
