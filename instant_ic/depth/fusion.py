@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..ranges import Positive, check_ranges
-from .lidar_depth import LEAST_SIGMA, LidarDepth
+from .lidar_depth import LEAST_SIGMA, LidarDepth, Origin
 
 Floats = NDArray[np.floating]
 
@@ -65,11 +65,13 @@ class Corrected:
         depth_m: (H, W) metres, 0 = unknown.
         wrong: (H, W) share of the points around each pixel that are still plainly off.
         sigma: relative standard deviation at the points that are not.
+        before_m: (H, W) what was corrected, metres.
     """
 
     depth_m: NDArray[np.float32]
     wrong: NDArray[np.float32]
     sigma: float
+    before_m: NDArray[np.float32]
 
 
 def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corrected:
@@ -109,7 +111,7 @@ def correct(network_m: Floats, measured_m: Floats, config: FusionConfig) -> Corr
     share = float((left > 0.25).mean()) if len(left) else 1.0
     wrong = grown((blurred(bad) + np.float32(0.01) * share) / (near + np.float32(0.01)))
     depth = np.where(network_m > 0, network_m * np.exp(field), 0).astype(np.float32)
-    return Corrected(depth, wrong, max(spread, 0.02))
+    return Corrected(depth, wrong, max(spread, 0.02), np.asarray(network_m, np.float32))
 
 
 #: What is known beforehand of structure of each ``Origin``: its relative standard deviation where it is right, and the
@@ -128,6 +130,11 @@ _TRUST = np.array(
     ],
     np.float32,
 )
+
+#: A thing that is nearer than this is met by the highest ring below a table's height (0.92 m, LiDAR at 0.6 m). It is
+#: likelier a box that ends there than a wall where the network sees something this many times as far over it, and where
+#: it takes no more of the circle than this share.
+_LOW_WITHIN_M, _OVER_IT, _BOX_SHARE = 1.2, 1.5, 0.2
 
 #: Relative standard deviation of fused depth for each ``Origin`` of the structure: at a point, its growth with the log
 #: ratio of network and structure, with the angle (1/rad) to the next point, and with ``Corrected.wrong``.
@@ -166,6 +173,18 @@ def fused_sigma(origin: NDArray[np.uint8], gap_rad: Floats, off: Floats, wrong: 
     return np.asarray(np.maximum(sigma, LEAST_SIGMA), np.float32)
 
 
+def narrow(columns: NDArray[np.bool_], most: float) -> NDArray[np.bool_]:
+    """Of ``columns`` (W,) round the circle those whose run is no longer than the share ``most`` of it."""
+    if columns.all() or not columns.any():
+        return np.zeros_like(columns)
+    first = int(np.argmin(columns))  # no run goes through it
+    edges = np.diff(np.roll(columns, -first).astype(np.int8), prepend=0, append=0)
+    kept = np.zeros_like(columns)
+    for start, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        kept[start:end] = end - start <= most * len(columns)
+    return np.roll(kept, first)
+
+
 def fuse(network: Corrected, structure: LidarDepth) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Fuses corrected network depth with LiDAR structure, pixel by pixel.
 
@@ -182,10 +201,15 @@ def fuse(network: Corrected, structure: LidarDepth) -> tuple[NDArray[np.float32]
     both = known_n & known_s
     n = np.log(np.where(known_n, network.depth_m, np.float32(1)))
     s = np.log(np.where(known_s, structure.depth_m, np.float32(1)))
+    up = both & (structure.origin == Origin.UP)
+    near = up & (structure.depth_m < _LOW_WITHIN_M)
+    over = near & narrow(near.any(axis=0), _BOX_SHARE) & (network.before_m > _OVER_IT * structure.depth_m)
+    over = up & np.maximum.accumulate(over[::-1])[::-1]  # and all above it
+    n = np.where(over, np.log(np.where(over, network.before_m, np.float32(1))), n)
     off = np.where(both, n - s, np.float32(0))
     conflict = both & (off * off > 9 * (sigma_s**2 + sigma_n**2))
     likely = np.where(off > 0, farther, nearer) * (1 - network.wrong)
-    takes_network = conflict & (likely > network.wrong * (1 - nearer - farther))
+    takes_network = over | (conflict & (likely > network.wrong * (1 - nearer - farther)))
     w_n = (known_n & (~conflict | takes_network)) / sigma_n**2
     w_s = (known_s & ~takes_network) / sigma_s**2
     total = np.maximum(w_n + w_s, np.float32(1e-9))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from instant_ic.depth.fusion import FusionConfig, ceiling_height, correct, fused_sigma
+from instant_ic.depth.fusion import FusionConfig, ceiling_height, correct, fused_sigma, narrow
 from instant_ic.depth.lidar_depth import (
     LEAST_SIGMA,
     LidarDepthConfig,
@@ -345,3 +345,27 @@ def test_wrong_use_is_told() -> None:
         SourceConfig(source="sonar")
     with pytest.raises(ValueError, match="source fused needs the network's depth"):
         DepthSource().estimate(None, POINTS, UP, CAMERA_M)
+
+
+def test_what_is_seen_over_a_near_box_comes_from_the_network_that_missed_the_box() -> None:
+    """A box half a metre ahead and 0.9 m high, whose top no ring passes: the camera looks over it at the wall."""
+    box = (np.array([0.5, -0.25, -CAMERA_M]), np.array([1.0, 0.25, -0.3]))
+    true, network = truth(box=box), truth()
+    result = DepthSource(SourceConfig(source="fused")).estimate(network, revolution(box=box), UP, CAMERA_M)
+    rays = equirect_directions(SIZE[1], SIZE[0])
+    ahead = np.abs(np.arctan2(rays[..., 1], rays[..., 0])) < 0.3
+    over = ahead & (rays[..., 2] > -0.1)  # from below the horizon up to the ceiling: all of it the room's
+    assert (true[over] == network[over]).all()
+    assert np.abs(result.depth_m[over] / true[over] - 1).max() < 0.1
+    hit = ahead & (rays[..., 2] < -0.75) & (true < 0.8 * network)  # where the rings meet the box it stays
+    assert hit.sum() > 20 and np.median(np.abs(result.depth_m[hit] / true[hit] - 1)) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("columns", "most", "kept"),
+    [("0110", 0.5, "0110"), ("0110", 0.25, "0000"), ("1001", 0.5, "1001"), ("1001", 0.25, "0000"),
+     ("1011", 0.5, "0000"), ("101110000010", 0.2, "100000000010"), ("1111", 1.0, "0000"), ("0000", 1.0, "0000")],
+)  # fmt: skip
+def test_narrow_runs_round_the_circle(columns: str, most: float, kept: str) -> None:
+    found = narrow(np.array([c == "1" for c in columns]), most)
+    assert "".join("01"[int(c)] for c in found) == kept
