@@ -1,8 +1,16 @@
 """docs/reference.md names every node, topic and parameter as the code has them."""
 
+import dataclasses
+import importlib
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
+
+from instant_ic.bus import Node
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -15,3 +23,54 @@ def test_reference_is_current():
         timeout=120,
     )
     assert result.returncode == 0, result.stderr
+
+
+NEEDED = {
+    "bag_player": {"bag": "recording"},
+    "host_bridge": {"listen": "tcp://0.0.0.0:7450", "to_robot": ("/operator/estop",)},
+}
+"""Parameters without a usable default, which a configuration cannot be constructed without."""
+
+
+def documented_defaults():
+    """Node → key → default, as docs/reference.md writes them."""
+    found = {}
+    for line in (ROOT / "docs/reference.md").read_text().splitlines():
+        if line.startswith("## "):
+            found[line[3:]] = section = {}
+        cells = re.split(r"(?<!\\)\|", line)
+        if line.startswith("| `"):
+            section[cells[1].strip(" `")] = cells[3].strip().removeprefix("`").removesuffix("`").replace("\\|", "|")
+    return found
+
+
+def constructed_defaults(config, prefix=""):
+    """Key → value of a configuration, read from its attributes alone."""
+    found = {}
+    for name in [field.name for field in dataclasses.fields(config)]:
+        value = getattr(config, name)
+        if dataclasses.is_dataclass(value):
+            found |= constructed_defaults(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = list(value) if isinstance(value, tuple) else value
+    return found
+
+
+@pytest.mark.parametrize("module", sorted(path.stem for path in (ROOT / "instant_ic/nodes").glob("[a-z]*.py")))
+def test_documented_defaults_are_those_of_a_constructed_configuration(module):
+    imported = importlib.import_module(f"instant_ic.nodes.{module}")
+    (node,) = [
+        value
+        for _, value in inspect.getmembers(imported, inspect.isclass)
+        if issubclass(value, Node) and value.__module__ == imported.__name__
+    ]
+    given = NEEDED.get(module, {})
+    actual = {
+        key: repr(str(value) if isinstance(value, Path) else value)
+        for key, value in constructed_defaults(node.config_class()(**given)).items()
+    }
+    documented = documented_defaults()[node.name]
+    for key in given:
+        assert documented.pop(key) in ("''", "[]")
+        actual.pop(key)
+    assert documented == actual

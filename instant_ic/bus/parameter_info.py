@@ -13,6 +13,7 @@ from typing import Any, get_args, get_type_hints
 
 from .. import paths
 from ..ranges import ranges
+from .params import field_default
 
 
 @dataclass(frozen=True)
@@ -59,23 +60,22 @@ def parameter_infos(
         dataclasses.replace(
             info, live=is_live(info.name, live), description=described.get(info.name) or info.description
         )
-        for info in _infos(config_class, config, "")
+        for info in _infos(config_class, config, None, "")
     ]
 
 
-def _infos(config_class: type[Any], config: Any, prefix: str) -> list[ParameterInfo]:
+def _infos(config_class: type[Any], config: Any, defaults: Any, prefix: str) -> list[ParameterInfo]:
+    """Parameters of one group; ``defaults`` is the group as its parent makes it, None at the top."""
     infos: list[ParameterInfo] = []
     meanings = attributes(config_class)
     hints, bounds = get_type_hints(config_class), ranges(config_class)  # type: ignore[arg-type]
     for field in dataclasses.fields(config_class):
         hint, key = hints[field.name], f"{prefix}{field.name}"
-        default = field.default if field.default is not dataclasses.MISSING else None
-        if field.default_factory is not dataclasses.MISSING:
-            default = field.default_factory()
+        default = field_default(field) if defaults is None else getattr(defaults, field.name)
         value = default if config is None else getattr(config, field.name)
         if dataclasses.is_dataclass(hint):
             assert isinstance(hint, type)
-            infos += _infos(hint, value, f"{key}.")
+            infos += _infos(hint, value, default, f"{key}.")
             continue
         limits = str(bounds[field.name]) if field.name in bounds else ""
         infos.append(

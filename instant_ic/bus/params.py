@@ -201,7 +201,8 @@ def _build(config_class: type[ConfigT], values: Values, prefix: str, base: Confi
         else:
             arguments[head] = _coerce(value.value, hints[head], full, value.where)
     for head, inner in nested.items():
-        group = None if base is None else getattr(base, head)
+        # A group's defaults are those of its parent: another group of the same class may have others.
+        group = field_default(fields[head]) if base is None else getattr(base, head)
         arguments[head] = _build(hints[head], inner, f"{prefix}{head}.", group)
     try:
         return config_class(**arguments) if base is None else dataclasses.replace(base, **arguments)  # type: ignore[type-var]
@@ -210,6 +211,13 @@ def _build(config_class: type[ConfigT], values: Values, prefix: str, base: Confi
             raise
         where = next((v.where for k, v in values.items() if k.split(".")[0] in str(error)), "parameters")
         raise ParameterError(f"{where}: {error}") from error
+
+
+def field_default(field: dataclasses.Field[Any]) -> Any:
+    """Value of a configuration's field where nothing is given; None where the field has no default."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return None if field.default is dataclasses.MISSING else field.default
 
 
 def _coerce(value: Any, hint: Any, key: str, where: str) -> Any:
