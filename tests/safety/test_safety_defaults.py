@@ -1,4 +1,4 @@
-"""Documented safety defaults are those of the code, and overriding one value of a group leaves the others as they are."""
+"""Documented safety defaults are those of the code; overriding one value of a group leaves its others as they are."""
 
 import pytest
 
