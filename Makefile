@@ -1,6 +1,7 @@
 # make run    set everything up in .venv/ and start the simulated stack
 # make test   format, lint, types and all tests
 # make check  format, lint and types alone
+# make lock   write requirements.lock anew after a change of constraints.txt or pyproject.toml (needs network)
 # make clean  take away what these made
 PYTHON ?= python3
 VENV   := .venv
@@ -8,7 +9,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: run test check clean install chromium
+.PHONY: run test check clean install lock chromium
 
 run: $(STAMP)
 	@exec $(BIN)/ic launch sim $(ARGS)
@@ -25,17 +26,21 @@ check: $(STAMP)
 
 install: $(STAMP)
 
-# torch first and by its exact pin: asked for by a range, pip would fetch the CUDA build of several gigabytes.
-$(STAMP): pyproject.toml constraints.txt
+# Only files whose hash is in the lock are installed. torch apart: an index would give its CUDA build of several gigabytes.
+PIP := $(BIN)/python -m pip install -q --disable-pip-version-check --progress-bar off
+$(STAMP): pyproject.toml constraints.txt requirements.lock scripts/install_torch.sh
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 run")'
 	@echo "Setting up $(VENV)/ (about three minutes, once)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt pip
+	@echo "  the packages of requirements.lock ..."
+	@$(PIP) --require-hashes -r requirements.lock
 	@echo "  torch (CPU build) ..."
 	@scripts/install_torch.sh $(BIN)/python
-	@echo "  the other packages ..."
-	@$(BIN)/python -m pip install -q --disable-pip-version-check --progress-bar off -c constraints.txt -e '.[dev]'
+	@$(PIP) --no-deps --no-build-isolation -e .
 	@touch $@
+
+lock:
+	@PYTHON=$(PYTHON) scripts/lock.sh
 
 # The browser test drives Debian's Chromium. Without root it must be there already, else those tests say they skip.
 chromium:

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Installs the pinned torch as a CPU build, never the CUDA build of several gigabytes.
+# Installs the pinned torch as a CPU build, never the CUDA build of several gigabytes. What torch itself needs stands in
+# requirements.lock, which is installed first.
 #   install_torch.sh PYTHON
 # TORCH_SPEC=torch==2.13.0+cu130 (say) chooses another build, for a machine with a GPU.
 set -euo pipefail
@@ -20,6 +21,5 @@ pip=("$python" -m pip install -q --disable-pip-version-check --progress-bar off)
 if [ -n "${TORCH_SPEC:-}" ]; then exec "${pip[@]}" "$spec"; fi
 # A dry run tells which build the index would give; only a CPU build is taken from it.
 report=$("$python" -m pip install -q --disable-pip-version-check --dry-run --no-deps --report - "$spec" 2>/dev/null || true)
-if printf '%s' "$report" | grep -q '%2Bcpu\|+cpu'; then exec "${pip[@]}" "$spec"; fi
-# --no-deps: what torch needs comes from the ordinary index with the other packages.
+if printf '%s' "$report" | grep -q '%2Bcpu\|+cpu'; then exec "${pip[@]}" --no-deps "$spec"; fi
 exec "${pip[@]}" --no-deps --index-url https://download.pytorch.org/whl/cpu "$spec"
