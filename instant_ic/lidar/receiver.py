@@ -1,19 +1,24 @@
 """Receives the sensor's UDP packets."""
 
+import ipaddress
 import selectors
 import socket
 import struct
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import TracebackType
 from typing import NamedTuple, Self
 
-from instant_ic.lidar.packets import DATA_PACKET_BYTES
+from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES, check_data_packet
+from instant_ic.lidar.sources import SourceGuard
 from instant_ic.pace import current
 
 _SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
 """Linux's number; Python 3.11 does not name it."""
 _TIMESPEC = struct.Struct("@ll")
+_MOST_AT_ONCE = 512
+"""Datagrams that one read takes from a port: a flood on it must not keep the other port and the shutdown waiting."""
 
 
 class ReceiverError(OSError):
@@ -28,7 +33,7 @@ class ReceiverConfig:
         host: local address; 0.0.0.0 also takes the broadcasts of a sensor in its factory state.
         port: of data packets; 0 lets the system choose (then see `PacketReceiver.port`).
         position_port: of position packets; -1 does without.
-        sensor: only packets from this address; empty takes all.
+        sensor: the sensor's IPv4 address; empty locks onto the first sender.
     """
 
     host: str = "0.0.0.0"
@@ -42,6 +47,11 @@ class ReceiverConfig:
             raise ValueError(f"port must be in 0..65535 (got {self.port})")
         if not -1 <= self.position_port <= 65535:
             raise ValueError(f"position_port must be in -1..65535 (got {self.position_port})")
+        if self.sensor:
+            try:
+                ipaddress.IPv4Address(self.sensor)
+            except ValueError as error:
+                raise ValueError(f"sensor must be an IPv4 address or empty (got {self.sensor!r})") from error
 
 
 class Received(NamedTuple):
@@ -62,12 +72,18 @@ class PacketReceiver:
         ...     for received in receiver.read(timeout_s=0.1): ...
 
     Attributes:
-        foreign: datagrams dropped because another host sent them.
+        sources: whose packets are taken.
     """
 
-    def __init__(self, config: ReceiverConfig) -> None:
+    def __init__(
+        self,
+        config: ReceiverConfig,
+        sources: SourceGuard | None = None,
+        steady_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
         self.config = config
-        self.foreign = 0
+        self.sources = sources or SourceGuard(config.sensor)
+        self._steady_ns = steady_ns
         self._selector: selectors.BaseSelector | None = None
         self._data: socket.socket | None = None
         self._position: socket.socket | None = None
@@ -119,7 +135,7 @@ class PacketReceiver:
         self.close()
 
     def read(self, timeout_s: float) -> Iterator[Received]:
-        """What has come, waiting at most ``timeout_s`` for the first datagram; nothing on a time-out.
+        """What has come from the sensor, waiting at most ``timeout_s`` for the first datagram; nothing on a time-out.
 
         Raises:
             ReceiverError: not connected.
@@ -129,15 +145,15 @@ class PacketReceiver:
         for key, _ in self._selector.select(timeout_s):
             bound = key.fileobj
             assert isinstance(bound, socket.socket)
-            while True:
+            is_data = bound is self._data
+            for _ in range(_MOST_AT_ONCE):
                 try:
                     payload, ancillary, _, sender = bound.recvmsg(DATA_PACKET_BYTES + 512, 64)
                 except BlockingIOError:
                     break
-                if self.config.sensor and sender[0] != self.config.sensor:
-                    self.foreign += 1
-                    continue
-                yield Received(_stamp_ns(ancillary), payload, bound is self._data)
+                well_formed = check_data_packet(payload) is None if is_data else len(payload) == POSITION_PACKET_BYTES
+                if self.sources.admit(sender, is_data, well_formed, self._steady_ns()):
+                    yield Received(_stamp_ns(ancillary), payload, is_data)
 
     def _bind(self, port: int) -> socket.socket:
         bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

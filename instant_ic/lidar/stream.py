@@ -30,6 +30,8 @@ _MAX_GAP_US = 20_000
 """A longer silence ends the revolution: at 1200 rpm the head may pass the cut unseen in half a turn, 25 ms."""
 _LATE_US = -100_000
 """A packet this much older than the newest is a late one; older still, and the sensor's clock was reset."""
+_LEAST_STEP = 0.75
+"""Share of the period by which a packet must follow the newest: one sensor cannot fire two packets at once."""
 _CLOCK_SET_US = 500_000
 """The sensor's time ran ahead of the host's by this much over a silence: it was set, no packets are missing."""
 _MAX_PACKETS = 400
@@ -75,7 +77,7 @@ class StreamCounters:
     Attributes:
         packets: data packets taken.
         missing: packets that never came.
-        late: packets dropped because newer ones had come before.
+        late: packets dropped because newer ones, or one of the same time, had come before.
         bad: payloads dropped because they are no data packets; by reason in ``bad_reasons``.
         clock_resets: jumps of the sensor's clock (it was switched on anew, or a capture starts again).
         revolutions: revolutions given out.
@@ -137,7 +139,7 @@ class PacketStream:
         elapsed_us = (received_ns - self._received_ns) * 1e-3
         self._received_ns = received_ns
         if step_us is not None:
-            if _LATE_US < step_us <= 0:
+            if _LATE_US < step_us < _LEAST_STEP * period_us:
                 self.counters.late += 1
                 return None
             if step_us <= _LATE_US or (step_us > _MAX_GAP_US and step_us - elapsed_us > _CLOCK_SET_US):
@@ -165,6 +167,11 @@ class PacketStream:
         if before is not None and before - turned > 18000:
             done = self._end_at_cut(before) or done
         return done
+
+    def restart(self) -> None:
+        """Forget the revolution so far and the sensor's clock: what came before is not to be trusted."""
+        self._end_early()
+        self.clock.restart()
 
     def finish(self) -> Revolution | None:
         """Give what there is of the last revolution, as at the end of a capture."""

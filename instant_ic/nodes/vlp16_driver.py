@@ -18,6 +18,7 @@ from instant_ic.lidar.flatscan import coverage, flat_scan, warm_up
 from instant_ic.lidar.motion import MotionError, PlanarMotion
 from instant_ic.lidar.packets import DATA_PACKET_BYTES, PacketError, decode_position_packet
 from instant_ic.lidar.receiver import PacketReceiver, ReceiverConfig, ReceiverError
+from instant_ic.lidar.sources import SourceGuard
 from instant_ic.lidar.stream import PacketStream, Revolution
 from instant_ic.msg import (
     LaserScan,
@@ -47,7 +48,7 @@ class Vlp16DriverConfig:
         host: local address; 0.0.0.0 also takes broadcasts.
         port: of data packets.
         position_port: of position packets; -1 does without.
-        sensor: only packets from this address; empty takes all.
+        sensor: the sensor's IPv4 address; empty locks onto the first sender until the driver restarts.
         pcap: capture file, for source pcap.
         rate: the capture's pace, 1 as it was recorded.
         loop: start the capture again at its end.
@@ -99,6 +100,9 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.ending = threading.Event()
         self.thread: threading.Thread | None = None
         self.stream = PacketStream(config.decoder)
+        self.sources = SourceGuard(config.sensor)
+        self.doubtful = False
+        self.withheld = 0
         self.raw: list[tuple[bytes, int]] = []
         self.waiting = 0
         self.skipped = 0
@@ -121,7 +125,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         elif self.lockstep:
             raise NodeError("source udp cannot run in lockstep: use source:=pcap or source:=topic")
         else:
-            self.receiver = PacketReceiver(config.receiver())
+            self.receiver = PacketReceiver(config.receiver(), self.sources, self.clock.steady_ns)
             try:
                 self.receiver.connect()
             except ReceiverError as error:
@@ -192,7 +196,15 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     def take(self, payload: bytes, stamp: int) -> None:
         """Take one data packet; on whichever thread packets come."""
         self.last_ns = self.clock.steady_ns()
+        counters = self.stream.counters
+        taken, late = counters.packets, counters.late + counters.clock_resets
         revolution = self.stream.feed(payload, stamp)
+        self.sources.count(counters.packets - taken, counters.late + counters.clock_resets - late, self.last_ns)
+        doubtful, self.doubtful = self.doubtful, self.sources.doubt(self.last_ns) is not None
+        if doubtful and not self.doubtful:
+            # A forged packet may have moved the sensor's clock, and is in the revolution so far.
+            self.stream.restart()
+            revolution = None
         if len(payload) == DATA_PACKET_BYTES:
             self.raw.append((payload, stamp))
         if revolution is not None:
@@ -229,6 +241,12 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                     ],
                 )
             )
+        doubt = self.sources.doubt(self.clock.steady_ns())
+        if doubt is not None:
+            # No scan stops the robot; a forged one could drive it into a wall.
+            self.withheld += 1
+            self.diagnose("source", ERROR, doubt, withheld=self.withheld)
+            return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
         if coverage(revolution) < config.scan.min_coverage:
             # Half blind: matched to a map it misleads, and nobody else could see that from the scan.
@@ -298,6 +316,14 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             "revolutions_skipped": self.skipped,
             "revolutions_partial": self.partial,
         }
+        doubt = self.sources.doubt(self.clock.steady_ns())
+        self.diagnose(
+            "source",
+            OK if doubt is None else ERROR,
+            doubt or "one sender, in order",
+            foreign=self.sources.foreign,
+            withheld=self.withheld,
+        )
         if silent_s > self.config.silence_s:
             self.diagnose("packets", ERROR, self.silence(silent_s), **values)
         elif not counters.packets:

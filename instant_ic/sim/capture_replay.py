@@ -32,7 +32,11 @@ class CaptureReplay:
         if not datagrams:
             raise ValueError(f"pcap {path} holds no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
         first = min(d.stamp_ns for d in datagrams)
-        self._items = sorted(((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams)
+        # By time alone: packets of one stamp keep their order, or the driver would find them late.
+        self._items = sorted(
+            (((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams),
+            key=lambda item: item[0],
+        )
         count = len(self._items)
         self.duration_s = self._items[-1][0]
         self._period_s = self.duration_s * (count + 1) / count if count > 1 else 0.1

@@ -6,7 +6,7 @@ import dataclasses
 import socket
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -210,6 +210,87 @@ def test_udp_over_real_sockets(run_dir: Path) -> None:
         for node in reversed(nodes):
             node.close()
     assert driver.thread is not None and not driver.thread.is_alive()
+
+
+def test_packets_of_a_second_address_ahead_of_the_sensor_withhold_the_scan(run_dir: Path) -> None:
+    """A wall at 1.0 m became one at 20.0 m: 90 ms ahead, the stranger made every packet of the sensor late."""
+    clock = SystemClock()
+    config = Vlp16DriverConfig(host="127.0.0.1", port=0, position_port=0)
+    nodes: list[Node[Any]] = []
+    for kind in (Vlp16DriverNode, Probe):
+        nodes.append(kind(config, LocalTransport(run_dir, kind.name, clock.now_ns), clock))
+        nodes[-1].start()
+    driver, probe = nodes
+    assert isinstance(driver, Vlp16DriverNode) and isinstance(probe, Probe)
+    real, forged = wall_stream(6000, 1.0), wall_stream(6000, 20.0, start_us=90_000)
+
+    def spin_until(what: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + 60.0
+        while not what() and time.monotonic() < deadline:
+            driver.spin_once()
+            probe.spin_once()
+        assert what()
+
+    try:
+        to = ("127.0.0.1", driver.receiver.port)
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+        ):
+            sensor.bind(("127.0.0.2", 0))
+            stranger.bind(("127.0.0.3", 0))
+            for index in range(200):
+                sensor.sendto(real[index], to)
+                # One at a time: what is asserted is whose packets are taken, not how fast the machine takes them.
+                spin_until(lambda count=index + 1: driver.stream.counters.packets >= count)  # type: ignore[misc]
+            spin_until(lambda: len(probe.scans) >= 1)
+            spin_until(lambda: driver.waiting == 0)
+            before = len(probe.scans)
+            for index in range(200, 500):
+                stranger.sendto(forged[index], to)
+                spin_until(lambda count=index - 199: driver.sources.foreign >= count)  # type: ignore[misc]
+                sensor.sendto(real[index], to)
+                spin_until(lambda count=index + 1: driver.stream.counters.packets >= count)  # type: ignore[misc]
+            spin_until(lambda: driver.withheld >= 3)
+        assert len(probe.scans) == before
+        level, text, _ = driver.diagnoses()["source"]
+        assert level == ERROR and "127.0.0.3" in text and "No scan" in text
+        assert driver.stream.counters.late == 0
+        for scan in probe.scans:
+            ranges = scan.ranges[np.isfinite(scan.ranges)]
+            np.testing.assert_allclose(ranges, 1.0, atol=2e-3)
+    finally:
+        for node in reversed(nodes):
+            node.close()
+
+
+def test_forged_packets_with_the_sensors_address_withhold_points_and_scan(tmp_path: Path) -> None:
+    period_ns = PACKET_PERIOD_US * 1000.0
+    frames = []
+    real, forged = wall_stream(8000, 1.0), wall_stream(8000, 20.0, start_us=90_000)
+    for index in range(4500):
+        frames.append((RECORDED + round((index + 1) * period_ns), udp_frame(real[index])))
+        if 450 <= index < 750:
+            frames.append((RECORDED + round((index + 1.1) * period_ns), udp_frame(forged[index])))
+    path = tmp_path / "forged.pcap"
+    path.write_bytes(pcap(frames, nano=True))
+    bus, node = played(path)
+    bus.advance(1.0)
+    level, text, _ = node.diagnoses()["source"]
+    assert level == ERROR and "out of order" in text
+    scans, clouds = len(bus.messages("/scan")), len(bus.messages("/lidar/points"))
+    assert scans > 0
+    bus.advance(2.5)  # the last forged packet was at 1.0 s; the doubt lasts 3 s
+    assert (len(bus.messages("/scan")), len(bus.messages("/lidar/points"))) == (scans, clouds)
+    bus.advance(1.5)
+    assert node.diagnoses()["source"][0] == OK
+    after = bus.messages("/scan")[scans:]
+    assert len(after) > 3
+    for scan in bus.messages("/scan"):
+        ranges = scan.ranges[np.isfinite(scan.ranges)]
+        np.testing.assert_allclose(ranges, 1.0, atol=2e-3)
+    # The forged clock ran 90 ms ahead; the stamps of what follows are the sensor's again.
+    assert stamp_ns(after[-1]) == pytest.approx(bus.records("/scan")[-1].stamp_ns, abs=2e7)
 
 
 def test_shipped_parameters_are_the_defaults() -> None:

@@ -2,6 +2,7 @@
 
 import socket
 import time
+from typing import Any
 
 import pytest
 
@@ -37,7 +38,7 @@ def test_packets_of_another_host_are_counted_and_dropped() -> None:
             sensor.bind(("127.0.0.2", 0))
             sensor.sendto(b"y", ("127.0.0.1", receiver.port))
         assert collect(receiver, 1) == [(b"y", True)]
-        assert receiver.foreign == 1
+        assert receiver.sources.foreign == 1
 
 
 def test_taken_port_is_told_with_what_to_do() -> None:
@@ -50,3 +51,26 @@ def test_taken_port_is_told_with_what_to_do() -> None:
 def test_read_without_connect_is_an_error() -> None:
     with pytest.raises(ReceiverError, match="connect"):
         list(PacketReceiver(LOCAL).read(0.0))
+
+
+def test_sensor_must_be_an_address() -> None:
+    with pytest.raises(ValueError, match="sensor must be an IPv4 address"):
+        ReceiverConfig(sensor="velodyne.local")
+
+
+def test_flood_on_one_port_does_not_keep_the_other_waiting() -> None:
+    config = ReceiverConfig(host="127.0.0.1", port=0, position_port=0, sensor="127.0.0.2")
+    with PacketReceiver(config) as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        target = ("127.0.0.1", receiver.port)
+        for _ in range(100):
+            stranger.sendto(b"x", target)
+        sources = receiver.sources
+        admit = sources.admit
+
+        def flooded(*arguments: Any) -> bool:
+            stranger.sendto(b"x", target)  # one more for each that is read: this port is never empty
+            return admit(*arguments)
+
+        sources.admit = flooded  # type: ignore[method-assign]
+        assert list(receiver.read(timeout_s=1.0)) == []
+        assert 0 < sources.foreign <= 512
