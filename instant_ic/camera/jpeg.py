@@ -11,6 +11,9 @@ if TYPE_CHECKING:
 SOI = b"\xff\xd8"
 EOI = b"\xff\xd9"
 
+MOST_PIXELS = 32 << 20
+"""Of an image that came over a network or in a bag. The Theta's largest photo (6720x3360) has 22.6 million."""
+
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
 
@@ -59,6 +62,16 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
             break
         at += 2 + length
     raise JpegError("has no frame header")
+
+
+def check_pixels(width: int, height: int) -> None:
+    """See that an image of this declared size may be decoded: 60 kB of JPEG can declare 65535 x 65535 pixels.
+
+    Raises:
+        JpegError: more pixels than `MOST_PIXELS`.
+    """
+    if width * height > MOST_PIXELS:
+        raise JpegError(f"declares {width}x{height} pixels; {MOST_PIXELS} at most are decoded")
 
 
 def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:

@@ -10,8 +10,9 @@ import re
 from instant_ic.camera.jpeg import JpegError, check_whole
 
 _HEADER_END = b"\r\n\r\n"
-_LENGTH = re.compile(rb"content-length[ \t]*:[ \t]*(\d+)", re.IGNORECASE)
+_LENGTH = re.compile(rb"content-length[ \t]*:[ \t]*(\d{1,12})", re.IGNORECASE)
 _MAX_HEADER = 4096
+_BOUNDARY = "osclivepreview"
 
 
 class PreviewParser:
@@ -22,7 +23,7 @@ class PreviewParser:
         last_fault: why the last one was dropped, in words.
     """
 
-    def __init__(self, boundary: str = "osclivepreview", max_frame_bytes: int = 16 << 20) -> None:
+    def __init__(self, boundary: str = _BOUNDARY, max_frame_bytes: int = 4 << 20) -> None:
         """Start before the first part.
 
         Args:
@@ -31,7 +32,7 @@ class PreviewParser:
         """
         self.bad_frames = 0
         self.last_fault = ""
-        self._boundary = boundary.strip("\"' \t-").encode("ascii", "replace")
+        self._boundary = (boundary.strip("\"' \t-") or _BOUNDARY).encode("ascii", "replace")
         self._max_frame_bytes = max_frame_bytes
         self._buffer = bytearray()
         self._length: int | None = None
@@ -61,24 +62,24 @@ class PreviewParser:
 
     def _read_header(self) -> bool:
         """Take a part's header out of the buffer; False when it is not whole yet."""
-        end = self._buffer.find(_HEADER_END)
-        if end < 0:
-            if len(self._buffer) > _MAX_HEADER:
-                self._drop(f"no part header within {_MAX_HEADER} bytes")
-                at = self._buffer.rfind(self._boundary)
-                del self._buffer[: at if at > 0 else len(self._buffer) - len(_HEADER_END)]
-            return False
-        header = bytes(self._buffer[:end])
-        del self._buffer[: end + len(_HEADER_END)]
-        lengths = _LENGTH.findall(header)
-        # After rubbish, the last one belongs to the part that begins here.
-        length = int(lengths[-1]) if lengths else 0
-        if not 4 <= length <= self._max_frame_bytes:
+        while True:
+            end = self._buffer.find(_HEADER_END)
+            if end < 0:
+                if len(self._buffer) > _MAX_HEADER:
+                    self._drop(f"no part header within {_MAX_HEADER} bytes")
+                    at = self._buffer.rfind(self._boundary)
+                    del self._buffer[: at if at > 0 else len(self._buffer) - len(_HEADER_END)]
+                return False
+            header = bytes(self._buffer[:end])
+            del self._buffer[: end + len(_HEADER_END)]
+            lengths = _LENGTH.findall(header)
+            # After rubbish, the last one belongs to the part that begins here.
+            length = int(lengths[-1]) if lengths else 0
+            if 4 <= length <= self._max_frame_bytes:
+                self._length = length
+                return True
             self._drop(f"Content-Length {length}" if lengths else "no Content-Length")
             self._skip_to_boundary()
-            return bool(self._buffer) and self._read_header()
-        self._length = length
-        return True
 
     def _resync_in_body(self) -> bool:
         """Where a part was cut, the next one begins inside its announced length: go there."""

@@ -1,5 +1,6 @@
 """Ricoh Theta Z1 over its Web API (Open Spherical Camera API, level 2, with Ricoh's options)."""
 
+import json
 import re
 import threading
 import time
@@ -9,10 +10,10 @@ from typing import Any
 
 import requests
 import urllib3
-from requests.auth import AuthBase, HTTPDigestAuth
 
 from instant_ic.camera.config import ThetaConfig
-from instant_ic.camera.jpeg import JpegError, jpeg_size
+from instant_ic.camera.http import Session, is_multipart
+from instant_ic.camera.jpeg import JpegError, check_pixels, jpeg_size
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.pace import current
@@ -22,6 +23,8 @@ NEVER = 65535
 
 _JSON = {"Content-Type": "application/json;charset=utf-8"}
 _CHUNK = 64 << 10
+_MOST_TEXT = 200
+"""Characters of a text of the camera that go into logs and diagnostics."""
 
 
 class ThetaError(CameraError):
@@ -107,13 +110,15 @@ class ThetaClient:
         Raises:
             CameraError: no answer.
         """
-        state = self._call("POST", "/osc/state", {}).get("state", {})
-        errors = state.get("_cameraError") or []
+        state = self._call("POST", "/osc/state", {}).get("state")
+        state = state if isinstance(state, dict) else {}
+        errors = state.get("_cameraError")
+        errors = errors if isinstance(errors, list) else [errors] if errors else []
         return ThetaState(
             battery=_number(state, "batteryLevel"),
             battery_temperature_c=_number(state, "_batteryTemp"),
             board_temperature_c=_number(state, "_boardTemp"),
-            errors=tuple(str(error) for error in ([errors] if isinstance(errors, str) else errors)),
+            errors=tuple(str(error)[:_MOST_TEXT] for error in errors[:20]),
         )
 
     def execute(self, name: str, parameters: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -142,7 +147,7 @@ class ThetaClient:
         """
         self.execute("camera.setOptions", {"options": dict(options)})
 
-    def open_preview(self) -> tuple[requests.Session, requests.Response]:
+    def open_preview(self) -> tuple[Session, requests.Response]:
         """Start ``camera.getLivePreview`` on a connection of its own; both have to be closed by the caller.
 
         Raises:
@@ -156,11 +161,10 @@ class ThetaClient:
                 "POST",
                 "/osc/commands/execute",
                 {"name": "camera.getLivePreview"},
-                timeout=(self.config.connect_timeout_s, current().wait_s(self.config.read_timeout_s)),
-                stream=True,
+                current().wait_s(self.config.read_timeout_s),
             )
-            kind = response.headers.get("Content-Type", "")
-            if not kind.lower().startswith("multipart/"):
+            if not is_multipart(response):
+                kind = response.headers.get("Content-Type", "")[:_MOST_TEXT]
                 raise CameraError(f"{self.url}: the preview is {kind or 'of no type'} instead of multipart")
         except CameraError:
             session.close()
@@ -172,27 +176,26 @@ class ThetaClient:
             response = self._request(self._session, method, path, body, self.config.connect_timeout_s)
         reply = _json(response)
         if reply is None:
-            raise CameraError(f"{self.url}{path}: the reply is no JSON object ({response.text[:80]!r})")
+            found = "a multipart stream" if is_multipart(response) else repr(response.content[:80])
+            response.close()
+            raise CameraError(f"{self.url}{path}: the reply is no JSON object ({found})")
         if reply.get("state") == "error":
             raise _refusal(self.url + path, body, response.status_code, reply)
         return reply
 
     def _request(
         self,
-        session: requests.Session,
+        session: Session,
         method: str,
         path: str,
         body: Mapping[str, Any] | None,
-        timeout: float | tuple[float, float],
-        stream: bool = False,
+        timeout_s: float,
     ) -> requests.Response:
         """One request, repeated with growing waits while the camera is busy."""
         wait_s = self.config.busy_wait_s
         for attempt in range(self.config.busy_retries + 1):
             try:
-                response = session.request(
-                    method, self.url + path, json=body, headers=_JSON, timeout=timeout, stream=stream
-                )
+                response = session.ask(method, self.url + path, body, _JSON, timeout_s)
             except requests.RequestException as error:
                 raise CameraError(
                     f"{self.url}{path}: no answer ({_cause(error)}); is the camera on, in the same network, "
@@ -211,14 +214,8 @@ class ThetaClient:
         response.close()
         raise refusal
 
-    def _new_session(self) -> requests.Session:
-        session = requests.Session()
-        # Proxies and .netrc of the environment are not for a camera on the local network.
-        session.trust_env = False
-        if self._user:
-            auth: AuthBase = HTTPDigestAuth(self._user, self._password)
-            session.auth = auth
-        return session
+    def _new_session(self) -> Session:
+        return Session(self._user, self._password)
 
 
 class ThetaCamera(Camera):
@@ -238,7 +235,7 @@ class ThetaCamera(Camera):
         super().__init__(self.config.latency_s, now_ns)
         self.client = ThetaClient(url, self.config, user, password, sleep)
         self._sleep = sleep
-        self._session: requests.Session | None = None
+        self._session: Session | None = None
         self._response: requests.Response | None = None
         self._parser = PreviewParser()
 
@@ -265,10 +262,11 @@ class ThetaCamera(Camera):
         self._sleep(config.settle_s)
         self._session, self._response = self.client.open_preview()
         found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
-        self._parser = PreviewParser(found.group(1) if found else "osclivepreview")
+        self._parser = PreviewParser(found.group(1) if found else "")
+        model, firmware = (str(info.get(key, "unknown"))[:_MOST_TEXT] for key in ("model", "firmwareVersion"))
         return (
-            f"{info.get('model', 'camera')} (firmware {info.get('firmwareVersion', 'unknown')}) at "
-            f"{self.client.url}, preview {config.width}x{config.height} at {config.rate_hz} Hz"
+            f"{model} (firmware {firmware}) at {self.client.url}, "
+            f"preview {config.width}x{config.height} at {config.rate_hz} Hz"
         )
 
     def read(self) -> Frame:
@@ -278,10 +276,13 @@ class ThetaCamera(Camera):
             CameraError: nothing within the read time-out, or the camera ended the preview (button, shooting,
                 change of mode).
         """
-        response = self._response
-        if response is None:
+        response, session = self._response, self._session
+        if response is None or session is None:
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
-        deadline = time.monotonic() + current().wait_s(self.config.read_timeout_s)
+        timeout_s = current().wait_s(self.config.read_timeout_s)
+        deadline = time.monotonic() + timeout_s
+        # One read may take several receptions: the head of a chunk could come byte by byte.
+        session.deadline.start(2.0 * timeout_s)
         while True:
             if time.monotonic() > deadline:
                 fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""
@@ -300,6 +301,7 @@ class ThetaCamera(Camera):
             for jpeg in reversed(frames):
                 try:
                     width, height = jpeg_size(jpeg)
+                    check_pixels(width, height)
                 except JpegError:
                     self.bad_frames += 1
                     continue
@@ -325,13 +327,17 @@ class ThetaCamera(Camera):
 
 def _number(state: Mapping[str, Any], key: str) -> float | None:
     value = state.get(key)
-    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < 1e6:
+        return None
+    return float(value)
 
 
 def _json(response: requests.Response) -> dict[str, Any] | None:
+    if is_multipart(response):
+        return None
     try:
-        reply = response.json()
-    except (requests.RequestException, ValueError):
+        reply = json.loads(response.content)
+    except (ValueError, RecursionError):
         return None
     return reply if isinstance(reply, dict) else None
 
@@ -339,12 +345,14 @@ def _json(response: requests.Response) -> dict[str, Any] | None:
 def _refusal(where: str, body: Mapping[str, Any] | None, status: int, reply: Mapping[str, Any]) -> ThetaError:
     error = reply.get("error")
     error = error if isinstance(error, dict) else {}
-    code = str(error.get("code", f"http {status}"))
-    text = str(error.get("message", ""))
+    code = str(error.get("code", f"http {status}"))[:_MOST_TEXT]
+    text = str(error.get("message", ""))[:_MOST_TEXT]
     command = f" {body['name']}" if body and "name" in body else ""
     hint = ""
     if status == 401:
         hint = "; set INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD (serial number, and its digits)"
+    elif 300 <= status < 400:
+        hint = "; it redirects, which no Theta does: is this the address of another device?"
     elif status == 503:
         hint = "; it stayed busy: switch the camera off and on again"
     return ThetaError(f"{where}:{command} refused: {code} {text}".rstrip() + hint, code)
