@@ -58,8 +58,10 @@ class CommandGate:
         if age_s < -self.limits.max_age_s:
             raise self.refuse("future", f"stamped {-age_s:.2f} s ahead of this machine's clock: set both by NTP")
 
-    def check_drive(self, sender: str, v: float, w: float, now_ns: int) -> None:
+    def check_drive(self, sender: str, v: float, w: float, steady_ns: int) -> None:
         """Refuses what no sane operator sends (m/s, rad/s), and a second driver.
+
+        ``steady_ns`` is of a clock that is never set, as it measures the lease.
 
         Raises:
             CommandRefused: see above.
@@ -69,9 +71,18 @@ class CommandGate:
         if abs(v) > self.limits.max_linear_mps or abs(w) > self.limits.max_angular_rps:
             limits = f"{self.limits.max_linear_mps:g} m/s, {self.limits.max_angular_rps:g} rad/s"
             raise self.refuse("too fast", f"{v:g} m/s, {w:g} rad/s: beyond {limits}")
-        if self._driver not in (None, sender) and now_ns - self._driver_ns <= self.limits.lease_s * 1e9:
+        if self._driver not in (None, sender) and steady_ns - self._driver_ns <= self.limits.lease_s * 1e9:
             raise self.refuse("second driver", f"{sender} may not drive while {self._driver} does")
-        self._driver, self._driver_ns = sender, now_ns
+        self._driver, self._driver_ns = sender, steady_ns
+
+    def check_release(self, sender: str, steady_ns: int) -> None:
+        """Refuses to release the emergency stop for anybody but the driver, while its commands come.
+
+        Raises:
+            CommandRefused: see above.
+        """
+        if self._driver != sender or steady_ns - self._driver_ns > self.limits.lease_s * 1e9:
+            raise self.refuse("release", f"{sender} does not drive; only the driver may release the emergency stop")
 
     def release(self, sender: str) -> bool:
         """Notes that a sender has left; true if it was the driver."""

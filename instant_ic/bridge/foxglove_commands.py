@@ -3,78 +3,82 @@
 from __future__ import annotations
 
 import json
-import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 from ..bus import ERROR, LATCHED, OK, SENSOR, Node, Publisher
 from ..msg import MessageError, deserialize, message_type, stamp_ns, twist_stamped, twist_values
 from .commands import CommandGate, CommandRefused
+from .foxglove_protocol import ClientChannel
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 _COMMAND_TYPES = {DRIVE: ("TwistStamped", "Twist"), STOP: ("Bool",)}
 
 
 class Commands:
-    """Commands of clients: checked, then published as the console's would be.
+    """Commands of clients: checked, then published as the console's would be. Called on the server's thread.
 
     Args:
         node: publishes them.
         gate: what they have to pass.
-        tell: words for the client.
+        tell: number of a client, words for it, and their level.
     """
 
-    def __init__(self, node: Node[Any], gate: CommandGate, tell: Callable[[str], None]) -> None:
+    def __init__(self, node: Node[Any], gate: CommandGate, tell: Callable[[int, str, int], None]) -> None:
         self._node = node
         self._gate = gate
         self._tell = tell
-        self._lock = threading.Lock()
-        self._channels: dict[tuple[int, int], Any] = {}
-        self._told: set[str] = set()
+        self._channels: dict[tuple[int, int], ClientChannel] = {}
+        self._told: dict[int, str] = {}
         self._drive: Publisher = node.publisher(DRIVE, message_type("TwistStamped"), SENSOR)
         self._stop: Publisher = node.publisher(STOP, message_type("Bool"), LATCHED)
 
-    def advertised(self, client: int, channel: Any) -> None:
+    def advertised(self, client: int, channel: ClientChannel) -> None:
         """A client is going to publish."""
         kinds = _COMMAND_TYPES.get(channel.topic)
         name = channel.schema_name.rsplit("/", 1)[-1]
         if kinds is None or name not in kinds or channel.encoding not in ("cdr", "json"):
             known = "; ".join(f"{topic} ({' or '.join(names)})" for topic, names in _COMMAND_TYPES.items())
-            self._tell(
-                f"{channel.topic} {channel.schema_name} {channel.encoding} is not taken; only {known}, cdr or json"
-            )
+            what = f"{channel.topic:.100} {channel.schema_name:.100} {channel.encoding:.20}"
+            self._tell(client, f"{what} is not taken; only {known}, cdr or json", ERROR)
             return
         self._channels[client, channel.id] = channel
 
     def unadvertised(self, client: int, channel_id: int) -> None:
-        """A client has left, or publishes no more: the robot it drove stands at once."""
+        """A client publishes no more: the robot it drove stands at once."""
         channel = self._channels.pop((client, channel_id), None)
-        if channel is None or channel.topic != DRIVE:
-            return
-        with self._lock:
-            driving = self._gate.release(f"client {client}")
-        if driving:
+        if channel is not None and channel.topic == DRIVE and self._gate.release(_name(client)):
             self._drive.publish(twist_stamped(0.0, 0.0, self._node.clock.now_ns()))
+
+    def left(self, client: int) -> None:
+        """A client has left."""
+        for number, channel_id in [key for key in self._channels if key[0] == client]:
+            self.unadvertised(number, channel_id)
+        self._told.pop(client, None)
 
     def message(self, client: int, channel_id: int, data: bytes) -> None:
         """A client's message."""
         channel = self._channels.get((client, channel_id))
         if channel is None:  # told at its advertisement
             return
-        name = channel.schema_name.rsplit("/", 1)[-1]
         try:
-            with self._lock:
-                if channel.topic == STOP:
-                    value = _json(data)["data"] if channel.encoding == "json" else deserialize(data, "Bool").data
-                    if not isinstance(value, bool):
-                        raise MessageError(f"data must be true or false (got {value!r})")
-                    self._stop.publish(message_type("Bool")(value))
-                    return
-                self._drive_by(client, name, channel.encoding, data)
+            if channel.topic == STOP:
+                self._stop_by(client, channel.encoding, data)
+            else:
+                self._drive_by(client, channel.schema_name.rsplit("/", 1)[-1], channel.encoding, data)
         except CommandRefused as error:
-            self._refused(f"command refused: {error}")
-        except (MessageError, AttributeError, KeyError, TypeError, ValueError) as error:  # JSON of any shape
-            self._refused(f"command refused: {channel.topic}: {type(error).__name__}: {error}")
+            self._refused(client, f"command refused: {error}")
+        except (MessageError, AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:  # any JSON
+            self._refused(client, f"command refused: {channel.topic}: {type(error).__name__}: {error}")
+
+    def _stop_by(self, client: int, encoding: str, data: bytes) -> None:
+        value = _json(data)["data"] if encoding == "json" else deserialize(data, "Bool").data
+        if not isinstance(value, bool):
+            raise MessageError(f"data must be true or false (got {value!r})")
+        if not value:
+            self._gate.check_release(_name(client), time.monotonic_ns())
+        self._stop.publish(message_type("Bool")(value))
 
     def _drive_by(self, client: int, name: str, encoding: str, data: bytes) -> None:
         now_ns = self._node.clock.now_ns()
@@ -91,17 +95,23 @@ class Commands:
             sent_ns = int(stamp.get("sec", 0)) * 1_000_000_000 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
         if sent_ns:  # a client without a clock (Foxglove's teleop panel) stamps nothing: its arrival counts
             self._gate.check_age(sent_ns, now_ns)
-        self._gate.check_drive(f"client {client}", v, w, now_ns)
+        self._gate.check_drive(_name(client), v, w, time.monotonic_ns())
         self._drive.publish(twist_stamped(v, w, sent_ns or now_ns))
-        if self._told:
-            self._told.clear()
+        if self._told.pop(client, None) is not None:
             self._node.call_soon(self._node.diagnose, "commands", OK, "commands come in")
 
-    def _refused(self, words: str) -> None:
-        if words not in self._told:
-            self._told.add(words)
-            self._tell(words)
+    def _refused(self, client: int, words: str) -> None:
+        """Tells the client, once until other words are due."""
+        words = words[:300]
+        if self._told.get(client) == words:
+            return
+        self._told[client] = words
+        self._tell(client, words, ERROR)
         self._node.call_soon(self._node.diagnose, "commands", ERROR, words)
+
+
+def _name(client: int) -> str:
+    return f"client {client}"
 
 
 def _json(data: bytes) -> dict[str, Any]:

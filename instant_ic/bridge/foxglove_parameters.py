@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import concurrent.futures
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..bus import ParameterError
+from ..bus import ParameterError, registry
 from ..bus.control import ControlError, NodeControl
+from .parameter_guard import never_set
 
 _TIMEOUT_S = 1.0
 
@@ -30,8 +31,9 @@ class Parameters:
 
     def _of(self, node: str) -> tuple[dict[str, Any], str]:
         try:
+            registry.check_node_name(node)  # it becomes part of a path
             return {f"/{node}.{key}": value for key, value in self._control(node).get().items()}, ""
-        except (ControlError, ParameterError) as error:
+        except (ControlError, ParameterError, registry.RegistryError) as error:
             return {}, str(error)
 
     def get(self, names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
@@ -44,23 +46,46 @@ class Parameters:
             silent += [words] if words else []
         return {name: values[name] for name in names if name in values} if names else values, silent
 
-    def set(self, wanted: dict[str, Any]) -> list[str]:
-        """Changes parameters, those of one node together; returns what was refused, in words."""
+    def set(self, wanted: Mapping[str, Any]) -> list[str]:
+        """Changes parameters, those of one node together; returns what was refused, in words.
+
+        Safety parameters (:mod:`.parameter_guard`) are always refused, and with them the whole change of their node.
+        """
         by_node: dict[str, dict[str, Any]] = {}
         for name, value in wanted.items():
             node, key = _split(name)
             by_node.setdefault(node, {})[key] = value
+        modules = {info.name: info.module for info in registry.list_nodes(self._run_dir)}
         refused = []
         for node, values in by_node.items():
             try:
+                if node not in modules:
+                    raise ControlError(f"node {node!r:.100} does not run")
+                for key, value in values.items():
+                    _check(modules[node], key, value)
                 self._control(node).set(values)
             except (ControlError, ParameterError) as error:
-                refused.append(f"{node}: {error}")
+                refused.append(f"{node:.100}: {error}")
         return refused
 
     def close(self) -> None:
         """Ends the threads."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _check(module: str, key: str, value: Any) -> None:
+    """Refuses a safety parameter, also as part of a group.
+
+    Raises:
+        ParameterError: see above.
+    """
+    items = value if isinstance(value, list) else [value]
+    if not all(isinstance(item, (bool, int, float, str)) for item in items):
+        raise ParameterError(f"{key!r:.100} must be a number, a text, true or false, or a list of them")
+    if never_set(module, key):
+        raise ParameterError(
+            f"{key!r:.100} is a safety parameter and cannot be set over a bridge; use `ic param set` on the robot"
+        )
 
 
 def _split(name: str) -> tuple[str, str]:

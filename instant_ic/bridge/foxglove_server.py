@@ -1,57 +1,67 @@
 """A Foxglove server that follows a run directory: its topics, its nodes' parameters, its graph.
 
-Bytes go through unchanged. Foxglove's SDK is an extra, imported when the server starts; its callbacks come on threads
-of its own.
+Bytes go through unchanged. The WebSockets live on an event loop in a thread of its own; what the node's thread gives it
+waits in queues of a fixed size, so neither a slow viewer nor a stalled loop holds the node up.
 """
 
 from __future__ import annotations
 
-import socket
+import asyncio
+import contextlib
+import logging
+import ssl
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from aiohttp import WSCloseCode, WSMsgType, web
 
 from ..bus import ERROR, OK, WARN, Node, Subscription
 from ..bus.qos import PRESETS, RELIABLE
 from ..bus.registry import NodeInfo, TopicInfo
 from ..bus.transport import Received
 from ..msg import MessageError, typestore
+from . import foxglove_protocol as protocol
 from .commands import CommandGate
 from .foxglove_commands import Commands
 from .foxglove_parameters import Parameters
+from .web_access import refusal
 
-_SETTLE_S = 0.1
+_START_S = 10.0
+_END_S = 2.0
+_HANDSHAKE_S = 5.0
+_HEARTBEAT_S = 30.0
+_MAX_CLIENT_FRAME = 64 * 1024
+_MAX_TEXTS = 1000  # answers that wait for a client; one that reads none of them is let go
+_MAX_BACKLOG_BYTES = 64 << 20
+_MAX_CHANNELS = 16  # that one client may publish on
+_MAX_PARAMETER_REQUESTS = 16
+_MAX_MESSAGES_PER_S = 200.0
+_WAITING_CONNECTIONS = 16  # connections beside the clients', until they have asked for a WebSocket
+_UNSUPPORTED = ("subscribeParameterUpdates", "unsubscribeParameterUpdates", "fetchAsset")
+_STATUS = {OK: protocol.INFO, WARN: protocol.WARNING}
+
+log = logging.getLogger(__name__)
+_http_log = logging.getLogger(f"{__name__}.http")
+_http_log.setLevel(logging.CRITICAL)  # a line for each malformed request would let strangers fill the disk
 
 
 class FoxgloveError(RuntimeError):
-    """The SDK is not installed, or the server cannot start; the message says what to do."""
+    """The server cannot start; the message says what to do."""
 
 
-def sdk() -> Any:
-    """Foxglove's SDK.
-
-    Raises:
-        FoxgloveError: the extra is not installed.
-    """
-    try:
-        import foxglove
-        import foxglove.websocket
-    except ImportError as error:
-        raise FoxgloveError(f"Foxglove's SDK is not installed ({error}): pip install 'instant-ic[foxglove]'") from None
-    return foxglove
-
-
-def schema_text(type_name: str) -> bytes:
+def schema_text(type_name: str) -> str:
     """Definition of a type with all that it holds, as ``ros2msg`` has it.
 
     Raises:
         MessageError: the type is not known.
     """
     try:
-        return typestore().generate_msgdef(type_name, ros_version=2)[0].encode()
+        return typestore().generate_msgdef(type_name, ros_version=2)[0]
     except Exception as error:  # rosbags raises its own error and KeyError
         raise MessageError(f"no definition of {type_name}: {error}") from error
 
@@ -65,8 +75,10 @@ class ServerSettings:
         host, port: where to listen; port 0 takes a free one.
         tls_cert, tls_key: files in PEM; with them the server speaks wss:// only.
         backlog: messages kept for a client that does not keep up; the oldest goes first.
+        max_clients: most clients at a time.
+        allowed_origins, allowed_hosts: see :func:`.web_access.refusal`.
         accept_operator: whether clients may drive and stop the robot.
-        set_parameters: whether clients may change parameters.
+        set_parameters: whether clients may change parameters that are no safety parameters.
         server_time: whether to tell clients the time (for simulated time).
     """
 
@@ -76,8 +88,11 @@ class ServerSettings:
     tls_cert: Path | None = None
     tls_key: Path | None = None
     backlog: int = 32
+    max_clients: int = 16
+    allowed_origins: tuple[str, ...] = ()
+    allowed_hosts: tuple[str, ...] = ()
     accept_operator: bool = False
-    set_parameters: bool = True
+    set_parameters: bool = False
     server_time: bool = False
 
 
@@ -91,6 +106,11 @@ class FoxgloveServer:
         takes: which topics to offer.
         gate: what commands have to pass.
 
+    Attributes:
+        count, bytes: messages of the bus that were handed to clients.
+        refused: requests that were turned away: wrong Origin or Host, or too many clients.
+        refusal: why the last of them was.
+
     Raises:
         FoxgloveError: see there.
     """
@@ -98,50 +118,43 @@ class FoxgloveServer:
     def __init__(
         self, node: Node[Any], run_dir: Path, settings: ServerSettings, takes: Callable[[str], bool], gate: CommandGate
     ) -> None:
-        self._sdk = sdk()
+        tls = _tls(settings)
         self._node = node
         self._takes = takes
-        self._context = self._sdk.Context()
+        self._settings = settings
+        self._lock = threading.Lock()  # over channels, watchers, clients and their queues; held for moments only
         self._channels: dict[str, _Channel] = {}
-        self._graph: tuple[Any, ...] | None = None
-        self._newcomers: dict[str, float] = {}
+        self._next_channel = 1
+        self._clients: list[_Client] = []
+        self._next_client = 1
+        self._dropped_before = 0
+        self._graph = protocol.Graph({}, {})
+        self._time_ns: int | None = None
+        self._flush_due = False
         self.parameters = Parameters(run_dir)
         self.may_set = settings.set_parameters
-        self.commands = Commands(node, gate, self.status) if settings.accept_operator else None
+        self.commands = Commands(node, gate, self._tell_client) if settings.accept_operator else None
         self.wake = threading.Event()
         self.count = 0
         self.bytes = 0
-        self._server = self._start(settings)
-        self.port: int = self._server.port
+        self.refused = 0
+        self.refusal = ""
+        self.port = 0
+        self._loop = asyncio.new_event_loop()
+        self._finish = asyncio.Event()
+        self._started = threading.Event()
+        self._start_error: Exception | None = None
+        self._thread = threading.Thread(target=self._run, args=(tls,), name="foxglove", daemon=True)
+        self._start()
 
-    def _start(self, settings: ServerSettings) -> Any:
-        capability = self._sdk.websocket.Capability
-        capabilities = [capability.Parameters, capability.ConnectionGraph]
-        if settings.accept_operator:
-            capabilities.append(capability.ClientPublish)
-        if settings.server_time:
-            capabilities.append(capability.Time)
-        try:
-            tls = {
-                name: path.read_bytes()
-                for name, path in (("tls_cert", settings.tls_cert), ("tls_key", settings.tls_key))
-                if path is not None
-            }
-            return self._sdk.start_server(
-                name=settings.title,
-                host=settings.host,
-                port=settings.port,
-                capabilities=capabilities,
-                server_listener=_listener(self),
-                supported_encodings=["cdr", "json"] if settings.accept_operator else None,
-                context=self._context,
-                message_backlog_size=settings.backlog,
-                **tls,
-            )
-        except OSError as error:
-            raise FoxgloveError(f"{error.filename}: cannot be read: {error.strerror}") from None
-        except (RuntimeError, ValueError) as error:
-            raise FoxgloveError(f"no server on {settings.host}:{settings.port}: {error}; set host or port") from None
+    def _start(self) -> None:
+        where = f"{self._settings.host}:{self._settings.port}"
+        self._thread.start()
+        if not self._started.wait(_START_S):
+            raise FoxgloveError(f"no server on {where}: not started within {_START_S:g} s; set host or port")
+        if self._start_error is not None:
+            self.parameters.close()
+            raise FoxgloveError(f"no server on {where}: {self._start_error}; set host or port") from None
 
     # -- on the node's thread --------------------------------------------------------------------
 
@@ -155,6 +168,12 @@ class FoxgloveServer:
         """Topics on offer."""
         return sorted(self._channels)
 
+    @property
+    def dropped(self) -> int:
+        """Messages that were dropped because a client did not keep up."""
+        with self._lock:
+            return self._dropped_before + sum(client.dropped for client in self._clients)
+
     def reconcile(self, present: Sequence[TopicInfo], nodes: Sequence[NodeInfo]) -> None:
         """Offers what has appeared, takes back what has left, listens to what is watched and to nothing else."""
         wanted = {info.topic: info for info in present if self._takes(info.topic)}
@@ -166,24 +185,30 @@ class FoxgloveServer:
             if channel is None and not self._offer(topic, info.type_name):
                 continue
             self._channels[topic].watch(info)
-        self._welcome()
         for topic in [topic for topic in self._channels if topic not in wanted]:
             self._withdraw(topic)
         self._tell_graph(present, nodes)
 
     def _offer(self, topic: str, type_name: str) -> bool:
         try:
-            definition = schema_text(type_name)
+            schema = schema_text(type_name)
         except MessageError as error:
             self._node.diagnose(f"topic {topic}", ERROR, str(error))
             return False
-        schema = self._sdk.Schema(name=type_name, encoding="ros2msg", data=definition)
-        channel = self._sdk.Channel(topic, message_encoding="cdr", schema=schema, context=self._context)
-        self._channels[topic] = _Channel(self, self._node, type_name, channel)
+        with self._lock:
+            channel = _Channel(self, self._node, self._next_channel, topic, type_name, schema)
+            self._next_channel += 1
+            self._channels[topic] = channel
+            self._to_all(protocol.text("advertise", channels=[channel.advertisement]))
         return True
 
     def _withdraw(self, topic: str) -> None:
-        self._channels.pop(topic).close()
+        with self._lock:
+            channel = self._channels.pop(topic)
+            for client in list(channel.watchers):
+                client.unsubscribe(channel.watchers[client])
+            self._to_all(protocol.text("unadvertise", channelIds=[channel.id]))
+        channel.drop()
 
     def _tell_graph(self, present: Sequence[TopicInfo], nodes: Sequence[NodeInfo]) -> None:
         published = {info.topic: sorted({p.node for p in info.publishers}) for info in present}
@@ -191,73 +216,445 @@ class FoxgloveServer:
         for node in nodes:
             for topic in node.subscribes:
                 subscribed.setdefault(topic, []).append(node.name)
-        now = (published, subscribed)
-        if now == self._graph:
-            return
-        self._graph = now
-        graph = self._sdk.ConnectionGraph()
-        for topic, names in published.items():
-            graph.set_published_topic(topic, names)
-        for topic, names in subscribed.items():
-            graph.set_subscribed_topic(topic, sorted(names))
-        self._server.publish_connection_graph(graph)
+        now = protocol.Graph(published, {topic: sorted(names) for topic, names in subscribed.items()})
+        with self._lock:
+            update = protocol.graph_update(self._graph, now)
+            self._graph = now
+            if update is not None:
+                self._to_all(update, lambda client: client.wants_graph)
 
-    def joined(self, topic: str) -> None:
-        """Somebody watches a topic from now on, maybe beside others."""
-        self._newcomers[topic] = time.monotonic()
+    def _joined(self, topic: str) -> None:
+        """Somebody watches a topic from now on, maybe beside others: fetches latched values again for the newcomer."""
+        if topic in self._channels:
+            self._channels[topic].renew()
 
-    def _welcome(self) -> None:
-        """Fetches latched values again, so that newcomers have them too."""
-        now = time.monotonic()
-        # The SDK tells of a newcomer a little before it would get messages.
-        for topic in [topic for topic, since in self._newcomers.items() if now - since > _SETTLE_S]:
-            del self._newcomers[topic]
-            if topic in self._channels:
-                self._channels[topic].renew()
+    def hand_out(self, channel: _Channel, received: Received) -> None:
+        """Queues a message for everybody who watches its channel."""
+        self.count += 1
+        self.bytes += len(received.payload)
+        with self._lock:
+            for client, subscription in channel.watchers.items():
+                client.put(protocol.message_data(subscription, received.publish_ns, received.payload))
+            self._flush_soon()
 
     # -- from any thread -------------------------------------------------------------------------
 
     def tell_time(self, now_ns: int) -> None:
         """Tells clients the simulated time."""
-        self._server.broadcast_time(now_ns)
+        with self._lock:
+            self._time_ns = now_ns
+            for client in self._clients:
+                client.time = protocol.time_data(now_ns)
+            self._flush_soon()
 
-    def status(self, words: str, level: int = ERROR) -> None:
-        """Shows words in Foxglove's list of problems."""
-        levels = self._sdk.StatusLevel
-        self._server.publish_status(words, {OK: levels.Info, WARN: levels.Warning}.get(level, levels.Error))
+    def _tell_client(self, number: int, words: str, level: int) -> None:
+        """Shows words in one client's list of problems."""
+        with self._lock:
+            self._to_all(_status(words, level), lambda client: client.number == number)
+
+    def _to_all(self, text: str, which: Callable[[_Client], bool] = lambda client: True) -> None:
+        """Queues a text for clients; under the lock."""
+        for client in self._clients:
+            if which(client):
+                client.texts.append(text)
+        self._flush_soon()
+
+    def _flush_soon(self) -> None:
+        """Wakes the senders, at most once until they have been; under the lock."""
+        if not self._flush_due and not self._loop.is_closed():
+            self._flush_due = True
+            self._loop.call_soon_threadsafe(self._flush)
 
     def close(self) -> None:
-        """Ends the server and every listening."""
+        """Ends the server and every listening; twice does no harm."""
         for topic in list(self._channels):
             self._withdraw(topic)
-        self._server.stop()
+        if self._thread.is_alive():
+            with contextlib.suppress(RuntimeError):  # it ends by itself in this moment
+                self._loop.call_soon_threadsafe(self._finish.set)
+            self._thread.join(2 * _END_S)
+            if self._thread.is_alive():
+                log.error(
+                    "Foxglove: the server's thread does not end within %g s; it goes with the process", 2 * _END_S
+                )
         self.parameters.close()
+
+    # -- on the loop's thread --------------------------------------------------------------------
+
+    def _run(self, tls: ssl.SSLContext | None) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.set_exception_handler(_Quiet())
+        try:
+            self._loop.run_until_complete(self._serve(tls))
+        except Exception as error:
+            self._start_error = error
+            if self._started.is_set():
+                log.exception("Foxglove: the server's thread failed")
+                self._node.stop()  # the launcher starts it again
+        finally:
+            with self._lock:  # from here on nobody wakes the loop
+                self._loop.close()
+            self._started.set()
+
+    async def _serve(self, tls: ssl.SSLContext | None) -> None:
+        server = web.Server(self._handle, access_log=None, logger=_http_log, keepalive_timeout=_HANDSHAKE_S)
+
+        def accept() -> asyncio.Protocol:
+            if len(server.connections) >= self._settings.max_clients + _WAITING_CONNECTIONS:
+                self._refuse("too many connections")
+                return _Refusing()
+            connection = server()
+            self._loop.call_later(_HANDSHAKE_S, self._end_idle, connection)
+            return connection
+
+        listener = await self._loop.create_server(
+            accept,
+            self._settings.host,
+            self._settings.port,
+            ssl=tls,
+            ssl_handshake_timeout=_HANDSHAKE_S if tls else None,
+        )
+        self.port = listener.sockets[0].getsockname()[1]
+        self._started.set()
+        try:
+            await self._finish.wait()
+        finally:
+            listener.close()
+            for client in list(self._clients):
+                client.abort()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(server.shutdown(_END_S / 2), _END_S)
+
+    def _end_idle(self, connection: web.RequestHandler) -> None:
+        """Ends a connection that has not become a client's in time."""
+        if all(client.connection is not connection for client in self._clients):
+            connection.force_close()
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        self.refusal = why
+
+    async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
+        """One request: a client's whole life, if it may come in."""
+        settings = self._settings
+        why = refusal(
+            request.headers.get("Origin"), request.headers.get("Host"), settings.allowed_origins, settings.allowed_hosts
+        )
+        if why:
+            self._refuse(why)
+            return web.Response(status=403, text=f"{why} of foxglove_bridge\n")
+        if len(self._clients) >= settings.max_clients:
+            self._refuse("too many clients")
+            return web.Response(status=503, text=f"{settings.max_clients} clients are connected; see max_clients\n")
+        socket = web.WebSocketResponse(
+            protocols=protocol.SUBPROTOCOLS,
+            max_msg_size=_MAX_CLIENT_FRAME,
+            compress=False,
+            heartbeat=_HEARTBEAT_S,
+            autoping=False,
+            timeout=_END_S / 2,
+        )
+        if not socket.can_prepare(request).ok or not _asks_for_protocol(request):
+            return web.Response(status=400, text=f"a WebSocket of {' or '.join(protocol.SUBPROTOCOLS)} is expected\n")
+        await socket.prepare(request)
+        client = _Client(self._next_client, socket, request, settings.backlog)
+        self._next_client += 1
+        with self._lock:
+            client.texts.append(self._server_info())
+            channels = [channel.advertisement for channel in self._channels.values()]
+            client.texts.append(protocol.text("advertise", channels=channels))
+            client.time = None if self._time_ns is None else protocol.time_data(self._time_ns)
+            self._clients.append(client)
+        client.awake.set()
+        tasks = [asyncio.create_task(work) for work in (self._send(client), self._answer_parameters(client))]
+        try:
+            await self._receive(client)
+        finally:
+            for task in tasks:
+                task.cancel()
+            self._leave(client)
+        return socket
+
+    def _leave(self, client: _Client) -> None:
+        with self._lock:
+            self._clients.remove(client)
+            self._dropped_before += client.dropped
+            for subscription in list(client.subscriptions):
+                client.unsubscribe(subscription)
+        self.wake.set()
+        if self.commands is not None:
+            self.commands.left(client.number)
+
+    def _server_info(self) -> str:
+        settings = self._settings
+        capabilities = ["parameters", "connectionGraph"]
+        capabilities += ["clientPublish"] * settings.accept_operator + ["time"] * settings.server_time
+        return protocol.text(
+            "serverInfo",
+            name=settings.title,
+            capabilities=capabilities,
+            supportedEncodings=["cdr", "json"] if settings.accept_operator else None,
+            metadata={},
+            sessionId=str(id(self)),
+        )
+
+    def _flush(self) -> None:
+        with self._lock:
+            self._flush_due = False
+        for client in self._clients:
+            client.awake.set()
+
+    async def _send(self, client: _Client) -> None:
+        """Sends what waits for a client; texts before time before messages."""
+        try:
+            while True:
+                await client.awake.wait()
+                client.awake.clear()
+                if len(client.texts) > _MAX_TEXTS:
+                    log.warning("Foxglove: client %d reads no answers; it is disconnected", client.number)
+                    client.abort()
+                    return
+                while (frame := self._next_frame(client)) is not None:
+                    if isinstance(frame, str):
+                        await client.socket.send_str(frame)
+                    else:
+                        await client.socket.send_bytes(frame)
+        except (ConnectionError, RuntimeError):  # it has left; the receiving side cleans up
+            client.abort()
+
+    def _next_frame(self, client: _Client) -> str | bytes | None:
+        with self._lock:
+            if client.texts:
+                return client.texts.popleft()
+            if client.time is not None:
+                frame, client.time = client.time, None
+                return frame
+            return client.take()
+
+    async def _receive(self, client: _Client) -> None:
+        """Takes a client's messages until it leaves, sends too many, or too long ones."""
+        tokens, at_s = _MAX_MESSAGES_PER_S, time.monotonic()
+        while True:
+            message = await client.socket.receive()
+            now_s = time.monotonic()
+            tokens = min(_MAX_MESSAGES_PER_S, tokens + (now_s - at_s) * _MAX_MESSAGES_PER_S) - 1.0
+            at_s = now_s
+            if tokens < 0:
+                await self._end(client, f"more than {_MAX_MESSAGES_PER_S:g} messages a second")
+                return
+            try:
+                if message.type is WSMsgType.TEXT:
+                    self._on_text(client, protocol.parse_text(message.data))
+                elif message.type is WSMsgType.BINARY:
+                    self._on_data(client, *protocol.parse_data(message.data))
+                elif message.type is WSMsgType.PING:
+                    await client.socket.pong(message.data)
+                elif message.type is not WSMsgType.PONG:
+                    return
+            except protocol.ProtocolError as error:
+                self._tell_client(client.number, f"Invalid message: {error}", ERROR)
+            except ConnectionError:
+                return
+
+    async def _end(self, client: _Client, why: str) -> None:
+        log.warning("Foxglove: client %d sends %s; it is disconnected", client.number, why)
+        with contextlib.suppress(TimeoutError, ConnectionError):
+            await asyncio.wait_for(client.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=why.encode()), _END_S)
+        client.abort()
+
+    def _on_text(self, client: _Client, content: dict[str, Any]) -> None:
+        op = content["op"]
+        match op:
+            case "subscribe":
+                for entry in protocol.objects(content, "subscriptions"):
+                    self._subscribe(client, protocol.number(entry, "id"), protocol.number(entry, "channelId"))
+            case "unsubscribe":
+                with self._lock:
+                    for number in protocol.numbers(content, "subscriptionIds"):
+                        client.unsubscribe(number)
+                self.wake.set()
+            case "getParameters" | "setParameters":
+                if len(client.requests) >= _MAX_PARAMETER_REQUESTS:
+                    raise protocol.ProtocolError(f"more than {_MAX_PARAMETER_REQUESTS} parameter requests wait")
+                client.requests.append(content)
+                client.asked.set()
+            case "subscribeConnectionGraph" | "unsubscribeConnectionGraph":
+                with self._lock:
+                    client.wants_graph = op == "subscribeConnectionGraph"
+                    if client.wants_graph:
+                        client.texts.append(self._graph.encode())
+                client.awake.set()
+            case "advertise" | "unadvertise" if self.commands is not None:
+                self._on_advertise(client, op, content)
+            case "advertise" | "unadvertise":
+                raise protocol.ProtocolError("this server takes no messages (accept_operator: false)")
+            case _ if op not in _UNSUPPORTED:
+                raise protocol.ProtocolError(f"unknown op {op!r:.40}")
+
+    def _subscribe(self, client: _Client, number: int, channel_id: int) -> None:
+        with self._lock:
+            channel = next((each for each in self._channels.values() if each.id == channel_id), None)
+            if channel is None:
+                problem = f"Unknown channel {channel_id}"
+            elif number in client.subscriptions or client in channel.watchers:
+                problem = f"Channel {channel_id} or subscription {number} is subscribed already"
+            else:
+                problem = ""
+                client.subscriptions[number] = channel
+                channel.watchers[client] = number
+        if channel is None or problem:
+            self._tell_client(client.number, problem, ERROR if channel is None else WARN)
+            return
+        self._node.call_soon(self._joined, channel.topic)
+        self.wake.set()
+
+    def _on_advertise(self, client: _Client, op: str, content: dict[str, Any]) -> None:
+        assert self.commands is not None
+        if op == "unadvertise":
+            for number in protocol.numbers(content, "channelIds"):
+                if client.channels.pop(number, None) is not None:
+                    self.commands.unadvertised(client.number, number)
+            return
+        for entry in protocol.objects(content, "channels"):
+            channel = protocol.client_channel(entry)
+            if channel.id not in client.channels and len(client.channels) >= _MAX_CHANNELS:
+                raise protocol.ProtocolError(f"more than {_MAX_CHANNELS} channels of one client")
+            if channel.id in client.channels:
+                raise protocol.ProtocolError(f"channel {channel.id} is advertised already")
+            client.channels[channel.id] = channel
+            self.commands.advertised(client.number, channel)
+
+    def _on_data(self, client: _Client, channel_id: int, payload: bytes) -> None:
+        if self.commands is None or channel_id not in client.channels:
+            raise protocol.ProtocolError(f"Unknown channel {channel_id}")
+        self.commands.message(client.number, channel_id, payload)
+
+    # -- parameters: asked on a thread, as a node may take its time ------------------------------
+
+    async def _answer_parameters(self, client: _Client) -> None:
+        """Answers one request after the other, beside the client's other messages."""
+        while True:
+            await client.asked.wait()
+            client.asked.clear()
+            while client.requests:
+                request = client.requests.popleft()
+                try:
+                    answer, problems = await asyncio.to_thread(self._parameters, request)
+                except protocol.ProtocolError as error:
+                    self._tell_client(client.number, f"Invalid message: {error}", ERROR)
+                    continue
+                for level, words in problems:
+                    self._tell_client(client.number, words, level)
+                with self._lock:
+                    client.texts.append(answer)
+                client.awake.set()
+
+    def _parameters(self, request: dict[str, Any]) -> tuple[str, list[tuple[int, str]]]:
+        problems: list[tuple[int, str]] = []
+        if request["op"] == "setParameters":
+            entries = protocol.objects(request, "parameters")
+            names = protocol.strings({"names": [entry.get("name") for entry in entries]}, "names")
+            if self.may_set:
+                refused = self.parameters.set({name: _value(e) for name, e in zip(names, entries, strict=True)})
+            else:
+                refused = ["parameters can only be read here (set_parameters: false)"]
+            problems += [(ERROR, words) for words in refused]
+        else:
+            names = protocol.strings(request, "parameterNames")
+        # An empty list asks for everything: after an empty change there is nothing to tell.
+        values, silent = ({}, []) if not names and request["op"] == "setParameters" else self.parameters.get(names)
+        problems += [(WARN, words) for words in silent]
+        request_id = request.get("id")
+        if request_id is not None and not isinstance(request_id, str):
+            raise protocol.ProtocolError("id must be a text")
+        return protocol.text("parameterValues", parameters=protocol.parameters(values), id=request_id), problems
+
+
+class _Client:
+    """A viewer; its queues are under the server's lock."""
+
+    def __init__(self, number: int, socket: web.WebSocketResponse, request: web.BaseRequest, backlog: int) -> None:
+        self.number = number
+        self.socket = socket
+        self.connection = request.protocol
+        self.awake = asyncio.Event()
+        self.asked = asyncio.Event()
+        self.texts: deque[str] = deque()
+        self.time: bytes | None = None
+        self.requests: deque[dict[str, Any]] = deque()
+        self.subscriptions: dict[int, _Channel] = {}
+        self.channels: dict[int, protocol.ClientChannel] = {}
+        self.wants_graph = False
+        self.dropped = 0
+        self._transport = request.transport
+        self._backlog = backlog
+        self._messages: deque[bytes] = deque()
+        self._bytes = 0
+
+    def put(self, frame: bytes) -> None:
+        """Queues a message; the oldest make room."""
+        while self._messages and (
+            len(self._messages) >= self._backlog or self._bytes + len(frame) > _MAX_BACKLOG_BYTES
+        ):
+            self.take()
+            self.dropped += 1
+        self._messages.append(frame)
+        self._bytes += len(frame)
+
+    def take(self) -> bytes | None:
+        """The oldest message that waits."""
+        if not self._messages:
+            return None
+        frame = self._messages.popleft()
+        self._bytes -= len(frame)
+        return frame
+
+    def unsubscribe(self, subscription: int) -> None:
+        """Ends a subscription, if there is one of that number."""
+        channel = self.subscriptions.pop(subscription, None)
+        if channel is not None:
+            channel.watchers.pop(self, None)
+
+    def abort(self) -> None:
+        """Cuts the connection; whoever waits to send or to receive on it is woken."""
+        if self._transport is not None:
+            self._transport.abort()
 
 
 class _Channel:
-    """One topic on offer."""
+    """One topic on offer; ``watchers`` is under the server's lock, the rest belongs to the node's thread."""
 
-    def __init__(self, server: FoxgloveServer, node: Node[Any], type_name: str, channel: Any) -> None:
+    def __init__(
+        self, server: FoxgloveServer, node: Node[Any], number: int, topic: str, type_name: str, schema: str
+    ) -> None:
+        self.id = number
+        self.topic = topic
         self.type_name = type_name
+        self.advertisement = {
+            "id": number,
+            "topic": topic,
+            "encoding": "cdr",
+            "schemaName": type_name,
+            "schema": schema,
+            "schemaEncoding": "ros2msg",
+        }
+        self.watchers: dict[_Client, int] = {}
         self.subscription: Subscription | None = None
         self._server = server
         self._node = node
-        self._channel = channel
         self._latched = False
 
     def watch(self, info: TopicInfo) -> None:
         """Listens on our bus if somebody watches, else lets go."""
-        watched = self._channel.has_sinks()
-        if watched and self.subscription is None:
+        if self.watchers and self.subscription is None:
             qos = max(
                 (PRESETS.get(p.qos, RELIABLE) for p in info.publishers), key=lambda qos: (qos.latched, qos.reliable)
             )
             self._latched = qos.latched
             # With ``sensor`` the bus keeps the newest only: a stall of this process cannot end in a flood of old ones.
             self.subscription = self._node.subscribe_received(info.topic, self._forward, qos)
-        elif not watched and self.subscription is not None:
-            self._node.drop(self.subscription)
-            self.subscription = None
+        elif not self.watchers:
+            self.drop()
 
     def renew(self) -> None:
         """Subscribes anew, which brings the latched value of every publisher once more."""
@@ -267,65 +664,71 @@ class _Channel:
 
     def _forward(self, received: Received) -> None:
         if received.type_name == self.type_name:
-            self._server.count += 1
-            self._server.bytes += len(received.payload)
-            self._channel.log(bytes(received.payload), log_time=received.publish_ns)
+            self._server.hand_out(self, received)
 
-    def close(self) -> None:
+    def drop(self) -> None:
+        """Listens no more."""
         if self.subscription is not None:
             self._node.drop(self.subscription)
             self.subscription = None
-        self._channel.close()
 
 
-def _listener(server: FoxgloveServer) -> Any:
-    """What the SDK calls, on its own threads; nothing of the bus is touched there."""
-    foxglove = server._sdk
-    node = server._node
+class _Refusing(asyncio.Protocol):
+    """A connection beyond the limit."""
 
-    class Listener(foxglove.websocket.ServerListener):  # type: ignore[name-defined]
-        def on_subscribe(self, client: Any, channel: Any) -> None:
-            node.call_soon(server.joined, channel.topic)
-            server.wake.set()
-
-        def on_unsubscribe(self, client: Any, channel: Any) -> None:
-            server.wake.set()
-
-        def on_client_advertise(self, client: Any, channel: Any) -> None:
-            if server.commands is not None:
-                server.commands.advertised(client.id, channel)
-
-        def on_client_unadvertise(self, client: Any, client_channel_id: int) -> None:
-            if server.commands is not None:
-                server.commands.unadvertised(client.id, client_channel_id)
-
-        def on_message_data(self, client: Any, client_channel_id: int, data: bytes) -> None:
-            if server.commands is not None:
-                server.commands.message(client.id, client_channel_id, data)
-
-        def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:
-            return self._parameters(param_names)
-
-        def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
-            wanted = {parameter.name: parameter.get_value() for parameter in parameters}
-            refused = server.parameters.set(wanted) if server.may_set else ["parameters can only be read here"]
-            for words in refused:
-                server.status(words)
-            return self._parameters(list(wanted))
-
-        def _parameters(self, names: list[str]) -> list[Any]:
-            values, silent = server.parameters.get(names)
-            for words in silent:
-                server.status(words, WARN)
-            return [foxglove.Parameter(name, value=value) for name, value in values.items() if value is not None]
-
-    return Listener()
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.abort()
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a host name or address."""
+class _Quiet:
+    """What goes wrong on a connection is logged at most once a second: strangers must not fill the disk."""
+
+    def __init__(self) -> None:
+        self._next_s = 0.0
+        self._left_out = 0
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            self._left_out += 1
+            return
+        self._next_s = now_s + 1.0
+        log.warning("Foxglove: %s (%d more like it)", context.get("exception", context.get("message")), self._left_out)
+        self._left_out = 0
+
+
+def _tls(settings: ServerSettings) -> ssl.SSLContext | None:
+    if settings.tls_cert is None or settings.tls_key is None:
+        return None
+    for path in (settings.tls_cert, settings.tls_key):
+        try:
+            path.read_bytes()
+        except OSError as error:
+            raise FoxgloveError(f"{path}: cannot be read: {error.strerror}") from None
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        addresses = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None)}
-    except OSError:
-        return False
-    return all(address == "::1" or address.startswith("127.") for address in addresses)
+        context.load_cert_chain(settings.tls_cert, settings.tls_key)
+    except ssl.SSLError as error:
+        raise FoxgloveError(
+            f"{settings.tls_cert} and {settings.tls_key}: no certificate with its key: {error}"
+        ) from None
+    return context
+
+
+def _asks_for_protocol(request: web.BaseRequest) -> bool:
+    asked = ",".join(request.headers.getall("Sec-WebSocket-Protocol", ())).split(",")
+    return any(name.strip() in protocol.SUBPROTOCOLS for name in asked)
+
+
+def _status(words: str, level: int) -> str:
+    return protocol.text("status", level=_STATUS.get(level, protocol.ERROR), message=words[:1000])
+
+
+def _value(entry: dict[str, Any]) -> Any:
+    """A parameter's value; a whole number may stand for a float."""
+    value = entry.get("value")
+    if entry.get("type") == "float64" and type(value) is int:
+        return float(value)
+    return value

@@ -15,6 +15,10 @@ ADMIN_SPACE = "@ros2_lv"
 GID_SIZE = 16
 """Bytes of a publisher's id."""
 
+SENDER_SIZE = 8
+"""Bytes at its head that all publishers of one session of ours share: by them a drive command and the release of an
+emergency stop are known to be of one sender. Publishers of ROS 2 have ids of their own throughout."""
+
 _ATTACHMENT = struct.Struct("<qqB16s")
 _DDS_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_\Z")
 _ROS_TYPE = re.compile(r"(\w+)/(\w+)/(\w+)\Z")
@@ -42,6 +46,11 @@ class Attachment:
     sequence: int
     source_ns: int
     gid: bytes
+
+    @property
+    def sender(self) -> str:
+        """The head of the publisher's id, hex digits."""
+        return self.gid[:SENDER_SIZE].hex()
 
     def pack(self) -> bytes:
         """The 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``.

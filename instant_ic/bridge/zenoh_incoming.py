@@ -16,8 +16,8 @@ from .zenoh_format import Attachment, Token, TopicQoS
 from .zenoh_session import RosNode, RosSubscription
 from .zenoh_topics import COMMANDS, GRACE_S, Namespace, bus_qos, known_hash, parse_subscribe, takes
 
-_ACTED_ON = ("/operator/*", "/cmd_vel", "/nav/cmd_vel")
-"""Topics that move a robot: never brought in by a pattern."""
+_ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
+"""Topics that move a robot, in any namespace, and what tells of its parameters: never brought in by a pattern."""
 
 _TF = "tf2_msgs/msg/TFMessage"
 
@@ -64,6 +64,7 @@ class Incoming:
             else when a publisher of it appears.
         commands: which of :data:`COMMANDS` may come in.
         gate: what commands have to pass.
+        no_commands: why no command is taken but an emergency stop; empty where the link is secure enough.
 
     Raises:
         ValueError: a type or a topic in the lists is wrong.
@@ -77,7 +78,9 @@ class Incoming:
         subscribe: Sequence[str],
         commands: Sequence[str],
         gate: CommandGate,
+        no_commands: str = "",
     ) -> None:
+        self._no_commands = no_commands
         self._node = node
         self._namespace = namespace
         self._gate = gate
@@ -215,14 +218,21 @@ class Incoming:
         except MessageError as error:
             raise self._gate.refuse("not readable", str(error)) from None
         if topic == "/operator/estop":
-            # A stop is never too old, and anybody may stop; only the release has to be fresh.
+            # A stop is never too old, and anybody may stop; the release is the driver's alone, and has to be fresh.
             if not message.data:
+                self._check_link()
                 self._gate.check_age(attachment.source_ns, now_ns)
+                self._gate.check_release(attachment.sender, time.monotonic_ns())
             return
+        self._check_link()
         if not entry.sources:
             raise self._gate.refuse("no sender", "nobody in the ROS graph sends this topic, or not any more")
         self._gate.check_age(attachment.source_ns, now_ns)
-        self._gate.check_drive(attachment.gid.hex()[:8], *twist_values(message), now_ns)
+        self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns())
+
+    def _check_link(self) -> None:
+        if self._no_commands:
+            raise self._gate.refuse("link not secure", self._no_commands)
 
     def _tell(self, topic: str, level: int, words: str) -> None:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)

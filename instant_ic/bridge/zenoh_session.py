@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from ..paths import shipped_file
-from .zenoh_format import ADMIN_SPACE, GID_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
+from .zenoh_format import ADMIN_SPACE, GID_SIZE, SENDER_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 _OPEN_S = 10.0
@@ -176,6 +176,7 @@ class RosSession:
         self.domain = domain
         self.zenoh = open_zenoh(config)
         self.id = str(self.zenoh.info.zid())
+        self.gid_head = os.urandom(SENDER_SIZE)
         self._ids = itertools.count()
         self._watch: Any = None
 
@@ -282,7 +283,7 @@ class RosPublisher:
             self._publisher = session.zenoh.declare_publisher(key, **options)
         self._token = node.endpoint("MP", topic, type_name, type_hash, qos)
         self._lock = threading.Lock()
-        self.gid = os.urandom(GID_SIZE)
+        self.gid = session.gid_head + os.urandom(GID_SIZE - SENDER_SIZE)
         self.count = 0
 
     def put(self, payload: bytes | memoryview, source_ns: int) -> None:

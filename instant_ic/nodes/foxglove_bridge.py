@@ -10,12 +10,14 @@ from typing import Annotated
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bridge.commands import CommandGate, CommandLimits
-from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerSettings, is_loopback
+from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerSettings
 from instant_ic.bridge.topic_watch import TopicWatch
+from instant_ic.bridge.web_access import is_loopback
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
 from instant_ic.ranges import Range, check_ranges
 
 _TIME_S = 0.05
+_REFUSED_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,16 @@ class FoxgloveBridgeConfig:
         port: 0 = any free port, told in the log.
         tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
         tls_key: its private key, PKCS#8 in PEM.
+        allowed_origins: web pages that may connect, by their Origin, beside those of this machine; "*" lets every page
+            in. Programs that are no browsers send no Origin and are let in.
+        allowed_hosts: names by which clients may reach the server, beside localhost and any address.
+        max_clients: most clients at a time.
         backlog: messages kept for a client that does not keep up; the oldest goes first, so it never gets a flood of
             old ones.
         topics: topics to offer, names or patterns; empty offers all.
         exclude: names or patterns to leave out.
         accept_operator: whether clients may drive (/operator/cmd_vel) and stop (/operator/estop) the robot.
-        set_parameters: whether clients may change the nodes' parameters.
+        set_parameters: whether clients may change parameters that are no safety parameters.
         limits: what their commands have to pass.
         discovery_period_s: how often to look for topics that come and go, s.
     """
@@ -43,11 +49,14 @@ class FoxgloveBridgeConfig:
     port: Annotated[int, Range(0, 65535)] = 8765
     tls_cert: str = ""
     tls_key: str = ""
+    allowed_origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
+    allowed_hosts: tuple[str, ...] = ()
+    max_clients: Annotated[int, Range(1, 256)] = 16
     backlog: Annotated[int, Range(1, 1024)] = 32
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
     accept_operator: bool = False
-    set_parameters: bool = True
+    set_parameters: bool = False
     limits: CommandLimits = field(default_factory=CommandLimits)
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.25
 
@@ -75,6 +84,9 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             port=config.port,
             tls_cert=Path(config.tls_cert).expanduser() if config.tls_cert else None,
             tls_key=Path(config.tls_key).expanduser() if config.tls_key else None,
+            allowed_origins=config.allowed_origins,
+            allowed_hosts=config.allowed_hosts,
+            max_clients=config.max_clients,
             backlog=config.backlog,
             accept_operator=config.accept_operator,
             set_parameters=config.set_parameters,
@@ -90,8 +102,10 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         scheme = "wss" if config.tls_cert else "ws"
         self.log.info("Foxglove: open %s://%s:%d", scheme, config.host, self.server.port)
         may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
-        if may and not is_loopback(config.host):
-            self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {' and '.join(may)}")
+        if not is_loopback(config.host):
+            what = " and ".join(may or ["read everything"])
+            self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {what}: no sign-in")
+        self._refused, self._next_refused_s = 0, 0.0
         # A thread, not a timer: with simulated time the timers stand still while topics already come.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
         self._look_thread.start()
@@ -119,7 +133,18 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         self.server.reconcile(self._watch.topics(), nodes)
         refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
         words = f"{len(self.server.watched)} of {len(self.server.topics)} topics watched"
-        self.diagnose("topics", OK, words, messages=self.server.count, megabytes=self.server.bytes / 1e6, **refused)
+        self.diagnose(
+            "topics",
+            OK,
+            words,
+            messages=self.server.count,
+            megabytes=self.server.bytes / 1e6,
+            dropped=self.server.dropped,
+            **refused,
+        )
+        if self.server.refused != self._refused and time.monotonic() >= self._next_refused_s:  # strangers fill no log
+            self._refused, self._next_refused_s = self.server.refused, time.monotonic() + _REFUSED_S
+            self.diagnose("door", WARN, f"turned away: {self.server.refusal}", requests=self.server.refused)
 
     def teardown(self) -> None:
         """Ends the server."""

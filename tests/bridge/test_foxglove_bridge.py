@@ -3,21 +3,15 @@
 import contextlib
 import json
 import socket
-import struct
-import sys
 import time
-from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from live_nodes import LiveNode, Neighbour, cdr, wait_for
+from foxglove_client import FoxgloveWorld, TalkerConfig, TalkerNode
+from live_nodes import LiveNode, cdr, wait_for
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
-from instant_ic.bus.control import ControlServer
-from instant_ic.bus.node import Node
 from instant_ic.evaluation.stack import free_port
 from instant_ic.msg import (
     Bool,
@@ -37,121 +31,13 @@ from instant_ic.msg import (
 )
 from instant_ic.nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
 
-pytest.importorskip("foxglove")
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
-
-
-class Client:
-    """A client of Foxglove's protocol."""
-
-    def __init__(self, port, **options):
-        # The SDK's name of the protocol since 0.14; foxglove.websocket.v1 before.
-        self._open = contextlib.ExitStack()
-        self.socket = self._open.enter_context(
-            connect(
-                f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None, compression=None, **options
-            )
-        )
-        self.channels = {}
-        self.messages = deque()
-        self.texts = deque()
-        self.times = []
-        self.info = self.until(lambda: self.text("serverInfo"), "serverInfo")
-
-    def send(self, **content):
-        self.socket.send(json.dumps(content))
-
-    def poll(self, timeout_s=0.02):
-        """Takes what comes within the time."""
-        with contextlib.suppress(TimeoutError):
-            frame = self.socket.recv(timeout_s)
-            if isinstance(frame, bytes):
-                if frame[0] == 1:
-                    subscription, log_time = struct.unpack_from("<IQ", frame, 1)
-                    self.messages.append((subscription, log_time, frame[13:]))
-                elif frame[0] == 2:
-                    self.times.append(struct.unpack_from("<Q", frame, 1)[0])
-                return
-            content = json.loads(frame)
-            if content["op"] == "advertise":
-                self.channels.update({c["topic"]: c for c in content["channels"]})
-            elif content["op"] == "unadvertise":
-                for topic in [t for t, c in self.channels.items() if c["id"] in content["channelIds"]]:
-                    del self.channels[topic]
-            else:
-                self.texts.append(content)
-
-    def text(self, op):
-        return next((t for t in self.texts if t["op"] == op), None)
-
-    def until(self, condition, what, timeout_s=30.0):
-        deadline = time.monotonic() + timeout_s
-        while not (value := condition()):
-            assert time.monotonic() < deadline, f"no {what} within {timeout_s:g} s"
-            self.poll()
-        return value
-
-    def spin(self, seconds):
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.poll()
-
-    def subscribe(self, topic, number=1):
-        channel = self.until(lambda: self.channels.get(topic), f"advertisement of {topic}")
-        self.texts.clear()
-        self.send(op="subscribe", subscriptions=[{"id": number, "channelId": channel["id"]}])
-        self.spin(0.1)
-        if (status := self.text("status")) and "Unknown channel" in status["message"]:
-            # The SDK (0.30.3) tells clients of a channel a moment before it knows it itself.
-            self.send(op="subscribe", subscriptions=[{"id": number, "channelId": channel["id"]}])
-        return channel
-
-    def unsubscribe(self, number=1):
-        self.send(op="unsubscribe", subscriptionIds=[number])
-
-    def parameters(self, *names, request="r"):
-        self.texts.clear()
-        self.send(op="getParameters", parameterNames=list(names), id=request)
-        answer = self.until(lambda: self.text("parameterValues"), "parameters")
-        assert answer["id"] == request
-        return {p["name"]: p["value"] for p in answer["parameters"]}
-
-    def advertise(self, topic, name, encoding="json", number=5):
-        self.send(op="advertise", channels=[{"id": number, "topic": topic, "encoding": encoding, "schemaName": name}])
-
-    def publish(self, data, number=5):
-        self.socket.send(struct.pack("<BI", 1, number) + data)
-
-    def close(self):
-        self._open.close()
 
 
 @pytest.fixture
 def world(tmp_path_factory):
-    """A run directory with the bridge, and ways to its bus and its server; everything is ended afterwards."""
-    open_things = []
-
-    class World:
-        run_dir = tmp_path_factory.mktemp("r")
-
-        def keep(self, thing):
-            open_things.append(thing)
-            return thing
-
-        def bridge(self, sim_time=False, **parameters):
-            config = FoxgloveBridgeConfig(port=0, discovery_period_s=0.05, **parameters)
-            self.live = self.keep(LiveNode(self.run_dir, FoxgloveBridgeNode, config, "foxglove_bridge", sim_time))
-            return self.live.node
-
-        def client(self, **options):
-            return self.keep(Client(self.live.node.server.port, **options))
-
-        def neighbour(self, name="talker"):
-            return self.keep(Neighbour(self.run_dir, name))
-
-    yield World()
-    for thing in reversed(open_things):
-        thing.close()
+    with FoxgloveWorld(tmp_path_factory.mktemp("r")) as world:
+        yield world
 
 
 # -- topics ------------------------------------------------------------------------------------------
@@ -321,40 +207,13 @@ def test_simulated_time_is_told_also_before_topics_flow(world):
 # -- parameters --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class TalkerConfig:
-    """Attributes:
-    rate_hz: how often.
-    words: what.
-    """
-
-    rate_hz: float = 2.0
-    words: str = "hello"
-    places: tuple[float, ...] = (1.0, 2.5)
-
-    def __post_init__(self) -> None:
-        if self.rate_hz <= 0:
-            raise ValueError(f"rate_hz must be > 0 (got {self.rate_hz})")
-
-
-class TalkerNode(Node[TalkerConfig]):
-    name = "talker"
-    live_parameters = ("rate_hz", "places")
-
-
 @pytest.fixture
 def talker(world):
-    """A node with parameters and a control channel, as every process of the stack has one."""
-    live = world.keep(LiveNode(world.run_dir, TalkerNode, TalkerConfig(), "talker"))
-    world.keep(ControlServer(live.node, world.run_dir / "nodes" / "talker.sock"))
-    claim = registry.Claim(world.run_dir / "nodes" / "talker", "node talker")
-    claim.write({**live.node.describe(), "started_ns": 1})
-    yield live.node
-    claim.release()
+    return world.running(TalkerNode, TalkerConfig(), "talker")
 
 
 def test_parameters_of_every_node_are_served_and_changed_where_the_node_allows_it(world, talker):
-    bridge = world.bridge()
+    bridge = world.bridge(set_parameters=True)
     client = world.client()
     wait_for(lambda: "talker" in bridge.server.parameters.nodes, "the node")
     values = client.parameters()
@@ -494,12 +353,6 @@ def test_robot_is_told_to_stand_when_its_driver_leaves_and_a_second_one_waits(dr
 # -- start -------------------------------------------------------------------------------------------
 
 
-def test_without_the_extra_the_error_names_what_to_install(monkeypatch, tmp_path_factory):
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(NodeError, match=r"pip install 'instant-ic\[foxglove\]'"):
-        LiveNode(tmp_path_factory.mktemp("r"), FoxgloveBridgeNode, FoxgloveBridgeConfig(port=0), "foxglove_bridge")
-
-
 def test_a_port_in_use_and_wrong_files_are_told(tmp_path_factory):
     port = free_port()
     with socket.socket() as other:
@@ -518,12 +371,12 @@ def test_a_port_in_use_and_wrong_files_are_told(tmp_path_factory):
 
 def test_default_is_this_machine_only_and_an_open_door_for_drivers_is_told(world):
     assert FoxgloveBridgeConfig().host == "127.0.0.1"
-    node = world.bridge(host="0.0.0.0", accept_operator=True)
+    node = world.bridge(host="0.0.0.0", accept_operator=True, set_parameters=True)
     assert "can drive the robot and change parameters" in node.diagnoses()["access"][1]
 
 
-def test_parameters_can_be_made_read_only(world, talker):
-    bridge = world.bridge(set_parameters=False)
+def test_parameters_are_read_only_by_default(world, talker):
+    bridge = world.bridge()
     client = world.client()
     wait_for(lambda: "talker" in bridge.server.parameters.nodes, "the node")
     client.texts.clear()

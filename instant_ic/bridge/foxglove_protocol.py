@@ -1,0 +1,222 @@
+"""Foxglove's WebSocket protocol as strings and bytes (foxglove/ws-protocol, docs/spec.md); no socket, no bus."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
+"""Names of the protocol: since foxglove-sdk 0.14, and before. The messages used here are the same in both."""
+
+INFO, WARNING, ERROR = range(3)
+"""Levels of a status."""
+
+_Names = Mapping[str, Sequence[str]]
+
+_MESSAGE_DATA = struct.Struct("<BIQ")
+_CLIENT_DATA = struct.Struct("<BI")
+_TIME = struct.Struct("<BQ")
+_MAX_NUMBER = (1 << 32) - 1
+
+
+class ProtocolError(ValueError):
+    """A client's frame that the protocol does not know; the message says what is wrong in it."""
+
+
+@dataclass(frozen=True)
+class ClientChannel:
+    """A channel that a client wants to publish on."""
+
+    id: int
+    topic: str
+    encoding: str
+    schema_name: str
+
+
+# -- server to client ----------------------------------------------------------------------------------
+
+
+def text(op: str, **content: Any) -> str:
+    """A text message; fields that are None are left out."""
+    fields = {key: value for key, value in content.items() if value is not None}
+    return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
+
+
+def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) -> bytes:
+    """A message of a channel to one subscription."""
+    return _MESSAGE_DATA.pack(1, subscription, log_ns) + payload
+
+
+def time_data(now_ns: int) -> bytes:
+    """The server's time."""
+    return _TIME.pack(2, now_ns)
+
+
+def parameters(values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Parameters as the protocol writes them; those without a value are left out."""
+    found = []
+    for name, value in values.items():
+        if value is None:
+            continue
+        entry: dict[str, Any] = {"name": name, "value": _finite(value)}
+        if isinstance(value, float):
+            entry["type"] = "float64"
+        elif isinstance(value, (list, tuple)) and all(isinstance(item, float) for item in value):
+            entry["type"] = "float64_array"
+        if entry["value"] != value:  # text now
+            entry.pop("type", None)
+        found.append(entry)
+    return found
+
+
+def _finite(value: Any) -> Any:
+    """The value as JSON can carry it: infinity and NaN become text."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return value
+
+
+def graph_update(before: Graph, now: Graph) -> str | None:
+    """The change from one connection graph to another; None without one."""
+    removed = sorted(before.topics - now.topics)
+    published = _changed(before.published, now.published, removed)
+    subscribed = _changed(before.subscribed, now.subscribed, removed)
+    if not (published or subscribed or removed):
+        return None
+    return _graph_text(published, subscribed, removed)
+
+
+def _changed(before: _Names, now: _Names, removed: Sequence[str]) -> _Names:
+    """Topics with other names than before, except those that are removed altogether."""
+    return {
+        topic: now.get(topic, ())
+        for topic in {*before, *now}
+        if now.get(topic) != before.get(topic) and topic not in removed
+    }
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Who publishes and who subscribes, by topic."""
+
+    published: _Names
+    subscribed: _Names
+
+    @property
+    def topics(self) -> set[str]:
+        """All topics in it."""
+        return {*self.published, *self.subscribed}
+
+    def encode(self) -> str:
+        """The whole graph, for a client that asks for it."""
+        return _graph_text(self.published, self.subscribed, [])
+
+
+def _graph_text(published: _Names, subscribed: _Names, removed: Sequence[str]) -> str:
+    return text(
+        "connectionGraphUpdate",
+        publishedTopics=[{"name": name, "publisherIds": list(ids)} for name, ids in sorted(published.items())],
+        subscribedTopics=[{"name": name, "subscriberIds": list(ids)} for name, ids in sorted(subscribed.items())],
+        advertisedServices=[],
+        removedTopics=list(removed),
+        removedServices=[],
+    )
+
+
+# -- client to server ----------------------------------------------------------------------------------
+
+
+def parse_text(data: str) -> dict[str, Any]:
+    """A client's text message: an object with the text ``op``.
+
+    Raises:
+        ProtocolError: it is none.
+    """
+    try:
+        content = json.loads(data, parse_constant=_no_constant)
+    except (ValueError, RecursionError) as error:
+        raise ProtocolError(f"not JSON: {error}") from None
+    if not isinstance(content, dict) or not isinstance(content.get("op"), str):
+        raise ProtocolError("not a JSON object with an op")
+    return content
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(f"{name} is no number")
+
+
+def parse_data(data: bytes) -> tuple[int, bytes]:
+    """Channel and payload of a client's message.
+
+    Raises:
+        ProtocolError: another kind of frame, or too short.
+    """
+    if len(data) < _CLIENT_DATA.size or data[0] != 1:
+        raise ProtocolError(f"unknown binary message ({data[:1].hex() or 'empty'}, {len(data)} bytes)")
+    return int(_CLIENT_DATA.unpack_from(data)[1]), data[_CLIENT_DATA.size :]
+
+
+def objects(content: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    """A field that must be a list of objects.
+
+    Raises:
+        ProtocolError: it is something else.
+    """
+    value = content.get(key)
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise ProtocolError(f"{content.get('op')}: {key} must be a list of objects")
+    return value
+
+
+def numbers(content: Mapping[str, Any], key: str) -> list[int]:
+    """A field that must be a list of channel or subscription numbers.
+
+    Raises:
+        ProtocolError: it is something else.
+    """
+    value = content.get(key)
+    if not isinstance(value, list):
+        raise ProtocolError(f"{content.get('op')}: {key} must be a list of numbers")
+    return [number({key: item}, key) for item in value]
+
+
+def number(content: Mapping[str, Any], key: str) -> int:
+    """A field that must be a number of 32 bits.
+
+    Raises:
+        ProtocolError: it is something else.
+    """
+    value = content.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_NUMBER:
+        raise ProtocolError(f"{key} must be a number of 32 bits (got {value!r:.40})")
+    return value
+
+
+def strings(content: Mapping[str, Any], key: str) -> list[str]:
+    """A field that must be a list of texts.
+
+    Raises:
+        ProtocolError: it is something else.
+    """
+    value = content.get(key)
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise ProtocolError(f"{content.get('op')}: {key} must be a list of texts")
+    return value
+
+
+def client_channel(content: Mapping[str, Any]) -> ClientChannel:
+    """One entry of a client's ``advertise``.
+
+    Raises:
+        ProtocolError: a field is missing or wrong.
+    """
+    fields = [content.get(key) for key in ("topic", "encoding", "schemaName")]
+    if not all(isinstance(field, str) for field in fields):
+        raise ProtocolError("advertise: topic, encoding and schemaName must be texts")
+    return ClientChannel(number(content, "id"), *(str(field) for field in fields))

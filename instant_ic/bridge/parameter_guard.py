@@ -1,0 +1,29 @@
+"""Parameters that nobody outside may set, by whatever bridge: one rule for all of them."""
+
+from __future__ import annotations
+
+import fnmatch
+
+NEVER_SET = (
+    # nodes between a command and the tracks, and what they measure the world with
+    *("arbiter.*", "crawler_base.*", "virtual_robot.*", "navigator.*"),
+    *("vlp16_driver.*", "theta_camera.*", "grid_slam.*"),
+    # ways in, and what stands in for the world
+    *("console.*", "host_bridge.*", "foxglove_bridge.*", "zenoh_*.*", "bag_player.*", "simulator.*"),
+    # of any node, also of one that is not ours
+    *("*timeout*", "*time_out*", "*max_age*", "*silence*", "*limit*", "*footprint*", "*collision*", "*estop*"),
+    *("*e_stop*", "*emergency*", "*command*", "*cmd_vel*", "*watchdog*", "*max_speed*", "*max_vel*", "*max_acc*"),
+    *("*deceleration*", "*use_sim_time"),
+)
+"""Patterns of ``NODE.KEY``, where NODE is the last part of the node's module: a node keeps it under any name."""
+
+
+def never_set(module: str, key: str) -> bool:
+    """Whether a parameter can be changed only on this machine (``ic param set``).
+
+    Args:
+        module: of the node, ``instant_ic.nodes.arbiter``.
+        key: of the parameter, groups with dots.
+    """
+    name = f"{module.rsplit('.', 1)[-1]}.{key}".lower()
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in NEVER_SET)
