@@ -1,0 +1,80 @@
+"""Latch of the emergency stop, one rule for every node that obeys it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+FUTURE_NS = 500_000_000
+"""A release stamped farther ahead than this was published before the clock was set back."""
+
+
+@dataclass
+class EstopLatch:
+    """Emergency stop that anybody sets at once and only a newer release ends.
+
+    Each client has a latched value of its own. After a restart these values arrive in any order, so an old release of
+    one client must not end the stop of another: a press always counts, a release only if it is newer than the press.
+
+    Attributes:
+        pressed: a press has not been released yet.
+        publisher: name of the node that pressed last.
+        pressed_ns: publication time of that press, nanoseconds since the epoch.
+        buttons: names of the nodes that report a pressed button on the robot.
+    """
+
+    pressed: bool = False
+    publisher: str = ""
+    pressed_ns: int = 0
+    buttons: set[str] = field(default_factory=set)
+
+    @property
+    def button(self) -> bool:
+        """Whether a button on the robot is pressed; no release counts until it is released."""
+        return bool(self.buttons)
+
+    @property
+    def stopped(self) -> bool:
+        """Whether nothing may move."""
+        return self.pressed or self.button
+
+    def hear(self, pressed: bool, publisher: str, publish_ns: int, received_ns: int) -> str:
+        """Take a message of ``/operator/estop``.
+
+        Args:
+            pressed: its value.
+            publisher: name of the node that published it.
+            publish_ns: when it was published, nanoseconds since the epoch.
+            received_ns: when it arrived, by this machine's clock.
+
+        Returns:
+            Why a release is refused; empty if the message was obeyed.
+        """
+        if pressed:
+            self._press(publisher, publish_ns)
+            return ""
+        if not self.stopped:
+            return ""
+        if self.button:
+            return "the button on the robot is pressed. Release the button, then release the stop again."
+        again = "If a clock was set, press stop and release again."
+        if publish_ns > received_ns + FUTURE_NS:
+            ahead_s = (publish_ns - received_ns) / 1e9
+            return f"the release by {publisher} is stamped {ahead_s:.1f} s ahead. {again}"
+        if publish_ns < self.pressed_ns:
+            return f"the release by {publisher} is older than the stop by {self.publisher}. {again}"
+        self.pressed = False
+        return ""
+
+    def hear_button(self, pressed: bool, publisher: str, publish_ns: int) -> None:
+        """Take a message of ``/robot/estop``: a press latches, releasing the button ends nothing by itself."""
+        if pressed:
+            self.buttons.add(publisher)
+            self._press(publisher, publish_ns)
+        else:
+            self.buttons.discard(publisher)
+
+    def _press(self, publisher: str, publish_ns: int) -> None:
+        # The same publisher's own time counts, also after its clock was set back: its stop and release go together.
+        same = publisher == self.publisher
+        self.pressed_ns = publish_ns if same else max(publish_ns, self.pressed_ns)
+        self.pressed, self.publisher = True, publisher
