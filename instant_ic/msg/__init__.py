@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from .convert import (
+    HARD_STOP,
     POINT_DTYPE,
     cloud_array,
     cloud_message,
@@ -49,6 +50,7 @@ from .types import (
 )
 
 __all__ = [
+    "HARD_STOP",
     "POINT_DTYPE",
     "MessageError",
     "cloud_array",

@@ -316,8 +316,12 @@ def twist_message(v: float = 0.0, w: float = 0.0) -> Any:
     return message_type("Twist")(linear=vector(x=float(v), y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=float(w)))
 
 
+HARD_STOP = "hard_stop"
+"""``frame_id`` of a command that the base reaches at its hard deceleration. Only a zero twist carries it."""
+
+
 def twist_stamped(v: float, w: float, stamp: int, frame_id: str = "base_link") -> Any:
-    """geometry_msgs/TwistStamped of a planar robot."""
+    """geometry_msgs/TwistStamped of a planar robot; ``frame_id`` is ``HARD_STOP`` for a stop without the soft ramp."""
     return message_type("TwistStamped")(header=header(frame_id, stamp), twist=twist_message(v, w))
 
 
