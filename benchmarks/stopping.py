@@ -1,0 +1,533 @@
+#!/usr/bin/env python3
+"""How soon the robot stands when a process, a device or a link is lost; prints JSON.
+
+    python benchmarks/stopping.py --json stopping.json
+    python benchmarks/stopping.py --only arbiter --only "LiDAR packets" --repeat 5
+
+A simulated stack of real processes (no depth, no virtual space: they do not move the robot in REAL) drives through free
+space at 0.38 m/s. Then one thing is lost: a process is frozen (SIGSTOP) or killed (SIGKILL), a device or link is cut,
+the page goes away, or the emergency stop is pressed. Measured from that moment, by the simulator's true motion:
+
+    detect_s    to the first sign of the stop: /cmd_vel or the true speed falls by a tenth
+    stand_s     to a true speed below 0.01 m/s that stays there
+    distance_m  from the place at the loss to the place where it stands
+    after_m     that it moves in the second after it stands: must be nothing
+
+All times are seconds of the stack, which runs at the pace of the machine (``--pace``, 1.0 on one that is fast enough).
+The console's own time-outs go by the machine's clock and are stretched by the pace here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import math
+import os
+import random
+import select
+import shutil
+import signal
+import socket
+import statistics
+import sys
+import tempfile
+import threading
+import time
+import tty
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import aiohttp
+import yaml
+
+from instant_ic import pace
+from instant_ic.bus import LATCHED, registry
+from instant_ic.console.client import ConsoleClient
+from instant_ic.console.drive import DriveConfig
+from instant_ic.evaluation.drive import pump
+from instant_ic.evaluation.impaired_link import ImpairedLink
+from instant_ic.evaluation.stack import Stack, StackError, free_port, machine_pace
+from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.msg import ControlState, message_type, pose_matrix, stamp_ns, twist_values
+from instant_ic.paths import share_dir
+
+SPEED_M_S = 0.38
+STANDS_M_S = 0.01
+STANDS_S = 0.3
+"""It must be slow for so long to count as standing."""
+LONGEST_S = 4.0
+AFTER_S = 1.0
+_TRIES = 5
+PROCESSES = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver", "theta_camera")
+LAUNCH = """launch:
+- node:
+    exec: simulator
+    param:
+    - from: $(config sim.yaml)
+    - {{name: world, value: corridor-free}}
+    - {{name: camera.port, value: {camera}}}
+    - {{name: lidar.data_port, value: {lidar}}}
+    - {{name: lidar.position_port, value: {position}}}
+    required: true
+- include:
+    file: {folder}/robot.yaml
+    arg:
+    - {{name: camera_url, value: "http://127.0.0.1:{camera_link}"}}
+    - {{name: lidar_host, value: 127.0.0.1}}
+    - {{name: lidar_port, value: {lidar_link}}}
+    - {{name: lidar_position_port, value: {position}}}
+    - {{name: serial_port, value: $(run-dir)/dev/relay}}
+- include:
+    file: {folder}/station.yaml
+    arg:
+    - {{name: depth, value: false}}
+    - {{name: vspace, value: false}}
+    - {{name: recorder, value: false}}
+    - {{name: console_port, value: {console}}}
+    - {{name: params, value: {params}}}
+"""
+
+
+class Truth(NamedTuple):
+    """The robot's true motion at one moment of the stack's time."""
+
+    at_ns: int
+    x: float
+    y: float
+    yaw: float
+    speed: float
+
+
+class PacketRelay:
+    """Passes UDP packets on from one port to another of this machine, unless it is cut."""
+
+    def __init__(self, source: int, target: int) -> None:
+        self.cut = False
+        self._target = ("127.0.0.1", target)
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", source))
+        self._socket.settimeout(0.2)
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="packets", daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._ends.is_set():
+            try:
+                data = self._socket.recv(2048)
+                if not self.cut:
+                    self._socket.sendto(data, self._target)
+            except (TimeoutError, ConnectionRefusedError):  # nobody sends, or the driver is not there
+                continue
+
+    def close(self) -> None:
+        """Ends it."""
+        self._ends.set()
+        self._thread.join(2.0)
+        self._socket.close()
+
+
+class SerialRelay:
+    """A serial line between the base's driver and the simulated controller that can lose replies or be pulled out."""
+
+    def __init__(self, link: Path, controller: Path) -> None:
+        self.mute = False
+        """The controller's replies are lost."""
+        self._link, self._controller = link, controller
+        self._lock = threading.Lock()
+        self._master = self._slave = self._far = -1
+        self._ends = threading.Event()
+        self.plug()
+        self._thread = threading.Thread(target=self._run, name="serial", daemon=True)
+        self._thread.start()
+
+    def plug(self) -> None:
+        """Makes the line, under the driver's name for it."""
+        with self._lock:
+            self._master, self._slave = os.openpty()
+            tty.setraw(self._slave)
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(os.ttyname(self._slave))
+
+    def pull(self) -> None:
+        """The driver's end is gone, as when the cable is pulled."""
+        with self._lock:
+            self._link.unlink(missing_ok=True)
+            os.close(self._master)
+            os.close(self._slave)
+            self._master = self._slave = -1
+
+    def close(self) -> None:
+        """Ends it."""
+        self._ends.set()
+        self._thread.join(2.0)
+        for descriptor in (self._master, self._slave, self._far):
+            if descriptor >= 0:
+                os.close(descriptor)
+
+    def _run(self) -> None:
+        while not self._ends.is_set():
+            if self._far < 0:
+                with contextlib.suppress(FileNotFoundError):  # the simulator is still starting
+                    self._far = os.open(self._controller, os.O_RDWR | os.O_NOCTTY)
+                    tty.setraw(self._far)
+            with self._lock:
+                self._pass_on()
+            if self._master < 0 or self._far < 0:
+                time.sleep(0.01)
+
+    def _pass_on(self) -> None:
+        ends = [end for end in (self._master, self._far) if end >= 0]
+        ready, _, _ = select.select(ends, [], [], 0.005)
+        if self._master in ready:
+            data = os.read(self._master, 4096)
+            if self._far >= 0:
+                os.write(self._far, data)
+        if self._far in ready:
+            data = os.read(self._far, 4096)
+            if self._master >= 0 and not self.mute:
+                os.write(self._master, data)
+
+
+@dataclass
+class Rig:
+    """A running stack, what is between its parts, and what has been seen of it."""
+
+    stack: Stack
+    run_dir: Path
+    console_port: int
+    page_link: ImpairedLink
+    camera_link: ImpairedLink
+    packets: PacketRelay
+    serial: SerialRelay
+    truth: list[Truth] = field(default_factory=list)
+    commands: list[tuple[int, float]] = field(default_factory=list)
+    state: Any = None
+    pace: pace.Pace = field(default_factory=pace.Pace)
+
+    def watch(self) -> None:
+        """Takes in the true motion, the commands and the arbiter's state."""
+        observer = self.stack.observer
+        observer.subscribe("/ground_truth/odom", message_type("Odometry"), self._on_truth)
+        observer.subscribe("/cmd_vel", message_type("TwistStamped"), self._on_command)
+        observer.subscribe("/ic/state", ControlState, self._on_state, LATCHED)
+
+    def _on_truth(self, message: Any) -> None:
+        x, y, yaw = pose2_from_matrix(pose_matrix(message))
+        linear = message.twist.twist.linear
+        self.truth.append(Truth(stamp_ns(message), x, y, yaw, math.hypot(linear.x, linear.y)))
+
+    def _on_command(self, message: Any) -> None:
+        self.commands.append((stamp_ns(message), abs(twist_values(message)[0])))
+
+    def _on_state(self, message: Any) -> None:
+        self.state = message
+
+    def ready(self) -> bool:
+        """Whether the arbiter lets the robot be driven now."""
+        if self.state is None or not self.truth:
+            return False
+        fresh = self.pace.now_ns() - stamp_ns(self.state) < 0.3e9
+        held = self.state.reason.startswith(("stopped", "emergency", "the robot's pose", "there is no costmap"))
+        return fresh and self.state.mode == ControlState.REAL and not held and self.truth[-1].speed < STANDS_M_S
+
+    def pid(self, node: str) -> int:
+        """Of a node that runs now.
+
+        Raises:
+            StackError: it does not.
+        """
+        for info in registry.list_nodes(self.run_dir):
+            if info.name == node:
+                return info.pid
+        raise StackError(f"node {node} does not run")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something to lose: what breaks it and what mends it, as they act on a rig and the operator's page."""
+
+    name: str
+    breaks: Callable[[Rig, ConsoleClient], Awaitable[None]]
+    mends: Callable[[Rig, ConsoleClient], Awaitable[None]]
+
+
+async def nothing(rig: Rig, page: ConsoleClient) -> None:
+    """Mends what mends itself: the launcher starts a killed process again, and each drive has a page of its own."""
+
+
+def at_once(does: Callable[[Rig], object]) -> Callable[[Rig, ConsoleClient], Awaitable[None]]:
+    """What only touches the rig."""
+
+    async def act(rig: Rig, page: ConsoleClient) -> None:
+        does(rig)
+
+    return act
+
+
+def process_faults(node: str) -> list[Fault]:
+    """A node frozen and killed."""
+    frozen: list[int] = []
+
+    def freeze(rig: Rig) -> None:
+        frozen[:] = [rig.pid(node)]
+        os.kill(frozen[0], signal.SIGSTOP)
+
+    return [
+        Fault(f"{node} frozen", at_once(freeze), at_once(lambda rig: os.kill(frozen[0], signal.SIGCONT))),
+        Fault(f"{node} killed", at_once(lambda rig: os.kill(rig.pid(node), signal.SIGKILL)), nothing),
+    ]
+
+
+async def let_go(rig: Rig, page: ConsoleClient) -> None:
+    await page.stop()
+
+
+async def press_estop(rig: Rig, page: ConsoleClient) -> None:
+    await page.estop()
+
+
+async def release_estop(rig: Rig, page: ConsoleClient) -> None:
+    await page.stop()
+    await page.release_estop()
+
+
+async def close_page(rig: Rig, page: ConsoleClient) -> None:
+    await page.close()
+
+
+async def silence_page(rig: Rig, page: ConsoleClient) -> None:
+    for task in page._tasks:
+        task.cancel()
+
+
+FAULTS = [
+    *(fault for node in PROCESSES for fault in process_faults(node)),
+    Fault("emergency stop pressed", press_estop, release_estop),
+    Fault("key let go (no loss; soft ramp)", let_go, nothing),
+    Fault("page closed", close_page, nothing),
+    Fault("page silent", silence_page, nothing),
+    Fault("page link cut", at_once(lambda rig: rig.page_link.cut()), at_once(lambda rig: rig.page_link.mend())),
+    Fault("camera link cut", at_once(lambda rig: rig.camera_link.cut()), at_once(lambda rig: rig.camera_link.mend())),
+    Fault(
+        "LiDAR packets cease",
+        at_once(lambda rig: setattr(rig.packets, "cut", True)),
+        at_once(lambda rig: setattr(rig.packets, "cut", False)),
+    ),
+    Fault(
+        "serial replies lost",
+        at_once(lambda rig: setattr(rig.serial, "mute", True)),
+        at_once(lambda rig: setattr(rig.serial, "mute", False)),
+    ),
+    Fault("serial cable pulled", at_once(lambda rig: rig.serial.pull()), at_once(lambda rig: rig.serial.plug())),
+]
+
+
+@contextlib.contextmanager
+def rig(factor: float, log: Path | None) -> Iterator[Rig]:
+    """A started stack with everything between its parts that can be cut."""
+    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
+    ports = {name: free_port() for name in ("camera", "console")}
+    ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
+    drive = DriveConfig()
+    # The page's server counts machine seconds.
+    stretched = {key: getattr(drive, key) / factor for key in ("watchdog_s", "beat_timeout_s", "max_command_age_s")}
+    params = run_dir / "stretched.yaml"
+    params.write_text(yaml.safe_dump({"console": {"ros__parameters": {"server": {"drive": stretched}}}}))
+    (run_dir / "dev").mkdir(mode=0o700)
+    launch = run_dir / "stopping.yaml"
+    with contextlib.ExitStack() as ends:
+        ends.callback(shutil.rmtree, run_dir, ignore_errors=True)
+        page_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["console"])))
+        camera_link = ends.enter_context(ImpairedLink(("127.0.0.1", ports["camera"])))
+        packets = PacketRelay(ports["lidar"], ports["lidar_link"])
+        ends.callback(packets.close)
+        serial = SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw")
+        ends.callback(serial.close)
+        launch.write_text(
+            LAUNCH.format(**ports, camera_link=camera_link.port, folder=share_dir("launch"), params=params)
+        )
+        stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
+        made = Rig(stack, run_dir, ports["console"], page_link, camera_link, packets, serial)
+        stack.wait_for(lambda: registry.list_nodes(run_dir), 60, "first node")
+        made.pace = pace.read(run_dir)
+        pace.use(made.pace)
+        made.watch()
+        yield made
+
+
+@contextlib.asynccontextmanager
+async def driver(rig: Rig, tries: int = 40) -> AsyncIterator[ConsoleClient]:
+    """A page that drives; the console may just be starting again."""
+    page = ConsoleClient(f"http://127.0.0.1:{rig.page_link.port}/")
+    for left in reversed(range(tries)):
+        try:
+            await page.connect(5.0)
+            break
+        except (OSError, TimeoutError, aiohttp.ClientError) as error:
+            if not left:
+                raise StackError(f"the console does not answer: {error!r}\n{rig.stack.log_tail()}") from error
+            await asyncio.sleep(0.5)
+    try:
+        await page.acquire(take=True, timeout_s=10.0)
+        yield page
+    finally:
+        # A connection that was cut ends as it may: the next drive has another.
+        with contextlib.suppress(OSError, TimeoutError, aiohttp.ClientError, asyncio.CancelledError):
+            await asyncio.wait_for(page.close(), 5.0)
+
+
+async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> float:
+    """Drives on the corridor's middle line until the speed has been steady for ``wait_s``; that speed, m/s."""
+    for _ in range(_TRIES):
+        await until(rig.ready, 90, "robot that can be driven")
+        sign = 1.0 if rig.truth[-1].x < 5.0 else -1.0
+
+        def fast(sign: float = sign) -> bool:
+            truth = rig.truth[-1]
+            # Back to the middle line, as far as the drive takes it.
+            page.drive(sign * SPEED_M_S, max(-0.3, min(0.3, -truth.yaw - sign * 0.5 * truth.y)))
+            return truth.speed > 0.97 * SPEED_M_S
+
+        try:
+            await until(fast, 5, "full speed")
+            page.drive(sign * SPEED_M_S, 0.0)
+            began_ns = rig.pace.now_ns()
+            await asyncio.sleep(rig.pace.wait_s(wait_s))
+        except StackError:  # a sensor was late on a busy machine: let go, as an operator does, and drive again
+            await page.stop()
+            continue
+        steady = [truth.speed for truth in rig.truth if truth.at_ns > began_ns]
+        sent = [speed for at_ns, speed in rig.commands if at_ns > began_ns]
+        if steady and sent and min(*steady, *sent) > 0.9 * SPEED_M_S:
+            return statistics.median(steady)
+        await page.stop()
+    raise StackError(f"no steady speed in {_TRIES} drives:\n{rig.stack.log_tail()}")
+
+
+async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[str, Any]:
+    """One drive that ends by one fault."""
+    async with driver(rig) as page:
+        cruise = await at_speed(rig, until, page, 0.7 + rng.uniform(0.0, 0.1))  # in step with no timer
+        lost_ns = rig.pace.now_ns()
+        await fault.breaks(rig, page)
+        try:
+
+            def over() -> bool:
+                stand_ns = stands_ns(rig.truth, lost_ns)
+                stood = stand_ns is not None and rig.truth[-1].at_ns - stand_ns > AFTER_S * 1e9
+                return stood or rig.pace.now_ns() - lost_ns > LONGEST_S * 1e9
+
+            await until(over, LONGEST_S + 10, "stand")
+            figures = measured(rig, lost_ns, cruise)
+            if not page.closed:
+                with contextlib.suppress(ConnectionError, OSError):
+                    await page.stop()
+        finally:
+            await fault.mends(rig, page)
+    return figures
+
+
+def stands_ns(truth: Sequence[Truth], lost_ns: int) -> int | None:
+    """When the robot began to stand for ``STANDS_S``; None if it has not."""
+    began: int | None = None
+    for row in truth:
+        if row.at_ns < lost_ns:
+            continue
+        if row.speed >= STANDS_M_S:
+            began = None
+        elif began is None:
+            began = row.at_ns
+        elif row.at_ns - began >= STANDS_S * 1e9:
+            return began
+    return None
+
+
+def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
+    """The figures of one drive."""
+    rows = [row for row in rig.truth if row.at_ns >= lost_ns]
+    start = max((row for row in rig.truth if row.at_ns <= lost_ns), key=lambda row: row.at_ns)
+    gap_s = (lost_ns - start.at_ns) / 1e9  # it drove on for that long before the loss
+    signs = [at for at, speed in rig.commands if at >= lost_ns and speed < 0.9 * cruise]
+    signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
+    stand_ns = stands_ns(rows, lost_ns)
+    found: dict[str, Any] = {
+        "cruise_m_s": round(cruise, 3),
+        "detect_s": round((min(signs) - lost_ns) / 1e9, 3) if signs else None,
+        "stand_s": None,
+        "distance_m": None,
+        "after_m": None,
+    }
+    if stand_ns is not None:
+        end = next(row for row in rows if row.at_ns == stand_ns)
+        later = [row for row in rows if row.at_ns > stand_ns]
+        found["stand_s"] = round((stand_ns - lost_ns) / 1e9, 3)
+        found["distance_m"] = round(math.dist(start[1:3], end[1:3]) - gap_s * cruise, 3)
+        found["after_m"] = round(max((math.dist(end[1:3], row[1:3]) for row in later), default=0.0), 3)
+    return found
+
+
+async def drives(rig: Rig, faults: Sequence[Fault], repeat: int, seed: int) -> dict[str, list[dict[str, Any]]]:
+    """All faults, in turn, again and again."""
+    rng, found = random.Random(seed), {fault.name: [] for fault in faults}  # type: dict[str, list[dict[str, Any]]]
+    async with pump(rig.stack) as until:
+        for turn in range(repeat):
+            for fault in faults:
+                figures = await one(rig, until, fault, rng)
+                found[fault.name].append(figures)
+                print(f"{turn + 1}/{repeat} {fault.name}: {figures}", file=sys.stderr, flush=True)
+                del rig.truth[:-1], rig.commands[:]
+    return found
+
+
+def summary(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Median and worst; a drive that found no stand makes the worst None."""
+    result: dict[str, Any] = {"n": len(drives)}
+    for key in ("detect_s", "stand_s", "distance_m", "after_m"):
+        values = [drive[key] for drive in drives]
+        known = [value for value in values if value is not None]
+        result[key] = {
+            "median": round(statistics.median(known), 3) if known else None,
+            "worst": max(known) if len(known) == len(values) else None,
+        }
+    return result
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="OUT", help="also write the result here")
+    parser.add_argument("--only", action="append", default=[], help="faults whose name begins so; may be repeated")
+    parser.add_argument("--repeat", type=int, default=2, help="drives for each fault (default 2)")
+    parser.add_argument(
+        "--pace", type=float, default=0.0, help="of the stack's time (default: what the machine can do)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of the moments of the losses")
+    parser.add_argument("--log", type=Path, default=None, help="where the stack's output goes")
+    args = parser.parse_args()
+    faults = [fault for fault in FAULTS if not args.only or fault.name.startswith(tuple(args.only))]
+    if not faults or args.repeat < 1:
+        parser.error(f"--only must begin one of: {', '.join(fault.name for fault in FAULTS)}; --repeat is 1 or more")
+    factor = args.pace or round(machine_pace(), 2)
+    result: dict[str, Any] = {
+        "cores": os.cpu_count(),
+        "load_average": round(os.getloadavg()[0], 1),
+        "pace": factor,
+        "speed_m_s": SPEED_M_S,
+    }
+    with rig(factor, args.log) as made:
+        found = asyncio.run(drives(made, faults, args.repeat, args.seed))
+    result["faults"] = {name: summary(rows) for name, rows in found.items()}
+    result["drives"] = found
+    text = json.dumps(result, indent=2)
+    if args.json:
+        args.json.write_text(text + "\n")
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
