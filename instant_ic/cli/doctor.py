@@ -130,22 +130,21 @@ def _check_run_dir(run_dir: Path) -> Finding:
 
 def check_packages() -> Iterator[Finding]:
     """Every package that the installed distribution asks for."""
+    from packaging.requirements import Requirement
+
     try:
         requirements = importlib.metadata.requires("instant-ic") or []
     except importlib.metadata.PackageNotFoundError:
         yield Finding(FAIL, "package", "instant-ic is not installed", "make run, or pip install -e .")
         return
     missing = []
-    for requirement in requirements:
-        if "extra ==" in requirement:
+    for requirement in map(Requirement, requirements):
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
-        name = requirement.split(";")[0].strip()
-        for mark in "<>=!~[ ":
-            name = name.split(mark)[0]
         try:
-            importlib.metadata.version(name)
+            importlib.metadata.version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
-            missing.append(name)
+            missing.append(requirement.name)
     if missing:
         yield Finding(FAIL, "packages", f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
     else:
