@@ -5,6 +5,7 @@ import re
 import tomllib
 from pathlib import Path
 
+import hatchling.build
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -59,10 +60,12 @@ def test_lock_and_constraints_pin_the_same_versions(lock, everywhere, constraint
         assert pinned(everywhere[name]) == pinned(constraints[name]), f"{name}: {ADVICE}"
 
 
-def test_lock_satisfies_every_dependency_of_the_project(lock, constraints):
+def test_lock_satisfies_every_dependency_of_the_project(lock, constraints, monkeypatch):
+    monkeypatch.chdir(ROOT)  # the build backend reads the project there
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     extras = project["project"]["optional-dependencies"]
     asked = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    asked += hatchling.build.get_requires_for_build_editable()
     asked += [one for extra, some in extras.items() if extra != "triton" for one in some]  # comes with a CUDA torch
     for requirement in map(Requirement, asked):
         if applies(requirement):
