@@ -15,11 +15,14 @@ from typing import Any
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader, ReaderError
 
+from instant_ic.bag.bounded import guard_rosbags
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
 from instant_ic.bus.qos import QoS
 from instant_ic.msg import deserialize
+
+guard_rosbags()
 
 
 @dataclass(frozen=True)

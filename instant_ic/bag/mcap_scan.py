@@ -9,11 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from instant_ic.bag.bounded import decompress
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import CHANNEL, CHUNK, DATA_END, HEADER, MAGIC, MESSAGE, METADATA, SCHEMA, Schema
 
 OWN_LIBRARY = "instant_ic"
 _KNOWN_OPCODES = range(0x01, 0x10)  # and from 0x80 on private ones
+_MOST_DAMAGED = 1000
+"""Damaged records that are listed; a file can be made of nothing else."""
 _UNREADABLE = (struct.error, IndexError, ValueError)  # UnicodeDecodeError is a ValueError
 
 
@@ -99,12 +102,16 @@ class McapScan:
                 try:
                     yield from self._record(opcode, data[body:end])
                 except _UNREADABLE as error:
-                    self.damaged.append(f"record at byte {at}: {error}")
+                    self._damage(f"record at byte {at}: {error}")
             if end > len(data):
                 self._stop(at, "the file ends inside a record")
                 return
             at = end
         self._stop(at, "the file ends without its index")
+
+    def _damage(self, text: str) -> None:
+        if len(self.damaged) < _MOST_DAMAGED:
+            self.damaged.append(text)
 
     def _stop(self, at: int, why: str) -> None:
         self.stopped_by = f"{self.path.name}, byte {at}: {why}"
@@ -115,13 +122,13 @@ class McapScan:
             compression, offset = _string(body, 28)
             (stored_size,) = struct.unpack_from("<Q", body, offset)
             stored = body[offset + 8 : offset + 8 + stored_size]
-            records = _decompress(stored, compression)
+            records = stored if compression == "" else memoryview(decompress(stored, compression, size))
         except _UNREADABLE as error:
             if complete:
-                self.damaged.append(f"chunk at byte {at}: {error}")
+                self._damage(f"chunk at byte {at}: {error}")
             return
         if complete and (len(records) != size or (crc and zlib.crc32(records) != crc)):
-            self.damaged.append(f"chunk at byte {at}: its check sum is wrong")
+            self._damage(f"chunk at byte {at}: its check sum is wrong")
             return
         inner = 0
         while len(records) - inner >= 9:
@@ -132,7 +139,7 @@ class McapScan:
             try:
                 yield from self._record(opcode, records[inner + 9 : end])
             except _UNREADABLE as error:
-                self.damaged.append(f"record in the chunk at byte {at}: {error}")
+                self._damage(f"record in the chunk at byte {at}: {error}")
             inner = end
 
     def _record(self, opcode: int, body: memoryview) -> Iterator[ScannedMessage]:
@@ -178,24 +185,3 @@ def _string_map(data: memoryview, at: int) -> tuple[dict[str, str], int]:
         key, at = _string(data, at)
         values[key], at = _string(data, at)
     return values, at
-
-
-def _decompress(data: memoryview, compression: str) -> memoryview:
-    """The records of a chunk; of a cut one what its whole blocks hold."""
-    if compression == "":
-        return data
-    if compression == "zstd":
-        import zstandard
-
-        try:
-            return memoryview(zstandard.ZstdDecompressor().decompressobj().decompress(bytes(data)))
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from None
-    if compression == "lz4":
-        import lz4.frame
-
-        try:
-            return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(bytes(data)))
-        except RuntimeError as error:
-            raise ValueError(str(error)) from None
-    raise ValueError(f"compression {compression!r} is not known")

@@ -7,6 +7,7 @@ from pathlib import Path
 from instant_ic.camera.config import FilesConfig
 from instant_ic.camera.jpeg import JpegError, check_whole, jpeg_size
 from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.limits import load_image
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")
 SUFFIXES = (*JPEG_SUFFIXES, ".png", ".bmp", ".tif", ".tiff", ".webp")
@@ -110,7 +111,7 @@ class FileCamera(Camera):
     def _encode(self, path: Path) -> bytes:
         import cv2
 
-        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        image = load_image(path, cv2.IMREAD_COLOR)
         if image is None:
             raise JpegError("OpenCV cannot read it as a picture")
         return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])[1].tobytes())

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from instant_ic.limits import MOST_PIXELS, decode_image
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
 SOI = b"\xff\xd8"
 EOI = b"\xff\xd9"
-
-MOST_PIXELS = 32 << 20
-"""Of an image that came over a network or in a bag. The Theta's largest photo (6720x3360) has 22.6 million."""
 
 _START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
@@ -64,16 +63,6 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
     raise JpegError("has no frame header")
 
 
-def check_pixels(width: int, height: int) -> None:
-    """See that an image of this declared size may be decoded: 60 kB of JPEG can declare 65535 x 65535 pixels.
-
-    Raises:
-        JpegError: more pixels than `MOST_PIXELS`.
-    """
-    if width * height > MOST_PIXELS:
-        raise JpegError(f"declares {width}x{height} pixels; {MOST_PIXELS} at most are decoded")
-
-
 def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """Decodes to (H, W, 3) uint8 RGB of at least the size that is needed.
 
@@ -98,10 +87,7 @@ def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: 
     ):
         if full_width >= n * width and full_height >= n * height:
             flag = reduced
-    try:
-        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
-    except cv2.error:  # no bytes at all
-        bgr = None
+    bgr = decode_image(data, flag)
     if bgr is None:
-        raise JpegError("cannot be decoded")
+        raise JpegError(f"cannot be decoded as JPEG or PNG of at most {MOST_PIXELS} pixels")
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

@@ -13,9 +13,10 @@ import urllib3
 
 from instant_ic.camera.config import ThetaConfig
 from instant_ic.camera.http import Session, is_multipart
-from instant_ic.camera.jpeg import JpegError, check_pixels, jpeg_size
+from instant_ic.camera.jpeg import JpegError, jpeg_size
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.limits import MOST_PIXELS
 from instant_ic.pace import current
 
 NEVER = 65535
@@ -301,8 +302,10 @@ class ThetaCamera(Camera):
             for jpeg in reversed(frames):
                 try:
                     width, height = jpeg_size(jpeg)
-                    check_pixels(width, height)
                 except JpegError:
+                    self.bad_frames += 1
+                    continue
+                if width * height > MOST_PIXELS:  # 60 kB can declare 65535 x 65535
                     self.bad_frames += 1
                     continue
                 return Frame(jpeg, stamp_ns, width, height)

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.limits import MOST_FILE_PIXELS, check_arrays, load_image
+
 DEPTH_SUFFIXES = (".png", ".npy", ".npz", ".exr")
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp")
 _BEYOND_M = 1e4
@@ -31,7 +33,8 @@ def load_picture(path: str | Path) -> NDArray[np.uint8]:
     """
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(_content(path), np.uint8), cv2.IMREAD_COLOR)
+    _check_readable(path)
+    picture = load_image(path, cv2.IMREAD_COLOR)
     if picture is None:
         raise DepthFileError(f"{path}: not a readable picture ({', '.join(s[1:] for s in PICTURE_SUFFIXES)})")
     return np.ascontiguousarray(picture[..., ::-1], np.uint8)
@@ -47,9 +50,9 @@ def load_depth(path: str | Path) -> NDArray[np.float32]:
     kind = path.suffix.lower()
     if kind not in DEPTH_SUFFIXES:
         raise DepthFileError(f"{path}: depth is read from {', '.join(DEPTH_SUFFIXES)}, not {kind or 'a bare name'!r}")
-    content = _content(path)
+    _check_readable(path)
     if kind == ".png":
-        values = _png(path, content)
+        values = _png(path)
     elif kind == ".exr":
         values = _exr(path)
     else:
@@ -64,20 +67,20 @@ def load_depth(path: str | Path) -> NDArray[np.float32]:
     return values
 
 
-def _content(path: str | Path) -> bytes:
+def _check_readable(path: str | Path) -> None:
     try:
-        content = Path(path).read_bytes()
+        with Path(path).open("rb") as file:
+            empty = not file.read(1)
     except OSError as error:
         raise DepthFileError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not content:
+    if empty:
         raise DepthFileError(f"{path}: the file is empty")
-    return content
 
 
-def _png(path: Path, content: bytes) -> NDArray[Any]:
+def _png(path: Path) -> NDArray[Any]:
     import cv2
 
-    values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    values = load_image(path, cv2.IMREAD_UNCHANGED)
     if values is None:
         raise DepthFileError(f"{path}: not a readable PNG")
     if values.dtype != np.uint16 or values.ndim != 2:
@@ -91,6 +94,8 @@ def _png(path: Path, content: bytes) -> NDArray[Any]:
 
 def _numpy(path: Path) -> NDArray[Any]:
     try:
+        if path.suffix.lower() == ".npz":
+            check_arrays(path)
         loaded = np.load(path, allow_pickle=False)
         if path.suffix.lower() == ".npz":
             with loaded:
@@ -99,7 +104,7 @@ def _numpy(path: Path) -> NDArray[Any]:
                 loaded = loaded["depth"]
     except DepthFileError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, MemoryError, zipfile.BadZipFile) as error:
         raise DepthFileError(f"{path}: not a readable numpy file: {error}") from error
     if not isinstance(loaded, np.ndarray) or loaded.dtype.kind not in "fiu":
         raise DepthFileError(f"{path}: must hold an array of numbers, metres (got {getattr(loaded, 'dtype', 'none')})")
@@ -110,9 +115,19 @@ def _exr(path: Path) -> NDArray[Any]:
     import OpenEXR
 
     try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            low, high = (np.asarray(corner, np.int64) for corner in file.header()["dataWindow"])
+        if (pixels := int(np.prod(high - low + 1))) > MOST_FILE_PIXELS:
+            raise DepthFileError(f"{path}: declares {pixels} pixels; {MOST_FILE_PIXELS} at most are read")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError) as error:  # a damaged part is left out with a warning, then it is missing
+    except DepthFileError:
+        raise
+    except (
+        RuntimeError,
+        ValueError,
+        KeyError,
+    ) as error:  # a damaged part is left out, then missing
         raise DepthFileError(f"{path}: not a readable OpenEXR file: {error}") from error
     if len(channels) == 1:
         return next(iter(channels.values()))

@@ -21,6 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.limits import load_image
+
 from .dataset import DatasetError, Sample
 from .files import DEPTH_SUFFIXES, PICTURE_SUFFIXES, DepthFileError, load_depth, load_picture
 
@@ -192,10 +194,7 @@ def _png_depth(path: Path, layout: Layout) -> NDArray[np.float32]:
     """Depth (H, W) in metres, 0 = unknown, of a 16-bit PNG in the data set's own unit."""
     import cv2
 
-    try:
-        values = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
-    except (OSError, cv2.error) as error:
-        raise DepthFileError(f"{path}: cannot be read: {error}") from error
+    values = load_image(path, cv2.IMREAD_UNCHANGED)
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         what = "damaged" if values is None else f"{values.dtype} of shape {values.shape}"
         raise DepthFileError(f"{path}: depth must be a PNG of one channel of 16 bits (it is {what})")

@@ -15,6 +15,7 @@ from instant_ic.depth.calibration import CalibrationError, Frame
 from instant_ic.depth.deskew import points_at
 from instant_ic.geometry.poses import Matrix, inverse, wrap_angle, yaw_of
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.limits import decode_image
 from instant_ic.msg import MessageError, cloud_array, deserialize, stamp_ns, transform_matrix
 
 PICTURE, CLOUD, PACKETS = (
@@ -278,7 +279,7 @@ def _nearest_clouds(
 def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
     import cv2
 
-    bgr = cv2.imdecode(np.frombuffer(bytes(picture.data), np.uint8), cv2.IMREAD_COLOR)
+    bgr = decode_image(bytes(picture.data), cv2.IMREAD_COLOR)
     if bgr is None:
         raise CalibrationError(f"{path}: the picture of {stamp_ns(picture) / 1e9:.3f} s cannot be decoded")
     if bgr.shape[1] != 2 * bgr.shape[0]:

@@ -13,6 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.limits import decode_image
+
 from .projections import perspective_directions
 
 WIDTH = 96
@@ -75,7 +77,7 @@ def decode_depth(png: bytes, near_m: float) -> NDArray[np.float32]:
     """
     import cv2
 
-    grey = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED) if png else None
+    grey = decode_image(png, cv2.IMREAD_UNCHANGED)
     if grey is None or grey.ndim != 2 or grey.dtype != np.uint8:
         raise ValueError(f"a depth picture of {len(png)} bytes is no grey PNG of 8 bits")
     return grey.astype(np.float32) * np.float32(1 / (255 * near_m))

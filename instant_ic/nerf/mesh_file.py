@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,13 +81,39 @@ def load_mesh(path: str | Path, max_triangles: int = 5_000_000) -> ScannedMesh:
             f"mesh {path}: {path.stat().st_size / 2**30:.1f} GiB, at most {MAX_FILE_BYTES >> 30} are read;"
             " simplify it first"
         )
-    parts = _parts(_scene(path), _Z_UP_FROM_Y_UP if suffix in _Y_UP else np.eye(3))
-    count = sum(len(part["triangles"]) for part in parts)
-    if count > max_triangles:
+    try:
+        if suffix in _Y_UP:
+            _check_accessors(path, 3 * max_triangles)
+        return _read(path, max_triangles)
+    except MeshError:
+        raise
+    except MemoryError as error:
+        raise MeshError(f"mesh {path}: does not fit into memory; simplify it first") from error
+    except Exception as error:  # trimesh's readers raise whatever their formats' parsers do
         raise MeshError(
-            f"mesh {path}: {count} triangles, space.mesh_max_triangles is {max_triangles};"
-            " simplify the mesh, or raise the limit"
-        )
+            f"mesh {path}: damaged, or not what its ending says ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _check_accessors(path: Path, most: int) -> None:
+    """See that a glTF's arrays are in its buffers: one without a buffer is zeros, of any number, in 50 bytes.
+
+    Raises:
+        MeshError: an array without a buffer, or of more elements than the mesh may have.
+    """
+    content = path.read_bytes()
+    if content[:4] == b"glTF":
+        content = content[20 : 20 + int.from_bytes(content[12:16], "little")]
+    for accessor in json.loads(content).get("accessors", []):
+        if "bufferView" not in accessor or not 0 <= accessor["count"] <= most:
+            raise MeshError(
+                f"mesh {path}: an array of {accessor['count']} elements is not in its buffers, or is of more than "
+                f"{most}; export it uncompressed, simplify the mesh, or raise space.mesh_max_triangles"
+            )
+
+
+def _read(path: Path, max_triangles: int) -> ScannedMesh:
+    parts = _parts(_scene(path), _Z_UP_FROM_Y_UP if path.suffix.lower() in _Y_UP else np.eye(3), path, max_triangles)
     pictures: dict[int, NDArray[np.uint8]] = {}
     for part in parts:
         if part["picture"] is not None:
@@ -126,24 +153,28 @@ def _scene(path: Path) -> Any:
         raise MeshError(
             "a mesh as the virtual space needs the packages trimesh and embreex: pip install them"
         ) from error
-    try:
-        return trimesh.load_scene(str(path), process=False)
-    except MemoryError as error:
-        raise MeshError(f"mesh {path}: does not fit into memory; simplify it first") from error
-    except Exception as error:  # trimesh's readers raise whatever their formats' parsers do
-        raise MeshError(
-            f"mesh {path}: damaged, or not what its ending says ({type(error).__name__}: {error})"
-        ) from error
+    return trimesh.load_scene(str(path), process=False)
 
 
-def _parts(scene: Any, turn: NDArray[np.float64]) -> list[dict[str, Any]]:
-    """Each geometry's triangles and colours; node transforms applied, units as metres."""
+def _parts(scene: Any, turn: NDArray[np.float64], path: Path, max_triangles: int) -> list[dict[str, Any]]:
+    """Each geometry's triangles and colours; node transforms applied, units as metres.
+
+    Raises:
+        MeshError: more triangles than are allowed; counted here, as one geometry may stand at many nodes.
+    """
     parts = []
+    count = 0
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
         if getattr(mesh, "faces", None) is None or len(mesh.faces) == 0:
             continue
+        count += len(mesh.faces)
+        if count > max_triangles:
+            raise MeshError(
+                f"mesh {path}: {count} triangles or more, space.mesh_max_triangles is {max_triangles};"
+                " simplify the mesh, or raise the limit"
+            )
         vertices = (np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]) @ turn.T
         faces = np.asarray(mesh.faces)
         uv = getattr(mesh.visual, "uv", None)

@@ -14,6 +14,8 @@ from typing import Any, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.limits import check_arrays
+
 from .config import VirtualSpaceConfig
 from .field import FieldParameters, Floats, Lattice
 from .prior import PanoramaPrior
@@ -97,6 +99,8 @@ def read(path: str | Path) -> SavedSpace:
     """
     file = space_file(path)
     try:
+        if file.is_file() and zipfile.is_zipfile(file):
+            check_arrays(file)
         with np.load(file, allow_pickle=False) as loaded:
             if not isinstance(loaded, np.lib.npyio.NpzFile) or not {"head", "sha256"} <= set(loaded.files):
                 raise SpaceFileError(f"{file}: not a saved virtual space")
@@ -105,7 +109,15 @@ def read(path: str | Path) -> SavedSpace:
         raise SpaceFileError(f"{file}: no such file; make one with: ic vspace train") from error
     except SpaceFileError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError, NotImplementedError) as error:
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        MemoryError,
+        zipfile.BadZipFile,
+        AttributeError,
+        NotImplementedError,
+    ) as error:
         raise SpaceFileError(f"{file}: damaged, or not a saved virtual space: {error}") from error
     if arrays.pop("sha256").tobytes() != _checksum(arrays):
         raise SpaceFileError(f"{file}: damaged: its content does not have its own SHA-256")

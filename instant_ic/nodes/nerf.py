@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.depth.keyframes import decode_sigma
 from instant_ic.geometry.depth_picture import encode_depth
+from instant_ic.limits import decode_image, load_image
 from instant_ic.msg import (
     CompressedImage,
     Keyframe,
@@ -114,7 +115,7 @@ def read_mask(path: str) -> NDArray[np.bool_] | None:
     """
     if not path:
         return None
-    picture = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    picture = load_image(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise NodeError(f"robot_mask {path}: no such file, or no picture that can be decoded")
     if picture.shape[1] != 2 * picture.shape[0]:
@@ -132,7 +133,7 @@ def decode_keyframe(keyframe: Any) -> tuple[Any, Any, Any, Any]:
     if not keyframe.fit:
         raise KeyframeError(f"its depth is not fit: {keyframe.message or 'no reason given'}")
     data = np.asarray(keyframe.panorama.data, np.uint8)
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    picture = decode_image(data, cv2.IMREAD_COLOR)
     if picture is None:
         raise KeyframeError(f"the panorama ({data.size} bytes) cannot be decoded")
     rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)

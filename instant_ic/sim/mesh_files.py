@@ -82,7 +82,7 @@ def load_world(path: str | Path, y_up: bool | None = None) -> World:
         raise ValueError(f"world {path}: no such file")
     try:
         scene = trimesh.load_scene(str(path))
-    except (ValueError, KeyError, OSError, AttributeError) as error:
+    except Exception as error:
         raise ValueError(f"world {path}: trimesh cannot read it ({error})") from error
     if y_up is None:
         y_up = path.suffix.lower() in _Y_UP

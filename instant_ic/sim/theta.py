@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.limits import load_image
 from instant_ic.pace import current
 
 log = logging.getLogger(__name__)
@@ -86,7 +87,7 @@ def panorama_file(path: str | Path) -> PictureSource:
     """
     import cv2
 
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = load_image(path, cv2.IMREAD_COLOR)
     if image is None:
         raise ValueError(f"panorama {path} cannot be read as a picture")
     rgb = np.ascontiguousarray(image[..., ::-1])

@@ -6,17 +6,21 @@ A log is an iterable of `LogEntry`; a fault is a `LogError` that names file and 
 from __future__ import annotations
 
 import gzip
+import io
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
 from instant_ic.geometry.poses import relative2
 from instant_ic.slam.scan import FloatArray, Scan
+
+_MOST_LINE = 1 << 20
+_MOST_LOG = 8 << 30
 
 
 class LogError(ValueError):
@@ -40,14 +44,29 @@ class LogEntry:
     logger_s: float | None = None
 
 
+class _Lines(io.TextIOWrapper):
+    """Lines of a text file; a few kilobytes of gzip can hold one line of gigabytes."""
+
+    def __init__(self, raw: Any, path: Path) -> None:
+        super().__init__(raw, encoding="ascii", errors="replace")
+        self._path, self._left = path, _MOST_LOG
+
+    def __next__(self) -> str:  # type: ignore[override]
+        line = self.readline(_MOST_LINE + 1)
+        self._left -= len(line)
+        if not line:
+            raise StopIteration
+        if len(line) > _MOST_LINE or self._left < 0:
+            raise LogError(f"{self._path}: a line of over {_MOST_LINE} characters, or over {_MOST_LOG} in all")
+        return line
+
+
 def open_log(path: str | Path) -> IO[str]:
     """Open a text log, gzip or not; the first two bytes tell."""
     path = Path(path)
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
-    if packed:
-        return gzip.open(path, "rt", encoding="ascii", errors="replace")
-    return path.open(encoding="ascii", errors="replace")
+    return _Lines(gzip.open(path, "rb") if packed else path.open("rb"), path)
 
 
 def read_log(path: str | Path) -> Iterator[LogEntry]:

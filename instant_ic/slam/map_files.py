@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.limits import check_arrays, load_image
 from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.slam.pose_graph import Edge
@@ -114,7 +115,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     image = path.parent / str(content.get("image", ""))
     if not image.is_file():
         raise MapError(f"{path}: image {image} does not exist")
-    picture: Any = cv2.imread(str(image), cv2.IMREAD_GRAYSCALE)
+    picture: Any = load_image(image, cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise MapError(f"{image} is no picture that can be read")
     grey = picture[::-1].astype(np.float64)
@@ -192,6 +193,8 @@ def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
     """
     path = graph_file(stem)
     try:
+        if path.is_file():
+            check_arrays(path)
         with np.load(path, allow_pickle=False) as file:
             data: dict[str, NDArray[Any]] = dict(file)
         if int(data["version"]) != _GRAPH_VERSION:

@@ -135,7 +135,7 @@ def test_preview_whose_chunk_head_drips_ends_by_the_deadline() -> None:
 def test_digest_challenge_that_cannot_be_answered_is_an_error(challenge: str) -> None:
     with (
         Stranger(reply(b"", f"WWW-Authenticate: {challenge}", status="401 Unauthorized")) as camera,
-        pytest.raises(CameraError, match="digest challenge|refused: http 401"),
+        pytest.raises(CameraError, match=r"digest challenge|refused: http 401"),
     ):
         ThetaClient(camera.url, PATIENT, "user", "password").info()
 

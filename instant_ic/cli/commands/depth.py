@@ -193,8 +193,9 @@ def estimate(args: argparse.Namespace) -> int:
 
     from instant_ic.depth.colour import depth_picture
     from instant_ic.depth.model import InferenceError
+    from instant_ic.limits import load_image
 
-    picture = cv2.imread(str(args.image), cv2.IMREAD_COLOR)
+    picture = load_image(args.image, cv2.IMREAD_COLOR)
     if picture is None:
         raise UserError(f"{args.image}: not a readable picture")
     model = _load(args)

@@ -1,0 +1,148 @@
+"""Decompression that stops at a limit, for our readers and for those of `rosbags`: 19 kB of zstd became 617 MB."""
+
+from __future__ import annotations
+
+import bz2
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, BinaryIO
+
+from instant_ic.bag.errors import BagError
+
+if TYPE_CHECKING:
+    import apsw
+
+MOST_CHUNK_BYTES = 256 << 20
+"""Of a chunk or a message, decompressed. Recorders end chunks at about 1 MB, but a message may be larger alone."""
+MOST_FILE_BYTES = 64 << 30
+"""Of a file that was compressed as a whole."""
+_FREE_BYTES = 2 << 30
+"""Stay free on the disk that such a file is unpacked to."""
+_PIECE = 1 << 20
+
+
+def decompress(data: bytes | memoryview, compression: str, declared_bytes: int | None = None) -> bytes:
+    """The content of one frame; of a cut one, what its whole blocks hold.
+
+    Args:
+        data: compressed.
+        compression: ``zstd``, ``lz4`` or ``bz2``; empty for none.
+        declared_bytes: what it says to hold; `MOST_CHUNK_BYTES` is the limit in any case.
+
+    Raises:
+        ValueError: damaged, longer than declared or than the limit, or an unknown compression.
+    """
+    most_bytes = MOST_CHUNK_BYTES if declared_bytes is None else declared_bytes
+    if most_bytes > MOST_CHUNK_BYTES:
+        raise ValueError(f"it declares {most_bytes} bytes; {MOST_CHUNK_BYTES} at most are decompressed")
+    if compression == "":
+        return bytes(data)
+    pieces = _PIECES.get(compression)
+    if pieces is None:
+        raise ValueError(f"compression {compression[:40]!r} is not known")
+    out: list[bytes] = []
+    size = 0
+    try:
+        for piece in pieces(bytes(data)):
+            size += len(piece)
+            if size > most_bytes:
+                raise ValueError(f"it holds more than the {most_bytes} bytes that it declares or may have")
+            out.append(piece)
+    except (RuntimeError, OSError, EOFError) as error:  # lz4's, bz2's
+        raise ValueError(str(error)) from None
+    return b"".join(out)
+
+
+def guard_rosbags() -> None:
+    """Put the limits into `rosbags`, which has none: chunks of MCAP and ROS 1, messages, whole files, SQLite's values.
+
+    Its tables of decompressors are replaced; a test holds that they are used.
+    """
+    import apsw
+    from rosbags.rosbag1 import reader as ros1
+    from rosbags.rosbag2 import reader as ros2
+    from rosbags.rosbag2 import storage_mcap
+
+    storage_mcap.DECOMPRESSORS["zstd"] = lambda data, size: decompress(data, "zstd", size)
+    storage_mcap.DECOMPRESSORS["lz4"] = lambda data, size: decompress(data, "lz4", size)
+    ros1.decompressors["bz2"] = lambda data: decompress(data, "bz2")
+    ros1.decompressors["lz4"] = lambda data: decompress(data, "lz4")
+    ros2.zstd = SimpleNamespace(  # type: ignore[assignment]
+        decompress=lambda data: decompress(data, "zstd"), open=_open_zstd
+    )
+    # A column may be computed: zeroblob(1000000000) is a gigabyte in 20 bytes.
+    if _limit_values not in apsw.connection_hooks:
+        apsw.connection_hooks.append(_limit_values)
+
+
+def _limit_values(connection: apsw.Connection) -> None:
+    import apsw
+
+    connection.limit(apsw.SQLITE_LIMIT_LENGTH, MOST_CHUNK_BYTES)
+
+
+@contextmanager
+def _open_zstd(stream: BinaryIO, _mode: str) -> Iterator[_FileLimit]:
+    import zstandard
+
+    with zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True, closefd=False) as reader:
+        yield _FileLimit(reader)
+
+
+class _FileLimit:
+    """A stream that ends with an error at the limit of files, or before the disk of temporary files is full."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._left = min(MOST_FILE_BYTES, shutil.disk_usage(tempfile.gettempdir()).free - _FREE_BYTES)
+
+    def read(self, size: int = _PIECE) -> bytes:
+        """The next piece.
+
+        Raises:
+            BagError: the limit is reached.
+        """
+        piece = self._stream.read(size)
+        self._left -= len(piece)
+        if piece and self._left < 0:
+            raise BagError(
+                f"a compressed file of the bag unpacks to more than {MOST_FILE_BYTES >> 30} GB, or to more than "
+                f"{tempfile.gettempdir()} has room for; set TMPDIR to a larger disk"
+            )
+        return piece
+
+
+def _zstd(data: bytes) -> Iterator[bytes]:
+    import zstandard
+
+    reader = zstandard.ZstdDecompressor().stream_reader(data)
+    try:
+        while piece := reader.read(_PIECE):
+            yield piece
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from None
+
+
+def _lz4(data: bytes) -> Iterator[bytes]:
+    import lz4.frame
+
+    return _pieces(lz4.frame.LZ4FrameDecompressor(), data)
+
+
+def _bz2(data: bytes) -> Iterator[bytes]:
+    return _pieces(bz2.BZ2Decompressor(), data)
+
+
+def _pieces(decompressor: bz2.BZ2Decompressor, data: bytes) -> Iterator[bytes]:
+    piece = decompressor.decompress(data, _PIECE)
+    while piece:
+        yield piece
+        if decompressor.eof or decompressor.needs_input:
+            return
+        piece = decompressor.decompress(b"", _PIECE)
+
+
+_PIECES: dict[str, Callable[[bytes], Iterator[bytes]]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}

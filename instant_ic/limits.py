@@ -1,0 +1,83 @@
+"""Limits of what is decoded from files and messages: a few kilobytes can declare an image or an array of gigabytes."""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+MOST_PIXELS = 32 << 20
+"""Of an image that came over a network or in a bag. The Theta's largest photo (6720x3360) has 22.6 million."""
+MOST_FILE_PIXELS = 160 << 20
+"""Of an image file that an operator names: panoramas of 16384x8192."""
+MOST_ARRAY_BYTES = 4 << 30
+"""Of all arrays of an ``.npz`` file together, decompressed."""
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def limit_opencv() -> None:
+    """Have OpenCV refuse larger images by their declared size; it reads this once, before the first image."""
+    os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_FILE_PIXELS))
+
+
+def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
+    """Decode a JPEG or PNG that came from outside, of at most `MOST_PIXELS`; None where that cannot be done.
+
+    Args:
+        data: the encoded image.
+        flags: of ``cv2.imdecode``.
+    """
+    import cv2
+    import numpy as np
+
+    from instant_ic.camera.jpeg import JpegError, jpeg_size
+
+    head = bytes(data[: len(_PNG) + 16])
+    if head.startswith(_PNG):
+        width, height = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    else:
+        try:
+            width, height = jpeg_size(data if isinstance(data, bytes | bytearray) else data.tobytes())
+        except JpegError:
+            return None
+    if not 0 < width * height <= MOST_PIXELS:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
+    """Read an image file of any kind that OpenCV knows, of at most `MOST_FILE_PIXELS`; None where that cannot be done.
+
+    Args:
+        path: the file.
+        flags: of ``cv2.imread``.
+    """
+    import cv2
+
+    try:
+        return cv2.imread(str(path), flags)
+    except cv2.error:  # larger than the limit
+        return None
+
+
+def check_arrays(path: str | Path) -> None:
+    """See that an ``.npz`` file does not unpack to more than `MOST_ARRAY_BYTES`.
+
+    Raises:
+        ValueError: it does.
+        zipfile.BadZipFile: it is none.
+        OSError: it cannot be read.
+    """
+    with zipfile.ZipFile(path) as archive:
+        size = sum(entry.file_size for entry in archive.infolist())
+    if size > MOST_ARRAY_BYTES:
+        raise ValueError(f"its arrays unpack to {size >> 20} MB; {MOST_ARRAY_BYTES >> 20} at most are read")
