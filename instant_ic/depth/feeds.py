@@ -302,7 +302,7 @@ class Renderers:
     def close(self) -> None:
         """Ends the processes."""
         for process in self._processes:
-            process.terminate()
+            process.kill()  # SIGTERM would wait where one is stopped
         for process in self._processes:
             process.join(10)
         self._processes = []

@@ -35,6 +35,7 @@ from ..control.warmup import warm_up
 from ..geometry.poses import matrix_from_pose2, relative2, wrap_angle
 from ..sim.robot import RobotConfig, TrackedRobot
 from . import follow_worlds as worlds
+from .processes import process_pool
 
 FloatArray = NDArray[np.float64]
 
@@ -309,8 +310,7 @@ def evaluate(
         TimeoutError: they took longer than ``timeout_s``.
         RuntimeError: a process died.
     """
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
 
     if episodes < 1 or jobs < 1:
@@ -323,19 +323,16 @@ def evaluate(
             done.append(run_episode(seed, index))
             tell(done[-1])
         return done
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=prepare)
-    try:
-        futures = [pool.submit(run_episode, seed, index) for index in range(episodes)]
-        for future in as_completed(futures, timeout=timeout_s):
-            done.append(future.result())
-            tell(done[-1])
-    except BrokenProcessPool as error:
-        raise RuntimeError("a process that drove an episode died (out of memory?); try --jobs 1") from error
-    except TimeoutError as error:
-        raise TimeoutError(f"the episodes took longer than {timeout_s:.0f} s; {len(done)} are done") from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
+    with process_pool(jobs, prepare) as pool:
+        try:
+            futures = [pool.submit(run_episode, seed, index) for index in range(episodes)]
+            for future in as_completed(futures, timeout=timeout_s):
+                done.append(future.result())
+                tell(done[-1])
+        except BrokenProcessPool as error:
+            raise RuntimeError("a process that drove an episode died (out of memory?); try --jobs 1") from error
+        except TimeoutError as error:
+            raise TimeoutError(f"the episodes took longer than {timeout_s:.0f} s; {len(done)} are done") from error
     return sorted(done, key=lambda episode: episode.index)
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from ..control.arbiter import Mode
 from ..control.warmup import warm_up
 from ..geometry.poses import pose_matrix
 from . import teleop_figures as figures
+from .processes import process_pool
 from .teleop_figures import Drive, Switch
 from .teleop_operator import Operator, Sight, make_operator, read_commands
 from .teleop_results import in_order
@@ -36,9 +37,6 @@ from .teleop_stack import (
     StackConfig,
 )
 from .teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
-
-if TYPE_CHECKING:
-    from concurrent.futures import ProcessPoolExecutor
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
@@ -284,7 +282,7 @@ def evaluate(
                 raise TimeoutError(late)
             take(run_episode(settings, index, methods=(name,))[0])
         return in_order(drives)
-    with _processes(min(jobs, len(tasks))) as pool:
+    with process_pool(min(jobs, len(tasks)), prepare) as pool:
         try:
             futures = [pool.submit(run_episode, settings, index, None, (name,)) for index, name in tasks]
             for future in as_completed(futures, timeout=timeout_s):
@@ -294,42 +292,6 @@ def evaluate(
         except TimeoutError as error:
             raise TimeoutError(late) from error
     return in_order(drives)
-
-
-@contextlib.contextmanager
-def _processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that drive; at the end of the block, however it comes, they are ended, too."""
-    import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor
-
-    pool = ProcessPoolExecutor(count, mp_context=multiprocessing.get_context("spawn"), initializer=_begin_process)
-    try:
-        yield pool
-    finally:
-        ours = list((pool._processes or {}).values())  # there is no public way to end one in the midst of a drive
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in ours:
-            process.terminate()
-
-
-def _begin_process() -> None:
-    import signal
-    import threading
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the one that collects ends the others
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    prepare()
-
-
-def _end_with_parent() -> None:
-    """One that was killed ends nobody."""
-    import multiprocessing
-    import os
-
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 __all__ = ["Drive", "Settings", "evaluate", "run_episode"]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -256,15 +255,6 @@ def test_an_interrupted_run_keeps_what_was_driven_and_goes_on(
     assert main([*words, "--resume"]) == 0
     assert [row["method"] for row in json.loads(file.read_text())["each"]] == ["ic", "stop"]
     assert set(json.loads(capsys.readouterr().out)["methods"]) == {"ic", "stop"}
-
-
-def test_whatever_ends_a_run_no_process_drives_on() -> None:
-    with pytest.raises(KeyboardInterrupt), teleop._processes(1) as pool:
-        pool.submit(time.sleep, 600.0)
-        (process,) = pool._processes.values()
-        raise KeyboardInterrupt
-    process.join(120.0)
-    assert process.exitcode is not None and process.exitcode != 0
 
 
 def furnished(thing: tuple[float, float] | None) -> teleop_worlds.World:
