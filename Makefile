@@ -14,10 +14,14 @@ ARGS   ?=
 run: $(STAMP)
 	@exec $(BIN)/ic launch sim $(ARGS)
 
-# The system tests start whole stacks, which want the machine for themselves: they run after the others, one by one.
+# The system tests start whole stacks, which want the machine for themselves: they run after the others, one by one,
+# and also where one of the others failed.
 test: check chromium
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not system"
-	$(BIN)/python -m pytest -m system
+	@units=passed; systems=passed; \
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not system" || units=FAILED; \
+	$(BIN)/python -m pytest -m system || systems=FAILED; \
+	echo "make test: unit tests $$units, system tests $$systems"; \
+	test $$units$$systems = passedpassed
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -1,0 +1,39 @@
+"""``make test`` reports unit and system tests, whichever of them fail."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.mark.parametrize("unit", [0, 1])
+@pytest.mark.parametrize("system", [0, 1])
+def test_both_halves_run_and_either_failure_counts(unit: int, system: int, tmp_path: Path) -> None:
+    python = tmp_path / "python"
+    python.write_text(
+        f'#!/bin/sh\ncase "$*" in *"not system"*) echo units; exit {unit};; esac\necho systems; exit {system}\n'
+    )
+    python.chmod(0o755)
+    made = subprocess.run(
+        ["make", "-o", "check", "-o", "chromium", "test", f"BIN={tmp_path}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    outcome = ["passed", "FAILED"]
+    assert made.stdout.splitlines()[:3] == [
+        "units",
+        "systems",
+        f"make test: unit tests {outcome[unit]}, system tests {outcome[system]}",
+    ], made.stderr
+    assert (made.returncode == 0) == (unit == system == 0)
+
+
+def test_the_check_comes_first() -> None:
+    recipe = subprocess.run(
+        ["make", "-n", "test"], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+    ).stdout
+    assert -1 < recipe.index("ruff check") < recipe.index("-m pytest")
