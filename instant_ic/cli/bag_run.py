@@ -125,6 +125,7 @@ def play(args: argparse.Namespace) -> int:
         publish_clock=not args.no_clock,
         delay_s=args.delay,
         wait_for=args.wait_for,
+        force=args.force,
     )
     for remap in args.remap:
         words += ["-r", remap]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import threading
 import time
 from dataclasses import dataclass
@@ -16,6 +17,11 @@ from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
 from instant_ic.msg import message_type, register_type, to_time
 from instant_ic.ranges import NotNegative, Positive, Range, check_ranges
+
+_BASE = "instant_ic.nodes.crawler_base"
+_BASE_PERIOD_S = 0.5
+_ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
+"""What a robot's nodes act on, in the namespace of its base."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,7 @@ class BagPlayerConfig:
         wait_for: nodes that must run, and be connected to what they read, before it begins.
         wait_timeout_s: how long to wait for them before it gives up, s.
         linger_s: how long it stays after the last message, so that the others finish their work, s.
+        force: play commands and states also beside a running base, which may then move the robot.
     """
 
     bag: str = ""
@@ -55,6 +62,7 @@ class BagPlayerConfig:
     wait_for: tuple[str, ...] = ()
     wait_timeout_s: Positive = 60.0
     linger_s: NotNegative = 1.0
+    force: bool = False
 
     def __post_init__(self) -> None:
         """Checks the values."""
@@ -83,6 +91,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
     player: BagPlayer | None = None
     _thread: threading.Thread | None = None
     _failed = ""
+    _next_base_s = 0.0
 
     def setup(self) -> None:
         """Opens the bag, makes its topics, starts the thread."""
@@ -90,6 +99,11 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config.play_options())
         except BagError as error:
             raise NodeError(str(error)) from None
+        try:
+            self.check_base()
+        except NodeError:
+            self.player.close()
+            raise
         self._clock_out: Publisher | None = None
         if self.config.publish_clock:
             self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
@@ -110,6 +124,33 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self._thread = threading.Thread(target=self._run, name="player", daemon=True)
         self._thread.start()
 
+    def check_base(self) -> None:
+        """Looks for a base in the run directory, real or simulated, that could obey what is played.
+
+        Raises:
+            NodeError: there is one, and ``force`` is not set.
+        """
+        assert self.player is not None
+        if self.run_dir is None or self.config.force:
+            return
+        for base in registry.list_nodes(self.run_dir):
+            if base.module != _BASE:
+                continue
+            spaces = {"", *(topic.removesuffix("/cmd_vel") for topic in base.subscribes if topic.endswith("/cmd_vel"))}
+            acted_on = {*base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
+            played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
+            wrong = [
+                played[topic]
+                for topic in sorted(played)
+                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in acted_on)
+            ]
+            if wrong:
+                raise NodeError(
+                    f"{self.config.bag}: {', '.join(wrong)} would reach the robot of {base.name}, which runs in "
+                    f"{self.run_dir}. Leave them out (-x {wrong[0]}), rename them (--remap "
+                    f"{wrong[0]}:=/bag{wrong[0]}), end the stack, or play them all the same with --force"
+                )
+
     def _run(self) -> None:
         assert self.player is not None
         try:
@@ -129,6 +170,9 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self.stop()
 
     def _send(self, message: BagMessage) -> None:
+        if (now_s := time.monotonic()) >= self._next_base_s:
+            self._next_base_s = now_s + _BASE_PERIOD_S
+            self.check_base()
         payload: bytes | None = message.payload
         if self.config.drop_transforms and message.topic in TRANSFORM_TOPICS:
             payload = without_children(message, self.config.drop_transforms)

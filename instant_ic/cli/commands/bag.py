@@ -100,6 +100,9 @@ def add_parser(subparsers: Any) -> None:
     playing.add_argument("--loop", action="store_true", help="begin again at the end")
     playing.add_argument("--start-paused", action="store_true", help="wait for space, → or ic bag control resume")
     playing.add_argument("--remap", action="append", default=[], metavar="FROM:=TO", help="other name; repeatable")
+    playing.add_argument(
+        "--force", action="store_true", help="play commands and states also beside a running base: the robot may move"
+    )
     playing.add_argument("--no-clock", action="store_true", help="send no /clock")
     playing.add_argument(
         "--delay", type=_seconds, default=0.5, metavar="S", help="for readers to connect (default: 0.5)"
