@@ -14,12 +14,14 @@ from ..msg import MessageError, deserialize, message_type, serialize, twist_stam
 from .commands import CommandGate, CommandRefused
 from .zenoh_format import Attachment, Token, TopicQoS
 from .zenoh_session import RosNode, RosSubscription
-from .zenoh_topics import COMMANDS, GRACE_S, Namespace, bus_qos, known_hash, parse_subscribe, takes
+from .zenoh_topics import COMMANDS, GRACE_S, STOP, Namespace, bus_qos, known_hash, parse_subscribe, takes
 
 _ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
 """Topics that move a robot, in any namespace, and what tells of its parameters: never brought in by a pattern."""
 
 _TF = "tf2_msgs/msg/TFMessage"
+MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200
+"""Most topics that come in, publishers of one of them, and characters of a name: the graph belongs to others."""
 
 
 class StaticTransforms:
@@ -89,11 +91,11 @@ class Incoming:
         self._refusing: set[str] = set()
         self._count_before = 0
         self._patterns, self._types = parse_subscribe(subscribe)
-        self._types.update({topic: COMMANDS[topic] for topic in commands})
-        self._commands = set(commands)
+        self._commands = set(commands) & {STOP} if no_commands else set(commands)
+        self._types.update({topic: COMMANDS[topic] for topic in self._commands})
         self._own = own
         for topic, name in self._types.items():
-            self._open(topic, name, TopicQoS(latched=topic == "/operator/estop", depth=1), always=True)
+            self._open(topic, name, TopicQoS(latched=topic == STOP, depth=1), always=True)
 
     @property
     def topics(self) -> list[str]:
@@ -129,6 +131,15 @@ class Incoming:
         if not alive:
             if entry is not None and source in entry.sources:
                 self._left(topic, entry, source)
+            return
+        sources = entry.sources if entry is not None else ()
+        if len(topic) > MAX_NAME or (entry is None and len(self._topics) >= MAX_TOPICS) or len(sources) >= MAX_SOURCES:
+            self._node.diagnose(
+                "names",
+                ERROR,
+                f"{topic!r:.60} is not brought in: at most {MAX_TOPICS} topics, {MAX_SOURCES} publishers of each, "
+                f"{MAX_NAME} characters a name; narrow `subscribe`",
+            )
             return
         if not self._same_type(topic, token, entry):
             return
@@ -217,22 +228,18 @@ class Incoming:
             message = deserialize(payload, COMMANDS[topic])
         except MessageError as error:
             raise self._gate.refuse("not readable", str(error)) from None
-        if topic == "/operator/estop":
+        if topic == STOP:
             # A stop is never too old, and anybody may stop; the release is the driver's alone, and has to be fresh.
             if not message.data:
-                self._check_link()
+                if self._no_commands:
+                    raise self._gate.refuse("link not secure", f"release: {self._no_commands}")
                 self._gate.check_age(attachment.source_ns, now_ns)
                 self._gate.check_release(attachment.sender, time.monotonic_ns())
             return
-        self._check_link()
         if not entry.sources:
             raise self._gate.refuse("no sender", "nobody in the ROS graph sends this topic, or not any more")
         self._gate.check_age(attachment.source_ns, now_ns)
         self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns())
-
-    def _check_link(self) -> None:
-        if self._no_commands:
-            raise self._gate.refuse("link not secure", self._no_commands)
 
     def _tell(self, topic: str, level: int, words: str) -> None:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)

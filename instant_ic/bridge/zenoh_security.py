@@ -4,52 +4,72 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from typing import Any
 
 from .web_access import is_loopback
 
-_ADDRESS = re.compile(r"(?P<link>[a-z0-9_.-]+)/(?P<host>\[[^\]]+\]|[^:\[\]]+):\d+\Z")
+_ENDPOINT = re.compile(r"(?P<link>\w+)/(\[(?P<ipv6>[^\]]+)\]|(?P<host>[^:\[\]/]+)):\d+(\?[^#]*)?\Z")
 _TLS_LINKS = ("tls", "quic")
 _LOOPBACK_LINKS = ("tcp", *_TLS_LINKS)
 
 
-def insecurity(config: Any, loopback: bool = False) -> str:
-    """Why strangers could send over links of this session; empty where they cannot.
+def insecurity(config: Any) -> str:
+    """Why a stranger could send over the links of a session; empty where none can.
 
     Each endpoint must be ``tls/`` or ``quic/`` with certificates on both sides (``enable_mtls``), and no other link may
     come about by discovery. The router decides for itself whom it lets in: its file must say ``enable_mtls`` too.
-
-    Args:
-        config: of Zenoh.
-        loopback: links within this machine will do, whatever they speak: everybody on the machine can then send.
     """
-    endpoints = [*_endpoints(config, "connect"), *_endpoints(config, "listen")]
-    if not endpoints:
-        return "there is no endpoint, so Zenoh looks for others itself: set connect"
-    if _value(config, "scouting/multicast/enabled") is not False:
-        return "scouting.multicast is enabled, so links of any kind may come about: disable it"
-    mode = _value(config, "mode")
-    protocols = _value(config, "transport/link/protocols") or []
-    only_tls = bool(protocols) and set(protocols) <= set(_TLS_LINKS)
-    if mode != "client" and _value(config, "scouting/gossip/enabled") is not False and not only_tls:
-        return 'as a peer it links with whom the router tells of: set mode: "client", or transport.link.protocols: ["tls"]'
-    if loopback:
-        return next((f"{endpoint} is not an address of this machine" for endpoint in endpoints if not _is_local(endpoint)), "")
-    for endpoint in endpoints:
+    if why := _other_links(config):
+        return why
+    listen = _endpoints(config, "listen")
+    for endpoint in [*_endpoints(config, "connect"), *listen]:
         if "#" in endpoint:
-            return f"{endpoint} has settings of its own (#...): put them under transport.link.tls"
+            return f"{endpoint} has settings of its own behind the #; set them under transport.link.tls"
         if endpoint.partition("/")[0] not in _TLS_LINKS:
-            return f"{endpoint} is not encrypted: use tls/ or quic/"
+            return f"{endpoint} is not encrypted; use tls/ or quic/"
     tls = _value(config, "transport/link/tls") or {}
     if tls.get("enable_mtls") is not True:
         return "transport.link.tls.enable_mtls is not true"
-    needed = [("root_ca_certificate",), ("connect_certificate",), ("connect_private_key",)]
-    if _endpoints_list(config, "listen"):
-        needed += [("listen_certificate",), ("listen_private_key",)]
-    for (name,) in needed:
-        if not (tls.get(name) or tls.get(f"{name}_base64")):
-            return f"transport.link.tls.{name} is missing"
     if tls.get("verify_name_on_connect") is False:
         return "transport.link.tls.verify_name_on_connect is false"
+    names = ["root_ca_certificate", "connect_certificate", "connect_private_key"]
+    names += ["listen_certificate", "listen_private_key"] if listen else []
+    missing = [name for name in names if not tls.get(name)]
+    return f"transport.link.tls has no {', '.join(missing)}" if missing else ""
+
+
+def beyond_loopback(config: Any) -> str:
+    """Why a link of a session could leave this machine; empty where none can."""
+    if why := _other_links(config):
+        return why
+    for endpoint in [*_endpoints(config, "connect"), *_endpoints(config, "listen")]:
+        match = _ENDPOINT.match(endpoint)
+        if match is None or match["link"] not in _LOOPBACK_LINKS or not is_loopback(match["ipv6"] or match["host"]):
+            return f"{endpoint} is not an address of this machine"
     return ""
+
+
+def _other_links(config: Any) -> str:
+    """Why links may come about that no endpoint names."""
+    if not _endpoints(config, "connect") and not _endpoints(config, "listen"):
+        return "no endpoint is set, so Zenoh looks for others by itself"
+    if _value(config, "scouting/multicast/enabled") is not False:
+        return "scouting.multicast.enabled is not false"
+    if _value(config, "adminspace/permissions/write") is True:
+        return "adminspace.permissions.write is true, so others may change this configuration"
+    protocols = _value(config, "transport/link/protocols") or ["tcp"]
+    gossips = _value(config, "scouting/gossip/enabled") is not False
+    if _value(config, "mode") != "client" and gossips and not set(protocols) <= set(_TLS_LINKS):
+        return 'a peer links with whom its router names, over any link; set mode: "client"'
+    return ""
+
+
+def _value(config: Any, key: str) -> Any:
+    return json.loads(config.get_json(key))
+
+
+def _endpoints(config: Any, key: str) -> list[str]:
+    found = _value(config, f"{key}/endpoints")
+    if isinstance(found, dict):  # by mode
+        found = found.get(_value(config, "mode") or "peer") or []
+    return [str(endpoint) for endpoint in found or []]

@@ -21,6 +21,9 @@ from ..paths import shipped_file
 from .zenoh_format import ADMIN_SPACE, GID_SIZE, SENDER_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
+MAX_PUBLISHERS = 256
+"""Publishers of one topic whose gaps are counted; ids are the senders' own to choose."""
+
 _OPEN_S = 10.0
 _HEARTBEAT_S = 0.5  # by which a late or unlucky reader of a latched topic finds what it missed, as in rmw_zenoh
 
@@ -371,15 +374,20 @@ class RosSubscription:
             if self.malformed == 1:
                 log.error("%s: a message that rmw_zenoh did not make is refused: %s", self.topic, error)
             return
-        last = self._sequences.get(attachment.gid)
+        last = self._sequences.pop(attachment.gid, None)
         if last is not None:
             if attachment.sequence <= last:  # sent again
+                self._sequences[attachment.gid] = last
                 return
             missing = attachment.sequence - last - 1
             if missing:
                 gid = attachment.gid.hex()
                 self.lost_by = {**self.lost_by, gid: self.lost_by.get(gid, 0) + missing}
         self._sequences[attachment.gid] = attachment.sequence
+        if len(self._sequences) > MAX_PUBLISHERS:  # the one that was silent for the longest
+            oldest = next(iter(self._sequences))
+            del self._sequences[oldest]
+            self.lost_by = {gid: lost for gid, lost in self.lost_by.items() if gid != oldest.hex()}
         self.count += 1
         self._on_message(sample.payload.to_bytes(), attachment)
 

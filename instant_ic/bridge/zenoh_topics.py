@@ -12,7 +12,8 @@ from ..bus.registry import check_topic
 from ..msg import MessageError, message_type, type_hash
 from .zenoh_format import TopicQoS
 
-COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", "/operator/estop": "std_msgs/msg/Bool"}
+STOP = "/operator/estop"
+COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
 """What an operator elsewhere may send, and its type."""
 
 GRACE_S = 3.0

@@ -9,6 +9,7 @@ from instant_ic.bridge.commands import CommandGate, CommandLimits
 from instant_ic.bridge.topic_watch import TopicWatch
 from instant_ic.bridge.zenoh_incoming import Incoming
 from instant_ic.bridge.zenoh_outgoing import Outgoing
+from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
     SESSION_DEFAULTS,
@@ -20,7 +21,7 @@ from instant_ic.bridge.zenoh_session import (
     load_config,
 )
 from instant_ic.bridge.zenoh_topics import COMMANDS, Namespace, parse_publish, parse_subscribe
-from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
+from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main, registry
 from instant_ic.msg import MessageError
 from instant_ic.ranges import Range, check_ranges
 
@@ -39,7 +40,10 @@ class ZenohGatewayConfig:
         session_file: Zenoh configuration (JSON5), path or file of config/, instead of mode; empty: none.
         publish: topics that go out: NAME or PATTERN, with rate_hz=N behind it for at most N messages a second.
         subscribe: topics that come in: NAME, PATTERN, or "NAME TYPE" to have it before anybody publishes it.
-        commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop.
+        commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop. Only over TLS with
+            certificates on both sides (session_file); without it nothing but the pressing of the emergency stop.
+        insecure_loopback_commands: take commands without TLS where every link stays within this machine, as in a
+            simulation; everybody who can run a program on it can then drive.
         limits: what commands have to pass.
         discovery_period_s: how often to look for topics that come and go, s.
     """
@@ -52,6 +56,7 @@ class ZenohGatewayConfig:
     publish: tuple[str, ...] = ()
     subscribe: tuple[str, ...] = ()
     commands: tuple[str, ...] = ()
+    insecure_loopback_commands: bool = False
     limits: CommandLimits = field(default_factory=CommandLimits)
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.2
 
@@ -73,6 +78,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
     name = "zenoh_gateway"
     session: RosSession | None = None
     _zenoh: Any
+    _no_commands: str
 
     def setup(self) -> None:
         """Opens the session."""
@@ -89,6 +95,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             defaults = CLIENT_DEFAULTS if config.mode == "client" else SESSION_DEFAULTS
             self._zenoh = load_config(config_path(config.session_file), config.connect, defaults=defaults)
             client = is_client(self._zenoh)
+            self._no_commands = self.check_link() if config.commands else ""
             if not client:
                 self.opened(RosSession(self._zenoh, config.domain))
         except (ZenohError, MessageError, FileNotFoundError, registry.RegistryError) as error:
@@ -99,6 +106,22 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             self.timer(_AGAIN_S, self.try_again)
         self.timer(config.discovery_period_s, self.look)
         self.timer(1.0, self.tell)
+
+    def check_link(self) -> str:
+        """Why no commands are taken over this configuration's links; empty where they are."""
+        why = insecurity(self._zenoh)
+        if why and self.config.insecure_loopback_commands:
+            if beyond := beyond_loopback(self._zenoh):
+                why = f"insecure_loopback_commands: {beyond}"
+            else:
+                self.diagnose("commands", WARN, "taken without TLS from every program of this machine")
+                return ""
+        if not why:
+            self.diagnose("commands", OK, "taken over TLS, from hosts with a certificate")
+            return ""
+        why = f"no commands are taken but emergency stops: {why} (docs/fleet.md, TLS and access control)"
+        self.diagnose("commands", ERROR, why)
+        return why
 
     def open(self, _: None) -> RosSession | ZenohError:
         """Tries to reach the router (background thread)."""
@@ -119,7 +142,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.session = session
         own = RosNode(session, namespace.ros, self.node_name)
         self.outgoing = Outgoing(self, session, namespace, own, config.publish)
-        self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate)
+        self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate, self._no_commands)
         self.outgoing.brought_in = self.incoming.wants
         session.watch(self.incoming.on_token)
         self.look()

@@ -11,11 +11,22 @@ from live_nodes import LiveNode, Neighbour, wait_for
 
 from instant_ic import paths
 from instant_ic.bridge.zenoh_format import TopicQoS
-from instant_ic.bridge.zenoh_session import RosNode, RosPublisher, RosSession, ZenohError, load_config, open_zenoh
+from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
+from instant_ic.bridge.zenoh_session import (
+    CLIENT_DEFAULTS,
+    SESSION_DEFAULTS,
+    RosNode,
+    RosPublisher,
+    RosSession,
+    ZenohError,
+    load_config,
+    open_zenoh,
+)
 from instant_ic.bus import LATCHED
+from instant_ic.bus.params import load_file
 from instant_ic.bus.registry import list_topics
 from instant_ic.evaluation.stack import free_port
-from instant_ic.msg import String, deserialize, serialize, type_hash
+from instant_ic.msg import String, deserialize, serialize, twist_stamped, type_hash
 from instant_ic.nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
 from instant_ic.nodes.zenoh_router import ZenohRouterConfig, ZenohRouterNode
 
@@ -71,6 +82,84 @@ def test_gateways_meet_at_a_router_node_by_the_shipped_files(tmp_path_factory):
     finally:
         for thing in reversed(things):
             thing.close()
+
+
+# -- when commands may come in -------------------------------------------------------------------------
+
+MTLS = 'root_ca_certificate: "ca.pem", connect_certificate: "a.pem", connect_private_key: "a.key", enable_mtls: true'
+QUIET = "scouting: {multicast: {enabled: false}}"
+
+
+def session_file(mode="client", connect='"tls/r.example:7447"', listen="", tls=MTLS, more=QUIET):
+    return zenoh.Config.from_json5(
+        f"""{{mode: "{mode}", connect: {{endpoints: [{connect}]}}, listen: {{endpoints: [{listen}]}},
+        transport: {{link: {{tls: {{{tls}}}}}}}, {more}}}"""
+    )
+
+
+def test_a_session_with_certificates_on_both_sides_may_carry_commands():
+    assert insecurity(session_file()) == ""
+    assert insecurity(session_file(connect='"quic/[2001:db8::1]:7447", "tls/r:1"')) == ""
+    assert insecurity(zenoh.Config.from_json5(with_tls("zenoh_robot.json5"))) == ""
+    both = MTLS + ', listen_certificate: "b.pem", listen_private_key: "b.key"'
+    assert insecurity(session_file(listen='"tls/[::]:7448"', tls=both)) == ""
+    assert (
+        insecurity(session_file("peer", more="scouting: {multicast: {enabled: false}, gossip: {enabled: false}}")) == ""
+    )
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"connect": '"tcp/r.example:7447"'}, "tcp/r.example:7447 is not encrypted"),
+        ({"connect": '"tls/r:7447", "tcp/127.0.0.1:7447"'}, "tcp/127.0.0.1:7447 is not encrypted"),
+        ({"connect": '"tls/r:7447#enable_mtls=false"'}, "settings of its own"),
+        ({"connect": ""}, "no endpoint"),
+        ({"listen": '"tcp/[::]:7448"'}, "tcp/[::]:7448 is not encrypted"),
+        ({"listen": '"tls/[::]:7448"'}, "no listen_certificate, listen_private_key"),
+        ({"tls": MTLS.replace("true", "false")}, "enable_mtls is not true"),
+        ({"tls": MTLS.replace(", enable_mtls: true", "")}, "enable_mtls is not true"),
+        ({"tls": MTLS.replace('root_ca_certificate: "ca.pem", ', "")}, "no root_ca_certificate"),
+        ({"tls": MTLS + ", verify_name_on_connect: false"}, "verify_name_on_connect"),
+        ({"more": "scouting: {multicast: {enabled: true}}"}, "multicast"),
+        ({"more": "scouting: {}"}, "multicast"),
+        ({"more": QUIET + ", adminspace: {enabled: true, permissions: {write: true}}"}, "adminspace"),
+        ({"mode": "peer"}, 'set mode: "client"'),
+    ],
+)
+def test_any_other_session_may_not_and_the_reason_names_the_setting(config, words):
+    assert words in insecurity(session_file(**config))
+
+
+def test_the_shipped_files_without_tls_and_the_defaults_may_not():
+    for name in ("zenoh_robot.json5", "zenoh_station.json5"):
+        assert insecurity(load_config(paths.shipped_file("config", name)))
+    for defaults in (CLIENT_DEFAULTS, SESSION_DEFAULTS):
+        assert insecurity(load_config(None, ("tls/r.example:7447",), defaults=defaults))
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "stays"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/[::1]:7447", True),
+        ("tcp/localhost:7447", True),
+        ("tcp/10.0.0.1:7447", False),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/127.0.0.1.evil.example:7447", False),
+        ("udp/127.0.0.1:7447", False),
+        ("tcp/127.0.0.1:7447#bind=10.0.0.1", False),
+    ],
+)
+def test_only_a_session_that_stays_within_the_machine_may_do_without(endpoint, stays):
+    assert (beyond_loopback(load_config(None, (endpoint,), defaults=CLIENT_DEFAULTS)) == "") is stays
+    assert beyond_loopback(load_config(None, (endpoint,), defaults=SESSION_DEFAULTS))  # a peer: its router names others
+
+
+def test_the_simulated_fleet_carries_commands_and_a_robot_that_is_started_alike_elsewhere_does_not():
+    parameters = load_file(paths.shipped_file("config", "fleet_sim.yaml"), "zenoh_gateway")
+    assert parameters["insecure_loopback_commands"].value is True
+    assert ZenohGatewayConfig().insecure_loopback_commands is False
 
 
 # -- TLS and access control ----------------------------------------------------------------------------
@@ -183,6 +272,27 @@ def test_latched_values_reach_late_stations_through_access_control(secure, certi
     listener.wait(lambda: heard, "the latched value")
     assert deserialize(heard[0].payload, STRING).data == "the map"
     assert "/map" in {info.topic for info in list_topics(run_dir)}
+
+
+def test_commands_come_in_over_tls_with_certificates(secure, certificates, tmp_path_factory):
+    text = with_tls("zenoh_robot.json5").replace("/etc/zenoh", str(certificates))
+    file = tmp_path_factory.mktemp("c") / "robot.json5"
+    file.write_text(text.replace("router.example:7447", secure.endpoint))
+    run_dir = tmp_path_factory.mktemp("r")
+    config = ZenohGatewayConfig("robot1", session_file=str(file), commands=("/operator/cmd_vel", "/operator/estop"))
+    gateway = secure.keep(LiveNode(run_dir, ZenohGatewayNode, config, "zenoh_gateway"))
+    wait_for(lambda: "taken over TLS" in gateway.told("commands"), "the diagnosis")
+    listener = secure.keep(Neighbour(run_dir, "listener"))
+    driven = listener.listen("/operator/cmd_vel")
+    name = "geometry_msgs/msg/TwistStamped"
+    station = RosNode(secure.session("station", "station"), "/robot1", "console")
+    drive = RosPublisher(station, "/robot1/operator/cmd_vel", name, type_hash(name), TopicQoS())
+
+    def command():
+        drive.put(bytes(serialize(twist_stamped(0.1, 0.0, time.time_ns()))), time.time_ns())
+        return driven
+
+    listener.wait(command, "the command")
 
 
 def test_without_a_certificate_nobody_gets_in(secure, certificates, tmp_path):

@@ -39,6 +39,8 @@ zenoh = pytest.importorskip("zenoh")
 pytestmark = pytest.mark.xdist_group("zenoh")
 STRING = "std_msgs/msg/String"
 TWIST = "geometry_msgs/msg/TwistStamped"
+COMMANDS = ("/operator/cmd_vel", "/operator/estop")
+LOOPBACK = {"mode": "client", "insecure_loopback_commands": True}
 
 
 @pytest.fixture(scope="module")
@@ -312,7 +314,7 @@ def test_another_definition_of_a_type_is_told_and_kept_out(world):
 @pytest.fixture
 def operator(world):
     """A robot that takes commands, and somebody outside who sends them with times and senders as told."""
-    gateway = world.gateway("robot", namespace="robot1", commands=("/operator/cmd_vel", "/operator/estop"))
+    gateway = world.gateway("robot", namespace="robot1", commands=COMMANDS, **LOOPBACK)
     listener = world.neighbour("robot", "listener")
     driven, stops = listener.listen("/operator/cmd_vel", SENSOR), listener.listen("/operator/estop", LATCHED)
     outside = RosNode(world.session(), "/robot1", "station")
@@ -372,15 +374,99 @@ def test_second_driver_is_refused_until_the_first_is_silent(operator, world):
 
 
 def test_a_stop_comes_in_however_old_it_is_and_only_a_fresh_release_does(operator):
-    gateway, listener, _, stops, _, stop, _ = operator
+    gateway, listener, _, stops, command, stop, _ = operator
     hour = 3_600_000_000_000
     stop.put(cdr(Bool(True)), time.time_ns() - hour)
     listener.wait(lambda: stops and deserialize(stops[-1].payload, "std_msgs/msg/Bool").data, "the stop")
     stop.put(cdr(Bool(False)), time.time_ns() - hour)
     wait_for(lambda: "command refused" in gateway.told("in /operator/estop"), "refusal of the old release")
     assert deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
+
+    def release():
+        command(0.0)  # the driver is there
+        stop.put(cdr(Bool(False)), time.time_ns())
+        return not deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
+
+    listener.wait(release, "the fresh release")
+
+
+def stop_publisher(world, node):
+    node = RosNode(world.session(), "/robot1", node)
+    kind = "std_msgs/msg/Bool"
+    return RosPublisher(node, "/robot1/operator/estop", kind, type_hash(kind), TopicQoS(True, True, 1))
+
+
+def test_nobody_but_the_driver_releases_the_emergency_stop_and_everybody_presses_it(operator, world):
+    gateway, listener, _, stops, command, stop, _ = operator
+    stranger = stop_publisher(world, "stranger")
+
+    def stopped():
+        return bool(stops) and deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
+
+    listener.wait(lambda: stranger.put(cdr(Bool(True)), time.time_ns()) or stopped(), "the stranger's stop")
+
+    def refused():
+        command(0.0)
+        stranger.put(cdr(Bool(False)), time.time_ns())
+        return gateway.node.gate.refused.get("release", 0) >= 3
+
+    listener.wait(refused, "refusals of the stranger's release")
+    listener.spin(0.2)
+    assert stopped()
+    listener.wait(lambda: command(0.0) and (stop.put(cdr(Bool(False)), time.time_ns()) or not stopped()), "the release")
+
+
+@pytest.mark.parametrize("loopback", [False, True])
+def test_without_tls_no_command_comes_in_but_the_pressing_of_the_emergency_stop(world, loopback):
+    """Loopback is allowed only where the parameter says so and no link can leave the machine: a peer's can."""
+    gateway = world.gateway(
+        "robot", namespace="robot1", commands=COMMANDS, subscribe=("/*",), insecure_loopback_commands=loopback
+    )
+    assert "no commands are taken but emergency stops" in gateway.told("commands")
+    assert gateway.node.diagnoses()["commands"][0] == 2
+    listener = world.neighbour("robot", "listener")
+    driven, stops = listener.listen("/operator/cmd_vel", SENSOR), listener.listen("/operator/estop", LATCHED)
+    stop = stop_publisher(world, "stranger")
+    drive = RosPublisher(stop_node(world), "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST), TopicQoS())
+
+    def press():
+        drive.put(cdr(twist_stamped(0.3, 0.0, time.time_ns())), time.time_ns())
+        stop.put(cdr(Bool(True)), time.time_ns())
+        return stops
+
+    listener.wait(press, "the stop")
     stop.put(cdr(Bool(False)), time.time_ns())
-    listener.wait(lambda: not deserialize(stops[-1].payload, "std_msgs/msg/Bool").data, "the fresh release")
+    wait_for(lambda: gateway.node.gate.refused.get("link not secure"), "the refusal of the release")
+    listener.spin(0.2)
+    assert driven == [] and "/operator/cmd_vel" not in world.topics("robot")
+    assert deserialize(stops[-1].payload, "std_msgs/msg/Bool").data
+
+
+def stop_node(world):
+    return RosNode(world.session(), "/robot1", "driver")
+
+
+def test_names_that_others_make_are_limited(world, monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.zenoh_incoming.MAX_TOPICS", 5)
+    monkeypatch.setattr("instant_ic.bridge.zenoh_session.MAX_PUBLISHERS", 5)
+    gateway = world.gateway("robot", namespace="robot1", subscribe=("/*",))
+    outside = RosNode(world.session(), "/robot1", "stranger")
+    kept = [
+        RosPublisher(outside, f"/robot1/{'x' * length}{number}", STRING, type_hash(STRING), TopicQoS())
+        for length, number in [(300, 0), *((1, number) for number in range(20))]
+    ]
+    wait_for(lambda: "at most 5 topics" in gateway.told("names"), "the refusal")
+    wait_for(lambda: len(gateway.node.incoming.topics) == 5, "the topics that are taken")
+    assert all(len(topic) < 10 for topic in gateway.node.incoming.topics) and len(kept) == 21
+    topic = gateway.node.incoming.topics[0]
+    raw = outside.session.zenoh.declare_publisher(data_key(0, f"/robot1{topic}", STRING, type_hash(STRING)))
+    wait_for(lambda: raw.matching_status.matching, "the gateway's subscription")
+    for sequence in (1, 3):
+        for number in range(20):
+            raw.put(cdr(String("x")), attachment=Attachment(sequence, 1, bytes([number] * 16)).pack())
+    entry = gateway.node.incoming._topics[topic]
+    wait_for(lambda: entry.subscription.count >= 40, "all messages")
+    assert len(entry.subscription._sequences) == 5 and len(entry.subscription.lost_by) <= 5
 
 
 def test_robot_is_told_to_stand_when_the_last_driver_leaves(operator):
@@ -396,9 +482,13 @@ def test_commands_do_not_come_in_where_they_are_not_configured(world):
     drive = RosPublisher(outside, "/robot1/operator/cmd_vel", TWIST, type_hash(TWIST), TopicQoS())
     chat = RosPublisher(outside, "/robot1/chatter", STRING, type_hash(STRING), TopicQoS())
     wait_for(lambda: "/chatter" in world.topics("robot"), "the harmless topic")
-    drive.put(cdr(twist_stamped(0.3, 0.0, time.time_ns())), time.time_ns())
-    chat.put(cdr(String("x")), time.time_ns())
-    wait_for(lambda: gateway.node.incoming.count, "the harmless message")
+
+    def sent():  # again and again: the gateway's subscription may not have reached the publisher yet
+        drive.put(cdr(twist_stamped(0.3, 0.0, time.time_ns())), time.time_ns())
+        chat.put(cdr(String("x")), time.time_ns())
+        return gateway.node.incoming.count
+
+    wait_for(sent, "the harmless message")
     assert world.topics("robot") & {"/operator/cmd_vel", "/cmd_vel"} == set()
 
 
