@@ -15,6 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from instant_ic.private import open_file
+
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
 STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0C, 0x0D, 0x0E, 0x0F
@@ -64,7 +66,7 @@ class McapWriter:
     """One MCAP file of CDR messages; not for several threads at once.
 
     Args:
-        path: the file, which must not exist.
+        path: the file, which must not exist; only its owner can read it.
         compressed: chunks are compressed with zstd.
         level: from 1, for what must keep pace, to 19, for what must be small.
 
@@ -80,7 +82,7 @@ class McapWriter:
             import zstandard
 
             self._compressor = zstandard.ZstdCompressor(level=level)
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._offset = 0
         self._schemas: dict[int, bytes] = {}
         self._channels: dict[int, tuple[int, bytes]] = {}

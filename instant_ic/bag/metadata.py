@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ from rosbags.rosbag2.metadata import dump_qos_v9
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
 from instant_ic.msg import MessageError, message_type, type_hash, typestore
+from instant_ic.private import open_file
 
 METADATA_FILE = "metadata.yaml"
 REPEATED = "instant_ic.repeated"
@@ -113,7 +115,8 @@ def write_metadata(
     text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False, width=1000)
     scratch = folder / f"{METADATA_FILE}.tmp"
     try:
-        scratch.write_text(text)
+        with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
+            file.write(text)
         scratch.replace(folder / METADATA_FILE)
     except OSError:
         scratch.unlink(missing_ok=True)

@@ -25,6 +25,7 @@ from instant_ic.bag.snapshot import Entry, SnapshotCache
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
+from instant_ic.private import make_folder
 
 FOREIGN_CLOCK_NS = 10_000_000_000
 """A stamp farther than this from the simulated clock was made by another clock."""
@@ -207,7 +208,7 @@ class Recorder:
         self._cache: SnapshotCache | None = None
         if self.options.snapshot_s:
             try:
-                path.mkdir(parents=True, exist_ok=True)
+                make_folder(path, exist_ok=True)
             except OSError as error:
                 raise BagError(f"folder {path} for snapshots cannot be made: {error.strerror}") from None
             self._cache = SnapshotCache(self.options.snapshot_s, self.options.cache_bytes)

@@ -13,6 +13,7 @@ from instant_ic.bag.latched import LatchedValue, LatchedValues
 from instant_ic.bag.mcap_writer import Buffer, McapWriter, Schema
 from instant_ic.bag.metadata import PartInfo, Topic, channel_metadata, schema_or_unknown, write_metadata
 from instant_ic.bus.qos import SENSOR, QoS
+from instant_ic.private import make_folder
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
@@ -40,7 +41,7 @@ class BagWriter:
     one file to recover.
 
     Args:
-        path: the folder, which must not exist yet.
+        path: the folder, which must not exist yet; only its owner can read it.
         compressed: chunks are compressed by zstd, for bags to keep or send: half the size for point packets.
         level: of the compression; 1 keeps pace with raw pictures, 3 is smaller.
         max_bytes: a file that has grown so large is followed by the next; 0 does not look at the size.
@@ -74,7 +75,7 @@ class BagWriter:
         self._part: _Part | None = None
         self._closed = False
         try:
-            path.mkdir(mode=0o755, parents=True)
+            make_folder(path)
         except FileExistsError:
             raise BagError(f"bag {path} cannot be made: {path} exists already, not overwriting") from None
         except OSError as error:

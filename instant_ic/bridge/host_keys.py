@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from instant_ic.private import make_folder, open_file
+
 ROLES = ("driver", "viewer")
 """What an allowed host may do: a driver's topics are taken in, a viewer only watches."""
 
@@ -265,7 +267,7 @@ class KeyStore:
         scratch = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             scratch.unlink(missing_ok=True)
-            with os.fdopen(os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL), "w") as file:
                 file.write(text)
                 file.flush()
                 os.fsync(file.fileno())
@@ -277,7 +279,7 @@ class KeyStore:
 
     def _make_folder(self) -> None:
         try:
-            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            make_folder(self.folder, exist_ok=True)
         except OSError as error:
             self._cannot_write(self.folder, error)
 
@@ -286,7 +288,7 @@ class KeyStore:
         """Two commands at a time must not lose each other's line."""
         self._make_folder()
         try:
-            fd = os.open(self.folder / ".lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            fd = open_file(self.folder / ".lock", os.O_RDWR | os.O_CREAT)
         except OSError as error:
             self._cannot_write(self.folder, error)
         try:

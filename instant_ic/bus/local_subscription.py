@@ -258,7 +258,7 @@ class LocalSubscription:
         self._depth = qos.depth
         self._now_ns, self._steady_ns, self._next_order = transport.now_ns, transport.steady_ns, transport.next_order
         self._folder = registry.topic_dir(transport.run_dir, topic)
-        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        registry.own_folder(self._folder)
         self._seen_mtime = -1
         self._next_full_look = 0.0
         self._inlets: dict[str, tuple[str, Inlet]] = {}  # by the publisher's identity: its socket's path, connection

@@ -146,6 +146,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
     run_dir = args.run_dir or paths.run_dir()
     try:
+        registry.prepare(run_dir)  # before anything in it is believed
         pace.use(pace.read(run_dir))
         transport = LocalTransport(run_dir, args.name, clock.now_ns, clock.steady_ns)
         claim = registry.Claim(run_dir / "nodes" / args.name, f"node {args.name}")

@@ -11,15 +11,20 @@ lock can be taken belongs to a dead process and is swept.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import json
 import os
 import re
+import stat
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from ..private import make_folder, open_file
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+\Z")
@@ -88,26 +93,73 @@ def check_node_name(name: str) -> str:
 
 
 def prepare(run_dir: Path) -> Path:
-    """Makes the run directory with mode 0700, or checks that it is ours.
+    """Make the run directory and its folders with mode 0700, or check that nobody else can reach into them.
 
     Raises:
-        RegistryError: it cannot be made or written, or it belongs to someone else.
+        RegistryError: it cannot be made or written; it, or a folder in it, is a symbolic link or belongs to another
+            user; or others can replace it, for a folder above it can be written by them.
     """
     try:
-        run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-        owner = run_dir.stat().st_uid
-        if owner != os.getuid():
-            raise RegistryError(
-                f"run directory {run_dir} belongs to user {owner}: set INSTANT_IC_RUN_DIR to one of yours"
-            )
-        run_dir.chmod(0o700)
-        for name in ("topics", "nodes", "dev", "log"):
-            (run_dir / name).mkdir(mode=0o700, exist_ok=True)
+        for folder in (run_dir, *(run_dir / name for name in ("topics", "nodes", "dev", "log"))):
+            own_folder(folder)
+        for parent in (folder := run_dir.absolute().parent.resolve(), *folder.parents):
+            mode, group = (status := parent.stat()).st_mode, status.st_gid
+            # A group of one's own, the primary one, is usual for a folder in a home.
+            by_others = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and group != os.getegid())
+            if by_others and not mode & stat.S_ISVTX:
+                raise RegistryError(
+                    f"run directory {run_dir} is not safe: other users can write to {parent} (mode "
+                    f"{stat.S_IMODE(mode):04o}) and so replace it; chmod go-w {parent}, or set INSTANT_IC_RUN_DIR to "
+                    "another folder"
+                )
     except OSError as error:
         raise RegistryError(
             f"run directory {run_dir} cannot be used: {error}; set INSTANT_IC_RUN_DIR to another"
         ) from error
     return run_dir
+
+
+def own_folder(folder: Path) -> None:
+    """Make a folder with mode 0700, or check that it is one of this user and give it this mode.
+
+    Raises:
+        RegistryError: it is a symbolic link or no folder, or it belongs to another user.
+        OSError: it cannot be made.
+    """
+    with suppress(FileExistsError):
+        make_folder(folder)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode):
+        what = "a symbolic link" if stat.S_ISLNK(status.st_mode) else "not a folder"
+        raise RegistryError(f"{folder} is {what}: remove it, or set INSTANT_IC_RUN_DIR to a folder of your own")
+    if status.st_uid != os.getuid():
+        raise RegistryError(
+            f"{folder} belongs to user {status.st_uid}, not to you ({os.getuid()}): set INSTANT_IC_RUN_DIR to a folder "
+            "of your own"
+        )
+    if stat.S_IMODE(status.st_mode) & 0o777 != 0o700:
+        folder.chmod(0o700)
+
+
+def open_lock(path: Path, create: bool = False) -> int:
+    """Open a lock file; returns its descriptor.
+
+    Raises:
+        RegistryError: it is a symbolic link or no plain file, or it belongs to another user.
+        OSError: it cannot be opened.
+    """
+    flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | (os.O_CREAT if create else 0)
+    try:
+        descriptor = os.open(path, flags, 0o600)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise RegistryError(f"{path} is a symbolic link: somebody else has put it there; remove it") from None
+    status = os.fstat(descriptor)
+    if stat.S_ISREG(status.st_mode) and status.st_uid == os.getuid():
+        return descriptor
+    os.close(descriptor)
+    raise RegistryError(f"{path} is not a file of yours (owner {status.st_uid}): remove it")
 
 
 def topic_dir(run_dir: Path, topic: str) -> Path:
@@ -133,8 +185,8 @@ class Claim:
         self.json_path = stem.with_name(stem.name + ".json")
         lock_path = stem.with_name(stem.name + ".lock")
         try:
-            stem.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._fd = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            own_folder(stem.parent)
+            self._fd = open_lock(lock_path, create=True)
         except OSError as error:
             raise RegistryError(f"{what}: {error}") from error
         deadline = time.monotonic() + timeout_s
@@ -156,7 +208,8 @@ class Claim:
         """
         scratch = self.json_path.with_suffix(".tmp")
         try:
-            scratch.write_text(json.dumps(content, default=str))
+            with os.fdopen(open_file(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w", encoding="utf-8") as file:
+                file.write(json.dumps(content, default=str))
             scratch.replace(self.json_path)
         except OSError as error:
             scratch.unlink(missing_ok=True)
@@ -200,8 +253,8 @@ def _alive(json_path: Path) -> bool:
     """Whether the owner of a JSON holds its lock."""
     lock_path = json_path.with_suffix(".lock")
     try:
-        fd = os.open(lock_path, os.O_RDWR | os.O_CLOEXEC)
-    except FileNotFoundError:
+        fd = open_lock(lock_path)
+    except (FileNotFoundError, RegistryError):  # what another user has put there is no entry
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -261,7 +314,7 @@ def sweep(run_dir: Path) -> int:
     """Takes away what dead processes left; returns how many places were cleared."""
     swept = 0
     for lock_path in [*(run_dir / "topics").glob("*/*.lock"), *(run_dir / "nodes").glob("*.lock")]:
-        fd = os.open(lock_path, os.O_RDWR | os.O_CLOEXEC)
+        fd = open_lock(lock_path)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -39,6 +39,7 @@ class Observer:
         self.topics = list(dict.fromkeys(absolute(name) for name in names))
         self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
         self._run_dir = run_dir or paths.run_dir()
+        registry.prepare(self._run_dir)  # before anything in it is believed
         try:
             pace.use(pace.read(self._run_dir))
         except pace.PaceError as error:

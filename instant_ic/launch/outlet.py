@@ -17,6 +17,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
+from instant_ic.private import make_folder, open_file
+
 
 class Outlet:
     """Runs calls one after another beside the caller.
@@ -86,7 +88,7 @@ class Outlet:
 
 
 class LogFile:
-    """A node's log file; the run before is kept beside it. Errors are told once and never raised.
+    """A node's log file, mode 0600; the run before is kept beside it. Errors are told once and never raised.
 
     Args:
         path: where; its folder need not be there yet.
@@ -147,8 +149,8 @@ class LogFile:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _open(self) -> None:
-        self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self._file = self.path.open("ab", buffering=0)
+        make_folder(self.path.parent, exist_ok=True)
+        self._file = os.fdopen(open_file(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab", buffering=0)
         self._size = self.path.stat().st_size
 
     def _rotate(self) -> None:

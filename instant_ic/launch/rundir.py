@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from types import TracebackType
 
+from instant_ic.bus.registry import open_lock
+
 
 class StackRunningError(RuntimeError):
     """Another stack has the run directory; the message says which and what to do."""
@@ -30,8 +32,9 @@ class StackLock:
 
         Raises:
             StackRunningError: another stack has it.
+            RegistryError: it is no file of this user.
         """
-        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = open_lock(self.path, create=True)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -1,0 +1,52 @@
+"""Folders and files that only their owner can read, whatever the umask."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+log = logging.getLogger(__name__)
+
+
+def make_folder(path: Path, exist_ok: bool = False) -> None:
+    """Make a folder and its missing parents, each with mode 0700; one that exists keeps its mode.
+
+    Raises:
+        FileExistsError: it exists and ``exist_ok`` is false, or it is no folder.
+        OSError: it cannot be made.
+    """
+    try:
+        path.mkdir(mode=0o700)
+    except FileNotFoundError:
+        make_folder(path.parent, exist_ok=True)
+        path.mkdir(mode=0o700)
+    except FileExistsError:
+        if not exist_ok or not path.is_dir():
+            raise
+        return
+    _restrict(path, path.lstat().st_mode, 0o700, path.chmod)
+
+
+def open_file(path: Path, flags: int) -> int:
+    """Open a file and give it mode 0600, whether this call makes it or not; never through a symbolic link.
+
+    Returns:
+        Its descriptor, which no child process inherits.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    _restrict(path, os.fstat(descriptor).st_mode, 0o600, lambda mode: os.fchmod(descriptor, mode))
+    return descriptor
+
+
+def _restrict(path: Path, present: int, mode: int, change: Callable[[int], None]) -> None:
+    if present & 0o777 == mode:
+        return
+    try:
+        change(mode)
+    except OSError as error:  # a USB stick with FAT has no modes; a recording on it is better than none
+        log.warning("%s cannot be hidden from other users (mode %04o): %s", path, mode, error.strerror)
