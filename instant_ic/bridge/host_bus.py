@@ -27,6 +27,9 @@ OLD_NEWS_NS = 1_000_000_000
 Bool has no such grace: which of a release and a stop came first is then uncertain, and the stop must hold.
 """
 
+MAX_LATCHED = 64
+"""Publishers of one latched topic whose last values are kept for late readers."""
+
 
 class ExportedTopics:
     """What this host's nodes publish, given to the link; not what a bridge publishes here.
@@ -155,7 +158,14 @@ class ImportedTopics:
                         return
                     topic.last.clear()
                 topic.newest_ns = max(arrived.born_ns, topic.newest_ns)
+                topic.last.pop(announce.origin, None)
                 topic.last[announce.origin] = arrived
+                if len(topic.last) > MAX_LATCHED:
+                    oldest = next(iter(topic.last))
+                    del topic.last[oldest]
+                    self._on_trouble(
+                        announce.topic, f"more than {MAX_LATCHED} nodes publish it: the value of {oldest} is forgotten"
+                    )
             if topic.publisher is None:
                 topic.waiting.append(arrived)
             else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -33,6 +34,14 @@ from .host_topics import TopicCounts, TopicRule
 
 MAX_MESSAGE = 64 << 20
 """Bytes of the longest message that is put together."""
+
+MAX_CHANNELS = 1024
+"""Channels that a peer may announce on one link; a robot has some hundred."""
+
+MAX_NAME = 128
+MAX_NOTICES = 16
+_NAME = re.compile(rf"[A-Za-z0-9_/.:-]{{1,{MAX_NAME}}}\Z")
+_MAX_TEXT = 300
 
 _FIRST_PINGS = 8
 _FIRST_PING_S = 0.02
@@ -348,7 +357,7 @@ class Session:
         now = self.clocks.mono_ns()
         match message:
             case Bye():
-                return self.end(message.code, message.reason)
+                return self.end(_text(message.code), _text(message.reason))
             case Hello() if not self._connecting and not self.up:
                 if message.version != VERSION:
                     return self._wrong_version(message)
@@ -377,11 +386,13 @@ class Session:
                     raise ProtocolError(f"{message} acknowledges what was not sent")
                 return []
             case Notice():
-                self.notices[message.name] = message.text
+                if message.name not in self.notices and len(self.notices) >= MAX_NOTICES:
+                    raise ProtocolError(f"more than {MAX_NOTICES} notices of different names")
+                self.notices[_checked("Notice: name", message.name)] = _text(message.text)
                 return []
             case Refuse():
                 channel = self.outbox.refuse(message.channel, message.reason)
-                return [] if channel is None else [Refused(channel.rule.topic, message.reason, here=False)]
+                return [] if channel is None else [Refused(channel.rule.topic, _text(message.reason), here=False)]
             case Announce():
                 return self._announced(message)
             case Data():
@@ -401,7 +412,7 @@ class Session:
         for topic, rate in wants.items():
             if not isinstance(rate, (int, float)) or isinstance(rate, bool) or not 0 <= rate < 1e6:
                 raise ProtocolError(f"{type(message).__name__}: rate of {topic} must be a number >= 0 (got {rate!r})")
-        self.peer_name, self.peer_instance = message.name[:64], message.instance[:64]
+        self.peer_name, self.peer_instance = _text(message.name)[:64], message.instance[:64]
         self.outbox.wants = {topic: float(rate) for topic, rate in wants.items()}
         self.up, self.up_ns = True, self.clocks.mono_ns()
         if not self.may_send:
@@ -414,6 +425,10 @@ class Session:
         return [Up(self.peer_name)]
 
     def _announced(self, announce: Announce) -> list[Event]:
+        for key in ("topic", "origin", "type_name", "digest", "qos"):
+            _checked(f"Announce: {key}", getattr(announce, key))
+        if len(self._incoming) >= MAX_CHANNELS and announce.channel not in self._incoming:
+            raise ProtocolError(f"more than {MAX_CHANNELS} channels are announced on one link")
         rule = self.side.imports.get(announce.topic)
         reason = ""
         if rule is None:
@@ -429,8 +444,6 @@ class Session:
                     )
             except ValueError as error:
                 reason = str(error)
-        if len(self._incoming) >= 4096:
-            raise ProtocolError("more than 4096 topics are announced")
         topic = announce.topic
         counts = self.memory.counts_in.setdefault(topic, TopicCounts()) if rule is not None else TopicCounts()
         self._incoming[announce.channel] = _Incoming(announce, rule or TopicRule("/none"), counts, reason)
@@ -496,7 +509,7 @@ class Session:
         last = self.memory.received.get(key)
         if last is not None and data.sequence > last + 1:
             counts.lost += data.sequence - last - 1
-        self.memory.received[key] = data.sequence
+        _remember(self.memory.received, key, data.sequence)
         born_ns = min(data.born_ns - self.clock.offset_ns, now)  # by our monotonic clock
         age_ns = now - born_ns
         rule = incoming.rule
@@ -524,8 +537,34 @@ class Session:
             key = (self.peer_instance, announce.topic, announce.origin)
             if self.memory.latched.get(key) == born_ns:
                 return []
-            self.memory.latched[key] = born_ns
+            _remember(self.memory.latched, key, born_ns)
         counts.messages += 1
         counts.bytes += len(arrived.payload)
         counts.newest_age_ns = arrived.age_ns
         return [arrived]
+
+
+def _checked(what: str, name: str) -> str:
+    """A name that the other host makes, if it may be kept here.
+
+    Raises:
+        ProtocolError: it is too long, or has other characters than names have.
+    """
+    if not _NAME.match(name):
+        raise ProtocolError(
+            f"{what} {name[:40]!r} of {len(name)} characters must have 1 to {MAX_NAME} letters, digits or _ / . : -"
+        )
+    return name
+
+
+def _text(text: str) -> str:
+    """The other host's words as they may be logged: one line, not long."""
+    return "".join(c if c.isprintable() else " " for c in text[:_MAX_TEXT])
+
+
+def _remember(memory: dict[tuple[str, str, str], int], key: tuple[str, str, str], value: int) -> None:
+    """Keeps a number for a publisher; of too many the one that was silent for the longest is forgotten."""
+    memory.pop(key, None)
+    memory[key] = value
+    if len(memory) > MAX_CHANNELS:
+        del memory[next(iter(memory))]

@@ -33,6 +33,7 @@ from instant_ic.ranges import Positive, check_ranges
 LOOK_S = 0.5
 LATE_READERS_S = 0.1
 RECENT_S = 10.0
+UNLISTED = "of no list"
 
 
 @dataclass(frozen=True)
@@ -104,6 +105,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         self.missed = 0
         self.clock_told: set[str] = set()
         self.troubled: set[str] = set()
+        self.listed = {*to_station, *to_robot}
         self.outgoing.look()
         self.link.start()
         self.timer(LOOK_S, self.outgoing.look)
@@ -165,7 +167,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.tell()
 
     def trouble(self, topic: str, text: str) -> None:
-        """A topic that does not go over the link."""
+        """A topic that does not go over the link; those on no list of this host share one diagnosis."""
+        if topic not in self.listed:
+            topic, text = UNLISTED, f"{topic}: {text}"
         self.troubled.add(topic)
         self.diagnose(f"topic {topic}", ERROR, text)
 

@@ -308,6 +308,37 @@ def test_of_two_hosts_words_within_a_second_the_stop_holds_in_either_order(stop_
     assert bus.records("/operator/estop")[-1].payload == b"\x00"
 
 
+class Collector(Node[NoConfig]):
+    name = "collector"
+
+    def setup(self):
+        self.troubles = []
+        rules = {"/state": TopicRule("/state")}
+        self.incoming = ImportedTopics(self, rules, lambda topic, text: self.troubles.append((topic, text)))
+
+
+def test_latched_values_that_a_peer_makes_are_limited_with_a_clear_error():
+    bus = LockstepBus()
+    collector = bus.add(Collector)
+    for number in range(100):
+        announce = Announce(number, "/state", f"node{number}", Bool.__msgtype__, "", "latched")
+        collector.incoming.take(Arrived(announce, bytes(serialize(Bool(data=True))), number, 0, number))
+    last = collector.incoming._topics["/state"].last
+    assert list(last) == [f"node{number}" for number in range(36, 100)]  # the newest 64
+    assert collector.troubles[0] == ("/state", "more than 64 nodes publish it: the value of node0 is forgotten")
+
+
+def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
+    hosts.host("robot")
+    robot = hosts.bridge("robot").node
+    before = set(robot.diagnoses())
+    for number in range(100):
+        robot.trouble(f"/x{number}", "refused here: it is not on the list of robot")
+    robot.trouble("/operator/cmd_vel", "refused here: other fields")
+    assert set(robot.diagnoses()) - before == {"topic of no list", "topic /operator/cmd_vel"}
+    assert robot.diagnoses()["topic of no list"][1].startswith("/x99: refused")
+
+
 def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
     hosts.host("robot")
     hosts.host("station")

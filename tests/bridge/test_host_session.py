@@ -3,7 +3,7 @@
 import pytest
 from simulated_link import DIGEST, MS, Way, World
 
-from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Ping, decode
+from instant_ic.bridge.host_protocol import VERSION, Announce, Bye, Data, Hello, Notice, Ping, decode
 from instant_ic.bridge.host_session import ClockStepped, Ended, LinkTimes, Refused, Up
 from instant_ic.bridge.host_topics import TopicRule
 
@@ -474,3 +474,76 @@ def test_many_topics_share_the_link_in_turn():
     world.run(10.0, each=every(20, each))
     counts = [len(world.arrived("station", rule.topic)) for rule in rules]
     assert min(counts) > 80 and max(counts) - min(counts) <= 3
+
+
+# -- what a peer can make grow (review, finding 18) ------------------------------------------------------
+
+
+def linked(to_robot=(STATE,)):
+    world = World(to_robot=list(to_robot))
+    world.run(0.1)
+    return world, world.sessions["robot"]
+
+
+def announce(channel=1, topic=STATE.topic, origin="node", type_name="std_msgs/msg/String", qos="latched"):
+    return Announce(channel, topic, origin, type_name, DIGEST, qos).encode()
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        {"origin": "x" * 129},
+        {"origin": ""},
+        {"origin": "a\nWARNING forged"},
+        {"topic": "/" + "x" * 60_000},
+        {"type_name": "x" * 129},
+        {"qos": "\x1b[2J"},
+    ],
+)
+def test_names_that_are_too_long_or_no_names_end_the_link_with_a_clear_error(names):
+    _, robot = linked()
+    (ended,) = robot.receive(announce(**names))
+    assert isinstance(ended, Ended) and ended.code == "protocol"
+    assert f"Announce: {next(iter(names))}" in ended.reason and "1 to 128 letters" in ended.reason
+    assert len(ended.reason) < 250 and ended.reason.isprintable()
+
+
+def test_channels_of_one_link_are_limited_with_a_clear_error(monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.host_session.MAX_CHANNELS", 10)
+    _, robot = linked()
+    for number in range(10):
+        robot.receive(announce(number, origin=f"node{number}"))
+    robot.receive(announce(3, origin="again"))  # the same number again replaces
+    assert robot.ended is None and len(robot._incoming) == 10
+    (ended,) = robot.receive(announce(10))
+    assert "more than 10 channels are announced" in ended.reason
+
+
+def test_publishers_that_are_remembered_over_many_links_are_limited(monkeypatch):
+    monkeypatch.setattr("instant_ic.bridge.host_session.MAX_CHANNELS", 10)
+    world = World(to_robot=[STATE])
+    for link in range(5):
+        world.connect()
+        world.run(0.1)
+        for number in range(8):
+            world.publish("station", STATE.topic, b"x", latched=True, origin=f"node{link}_{number}")
+        world.run(0.2)
+        assert len(world.arrived("robot")) == 8
+    memory = world.memories["robot"]
+    assert len(memory.received) == len(memory.latched) == 10
+    assert ("station-1", STATE.topic, "node4_7") in memory.received  # the newest are kept
+
+
+def test_notices_are_limited_in_number_and_length():
+    _, robot = linked()
+    for number in range(16):
+        robot.receive(Notice(f"n{number}", "x" * 10_000 + "\n").encode())
+    assert robot.ended is None and max(map(len, robot.notices.values())) <= 300
+    (ended,) = robot.receive(Notice("one more", "x").encode())
+    assert "more than 16 notices" in ended.reason and len(robot.notices) == 16
+
+
+def test_words_of_the_other_host_are_one_short_line():
+    _, robot = linked()
+    (ended,) = robot.receive(Bye("x" * 1000, "over\nERROR forged " + "y" * 60_000).encode())
+    assert len(ended.reason) == 300 and ended.reason.isprintable() and len(ended.code) <= 300
