@@ -147,7 +147,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             if wrong:
                 raise NodeError(
                     f"{self.config.bag}: {', '.join(wrong)} would reach the robot of {base.name}, which runs in "
-                    f"{self.run_dir}. Leave them out (-x {wrong[0]}), rename them (--remap "
+                    f"{self.run_dir}. Leave them out ({' '.join(f'-x {topic}' for topic in wrong)}), rename them (--remap "
                     f"{wrong[0]}:=/bag{wrong[0]}), end the stack, or play them all the same with --force"
                 )
 
