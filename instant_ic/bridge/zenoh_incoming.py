@@ -14,10 +14,7 @@ from ..msg import MessageError, deserialize, message_type, serialize, twist_stam
 from .commands import CommandGate, CommandRefused
 from .zenoh_format import Attachment, Token, TopicQoS
 from .zenoh_session import RosNode, RosSubscription
-from .zenoh_topics import COMMANDS, GRACE_S, STOP, Namespace, bus_qos, known_hash, parse_subscribe, takes
-
-_ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
-"""Topics that move a robot, in any namespace, and what tells of its parameters: never brought in by a pattern."""
+from .zenoh_topics import ACTED_ON, COMMANDS, GRACE_S, STOP, Namespace, bus_qos, known_hash, parse_subscribe, takes
 
 _TF = "tf2_msgs/msg/TFMessage"
 MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200
@@ -156,7 +153,7 @@ class Incoming:
         """Whether a topic comes in as soon as somebody there publishes it."""
         if topic in self._commands:
             return True
-        return takes(self._patterns, topic) and not takes(_ACTED_ON, topic)
+        return takes(self._patterns, topic) and not takes(ACTED_ON, topic)
 
     def _same_type(self, topic: str, token: Token, entry: _In | None) -> bool:
         """Whether a publisher there sends what its topic carries here; tells if not."""

@@ -8,13 +8,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..bus import LATCHED, RELIABLE, SENSOR, QoS
-from ..bus.registry import check_topic
+from ..bus.registry import RegistryError, check_topic
 from ..msg import MessageError, message_type, type_hash
 from .zenoh_format import TopicQoS
 
 STOP = "/operator/estop"
 COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
 """What an operator elsewhere may send, and its type."""
+
+ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
+"""Topics that move a robot, in any namespace, and what tells of its parameters: never brought in by `subscribe`."""
 
 GRACE_S = 3.0
 """A topic that leaves and comes back, as when its node restarts, keeps its place for so long."""
@@ -101,12 +104,14 @@ def parse_subscribe(entries: Sequence[str]) -> tuple[list[str], dict[str, str]]:
     """Patterns, and types of those topics that have one, of lines like ``/scan`` and ``/x std_msgs/msg/String``.
 
     Raises:
-        RegistryError, MessageError: a topic's name is not legal, or a type is not known.
+        RegistryError, MessageError: a topic's name is not legal, a type is not known, or the topic is of ACTED_ON.
     """
     patterns, types = [], {}
     for entry in entries:
         topic, _, name = entry.partition(" ")
         if name:
+            if takes(ACTED_ON, topic):
+                raise RegistryError(f"subscribe: {topic} moves a robot; list it under commands, or rename it there")
             types[check_topic(topic)] = message_type(name.strip()).__msgtype__
         patterns.append(topic)
     return patterns, types

@@ -145,9 +145,10 @@ class BagPlayerNode(Node[BagPlayerConfig]):
                 if any(fnmatch.fnmatchcase(topic, pattern) for pattern in acted_on)
             ]
             if wrong:
+                left_out = " ".join(f"-x {topic}" for topic in wrong)
                 raise NodeError(
                     f"{self.config.bag}: {', '.join(wrong)} would reach the robot of {base.name}, which runs in "
-                    f"{self.run_dir}. Leave them out ({' '.join(f'-x {topic}' for topic in wrong)}), rename them (--remap "
+                    f"{self.run_dir}. Leave them out ({left_out}), rename them (--remap "
                     f"{wrong[0]}:=/bag{wrong[0]}), end the stack, or play them all the same with --force"
                 )
 

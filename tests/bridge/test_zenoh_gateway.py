@@ -608,6 +608,8 @@ def test_wrong_files_types_and_endpoints_are_named(tmp_path, tmp_path_factory):
     for parameters, words in [
         ({"session_file": "nothing.json5"}, "nothing.json5 does not exist"),
         ({"subscribe": ("/chatter std_msgs/msg/Strin",)}, "no message type"),
+        ({"subscribe": (f"/operator/cmd_vel {TWIST}",)}, "/operator/cmd_vel moves a robot"),
+        ({"subscribe": (f"/robot1/cmd_vel {TWIST}",)}, "/robot1/cmd_vel moves a robot"),
         ({"subscribe": ("chatter std_msgs/msg/String",)}, "topic name 'chatter' is not legal"),
     ]:
         with pytest.raises(NodeError, match=words):
