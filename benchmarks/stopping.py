@@ -328,7 +328,7 @@ FAULTS = [
 
 
 @contextlib.contextmanager
-def rig(factor: float, log: Path | None) -> Iterator[Rig]:
+def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
     """A started stack with everything between its parts that can be cut."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     ports = {name: free_port() for name in ("camera", "console")}
@@ -348,9 +348,7 @@ def rig(factor: float, log: Path | None) -> Iterator[Rig]:
         ends.callback(packets.close)
         serial = SerialRelay(run_dir / "dev" / "relay", run_dir / "dev" / "roboclaw")
         ends.callback(serial.close)
-        launch.write_text(
-            LAUNCH.format(**ports, camera_link=camera_link.port, folder=share_dir("launch"), params=params)
-        )
+        launch.write_text(text.format(**ports, camera_link=camera_link.port, folder=share_dir("launch"), params=params))
         stack = ends.enter_context(Stack(str(launch), run_dir, {}, log, pace=factor))
         made = Rig(stack, run_dir, ports["console"], page_link, camera_link, packets, serial)
         stack.wait_for(lambda: registry.list_nodes(run_dir), 60, "first node")
