@@ -41,6 +41,11 @@ def run_dir() -> Path:
     return Path(f"/tmp/instant_ic-{os.getuid()}")
 
 
+def sign_in_file(run_dir: Path, node: str) -> Path:
+    """Where a console leaves its address with the token, for its user alone: others may read the log."""
+    return run_dir / f"{node}.sign_in"
+
+
 def cache_dir() -> Path:
     """What can be made again: ``XDG_CACHE_HOME/instant_ic``, else ``~/.cache/instant_ic``; may not be there yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "instant_ic"

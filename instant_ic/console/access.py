@@ -23,8 +23,11 @@ from ..ranges import Positive, Range, check_ranges
 COOKIE = "instant_ic_session"
 SIGN_IN = ("auto", "always", "never")
 MIN_TOKEN = 16
+FIRST_WAIT_S = 0.25  # before a token is looked at, once an address has sent too many wrong ones
+MAX_WAIT_S = 4.0  # whoever shares the address with a guesser waits so long at most
 _MOST_SESSIONS = 256
 _MOST_ADDRESSES = 1024
+_MOST_DOUBLINGS = 8
 
 
 class AccessError(ValueError):
@@ -45,10 +48,11 @@ class AccessConfig:
     Attributes:
         sign_in: ``auto``: needed where the page is open to the network or a token file is given; ``always``; ``never``.
         token_file: file with the token of whoever may drive, readable by its owner alone; empty: one is made at each
-            start and told in the log.
+            start; it stands on the terminal and in a file for its owner alone, never in the log.
         watch_token_file: likewise of those who may only watch (and stop the robot); empty: there are none.
         session_hours: a page stays signed in for so long.
-        tries_per_minute: wrong tokens of one address; further ones are refused unread.
+        tries_per_minute: wrong tokens of one address without a wait; each further one doubles the wait of the address's
+            next try, right or wrong, up to ``MAX_WAIT_S``. A right token is never refused.
         tls_certificate, tls_key: PEM files; both empty: plain HTTP.
     """
 
@@ -152,16 +156,16 @@ class Access:
             self._digests[Role.WATCH] = _digest(watch)
 
     def role_of_token(self, token: str, address: str, now_s: float) -> Role | None:
-        """What a token allows; None for a wrong one, which is counted against the address."""
-        if self.wait_s(address, now_s) > 0:
-            return None
+        """What a token allows; None for a wrong one, which is counted against the address.
+
+        The caller waits :meth:`wait_s` before it asks: guesses are slow, and a right token is slow at worst.
+        """
         digest = _digest(token)
         # Every token is compared, each in constant time: how long it takes tells nothing.
         roles = [role for role, known in self._digests.items() if hmac.compare_digest(known, digest)]
         if roles:
-            self._failures.pop(address, None)
-            return roles[0]
-        failures = self._failures.setdefault(address, deque(maxlen=self.config.tries_per_minute))
+            return roles[0]  # earlier failures still count: they may be somebody else's behind the same address
+        failures = self._failures.setdefault(address, deque(maxlen=self.config.tries_per_minute + _MOST_DOUBLINGS))
         self._failures.move_to_end(address)
         failures.append(now_s)
         while len(self._failures) > _MOST_ADDRESSES:
@@ -169,11 +173,10 @@ class Access:
         return None
 
     def wait_s(self, address: str, now_s: float) -> float:
-        """Seconds until the address may try again; 0 where it may now."""
-        failures = self._failures.get(address)
-        if failures is None or len(failures) < self.config.tries_per_minute:
-            return 0.0
-        return max(0.0, math.ceil(failures[0] + 60.0 - now_s))
+        """Seconds that a token of this address has to wait before it is compared, at most ``MAX_WAIT_S``."""
+        recent = sum(now_s - at < 60.0 for at in self._failures.get(address, ()))
+        too_many = recent - self.config.tries_per_minute
+        return min(MAX_WAIT_S, FIRST_WAIT_S * 2.0**too_many) if too_many >= 0 else 0.0
 
     def open_session(self, role: Role, now_s: float) -> str:
         """A new cookie's value."""
@@ -187,6 +190,11 @@ class Access:
         """What a cookie allows; None for one that is not known or too old."""
         found = self._sessions.get(_digest(cookie))
         return found[0] if found is not None and now_s < found[1] else None
+
+    def end_of_session_s(self, cookie: str) -> float:
+        """When a cookie's sign-in ends; minus infinity where there is none."""
+        found = self._sessions.get(_digest(cookie))
+        return -math.inf if found is None else found[1]
 
     def close_session(self, cookie: str) -> None:
         """Signs a page out."""

@@ -25,8 +25,19 @@ from urllib.parse import quote, urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, tls_context
+from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, is_loopback, tls_context
+from instant_ic.console.connections import (
+    CLOSE_S,
+    HEADERS_S,
+    AddressBuckets,
+    Connection,
+    Limits,
+    Listener,
+    TokenBucket,
+    network_of,
+)
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
+from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, whole, words
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
@@ -35,7 +46,12 @@ from ..ranges import Positive, PositiveInt, Range, check_ranges
 
 STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096
+MAX_BODY = 4096
 MAX_BAD_MESSAGES = 20
+BURST_S = 2.0  # of messages that may come at once: what a radio link held back
+REQUESTS_PER_S = 40.0  # of one address; a page with its modules takes about 25
+BURST_REQUESTS = 150.0
+RESERVED_FOR_DRIVERS = 2  # of max_clients: pages that may only watch cannot take all places
 MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
 OWN_S = 1.5
@@ -45,9 +61,12 @@ SECURITY_HEADERS = {
     "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",  # a new version of the page must not meet an old module
 }
+PLAIN_HTTP = "Plain HTTP: whoever listens in on the network can take over. Set server.access.tls_certificate."
 logger = logging.getLogger("instant_ic.console")
+_COOKIE: web.RequestKey[str] = web.RequestKey("cookie", str)
 _ROLE: web.RequestKey[Role | None] = web.RequestKey("role", Role | None)  # type: ignore[arg-type]
 
 
@@ -91,6 +110,9 @@ class ServerConfig:
     port: Annotated[int, Range(0, 65535)] = 8080  # 0 = any free port
     allowed_hosts: tuple[str, ...] = ()  # names by which browsers may reach the page besides localhost
     max_clients: PositiveInt = 16
+    max_connections: PositiveInt = 128
+    max_connections_per_address: PositiveInt = 32
+    max_messages_per_s: Positive = 300.0  # of one page; it closes beyond, see BURST_S
     background_picture_hz: Positive = 2.0  # pictures that are not shown (camera in the v-space)
     access: AccessConfig = field(default_factory=AccessConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
@@ -123,6 +145,7 @@ class ConsoleServer:
         self.port = 0
         self._sessions: dict[int, Session] = {}
         self._next_number = 1
+        self._requests = AddressBuckets(REQUESTS_PER_S, BURST_REQUESTS)
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}
         self._looks: dict[int, Look] = {}
@@ -133,6 +156,7 @@ class ConsoleServer:
         self._operator = False  # whether the backend has been told that a driver is there
         self._gate_wake = asyncio.Event()
         self._finish = asyncio.Event()
+        self._exporting = asyncio.Lock()
         self._started: threading.Event = threading.Event()
         self._start_error: Exception | None = None
 
@@ -169,6 +193,11 @@ class ConsoleServer:
         host = "127.0.0.1" if self.config.host in ("0.0.0.0", "::") else self.config.host
         scheme = "http" if self._tls is None else "https"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{self.port}/"
+
+    @property
+    def plain_http(self) -> bool:
+        """Whether token, cookie and commands go over the network unencrypted."""
+        return self._tls is None and not is_loopback(self.config.host)
 
     @property
     def sign_in_url(self) -> str:
@@ -227,100 +256,124 @@ class ConsoleServer:
 
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
-        app = web.Application(middlewares=[self._guard])
+        limit_logs()
+        app = web.Application(middlewares=[self._guard], client_max_size=MAX_BODY)
+        app.on_response_prepare.append(_secure_headers)
         app.router.add_get("/", self._index)
         app.router.add_get("/health", self._health)
         app.router.add_get("/export/panorama.jpg", self._export_panorama)
         app.router.add_get("/export/map.zip", self._export_map)
         app.router.add_post("/sign-in", self._sign_in)
         app.router.add_post("/sign-out", self._sign_out)
+        app.router.add_post("/estop", self._estop)
         app.router.add_get("/ws", self._websocket)
         app.router.add_static("/static/", STATIC)
         runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=1.0)
         await runner.setup()
+        assert runner.server is not None
+        limits = Limits(self.config.max_connections, self.config.max_connections_per_address)
+        listener = Listener(runner.server, limits, self._tls, SECURITY_HEADERS)
         try:
-            site = web.TCPSite(runner, self.config.host, self.config.port, ssl_context=self._tls)
-            await site.start()
-            self.port = runner.addresses[0][1]
+            self.port = await listener.open(self.config.host, self.config.port)
             drive_task = asyncio.create_task(self._drive_forever())
             self._started.set()
             await self._finish.wait()
             drive_task.cancel()
             self.gate.stop(time.monotonic())
             self._emit_due()
-            for session in list(self._sessions.values()):
-                await session.socket.close(code=WSCloseCode.GOING_AWAY, message=b"console ends")
+            await listener.close()
+            sessions = list(self._sessions.values())
+            for session in sessions:
+                self._end(session, WSCloseCode.GOING_AWAY, "console ends")
+            await asyncio.gather(*(session.closing for session in sessions if session.closing is not None))
         finally:
+            await listener.close()
             await runner.cleanup()
 
     @web.middleware
     async def _guard(
         self, request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
     ) -> web.StreamResponse:
+        request[_COOKIE] = cookie = request.cookies.get(COOKIE, "")
+        signed_in = not self.access.required or self.access.role_of_session(cookie, time.monotonic()) is not None
+        if not (signed_in and request.path == "/estop"):
+            await self._pace(request)
         if not host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts):
             raise web.HTTPForbidden(text="unknown Host; name it in server.allowed_hosts\n")
-        request[_ROLE] = role = self._role(request)
+        request[_ROLE] = role = await self._role(request)
         open_to_all = request.path == "/sign-in" or request.path.startswith("/static/")
-        if role is None and not open_to_all:
-            response = self._turn_away(request)
-        else:
-            response = await handler(request)
-        if not response.prepared:
-            response.headers.update(SECURITY_HEADERS)
-        return response
+        return await (self._turn_away(request) if role is None and not open_to_all else handler(request))
 
-    def _role(self, request: web.Request) -> Role | None:
+    async def _pace(self, request: web.Request) -> None:
+        """Makes an address wait that asks too often; how many wait, its number of connections bounds."""
+        bucket = self._requests.of(network_of(request.remote or ""))
+        while not bucket.take(time.monotonic()):
+            await asyncio.sleep(bucket.wait_s())
+
+    async def _role(self, request: web.Request) -> Role | None:
         """What whoever asks may do; programs bring their token in the header, pages the cookie of their sign-in."""
         if not self.access.required:
             return Role.DRIVE
-        now, (scheme, _, token) = time.monotonic(), request.headers.get("Authorization", "").partition(" ")
+        scheme, _, token = request.headers.get("Authorization", "").partition(" ")
         if scheme.lower() == "bearer" and token:
-            return self._role_of_token(request, token.strip())
-        return self.access.role_of_session(request.cookies.get(COOKIE, ""), now)
+            request[_COOKIE] = ""
+            return await self._role_of_token(request, token.strip())
+        return self.access.role_of_session(request[_COOKIE], time.monotonic())
 
-    def _role_of_token(self, request: web.Request, token: str) -> Role | None:
-        now, address = time.monotonic(), request.remote or ""
-        role = self.access.role_of_token(token, address, now)
+    async def _role_of_token(self, request: web.Request, token: str) -> Role | None:
+        address = network_of(request.remote or "")
+        await asyncio.sleep(self.access.wait_s(address, time.monotonic()))
+        role = self.access.role_of_token(token, address, time.monotonic())
         if role is None:
             logger.warning("wrong token from %s", address)
         return role
 
-    def _turn_away(self, request: web.Request) -> web.StreamResponse:
+    async def _turn_away(self, request: web.Request) -> web.StreamResponse:
         """Without a sign-in: the form for browsers that open the page, words for everything else."""
         if request.path == "/" and request.method == "GET":
             if token := request.query.get("token", ""):
-                return self._enter(request, token)
-            return _sign_in_page("Sign in to see the robot.", 401)
+                return await self._enter(request, token)
+            return self._sign_in_page("Sign in to see the robot.")
         return web.Response(
             status=401, text="sign in first, or send 'Authorization: Bearer TOKEN'\n",
             headers={"WWW-Authenticate": "Bearer"},
         )  # fmt: skip
 
-    def _enter(self, request: web.Request, token: str) -> web.Response:
+    async def _enter(self, request: web.Request, token: str) -> web.Response:
         """Signs a browser in: a cookie in place of the token, which goes out of the address and the history."""
-        now, address = time.monotonic(), request.remote or ""
-        role = self._role_of_token(request, token)
+        role = await self._role_of_token(request, token)
         if role is None:
-            if wait_s := self.access.wait_s(address, now):
-                return _sign_in_page(f"Too many wrong tokens. Try again in {wait_s:.0f} s.", 429)
-            return _sign_in_page("This token is wrong.", 401)
+            return self._sign_in_page("This token is wrong.")
+        now = time.monotonic()
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
             COOKIE, self.access.open_session(role, now), httponly=True, samesite="Strict",
             secure=self._tls is not None, max_age=round(self.config.access.session_hours * 3600),
         )  # fmt: skip
-        logger.info("%s has signed in to %s", address, role.value)
+        self._end_signed_out()  # those whose sign-in the new one displaced
+        logger.info("%s has signed in to %s", request.remote, role.value)
         return response
+
+    def _sign_in_page(self, text: str) -> web.Response:
+        page = (STATIC / "sign-in.html").read_text(encoding="utf-8")
+        warning = PLAIN_HTTP if self.plain_http else ""
+        page = page.replace("{text}", html.escape(text)).replace("{warning}", html.escape(warning))
+        return web.Response(status=401, text=page, content_type="text/html")
 
     async def _sign_in(self, request: web.Request) -> web.StreamResponse:
         if not self.access.required:
             raise web.HTTPSeeOther("/")
-        token = (await request.post()).get("token", "")
-        return self._enter(request, token.strip() if isinstance(token, str) else "")
+        try:
+            async with asyncio.timeout(HEADERS_S):
+                token = (await request.post()).get("token", "")
+        except TimeoutError:
+            raise web.HTTPRequestTimeout(text=f"the token did not come within {HEADERS_S:g} s\n") from None
+        return await self._enter(request, token.strip() if isinstance(token, str) else "")
 
     async def _sign_out(self, request: web.Request) -> web.StreamResponse:
         if self.access.required:
-            self.access.close_session(request.cookies.get(COOKIE, ""))
+            self.access.close_session(request[_COOKIE])
+            self._end_signed_out()
         response = web.HTTPSeeOther("/")
         response.del_cookie(COOKIE)
         raise response
@@ -348,37 +401,103 @@ class ConsoleServer:
         return _download(frame.payload, "panorama", "jpg", "image/jpeg")
 
     async def _export_map(self, request: web.Request) -> web.StreamResponse:
-        files = await asyncio.to_thread(self.backend.export_map)
-        if not files:
-            raise web.HTTPNotFound(text="there is no map yet\n")
-        return _download(zip_of(files), "map", "zip", "application/zip")
+        # One at a time, and not on this thread: packing takes long beside a driver's commands.
+        async with self._exporting:
+            files = await asyncio.to_thread(self.backend.export_map)
+            if not files:
+                raise web.HTTPNotFound(text="there is no map yet\n")
+            packed = await asyncio.to_thread(zip_of, files)
+        return _download(packed, "map", "zip", "application/zip")
+
+    async def _estop(self, request: web.Request) -> web.StreamResponse:
+        """Emergency stop by a connection of its own: the page's WebSocket may be stuck. Only that releases the stop."""
+        self._check_origin(request)
+        self._stop_robot(request.remote or "")
+        return web.Response(status=204)
+
+    @staticmethod
+    def _check_origin(request: web.Request) -> None:
+        origin = request.headers.get("Origin")
+        if not origin_allowed(origin, request.headers.get("Host", "")):
+            logger.warning("refused %s from origin %.200r", request.path, origin)
+            raise web.HTTPForbidden(text="Origin does not match Host\n")
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
-        if not origin_allowed(request.headers.get("Origin"), request.headers.get("Host", "")):
-            logger.warning("refused a WebSocket from origin %r", request.headers.get("Origin"))
-            raise web.HTTPForbidden(text="Origin does not match Host\n")
-        if len(self._sessions) >= self.config.max_clients:
-            raise web.HTTPServiceUnavailable(text=f"{self.config.max_clients} clients already\n")
-        socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=1.0)
-        await socket.prepare(request)
-        session = Session(self._next_number, socket, may_drive=request[_ROLE] is Role.DRIVE)
+        self._check_origin(request)
+        may_drive = request[_ROLE] is Role.DRIVE
+        places = self.config.max_clients if may_drive else max(1, self.config.max_clients - RESERVED_FOR_DRIVERS)
+        if len(self._sessions) >= places:
+            raise web.HTTPServiceUnavailable(text=f"{len(self._sessions)} clients already\n")
+        connection = request.protocol
+        assert isinstance(connection, Connection)
+        # Pings of the protocol itself come to the reader too, or they would pass by its limit.
+        socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=CLOSE_S, autoping=False)
+        session = Session(self._next_number, socket, connection, may_drive, request[_COOKIE])
         self._next_number += 1
-        self._sessions[session.number] = session
-        self._greet(session)
-        sender = asyncio.create_task(session.send_forever())
+        self._sessions[session.number] = session  # before anything is awaited: the place is taken
+        loop = asyncio.get_running_loop()
+        sender: asyncio.Task[None] | None = None
+        expiry: asyncio.TimerHandle | None = None
         try:
+            connection.keep(lambda: self._flooded(session))
+            await socket.prepare(request)
+            self._greet(session)
+            sender = asyncio.create_task(session.send_forever())
+            if self.access.required and session.cookie:
+                # A little later than the end itself, which a timer may otherwise find not yet there.
+                expiry = loop.call_at(self.access.end_of_session_s(session.cookie) + 0.01, self._end_signed_out)
             await self._read_forever(session)
         finally:
-            sender.cancel()
-            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
-                await sender
-            self.gate.forget(session.number, time.monotonic())
-            del self._sessions[session.number]
-            self._looks.pop(session.number, None)
-            self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
-            self._emit_due()
-            self._tell_session()
+            if expiry is not None:
+                expiry.cancel()
+            self._drop(session)
+            if sender is not None:
+                sender.cancel()
+                with contextlib.suppress(asyncio.CancelledError, ConnectionError):
+                    await sender
+            if session.closing is not None:
+                await asyncio.wait({session.closing})
         return socket
+
+    def _drop(self, session: Session) -> None:
+        """Takes all rights from a session: it drives no more, and nothing more is sent to it."""
+        if self._sessions.pop(session.number, None) is None:
+            return
+        self.gate.forget(session.number, time.monotonic())
+        self._looks.pop(session.number, None)
+        self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
+        self._emit_due()
+        self._tell_session()
+
+    def _end(self, session: Session, code: WSCloseCode, reason: str) -> None:
+        """Drops a session at once, and then closes its socket, whatever its client does."""
+        self._drop(session)
+        if session.closing is None:
+            session.closing = asyncio.create_task(self._close(session, code, reason))
+
+    @staticmethod
+    async def _close(session: Session, code: WSCloseCode, reason: str) -> None:
+        try:
+            async with asyncio.timeout(2 * CLOSE_S):
+                await session.socket.close(code=code, message=reason.encode())
+        except (TimeoutError, ConnectionError, RuntimeError) as error:  # does not read, or has gone
+            logger.debug("client %d took no closing frame: %s", session.number, error)
+        finally:
+            session.connection.abort()
+
+    def _end_signed_out(self) -> None:
+        """Ends the sessions whose sign-in has ended: signed out, expired, or displaced by newer ones."""
+        now = time.monotonic()
+        for session in list(self._sessions.values()):
+            if self.access.required and session.cookie and self.access.role_of_session(session.cookie, now) is None:
+                logger.info("client %d: its sign-in has ended", session.number)
+                self._end(session, WSCloseCode.POLICY_VIOLATION, "signed out")
+
+    def _flooded(self, session: Session) -> None:
+        """Ends a session that sends more than any page does."""
+        logger.warning("client %d sends too much: closed", session.number)
+        session.connection.mute()
+        self._end(session, WSCloseCode.POLICY_VIOLATION, "too many messages")
 
     def _greet(self, session: Session) -> None:
         drive = self.config.drive
@@ -402,25 +521,46 @@ class ConsoleServer:
         self._tell_session()
 
     async def _read_forever(self, session: Session) -> None:
-        while True:
+        limit = self.config.max_messages_per_s
+        bucket = TokenBucket(limit, limit * BURST_S)
+        while session.number in self._sessions:
             try:
                 message = await session.socket.receive(timeout=SILENT_CLIENT_S)
             except TimeoutError:
-                await session.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"silent")
+                self._end(session, WSCloseCode.POLICY_VIOLATION, "silent")
                 return
-            if message.type is not WSMsgType.TEXT:
-                if message.type is WSMsgType.BINARY:
-                    await session.socket.close(code=WSCloseCode.UNSUPPORTED_DATA)
+            if session.number not in self._sessions:  # ended while it waited
                 return
             now = time.monotonic()
-            try:
-                self._handle(session, parse_text(message.data), now)
-            except ProtocolError as error:
-                session.bad_messages += 1
-                logger.warning("client %d: %s", session.number, error)
-                if session.bad_messages >= MAX_BAD_MESSAGES:
-                    await session.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=b"bad messages")
-                    return
+            within = bucket.take(now)
+            if message.type is WSMsgType.TEXT:
+                self._take(session, message.data, now, only_a_stop=not within)
+            elif message.type is WSMsgType.PING:
+                if within:
+                    await session.socket.pong(message.data)
+            elif message.type is not WSMsgType.PONG:
+                if message.type is WSMsgType.BINARY:
+                    self._end(session, WSCloseCode.UNSUPPORTED_DATA, "binary message")
+                return
+            if not within:
+                self._flooded(session)
+            elif session.chokes:
+                session.connection.mute()
+                self._end(session, WSCloseCode.POLICY_VIOLATION, "does not read its answers")
+            await asyncio.sleep(0)  # one message a turn: nobody's queue is worked off before another's message
+
+    def _take(self, session: Session, text: str, now: float, *, only_a_stop: bool) -> None:
+        """Handles one message; an emergency stop counts even where it is the one too many."""
+        try:
+            message = parse_text(text)
+            if not only_a_stop or message["type"] == "estop":
+                self._handle(session, message, now)
+        except ProtocolError as error:
+            session.bad_messages += 1
+            logger.warning("client %d: %s", session.number, error)
+            if session.bad_messages >= MAX_BAD_MESSAGES:
+                self._end(session, WSCloseCode.POLICY_VIOLATION, "bad messages")
+            else:
                 session.reply({"type": "error", "text": str(error)})
 
     def _handle(self, session: Session, message: dict[str, Any], now: float) -> None:
@@ -472,21 +612,29 @@ class ConsoleServer:
         take = flag(message, "take", False)
         if not self._may_drive(session):
             return
+        before = self.gate.driver
         self.gate.request(session.number, now, take=take)
         self._emit_due()
-        self._tell_session()
+        self._tell_session(None if self.gate.driver != before else session)
 
     def _on_yield(self, session: Session, message: dict[str, Any], now: float) -> None:
+        before = self.gate.driver
         self.gate.leave(session.number, now)
         self._emit_due()
-        self._tell_session()
+        self._tell_session(None if self.gate.driver != before else session)
 
     def _on_estop(self, session: Session, message: dict[str, Any], now: float) -> None:
-        self.gate.set_estop(now)
+        self._stop_robot(f"client {session.number}")
+
+    def _stop_robot(self, who: str) -> None:
+        """Emergency stop, on the topic before this returns."""
+        news = not self.gate.estop
+        self.gate.set_estop(time.monotonic())
         self.backend.on_estop(True)
         self._emit_due()
-        self._tell_session()
-        logger.warning("emergency stop from client %d", session.number)
+        if news:
+            self._tell_session()
+        logger.warning("emergency stop from %s", who)
 
     def _on_estop_release(self, session: Session, message: dict[str, Any], now: float) -> None:
         if not self.gate.release_estop(session.number):
@@ -562,8 +710,9 @@ class ConsoleServer:
         if wake:
             self._gate_wake.set()
 
-    def _tell_session(self) -> None:
-        for session in self._sessions.values():
+    def _tell_session(self, only: Session | None = None) -> None:
+        """Sends all who are connected, or one alone, how the lease stands."""
+        for session in list(self._sessions.values()) if only is None else [only]:
             driver = self.gate.driver
             role = "none" if driver is None else "you" if driver == session.number else "other"
             message = {
@@ -615,9 +764,10 @@ def _download(content: bytes, stem: str, ending: str, content_type: str) -> web.
     return web.Response(body=content, content_type=content_type, headers=headers)
 
 
-def _sign_in_page(text: str, status: int) -> web.Response:
-    page = (STATIC / "sign-in.html").read_text(encoding="utf-8").replace("{text}", html.escape(text))
-    return web.Response(status=status, text=page, content_type="text/html")
+async def _secure_headers(request: web.Request, response: web.StreamResponse) -> None:
+    """Headers of every answer, errors among them."""
+    for name, value in SECURITY_HEADERS.items():
+        response.headers.setdefault(name, value)
 
 
 def host_allowed(host: str, allowed: tuple[str, ...]) -> bool:

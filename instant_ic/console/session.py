@@ -11,9 +11,11 @@ from typing import Any
 
 from aiohttp import web
 
+from instant_ic.console.connections import Connection
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 
 # Small things first: a picture must not delay the state, nor the map a picture.
+MAX_REPLIES = 256  # that wait: about a second's worth of a page; whoever has more does not read
 FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.MAP, FrameKind.COSTMAP)
 
 
@@ -32,11 +34,25 @@ class Session:
     waits; the next frame of a kind goes when the last was acknowledged.
     """
 
-    def __init__(self, number: int, socket: web.WebSocketResponse, may_drive: bool = True) -> None:
+    def __init__(
+        self,
+        number: int,
+        socket: web.WebSocketResponse,
+        connection: Connection,
+        may_drive: bool = True,
+        cookie: str = "",
+    ) -> None:
         self.number = number
         self.socket = socket
+        self.connection = connection
         self.may_drive = may_drive
+        self.cookie = cookie
+        """Of its sign-in, with which it ends; empty where it came without or by a token."""
+        self.closing: asyncio.Task[None] | None = None
+        """The closing handshake, once the session has ended."""
         self.bad_messages = 0
+        self.chokes = False
+        """Whether more replies wait than a client that reads leaves there."""
         self.away = False
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}
@@ -49,7 +65,10 @@ class Session:
         self._wake = asyncio.Event()
 
     def reply(self, message: dict[str, Any]) -> None:
-        """Queues an answer that must not be lost; the reader's own pace bounds the queue."""
+        """Queues an answer that must not be lost; one too many sets ``chokes``, and the session must end."""
+        if len(self._replies) >= MAX_REPLIES:
+            self.chokes = True
+            return
         self._replies.append(json.dumps(message, separators=(",", ":"), allow_nan=False))
         self._wake.set()
 

@@ -113,7 +113,8 @@ class _Output:
         if health is None:
             return View(tuple(_row(process, None, []) for process in processes), looked=False, ending=self._ending)
         faults = health.topic_faults()
-        self._address = self._address or health.console_address()
+        # The token goes to a terminal only: what standard output is redirected to may be read by others.
+        self._address = self._address or health.console_address(with_token=sys.stdout.isatty())
         if not self._ending:
             down = {p.spec.label: p.state.value for p in processes if p.state in (State.FAILED, State.WAITING)}
             health.publish(down, faults)

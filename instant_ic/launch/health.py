@@ -15,6 +15,7 @@ from instant_ic.bus.node import ERROR, OK, WARN
 from instant_ic.launch.description import NodeSpec
 from instant_ic.launch.topics import nominal_rate
 from instant_ic.msg import deserialize, header, message_type, serialize
+from instant_ic.paths import sign_in_file
 
 SILENT_AFTER_S = 3.0
 """A node without a heartbeat for longer than this is shown as silent."""
@@ -215,13 +216,22 @@ class HealthMonitor:
             ]
             publisher.send(serialize(_diagnostic_array(entries)))
 
-    def console_address(self) -> str | None:
-        """Address of the operator's page once a node of the console says that it runs."""
+    def console_address(self, *, with_token: bool) -> str | None:
+        """Address of the operator's page once a node of the console says that it runs.
+
+        Args:
+            with_token: for a terminal: with the token, where one was made at this start; else the file that holds it.
+        """
         for spec in self._specs:
             health = self.nodes.get(spec.label)
             if spec.exec != "console" or health is None or health.state != "running":
                 continue
-            if address := find_console(registry.list_nodes(self._folders[spec.group]), [spec.name]):
+            folder = self._folders[spec.group]
+            address = find_console(registry.list_nodes(folder), [spec.name])
+            file = sign_in_file(folder, spec.name)
+            if file.is_file():
+                return file.read_text().strip() if with_token else f"{address or 'console'}, sign in as {file} says"
+            if address:
                 return address
         return None
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import math
+import os
+import sys
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -24,6 +26,7 @@ from instant_ic.console import (
 )
 from instant_ic.console.gridimage import grey_png, grid_image
 from instant_ic.console.recording import RecorderError, RecordingDesk
+from instant_ic.console.server import PLAIN_HTTP
 from instant_ic.console.view import view_shape
 from instant_ic.geometry.poses import Matrix, pose2_from_matrix, quaternion_from_matrix, transform_points
 from instant_ic.geometry.transforms import TransformError
@@ -54,6 +57,7 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
+from instant_ic.paths import sign_in_file
 from instant_ic.ranges import Positive, Range, check_ranges
 
 MODES = {0: "real", 1: "virtual", 2: "stopped", 3: "entering", 4: "returning"}
@@ -149,13 +153,33 @@ class ConsoleNode(Node[ConsoleConfig]):
         except ConsoleError as error:
             raise NodeError(str(error)) from error
         if not self.lockstep:
-            self.log.info("open %s in a browser", self.server.sign_in_url)
+            self.log.info("open %s in a browser", self.server.url)
+            self.offer_sign_in()
+        if self.server.plain_http:
+            self.log.warning(PLAIN_HTTP)
         if self.server.access.unguarded:
             self.log.warning("everybody on the network may drive: server.access.sign_in is never")
         self.timer(1.0 / config.state_rate_hz, self.tell_state)
         self.timer(0.2, self.send_plan)
         self.timer(1.0, self.send_health)
         self.timer(1.0 / config.map_rate_hz, self.send_grids)
+
+    def offer_sign_in(self) -> None:
+        """Shows the address with the token to this machine's user alone: the log goes to ``/rosout`` and into bags."""
+        assert self.run_dir is not None
+        file = sign_in_file(self.run_dir, self.node_name)
+        try:
+            file.unlink(missing_ok=True)  # of a console that was killed
+            if not self.server.access.made_token:
+                return
+            with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
+                out.write(f"{self.server.sign_in_url}\n")
+        except OSError as error:
+            raise NodeError(f"cannot write the address with the token to {file}: {error.strerror}") from error
+        self.log.info("the address with the token is in %s", file)
+        if sys.stdout.isatty():  # `ic run console`; the launcher shows it by itself
+            sys.stdout.write(f"sign in at {self.server.sign_in_url}\n")
+            sys.stdout.flush()
 
     def reconfigure(self, config: ConsoleConfig) -> None:
         super().reconfigure(config)
@@ -164,6 +188,8 @@ class ConsoleNode(Node[ConsoleConfig]):
     def teardown(self) -> None:
         if hasattr(self, "server"):
             self.server.stop()  # first: it stops the robot
+            if self.run_dir is not None:
+                sign_in_file(self.run_dir, self.node_name).unlink(missing_ok=True)
             self.recording.stop()
 
     # ---- from the operator, on the server's thread ----------------------------------------------
@@ -441,12 +467,14 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.check("camera", age_s <= PICTURE_TIMEOUT_S, "no picture from the camera", age_s=age_s)
         self.check("controller", self.control.message is not None, "no state from the arbiter")
         self.check("pose", self.robot_pose() is not None, "the robot's pose is unknown")
+        # Of the page alone, not a diagnosis: the node itself is well.
+        plain = [{"level": "warn", "name": "network", "text": PLAIN_HTTP}] if self.server.plain_http else []
         self.server.publish(
             "health",
             {
                 "vspace": _vspace(self.vspace.message),
                 "battery": _battery(self.battery.message),
-                "faults": self.faults(),
+                "faults": self.faults() + plain,
                 "nodes": sorted(self._heartbeats),
             },
         )

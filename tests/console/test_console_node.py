@@ -39,6 +39,8 @@ MS = 1_000_000
 class FakeServer:
     """Keeps what the node sends, in place of sockets."""
 
+    plain_http = False
+
     def __init__(self, clock):
         self.clock = clock
         self.texts, self.frames, self.shown = {}, [], None

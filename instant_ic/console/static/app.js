@@ -129,7 +129,10 @@ link.addEventListener("frame", async ({ detail: frame }) => {
 function stopNow() {
   drive.stop();
   link.send({ type: "estop" });
-  if (!link.connected) hud.toast("No link: the stop could not be sent");
+  // By a connection of its own as well: the WebSocket may be stuck, and a second stop changes nothing.
+  fetch("/estop", { method: "POST", keepalive: true }).then(({ ok }) => ok).catch(() => false).then((sent) => {
+    if (!sent && !link.connected) hud.toast("No link: the stop could not be sent");
+  });
 }
 
 /** Whoever wants to drive while nobody does, may. */

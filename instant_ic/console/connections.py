@@ -1,0 +1,288 @@
+"""Connections to the operator's page: how many, how fast and for how long. Knows HTTP's server, not the page.
+
+Times are seconds of the monotonic clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import logging
+import math
+import socket
+import ssl
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from aiohttp import web
+
+HEADERS_S = 5.0  # for a TLS handshake, for a request's headers, and for its body
+STALL_S = 30.0  # a client that takes no data for this long is cut off
+LINGER_S = 1.0  # for the rest of a body that nobody wants
+CLOSE_S = 1.0  # for a closing handshake
+RETRY_S = 0.2  # between two tries to accept, after one failed
+BYTES_PER_S = 48 * 1024  # of one connection, to the server: a page that drives by touch sends about a third
+BURST_BYTES = 48 * 1024
+CONNECTIONS_PER_S = 20.0  # of one address: a page opens about six
+BURST_CONNECTIONS = 64.0
+_MOST_ADDRESSES = 1024
+logger = logging.getLogger("instant_ic.console")
+
+
+class TokenBucket:
+    """Lets ``rate`` through each second on average, and ``burst`` at once. Times are given by the caller."""
+
+    __slots__ = ("_at", "_tokens", "burst", "rate")
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self.rate, self.burst = rate, burst
+        self._tokens, self._at = burst, -math.inf
+
+    def take(self, now: float, amount: float = 1.0) -> bool:
+        """Takes ``amount`` if it is there; False, and nothing taken, otherwise."""
+        if self._at > -math.inf:
+            self._tokens = min(self.burst, self._tokens + (now - self._at) * self.rate)
+        self._at = now
+        if amount > self._tokens:
+            return False
+        self._tokens -= amount
+        return True
+
+    def wait_s(self) -> float:
+        """Seconds from the last :meth:`take` until one token is there."""
+        return max(0.0, 1.0 - self._tokens) / self.rate
+
+
+class AddressBuckets:
+    """A token bucket for each address; the address unused for longest is forgotten first."""
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
+
+    def of(self, address: str) -> TokenBucket:
+        """The bucket of an address."""
+        bucket = self._buckets.setdefault(address, TokenBucket(self._rate, self._burst))
+        self._buckets.move_to_end(address)
+        while len(self._buckets) > _MOST_ADDRESSES:
+            self._buckets.popitem(last=False)
+        return bucket
+
+
+def network_of(host: str) -> str:
+    """The key by which an address is limited: IPv4 in full, of IPv6 the /64, which one subscriber has whole."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if isinstance(address, ipaddress.IPv6Address):
+        if address.ipv4_mapped is not None:
+            return str(address.ipv4_mapped)
+        return str(ipaddress.IPv6Network((int(address) >> 64 << 64, 64)))
+    return str(address)
+
+
+class Connection(web.RequestHandler):
+    """One client's connection: HTTP, then perhaps a WebSocket. Cut off where it floods or takes no data."""
+
+    __slots__ = ("_bucket", "_headers", "_on_flood", "_on_gone", "_stall", "kept", "muted", "network", "task")
+
+    def __init__(
+        self,
+        server: web.Server,
+        network: str,
+        headers: dict[str, str],
+        on_gone: Callable[[Connection], None],
+    ) -> None:
+        super().__init__(
+            server,
+            loop=asyncio.get_running_loop(),
+            keepalive_timeout=HEADERS_S,  # counts from the start of the connection, then from each answer
+            lingering_time=LINGER_S,
+            access_log=None,  # type: ignore[arg-type]
+        )
+        self.network = network
+        self.kept = False
+        """Whether it is a WebSocket, which no newer connection displaces."""
+        self.muted = False
+        """Whether what the client sends is thrown away unread."""
+        self.task: asyncio.Task[None] | None = None
+        self._headers = headers
+        self._on_gone = on_gone
+        self._on_flood: Callable[[], None] = self.abort
+        self._bucket = TokenBucket(BYTES_PER_S, BURST_BYTES)
+        self._stall: asyncio.TimerHandle | None = None
+
+    def keep(self, on_flood: Callable[[], None]) -> None:
+        """The connection is a WebSocket from now on; ``on_flood`` is called once where its client sends too much."""
+        self.kept, self._on_flood = True, on_flood
+
+    def mute(self) -> None:
+        """Reads nothing more: what waits for the client still goes out, what it sends costs nothing."""
+        self.muted = True
+        if self.transport is not None and not self.transport.is_closing():
+            self.transport.pause_reading()
+
+    def abort(self) -> None:
+        """Cuts the connection now, also during its TLS handshake."""
+        if self.transport is not None:
+            self.transport.abort()
+        elif self.task is not None:
+            self.task.cancel()
+
+    def data_received(self, data: bytes) -> None:
+        if self.muted:
+            return
+        # Bytes, not messages: frames without end make no message, and cost as much.
+        if self._bucket.take(time.monotonic(), len(data)):
+            super().data_received(data)
+            return
+        self.mute()
+        self._on_flood()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        if self.transport is not None:
+            self._stall = asyncio.get_running_loop().call_later(STALL_S, self.transport.abort)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._end_stall()
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        self._end_stall()
+        self._on_gone(self)
+        super().connection_lost(exc)
+
+    def handle_error(self, *args: Any, **kwargs: Any) -> web.StreamResponse:
+        response = super().handle_error(*args, **kwargs)
+        for name, value in self._headers.items():
+            response.headers.setdefault(name, value)
+        return response
+
+    def _end_stall(self) -> None:
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Connections at a time, in all and of one address."""
+
+    total: int
+    per_address: int
+
+
+class Listener:
+    """Accepts connections within limits.
+
+    Where an address has all that it may have, its oldest connection that is no WebSocket makes room; where all are
+    taken, the oldest one of the address that holds the most. So whoever holds idle connections displaces himself.
+
+    Args:
+        server: answers the requests.
+        limits: how many connections.
+        tls: for https; None: http.
+        headers: of every error that is answered below the server.
+    """
+
+    def __init__(self, server: web.Server, limits: Limits, tls: ssl.SSLContext | None, headers: dict[str, str]) -> None:
+        self._server, self._limits, self._tls, self._headers = server, limits, tls, headers
+        self._connections: dict[Connection, None] = {}  # the oldest first
+        self._rates = AddressBuckets(CONNECTIONS_PER_S, BURST_CONNECTIONS)
+        self._sockets: list[socket.socket] = []
+        self._tasks: list[asyncio.Task[None]] = []
+        self.refused = 0
+
+    async def open(self, host: str, port: int) -> int:
+        """Listens on every address of ``host``, and returns the port.
+
+        Raises:
+            OSError: host unknown, port in use or not allowed.
+        """
+        loop = asyncio.get_running_loop()
+        found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        try:
+            for family, address in dict.fromkeys((entry[0], entry[4]) for entry in found):
+                listener = socket.create_server(address[:2], family=socket.AddressFamily(family), backlog=128)
+                listener.setblocking(False)
+                self._sockets.append(listener)
+        except OSError:
+            self._close_sockets()
+            raise
+        self._tasks = [asyncio.create_task(self._accept_forever(listener)) for listener in self._sockets]
+        return int(self._sockets[0].getsockname()[1])
+
+    async def close(self) -> None:
+        """Accepts nothing more; the connections stay."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._close_sockets()
+
+    def _close_sockets(self) -> None:
+        for listener in self._sockets:
+            listener.close()
+        self._sockets = []
+
+    async def _accept_forever(self, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                accepted, peer = await loop.sock_accept(listener)
+            except ConnectionAbortedError:  # gone before its turn
+                continue
+            except OSError as error:  # no more file descriptors, or no memory
+                logger.error("cannot accept a connection: %s; an idle one is closed to make room", error.strerror)
+                self._displace(self._connections)
+                await asyncio.sleep(RETRY_S)
+                continue
+            self._admit(accepted, network_of(peer[0]))
+            await asyncio.sleep(0)  # what is connected already comes first
+
+    def _admit(self, accepted: socket.socket, network: str) -> None:
+        own = [connection for connection in self._connections if connection.network == network]
+        if not self._rates.of(network).take(time.monotonic()):
+            reason = f"more than {CONNECTIONS_PER_S:g} new ones a second"
+        elif len(own) >= self._limits.per_address and not self._displace(own):
+            reason = f"it has {len(own)} WebSockets"
+        elif len(self._connections) >= self._limits.total and not self._displace(self._connections):
+            reason = f"all {len(self._connections)} are WebSockets"
+        else:
+            connection = Connection(self._server, network, self._headers, self._forget)
+            self._connections[connection] = None
+            connection.task = asyncio.create_task(self._serve(accepted, connection))
+            return
+        accepted.close()
+        self.refused += 1
+        logger.warning("refused a connection from %s: %s", network, reason)
+
+    def _displace(self, connections: Iterable[Connection]) -> bool:
+        """Cuts the oldest connection, of the address that has the most of these, that is no WebSocket."""
+        idle = [connection for connection in connections if not connection.kept]
+        if not idle:
+            return False
+        ((network, _),) = Counter(connection.network for connection in idle).most_common(1)
+        oldest = next(connection for connection in idle if connection.network == network)
+        self._forget(oldest)
+        oldest.abort()
+        return True
+
+    def _forget(self, connection: Connection) -> None:
+        self._connections.pop(connection, None)
+
+    async def _serve(self, accepted: socket.socket, connection: Connection) -> None:
+        try:
+            await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: connection, accepted, ssl=self._tls, ssl_handshake_timeout=HEADERS_S if self._tls else None
+            )
+        except OSError as error:  # also what a TLS handshake fails by
+            logger.debug("no connection with %s: %s", connection.network, error)
+        finally:
+            if connection.transport is None:  # cut off, or failed, before it began
+                accepted.close()
+                self._forget(connection)
