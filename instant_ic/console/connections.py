@@ -33,13 +33,19 @@ logger = logging.getLogger("instant_ic.console")
 
 
 class TokenBucket:
-    """Lets ``rate`` through each second on average, and ``burst`` at once. Times are given by the caller."""
+    """Lets ``rate`` through each second on average, and ``burst`` at once. Times are given by the caller.
+
+    Args:
+        rate: a second.
+        burst: at most at once.
+        first: at once at the start; default ``burst``.
+    """
 
     __slots__ = ("_at", "_tokens", "burst", "rate")
 
-    def __init__(self, rate: float, burst: float) -> None:
+    def __init__(self, rate: float, burst: float, first: float | None = None) -> None:
         self.rate, self.burst = rate, burst
-        self._tokens, self._at = burst, -math.inf
+        self._tokens, self._at = burst if first is None else first, -math.inf
 
     def take(self, now: float, amount: float = 1.0) -> bool:
         """Takes ``amount`` if it is there; False, and nothing taken, otherwise."""
@@ -50,6 +56,10 @@ class TokenBucket:
             return False
         self._tokens -= amount
         return True
+
+    def give_back(self) -> None:
+        """Takes one :meth:`take` back."""
+        self._tokens = min(self.burst, self._tokens + 1.0)
 
     def wait_s(self) -> float:
         """Seconds from the last :meth:`take` until one token is there."""

@@ -49,8 +49,12 @@ MAX_CLIENT_MESSAGE = 4096
 MAX_BODY = 4096
 MAX_BAD_MESSAGES = 20
 BURST_S = 2.0  # of messages that may come at once: what a radio link held back
+WATCHER_SHARE = 0.4  # of max_messages_per_s, for a page that does not drive
+FIRST_S = 0.25  # likewise, of a new page
 REQUESTS_PER_S = 40.0  # of one address; a page with its modules takes about 25
 BURST_REQUESTS = 150.0
+SOCKETS_PER_S = 5.0  # WebSockets that one address may open; a new one gets all that is shown
+BURST_SOCKETS = 20.0
 RESERVED_FOR_DRIVERS = 2  # of max_clients: pages that may only watch cannot take all places
 MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
@@ -146,6 +150,7 @@ class ConsoleServer:
         self._sessions: dict[int, Session] = {}
         self._next_number = 1
         self._requests = AddressBuckets(REQUESTS_PER_S, BURST_REQUESTS)
+        self._sockets = AddressBuckets(SOCKETS_PER_S, BURST_SOCKETS)
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}
         self._looks: dict[int, Look] = {}
@@ -272,7 +277,7 @@ class ConsoleServer:
         await runner.setup()
         assert runner.server is not None
         limits = Limits(self.config.max_connections, self.config.max_connections_per_address)
-        listener = Listener(runner.server, limits, self._tls, SECURITY_HEADERS)
+        self._listener = listener = Listener(runner.server, limits, self._tls, SECURITY_HEADERS)
         try:
             self.port = await listener.open(self.config.host, self.config.port)
             drive_task = asyncio.create_task(self._drive_forever())
@@ -297,16 +302,17 @@ class ConsoleServer:
         request[_COOKIE] = cookie = request.cookies.get(COOKIE, "")
         signed_in = not self.access.required or self.access.role_of_session(cookie, time.monotonic()) is not None
         if not (signed_in and request.path == "/estop"):
-            await self._pace(request)
+            await self._pace(request, self._requests)
         if not host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts):
             raise web.HTTPForbidden(text="unknown Host; name it in server.allowed_hosts\n")
         request[_ROLE] = role = await self._role(request)
         open_to_all = request.path == "/sign-in" or request.path.startswith("/static/")
         return await (self._turn_away(request) if role is None and not open_to_all else handler(request))
 
-    async def _pace(self, request: web.Request) -> None:
+    @staticmethod
+    async def _pace(request: web.Request, buckets: AddressBuckets) -> None:
         """Makes an address wait that asks too often; how many wait, its number of connections bounds."""
-        bucket = self._requests.of(network_of(request.remote or ""))
+        bucket = buckets.of(network_of(request.remote or ""))
         while not bucket.take(time.monotonic()):
             await asyncio.sleep(bucket.wait_s())
 
@@ -424,6 +430,9 @@ class ConsoleServer:
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         self._check_origin(request)
+        await self._pace(request, self._sockets)
+        if request.transport is None:  # the client did not wait
+            return web.Response(status=408)
         may_drive = request[_ROLE] is Role.DRIVE
         places = self.config.max_clients if may_drive else max(1, self.config.max_clients - RESERVED_FOR_DRIVERS)
         if len(self._sessions) >= places:
@@ -432,7 +441,10 @@ class ConsoleServer:
         assert isinstance(connection, Connection)
         # Pings of the protocol itself come to the reader too, or they would pass by its limit.
         socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=CLOSE_S, autoping=False)
-        session = Session(self._next_number, socket, connection, may_drive, request[_COOKIE])
+        limit = self.config.max_messages_per_s
+        # A new one has had nothing held back: whoever is cut off and comes again brings no new burst.
+        bucket = TokenBucket(limit, limit * BURST_S, limit * FIRST_S)
+        session = Session(self._next_number, socket, connection, bucket, may_drive, request[_COOKIE])
         self._next_number += 1
         self._sessions[session.number] = session  # before anything is awaited: the place is taken
         loop = asyncio.get_running_loop()
@@ -522,7 +534,6 @@ class ConsoleServer:
 
     async def _read_forever(self, session: Session) -> None:
         limit = self.config.max_messages_per_s
-        bucket = TokenBucket(limit, limit * BURST_S)
         while session.number in self._sessions:
             try:
                 message = await session.socket.receive(timeout=SILENT_CLIENT_S)
@@ -532,7 +543,9 @@ class ConsoleServer:
             if session.number not in self._sessions:  # ended while it waited
                 return
             now = time.monotonic()
-            within = bucket.take(now)
+            # Whoever watches sends no commands, only beats and looks.
+            session.bucket.rate = limit if session.number == self.gate.driver else limit * WATCHER_SHARE
+            within = session.bucket.take(now)
             if message.type is WSMsgType.TEXT:
                 self._take(session, message.data, now, only_a_stop=not within)
             elif message.type is WSMsgType.PING:
@@ -682,7 +695,8 @@ class ConsoleServer:
             kind = FrameKind(whole(message, "kind"))
         except ValueError as error:
             raise ProtocolError(f"ack.kind: {error}") from None
-        session.acknowledge(kind, whole(message, "seq"))
+        if session.acknowledge(kind, whole(message, "seq")):
+            session.bucket.give_back()  # these the server's own frames limit
 
     async def _drive_forever(self) -> None:
         while True:

@@ -11,7 +11,7 @@ from typing import Any
 
 from aiohttp import web
 
-from instant_ic.console.connections import Connection
+from instant_ic.console.connections import Connection, TokenBucket
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 
 # Small things first: a picture must not delay the state, nor the map a picture.
@@ -39,12 +39,15 @@ class Session:
         number: int,
         socket: web.WebSocketResponse,
         connection: Connection,
+        bucket: TokenBucket,
         may_drive: bool = True,
         cookie: str = "",
     ) -> None:
         self.number = number
         self.socket = socket
         self.connection = connection
+        self.bucket = bucket
+        """Of its messages."""
         self.may_drive = may_drive
         self.cookie = cookie
         """Of its sign-in, with which it ends; empty where it came without or by a token."""
@@ -88,11 +91,13 @@ class Session:
         self._background_period_s = background_period_s
         self._wake.set()
 
-    def acknowledge(self, kind: FrameKind, sequence: int) -> None:
-        """The client has shown frame ``sequence``."""
-        if self._unacknowledged.get(kind) == sequence:
-            del self._unacknowledged[kind]
-            self._wake.set()
+    def acknowledge(self, kind: FrameKind, sequence: int) -> bool:
+        """The client has shown frame ``sequence``; False where it was not sent, or acknowledged before."""
+        if self._unacknowledged.get(kind) != sequence:
+            return False
+        del self._unacknowledged[kind]
+        self._wake.set()
+        return True
 
     async def send_forever(self) -> None:
         """Sends what waits until the socket closes."""

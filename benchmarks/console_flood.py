@@ -1,0 +1,218 @@
+"""What strangers cost the driver: round trip and emergency stop, without and under a flood by other clients.
+
+    python benchmarks/console_flood.py                  # 20 clients that send pings as fast as they can
+    python benchmarks/console_flood.py --flood limit    # 20 clients that keep just within the limit of a socket
+    python benchmarks/console_flood.py --flood http     # 20 clients that ask for the page as fast as they can
+    python benchmarks/console_flood.py --flood connect  # 20 clients that connect as fast as they can
+
+Server, driver and flood are three processes. The flood comes from 127.0.0.2, the driver from 127.0.0.1; ``--same``
+floods from the driver's address. A client that is cut off connects again at once. Round trip: ping to pong, 20 Hz, as
+the page measures it. Stop: from the driver's ``estop`` until it is on the topic, by the machine's monotonic clock.
+JSON, milliseconds; ``ratio`` is flood over quiet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import multiprocessing
+import os
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from instant_ic.console import ConsoleClient, ConsoleServer, ServerConfig
+from instant_ic.console.drive import DriveConfig
+
+ELSEWHERE = "127.0.0.2"
+PING = b'{"type":"ping","client_ms":0}'
+PATIENT = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0, max_command_age_s=60.0)
+
+
+@dataclass
+class Backend:
+    """Keeps when emergency stops reached the topic."""
+
+    stops_s: list[float] = field(default_factory=list)
+
+    def on_drive(self, linear: float, angular: float) -> None:
+        """Nothing moves."""
+
+    def on_operator(self, there: bool) -> None:
+        """Nobody asks."""
+
+    def on_look(self, look: Any) -> None:
+        """Nothing is rendered."""
+
+    def on_estop(self, stop: bool) -> None:
+        """Where the node publishes."""
+        if stop:
+            self.stops_s.append(time.monotonic())
+
+
+def serve(channel: Connection, max_clients: int) -> None:
+    """The server's process: sends its port, and at the end when the stops came."""
+    backend: Any = Backend()
+    server = ConsoleServer(backend, ServerConfig(port=0, max_clients=max_clients, drive=PATIENT))
+    server.start()
+    for n in range(4):  # what a running stack has sent: a new client gets it at once
+        server.publish(f"state{n}", {"filler": "x" * 400})
+    channel.send(server.port)
+    channel.recv()
+    channel.send(backend.stops_s)
+    server.stop()
+
+
+def flood(channel: Connection, port: int, kind: str, clients: int, address: str) -> None:
+    """The flood's process: until the channel says so; sends how much it sent, and how often it was cut off."""
+    counts = {"sent": 0, "cut_off": 0}
+    os.nice(19)  # elsewhere it would not cost this machine's time
+
+    async def one() -> None:
+        while True:
+            try:
+                reader, writer = await asyncio.open_connection("127.0.0.1", port, local_addr=(address, 0))
+            except OSError:
+                counts["cut_off"] += 1
+                await asyncio.sleep(0.001)
+                continue
+            try:
+                await send(reader, writer)
+            except (OSError, asyncio.IncompleteReadError):
+                counts["cut_off"] += 1
+            finally:
+                writer.close()
+            await asyncio.sleep(0.001)
+
+    async def send(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        head = f"HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n"
+        if kind == "connect":
+            return
+        if kind == "http":
+            batch, period_s = f"GET / {head}\r\n".encode() * 10, 0.001
+        else:
+            writer.write(
+                f"GET /ws {head}Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+                "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n".encode()
+            )
+            if b" 101 " not in await reader.readuntil(b"\r\n\r\n"):
+                raise ConnectionError("refused")
+            ping = bytes([0x81, 0x80 | len(PING)]) + bytes(4) + PING
+            batch, period_s = (ping * 29, 0.1) if kind == "limit" else (ping * 100, 0.001)
+        drain = asyncio.create_task(empty(reader))
+        try:
+            while not drain.done():
+                writer.write(batch)
+                counts["sent"] += 1
+                await writer.drain()
+                await asyncio.sleep(period_s)
+        finally:
+            drain.cancel()
+        raise ConnectionError("cut off")
+
+    async def empty(reader: asyncio.StreamReader) -> None:
+        with contextlib.suppress(OSError):
+            while await reader.read(1 << 16):
+                pass
+
+    async def run() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # connections cut off are its daily bread
+        tasks = [asyncio.create_task(one()) for _ in range(clients)]
+        await asyncio.to_thread(channel.recv)
+        for task in tasks:
+            task.cancel()
+
+    asyncio.run(run())
+    channel.send(counts)
+
+
+async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
+    """Round trips in seconds, and when emergency stops were sent."""
+    trips, stops = [], []
+    async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
+        await driver.acquire()
+        driver._tasks.pop().cancel()  # the beats: they are made here
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            sent_s = time.monotonic()
+            driver.messages.pop("pong", None)
+            await driver.send({"type": "ping", "client_ms": sent_s * 1000})
+            await driver.wait_for(lambda c: "pong" in c.messages, 30)
+            assert driver.round_trip_s is not None
+            trips.append(driver.round_trip_s)
+            if len(trips) % 5 == 0:
+                stops.append(time.monotonic())
+                await driver.estop()
+                await driver.release_estop()
+            await asyncio.sleep(max(0.0, 0.05 - (time.monotonic() - sent_s)))
+    return trips, stops
+
+
+def summary(values_s: Any) -> dict[str, float]:
+    """Half, 99 of 100, and worst, ms."""
+    values_ms = 1000 * np.asarray(values_s)
+    return {
+        "p50_ms": round(float(np.median(values_ms)), 2),
+        "p99_ms": round(float(np.percentile(values_ms, 99)), 2),
+        "worst_ms": round(float(values_ms.max()), 2),
+    }
+
+
+def measure(kind: str | None, clients: int, seconds: float, address: str) -> dict[str, Any]:
+    """One run, with a flood of ``kind`` or without."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    server = context.Process(target=serve, args=(theirs, clients + 4), daemon=True)
+    server.start()
+    port = ours.recv()
+    result: dict[str, Any] = {}
+    try:
+        if kind is not None:
+            flood_ours, flood_theirs = context.Pipe()
+            attack = context.Process(target=flood, args=(flood_theirs, port, kind, clients, address), daemon=True)
+            attack.start()
+            time.sleep(2.0)
+        trips, sent = asyncio.run(drive(port, seconds))
+        if kind is not None:
+            flood_ours.send(None)
+            result["flood"] = flood_ours.recv()
+            attack.join(10)
+        ours.send(None)
+        came = ours.recv()
+        assert len(came) == len(sent), f"{len(sent)} stops were sent, {len(came)} came"
+        result |= {"round_trip": summary(trips), "stop": summary(np.subtract(came, sent)), "pings": len(trips)}
+    finally:
+        server.join(10)
+        server.kill()
+    return result
+
+
+def main() -> None:
+    """Prints the figures as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--flood", choices=("pings", "limit", "http", "connect"), default="pings")
+    parser.add_argument("--clients", type=int, default=20)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--same", action="store_true", help="flood from the driver's own address")
+    args = parser.parse_args()
+    quiet = measure(None, args.clients, args.seconds, ELSEWHERE)
+    flooded = measure(args.flood, args.clients, args.seconds, "127.0.0.1" if args.same else ELSEWHERE)
+    ratio = {
+        what: {key: round(value / quiet[what][key], 2) for key, value in flooded[what].items()}
+        for what in ("round_trip", "stop")
+    }
+    print(
+        json.dumps(
+            {"flood_by": args.flood, "clients": args.clients, "load": os.getloadavg()[0], "quiet": quiet,
+             "under_flood": flooded, "ratio": ratio}, indent=1,
+        )
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,525 @@
+"""Clients that flood, hold connections or do not read: what they cost others. Counts and order, not speed."""
+
+import asyncio
+import contextlib
+import json
+import logging
+import subprocess
+import sys
+import textwrap
+import threading
+from collections import Counter
+
+import aiohttp
+import pytest
+from aiohttp import WSMsgType
+from test_console_access import DRIVE, WATCH, Nobody, token_file
+
+from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
+from instant_ic.console import connections as connections_module
+from instant_ic.console.access import AccessConfig
+from instant_ic.console.connections import AddressBuckets, TokenBucket, network_of
+from instant_ic.console.drive import DriveConfig
+from instant_ic.console.log_rate import LogRate
+from instant_ic.console.server import WATCHER_SHARE
+from instant_ic.console.session import MAX_REPLIES
+
+WAIT_S = 60.0
+PATIENT = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0, max_command_age_s=60.0)
+PING = b'{"type":"ping","client_ms":0}'
+TEXT, CONTINUATION, PING_FRAME = 0x1, 0x0, 0x9
+ELSEWHERE = ("127.0.0.2", 0)  # another address on this machine
+
+
+@pytest.fixture
+def serve():
+    servers = []
+
+    def start(**config):
+        server = ConsoleServer(Nobody(), ServerConfig(port=0, drive=PATIENT, **config))
+        server.start()
+        servers.append(server)
+        return server
+
+    yield start
+    for server in servers:
+        server.stop()
+
+
+def run(scenario):
+    async def bounded():
+        async with asyncio.timeout(WAIT_S):
+            await scenario()
+
+    asyncio.run(bounded())
+
+
+async def until(condition):
+    while not condition():
+        await asyncio.sleep(0.01)
+
+
+def frame(payload, opcode=TEXT, fin=True):
+    """A client's WebSocket frame, masked by zeros."""
+    assert len(payload) < 126
+    return bytes([(fin << 7) | opcode, 0x80 | len(payload)]) + bytes(4) + payload
+
+
+async def raw_socket(server, local=None):
+    """A WebSocket without a library, which would hold back what it sends."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=local)
+    writer.write(
+        f"GET /ws HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\n\r\n".encode()
+    )
+    assert b" 101 " in await reader.readuntil(b"\r\n\r\n")
+    return reader, writer
+
+
+async def frames_of(reader):
+    """Frames that the server sends, (opcode, payload), until the connection ends."""
+    while True:
+        try:
+            first, length = await reader.readexactly(2)
+            if length >= 126:
+                length = int.from_bytes(await reader.readexactly(2 if length == 126 else 8), "big")
+            yield first & 0x0F, await reader.readexactly(length)
+        except (asyncio.IncompleteReadError, ConnectionError):
+            return
+
+
+async def count_replies(reader):
+    """How many pongs came, and what the closing frame says."""
+    pongs, closed = 0, None
+    async for opcode, payload in frames_of(reader):
+        if opcode == 0x8:
+            closed = int.from_bytes(payload[:2], "big"), payload[2:].decode()
+            break
+        pongs += opcode == 0xA or b'"pong"' in payload
+    return pongs, closed
+
+
+# ---- floods ------------------------------------------------------------------------------------------
+
+
+def test_a_token_bucket_lets_its_rate_through():
+    bucket = TokenBucket(rate=10.0, burst=5.0)
+    assert [bucket.take(100.0) for _ in range(7)] == [True] * 5 + [False] * 2
+    assert bucket.wait_s() == pytest.approx(0.1)
+    assert [bucket.take(100.25) for _ in range(4)] == [True, True, False, False]  # 2.5 came back
+    assert bucket.take(1000.0, 5.0) and not bucket.take(1000.0)  # never more than the burst
+    buckets = AddressBuckets(1.0, 1.0)
+    assert buckets.of("a").take(0.0) and not buckets.of("a").take(0.0) and buckets.of("b").take(0.0)
+
+
+@pytest.mark.parametrize(
+    ("flood", "messages"),
+    [
+        (frame(PING), True),
+        (frame(b"", PING_FRAME), True),  # of the protocol itself
+        (frame(b'{"type":"nonsense"}'), True),
+        (frame(b"", CONTINUATION, fin=False) * 200, False),  # of the message begun below: it never comes
+    ],
+    ids=["pings", "protocol pings", "bad messages", "endless fragments"],
+)
+def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, flood, messages):
+    server = serve(max_messages_per_s=100.0)
+
+    async def scenario():
+        async with ConsoleClient(server.url) as driver:
+            await driver.acquire()
+            reader, writer = await raw_socket(server)
+            replies = asyncio.create_task(count_replies(reader))
+            if not messages:
+                writer.write(frame(b"", TEXT, fin=False))
+            while not replies.done():
+                writer.write(flood)
+                with contextlib.suppress(TimeoutError, ConnectionError):
+                    await asyncio.wait_for(writer.drain(), 0.01)
+                await asyncio.sleep(0)
+            pongs, closed = await replies
+            assert closed[0] == 1008
+            assert closed[1] in ("too many messages", "bad messages")
+            if messages:
+                assert pongs <= 200 + 100 * WAIT_S  # 2 s of them at once, then the rate
+            writer.close()
+            await driver.wait_for(lambda c: c.session["clients"] == 1)
+            assert driver.session["driver"] == "you" and not driver._socket.closed
+
+    run(scenario)
+
+
+def test_the_message_that_is_one_too_many_still_stops_the_robot(serve):
+    server = serve(max_messages_per_s=1.0)
+
+    async def scenario():
+        reader, writer = await raw_socket(server)
+        writer.write(frame(b'{"type":"estop"}') * 100)
+        _, closed = await count_replies(reader)
+        assert closed == (1008, "too many messages")
+        writer.close()
+
+    run(scenario)
+    assert server.backend.estops == [True]
+
+
+def test_fault_an_emergency_stop_waits_behind_other_clients_messages(serve):
+    """Each client has one message a turn: between stop and topic comes one of each flooder, not its queue."""
+    server = serve(max_messages_per_s=1e6)
+    handled, at_the_stop = Counter(), []
+    handle, on_estop = server._handle, server.backend.on_estop
+    server._handle = lambda session, message, now: (handled.update([session.number]), handle(session, message, now))
+    asked = asyncio.Event()
+
+    def stop(stopped):
+        at_the_stop.append(handled.copy())
+        on_estop(stopped)
+
+    server.backend.on_estop = stop
+
+    async def scenario():
+        flooders = [await raw_socket(server, ELSEWHERE) for _ in range(5)]
+        watcher, stopper = await raw_socket(server)
+        await until(lambda: len(server._sessions) == 6)
+        number = max(server._sessions)
+        # On the server's own thread: its turns stand still until all bytes lie in the sockets.
+        gate = asyncio.run_coroutine_threadsafe(hold(), server._loop)
+        await asked.wait()
+        for _, writer in flooders:
+            writer.write(frame(PING) * 1000)
+            await writer.drain()
+        stopper.write(frame(b'{"type":"estop"}'))
+        await stopper.drain()
+        release.set()
+        await asyncio.wrap_future(gate)
+        await until(lambda: at_the_stop)
+        others = [count for client, count in at_the_stop[0].items() if client != number]
+        assert sum(others) <= 5 * 3  # of 5000
+        for _, writer in [*flooders, (watcher, stopper)]:
+            writer.close()
+
+    release, loop_holder = threading.Event(), []
+
+    async def hold():
+        loop_holder[0].call_soon_threadsafe(asked.set)
+        assert release.wait(WAIT_S)
+
+    async def with_loop():
+        loop_holder.append(asyncio.get_running_loop())
+        await scenario()
+
+    run(with_loop)
+    assert server.backend.estops == [True]
+
+
+def test_an_emergency_stop_comes_by_a_connection_of_its_own(serve):
+    server = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as driver, aiohttp.ClientSession() as http:
+            await driver.acquire()
+            async with http.post(server.url + "estop", headers={"Origin": "http://evil.example"}) as response:
+                assert response.status == 403
+            host = f"evil.example:{server.port}"
+            async with http.post(server.url + "estop", headers={"Host": host, "Origin": f"http://{host}"}) as response:
+                assert response.status == 403
+            assert server.backend.estops == []
+            async with http.post(server.url + "estop", headers={"Origin": server.url.rstrip("/")}) as response:
+                assert response.status == 204
+            await driver.wait_for(lambda c: c.session["estop"])
+
+    run(scenario)
+    assert server.backend.estops == [True]
+
+
+def test_an_emergency_stop_needs_a_sign_in_and_a_watchers_suffices(serve, tmp_path):
+    files = {
+        "token_file": token_file(tmp_path, "drive", DRIVE),
+        "watch_token_file": token_file(tmp_path, "watch", WATCH),
+    }
+    server = serve(access=AccessConfig(**files))
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http:
+            async with http.post(server.url + "estop") as response:
+                assert response.status == 401
+            assert server.backend.estops == []
+            async with http.post(server.url + "estop", headers={"Authorization": f"Bearer {WATCH}"}) as response:
+                assert response.status == 204
+
+    run(scenario)
+    assert server.backend.estops == [True]
+
+
+def test_fault_a_client_that_does_not_read_grows_the_servers_memory(serve):
+    server = serve(max_messages_per_s=1e6)
+    most = []
+
+    async def scenario():
+        async with ConsoleClient(server.url) as driver:
+            await driver.acquire()
+            reader, writer = await raw_socket(server)  # reads nothing from here on
+            reader._transport.pause_reading()
+            await until(lambda: len(server._sessions) == 2)
+            session = server._sessions[max(server._sessions)]
+            while session.number in server._sessions:
+                most.append(len(session._replies))
+                server.send_frame(FrameKind.PANORAMA, {}, bytes(200_000))
+                writer.write(frame(PING) * 100)
+                with contextlib.suppress(TimeoutError, ConnectionError):
+                    await asyncio.wait_for(writer.drain(), 0.01)
+            assert len(session._replies) <= MAX_REPLIES
+            await until(lambda: session.connection.transport is None)  # cut off although it takes no closing frame
+            writer.close()
+            await driver.wait_for(lambda c: c.session["clients"] == 1)
+
+    run(scenario)
+    assert max(most) <= MAX_REPLIES
+
+
+def test_what_changes_nothing_is_not_sent_to_all(serve):
+    """Or one watcher's message would make one for everybody."""
+    server = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as driver, ConsoleClient(server.url) as watcher:
+            await driver.acquire()
+            await watcher.wait_for(lambda c: c.session["driver"] == "other")
+            heard = []
+            take = driver._on_text
+            driver._on_text = lambda message: (heard.append(message["type"]), take(message))
+            await watcher.send({"type": "lease", "take": False})
+            await watcher.send({"type": "yield"})
+            await watcher.send({"type": "estop_release"})
+            await watcher.wait_for(lambda c: c.refused == ["not_driver"])
+            driver.messages.pop("pong", None)
+            await driver.wait_for(lambda c: "pong" in c.messages)
+            assert "session" not in heard
+
+    run(scenario)
+
+
+# ---- connections -------------------------------------------------------------------------------------
+
+
+def test_networks_of_addresses():
+    assert network_of("10.1.2.3") == "10.1.2.3"
+    assert network_of("::ffff:10.1.2.3") == "10.1.2.3"
+    assert network_of("2001:db8:1:2:3:4:5:6") == network_of("2001:db8:1:2::9") == "2001:db8:1:2::/64"
+    assert network_of("fe80::1%eth0") == "fe80::/64"
+    assert network_of("unknown") == "unknown"
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n"], ids=["idle", "half-open"])
+def test_fault_idle_connections_starve_the_driver(serve, sent):
+    server = serve(max_connections=20, max_connections_per_address=10)
+
+    async def scenario():
+        held = []
+        for local in [ELSEWHERE] * 30 + [("127.0.0.3", 0)] * 15:
+            reader, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=local)
+            writer.write(sent)
+            held.append((reader, writer))
+        async with ConsoleClient(server.url) as driver:
+            await driver.acquire()
+            listener = server._listener
+            assert len(listener._connections) <= 20
+            counts = Counter(connection.network for connection in listener._connections)
+            assert max(counts.values()) <= 10
+            # The address that holds them still gets in itself, by its oldest.
+            async with aiohttp.ClientSession(connector=aiohttp.TCPConnector(local_addr=ELSEWHERE)) as http:
+                async with http.get(server.url + "health") as response:
+                    assert response.status == 200
+            assert not driver._socket.closed
+        for _, writer in held:
+            writer.close()
+
+    run(scenario)
+
+
+def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, tmp_path):
+    monkeypatch.setattr(connections_module, "HEADERS_S", 0.5)
+    monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 0.5)
+    server = serve(access=AccessConfig(token_file=token_file(tmp_path, "drive", DRIVE)))
+    slow = b"POST /sign-in HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/x-www-form-urlencoded\r\n"
+
+    async def trickle(start, more):
+        """Sends a byte now and again; returns what the server said until it closed."""
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        writer.write(start)
+        answer = asyncio.create_task(reader.read())
+        while not answer.done():
+            writer.write(more)
+            await asyncio.wait({answer}, timeout=0.05)
+        writer.close()
+        return await answer
+
+    async def scenario():
+        assert await trickle(b"GET / HTTP/1.1\r\nX-Slow: ", b"x") == b""
+        assert await trickle(b"", b"") == b""
+        assert b" 408 " in await trickle(slow + b"Content-Length: 4000\r\n\r\n", b"x")
+
+    run(scenario)
+
+
+def test_a_page_that_may_only_watch_leaves_places_for_drivers(serve, tmp_path):
+    files = {
+        "token_file": token_file(tmp_path, "drive", DRIVE),
+        "watch_token_file": token_file(tmp_path, "watch", WATCH),
+    }
+    server = serve(max_clients=4, access=AccessConfig(**files))
+
+    async def scenario():
+        async with ConsoleClient(server.url, token=WATCH), ConsoleClient(server.url, token=WATCH):
+            with pytest.raises(aiohttp.WSServerHandshakeError) as refused:
+                await ConsoleClient(server.url, token=WATCH).connect()
+            assert refused.value.status == 503
+            async with ConsoleClient(server.url, token=DRIVE) as driver:
+                await driver.acquire()
+
+    run(scenario)
+
+
+def test_more_connections_a_second_than_a_page_needs_are_refused_without_a_log_flood(serve, monkeypatch, caplog):
+    monkeypatch.setattr(connections_module, "BURST_CONNECTIONS", 5.0)
+    monkeypatch.setattr(connections_module, "CONNECTIONS_PER_S", 0.001)
+    server = serve()
+
+    async def scenario():
+        for _ in range(50):
+            _, writer = await asyncio.open_connection("127.0.0.1", server.port, local_addr=ELSEWHERE)
+            writer.close()
+        await until(lambda: server._listener.refused == 45)
+        async with ConsoleClient(server.url) as driver:  # from another address
+            await driver.acquire()
+
+    with caplog.at_level(logging.WARNING):
+        run(scenario)
+    # How many seconds it took, the machine decides: once a second, and 45 at once are one line.
+    assert 1 <= sum("refused a connection from 127.0.0.2" in line for line in caplog.messages) < 45
+
+
+SERVER_WITHOUT_FILES = """
+    import resource, sys
+    from types import SimpleNamespace
+    from instant_ic.console import ConsoleServer, ServerConfig
+    nothing = lambda *args: None
+    backend = SimpleNamespace(on_drive=nothing, on_operator=nothing, on_estop=nothing, on_look=nothing)
+    server = ConsoleServer(backend, ServerConfig(port=0, max_connections=1000, max_connections_per_address=1000))
+    server.start()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (40, 40))
+    print(server.port, flush=True)
+    sys.stdin.read()
+    server.stop()
+"""
+
+
+def test_fault_no_file_descriptors_floods_the_log_and_locks_the_driver_out(tmp_path):
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-c", textwrap.dedent(SERVER_WITHOUT_FILES)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log,
+        )  # fmt: skip
+    try:
+        port = int(process.stdout.readline())
+
+        async def scenario():
+            held = [await asyncio.open_connection("127.0.0.1", port, local_addr=ELSEWHERE) for _ in range(60)]
+            await until(lambda: b"cannot accept" in (tmp_path / "log").read_bytes())
+            async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
+                await driver.acquire()
+            for _, writer in held:
+                writer.close()
+
+        run(scenario)
+    finally:
+        process.communicate(timeout=WAIT_S)
+    assert process.returncode == 0
+    lines = (tmp_path / "log").read_text().splitlines()
+    assert 1 <= len(lines) <= 2 * WAIT_S and (tmp_path / "log").stat().st_size < 20_000
+
+
+def test_log_lines_of_one_place_come_once_a_second_with_a_count():
+    now = [0.0]
+    rate = LogRate(lambda: now[0])
+
+    def record(line, text="from %s"):
+        return logging.LogRecord("asyncio", logging.WARNING, "server.py", line, text, ("a",), None)
+
+    passed = [rate.filter(record(1)) for _ in range(1000)]
+    assert passed == [True] + [False] * 999
+    assert rate.filter(record(2))
+    now[0] = 1.0
+    after = record(1)
+    assert rate.filter(after) and after.getMessage() == "from a (999 more like it are left out)"
+    now[0] = 2.0
+    after = record(1)
+    assert rate.filter(after) and after.getMessage() == "from a"
+
+
+def test_fault_asyncio_and_aiohttp_log_as_often_as_a_stranger_likes(serve):
+    serve()
+    for name in ("instant_ic.console", "asyncio", "aiohttp.server"):
+        assert any(isinstance(each, LogRate) for each in logging.getLogger(name).filters)
+
+
+# ---- messages ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 4000,
+        '{"a":' * 800,
+        '{"type":"drive","seq":9,"time_ms":TIME,"linear":NaN,"angular":0}',
+        '{"type":"drive","seq":9,"time_ms":TIME,"linear":0,"angular":Infinity}',
+        '{"type":"drive","seq":9,"time_ms":TIME,"linear":1e999,"angular":0}',
+        '{"type":"drive","seq":9,"time_ms":NaN,"linear":0.1,"angular":0}',
+        '{"type":"drive","seq":9,"time_ms":TIME,"linear":' + "9" * 3900 + ',"angular":0}',
+        '{"type":"drive","seq":-1,"time_ms":TIME,"linear":0.1,"angular":0}',
+        '{"type":"drive","seq":9,"time_ms":TIME,"linear":"0.1","angular":0}',
+        '{"type":"\\ud800"}',
+    ],
+)
+def test_fault_hostile_json_drives_or_ends_the_server(serve, text):
+    server = serve()
+
+    async def scenario():
+        async with ConsoleClient(server.url) as client:
+            await client.acquire()
+            await client._socket.send_str(text.replace("TIME", str(server.now_ms())))
+            await client.wait_for(lambda c: len(c.errors) == 1)
+            await client.send_drive(0.1, 0.0)  # the connection is well
+            await until(lambda: (0.1, 0.0) in server.backend.commands)
+
+    run(scenario)
+    assert set(server.backend.commands) == {(0.0, 0.0), (0.1, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("kind", "payload", "code"),
+    [(WSMsgType.BINARY, b"x", 1003), (WSMsgType.TEXT, b"x" * 5000, 1009), (WSMsgType.TEXT, b"\xff", 1007)],
+    ids=["binary", "too long", "no UTF-8"],
+)
+def test_messages_that_no_page_sends_close_the_socket(serve, kind, payload, code):
+    server = serve()
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http, http.ws_connect(server.url + "ws") as socket:
+            await socket.send_frame(payload, kind)
+            while (await socket.receive()).type is WSMsgType.TEXT:
+                pass
+            assert socket.close_code == code
+
+    run(scenario)
+
+
+def test_the_page_keeps_within_its_limits():
+    """What page and client send at most, by their own periods, with a touch display of 120 Hz."""
+    config = ServerConfig()
+    watching = 20 + 2 * 30 + 10  # beats, acknowledgements (which count by their bytes only), looks
+    messages_per_s = watching + 120 + 20  # stick, repeated commands
+    assert messages_per_s < config.max_messages_per_s
+    assert watching < WATCHER_SHARE * config.max_messages_per_s
+    longest = len(json.dumps({"type": "drive", "seq": 2**40, "time_ms": 1e12 / 3, "linear": -1 / 3, "angular": 1 / 3}))
+    assert messages_per_s * (longest + 8) < connections_module.BYTES_PER_S
