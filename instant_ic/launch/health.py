@@ -224,7 +224,7 @@ class HealthMonitor:
         """
         for spec in self._specs:
             health = self.nodes.get(spec.label)
-            if spec.exec != "console" or health is None or health.state != "running":
+            if spec.exec != "console" or health is None or health.state not in _UP:
                 continue
             folder = self._folders[spec.group]
             address = find_console(registry.list_nodes(folder), [spec.name])

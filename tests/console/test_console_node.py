@@ -141,6 +141,16 @@ def view_message(bus, request_id, fov=1.8, near_m=0.7):
     )
 
 
+def test_plain_http_on_a_network_address_is_a_fault_on_the_page(setup):
+    _, node, server = setup
+    node.send_health()
+    assert "network" not in [fault["name"] for fault in server.texts["health"]["faults"]]
+    server.plain_http = True
+    node.send_health()
+    (fault,) = [fault for fault in server.texts["health"]["faults"] if fault["name"] == "network"]
+    assert fault["level"] == "warn" and "Plain HTTP" in fault["text"]
+
+
 def test_command_and_emergency_stop_go_to_the_bus(setup):
     bus, node, _ = setup
     node.on_drive(0.3, -0.2)

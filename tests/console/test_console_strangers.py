@@ -13,7 +13,7 @@ from collections import Counter
 import aiohttp
 import pytest
 from aiohttp import WSMsgType
-from test_console_access import DRIVE, WATCH, Nobody, token_file
+from test_console_access import DRIVE, WATCH, Nobody, certificate, token_file
 
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
 from instant_ic.console import connections as connections_module
@@ -24,6 +24,7 @@ from instant_ic.console.log_rate import LogRate
 from instant_ic.console.server import WATCHER_SHARE
 from instant_ic.console.session import MAX_REPLIES
 
+__all__ = ["certificate"]  # a fixture
 WAIT_S = 60.0
 PATIENT = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0, max_command_age_s=60.0)
 PING = b'{"type":"ping","client_ms":0}'
@@ -358,6 +359,19 @@ def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, t
         assert await trickle(b"GET / HTTP/1.1\r\nX-Slow: ", b"x") == b""
         assert await trickle(b"", b"") == b""
         assert b" 408 " in await trickle(slow + b"Content-Length: 4000\r\n\r\n", b"x")
+
+    run(scenario)
+
+
+def test_fault_a_tls_handshake_takes_for_ever(serve, monkeypatch, certificate):
+    monkeypatch.setattr(connections_module, "HEADERS_S", 0.5)
+    server = serve(access=AccessConfig(**certificate))
+
+    async def scenario():
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+        assert await reader.read() == b""
+        writer.close()
+        await until(lambda: not server._listener._connections)
 
     run(scenario)
 
