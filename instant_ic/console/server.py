@@ -451,8 +451,8 @@ class ConsoleServer:
         sender: asyncio.Task[None] | None = None
         expiry: asyncio.TimerHandle | None = None
         try:
+            await socket.prepare(request)  # raises where the request is no WebSocket's
             connection.keep(lambda: self._flooded(session))
-            await socket.prepare(request)
             self._greet(session)
             sender = asyncio.create_task(session.send_forever())
             if self.access.required and session.cookie:

@@ -338,6 +338,19 @@ def test_fault_idle_connections_starve_the_driver(serve, sent):
     run(scenario)
 
 
+def test_a_request_that_is_no_websockets_keeps_no_place(serve):
+    server = serve()
+
+    async def scenario():
+        async with aiohttp.ClientSession() as http:
+            async with http.get(server.url + "ws") as response:
+                assert response.status == 400
+            (connection,) = server._listener._connections
+            assert not connection.kept and not server._sessions
+
+    run(scenario)
+
+
 def test_fault_headers_bodies_and_handshakes_take_for_ever(serve, monkeypatch, tmp_path):
     monkeypatch.setattr(connections_module, "HEADERS_S", 0.5)
     monkeypatch.setattr("instant_ic.console.server.HEADERS_S", 0.5)
