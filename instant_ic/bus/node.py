@@ -106,10 +106,12 @@ class Latest:
         self.max_age_s = max_age_s
         self._message: Any = None
         self._received_ns = 0  # of the steady clock: setting the machine's clock makes nothing older or younger
+        self._given_ns = 0
 
-    def put(self, message: Any, steady_ns: int) -> None:
-        """Takes a newer message, and when it came by the steady clock."""
-        self._message, self._received_ns = message, steady_ns
+    def put(self, message: Any, received: Received) -> None:
+        """Takes a newer message, and how it came."""
+        self._message, self._received_ns = message, received.steady_ns
+        self._given_ns = received.given_ns(stamp_ns(message)) if hasattr(message, "header") else received.steady_ns
 
     @property
     def message(self) -> Any:
@@ -119,9 +121,17 @@ class Latest:
     @property
     def age_s(self) -> float:
         """Seconds since it came; inf before the first."""
+        return self._since_s(self._received_ns)
+
+    @property
+    def stamp_age_s(self) -> float:
+        """Seconds since it was measured or given (:meth:`Received.given_ns`); inf before the first."""
+        return self._since_s(self._given_ns)
+
+    def _since_s(self, instant_ns: int) -> float:
         if self._message is None:
             return float("inf")
-        age_ns = self._clock.steady_ns() - self._received_ns
+        age_ns = self._clock.steady_ns() - instant_ns
         # From the future: a clock was set back since, as when a player begins again.
         return age_ns / 1e9 if age_ns >= -_WENT_BACK_NS else float("inf")
 
@@ -352,7 +362,7 @@ class Node(Generic[ConfigT]):
         name = type_name(message_class)
 
         def keep(received: Received) -> None:
-            latest.put(deserialize(received.payload, name), received.steady_ns)
+            latest.put(deserialize(received.payload, name), received)
 
         self._subscribe(topic, name, keep, qos)
         return latest

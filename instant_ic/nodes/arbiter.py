@@ -229,7 +229,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.camera_ns = now_ns
 
     def age(self, key: str, latest: Latest) -> float:
-        """Seconds since the newest message came, or since it was measured where that is longer."""
+        """Seconds since the newest message was measured or given."""
         message = latest.message
         if message is None:
             return math.inf
@@ -238,7 +238,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             if key in self.heard:
                 self.rhythms[key].heard((now_ns - self.heard[key]) / 1e9 - latest.age_s)
             self.heard[key] = stamp
-        return max(latest.age_s, (now_ns - stamp) / 1e9)
+        return latest.stamp_age_s
 
     def on_shown(self, message: ShownPictures) -> None:
         """Notes what new pictures the operator's page has."""

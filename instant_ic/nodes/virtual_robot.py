@@ -133,7 +133,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
-            self.obeyed = self.operator(self.clock.now_ns())
+            self.obeyed = self.operator()
             self.robot.step(self.obeyed, robot_pose, dt_s, self.walls)
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls)
@@ -144,10 +144,10 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         slowed = f", slowed by {self.robot.slowed_by}" if self.robot.slowed_by else ""
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 
-    def operator(self, now_ns: int) -> tuple[float, float]:
+    def operator(self) -> tuple[float, float]:
         """The operator's command; zero when it is old, by arrival or by its stamp."""
         message = self.command.message
-        if message is None or now_ns - stamp_ns(message) > self.config.command_timeout_s * 1e9:
+        if message is None or self.command.stamp_age_s > self.config.command_timeout_s:
             return 0.0, 0.0
         return twist_values(message)
 
