@@ -63,16 +63,22 @@ class LimitsConfig:
         max_w: turn rate, rad/s.
         max_v_acceleration: change of the speed, m/s^2.
         max_w_acceleration: change of the turn rate, rad/s^2.
+        hard_deceleration: of the speed when the command is lost or asks for a hard stop, m/s^2.
+        hard_w_deceleration: of the turn rate, likewise, rad/s^2.
     """
 
     max_v: Positive = 0.5
     max_w: Positive = 1.0
     max_v_acceleration: Positive = 0.8
     max_w_acceleration: Positive = 2.0
+    hard_deceleration: Positive = 4.0
+    hard_w_deceleration: Positive = 10.0
 
     def __post_init__(self) -> None:
         """Check the values."""
         check_ranges(self)
+        for hard, soft in (("hard_deceleration", "max_v_acceleration"), ("hard_w_deceleration", "max_w_acceleration")):
+            _require(getattr(self, hard) >= getattr(self, soft), hard, getattr(self, hard), f"at least {soft}")
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ class RoboclawConfig:
         port: serial device, such as /dev/ttyACM0, or a pseudo-terminal.
         baud: 2400-460800; of no effect over USB.
         address: of the controller, 0x80-0x87 (128-135).
-        reply_timeout_s: how long a reply may take.
+        reply_timeout_s: how long a reply may take; after that the motors are stopped before anything is repeated.
         retries: how often a command is repeated before the link counts as lost.
         watchdog_s: the controller itself stops the motors when no packet came for this long; steps of 0.1 s.
         reconnect_min_s: first wait before the port is opened again.
@@ -118,7 +124,7 @@ class RoboclawConfig:
     address: int = 0x80
     reply_timeout_s: float = 0.1
     retries: int = 2
-    watchdog_s: float = 0.5
+    watchdog_s: float = 0.3
     reconnect_min_s: float = 0.2
     reconnect_max_s: float = 2.0
 
@@ -129,7 +135,7 @@ class RoboclawConfig:
         _require(self.address in ADDRESSES, "address", self.address, "in 128..135")
         _require(self.reply_timeout_s > 0.0, "reply_timeout_s", self.reply_timeout_s, "> 0 s")
         _require(self.retries >= 0, "retries", self.retries, ">= 0")
-        _require(0.1 <= self.watchdog_s <= 25.5, "watchdog_s", self.watchdog_s, "in 0.1..25.5 s")
+        _require(0.1 <= self.watchdog_s <= 1.0, "watchdog_s", self.watchdog_s, "in 0.1..1 s")
         _require(
             0.0 < self.reconnect_min_s <= self.reconnect_max_s,
             "reconnect_min_s",

@@ -2,16 +2,23 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
+
 from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawConfig, SkidSteerConfig
-from instant_ic.base.limits import TwistLimiter
-from instant_ic.base.odometry import OdometryEstimate, WheelOdometry
-from instant_ic.base.roboclaw import LinkError, Roboclaw, SerialPort, Status, open_serial
+from instant_ic.base.limits import TwistLimiter, accelerations
+from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
+from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
 
 from ..pace import current
 from ..ranges import Positive, Range, check_ranges
+
+
+_COUNTED_SINCE_M = 0.2
+"""Metres of track that a controller may have counted between its restart and the next reading."""
 
 
 @dataclass(frozen=True)
@@ -23,16 +30,16 @@ class ControllerConfig:
         geometry: tracks and encoders.
         limits: speeds and accelerations.
         odometry: growth of the uncertainty.
-        command_timeout_s: a command older than this counts no more: the base slows down to a stand.
-        health_period_s: battery and status are asked for this often.
+        command_timeout_s: a command older than this is dropped, and without a newer one the base stops hard.
+        health_period_s: battery, status and the controller's watchdog are asked for this often.
     """
 
     roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
     geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
     limits: LimitsConfig = field(default_factory=LimitsConfig)
     odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
-    command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.3
-    health_period_s: Positive = 1.0
+    command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.25
+    health_period_s: Positive = 0.25
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -71,20 +78,34 @@ class BaseState:
     w: float = 0.0
 
 
+@dataclass(frozen=True)
+class _Command:
+    v: float
+    w: float
+    hard: bool
+    given_ns: int
+    """By the steady clock."""
+
+
+_STOP = _Command(0.0, 0.0, True, 0)
+
+
 class BaseController:
-    """Steps the base; `command` may be called from any thread, everything else from one."""
+    """Steps the base; `command` and `emergency_stop` may be called from any thread, everything else from one."""
 
     def __init__(
         self,
         config: ControllerConfig,
         now_ns: Callable[[], int],
+        steady_ns: Callable[[], int],
         open_port: Callable[[RoboclawConfig], SerialPort] = open_serial,
     ) -> None:
         """Nothing is opened yet: the first `step` connects.
 
         Args:
             config: parameters.
-            now_ns: the clock that command stamps come from.
+            now_ns: clock of the stamps, nanoseconds since the epoch; it may be set at any time.
+            steady_ns: clock of every age, period and time-out, which nobody can set.
             open_port: how the serial port is opened.
         """
         self.config = config
@@ -92,58 +113,114 @@ class BaseController:
         self.odometry = WheelOdometry(config.geometry, config.odometry)
         self.limiter = TwistLimiter(config.limits)
         self._now_ns = now_ns
-        self._command: tuple[float, float, int] = (0.0, 0.0, 0)
+        self._steady_ns = steady_ns
+        self._lock = threading.Lock()
+        self._command: _Command | None = None
+        self._stopped = False
+        self._encoders: NDArray[np.int64] | None = None
         self._last_step_ns: int | None = None
         self._next_health_ns = 0
         self._next_connect_ns = 0
         self._backoff_s = config.roboclaw.reconnect_min_s
-        limits, geometry = config.limits, config.geometry
-        # The limiter shapes the twist; the controller's ramp is what one track needs for both parts at once.
-        self._ramp_pps2 = geometry.pulses_per_metre * (
-            limits.max_v_acceleration + 0.5 * geometry.effective_width * limits.max_w_acceleration
-        )
 
-    def command(self, v: float, w: float, stamp_ns: int) -> None:
-        """Set what the base shall do from now on: m/s, rad/s, and the time that the command was given."""
-        self._command = (v, w, stamp_ns)
+    def command(self, v: float, w: float, given_ns: int, hard: bool = False) -> None:
+        """Set what the base shall do from now on.
+
+        Args:
+            v: speed along x, m/s.
+            w: turn rate, rad/s.
+            given_ns: when the command was given, by the steady clock.
+            hard: reach it at the hard deceleration.
+        """
+        with self._lock:
+            self._command = _Command(v, w, hard, given_ns)
+
+    def emergency_stop(self, stopped: bool) -> None:
+        """Hold the motors at speed zero, reached without a ramp, for as long as ``stopped``.
+
+        The command at hand is void: nothing drives after the release until a new one comes.
+        """
+        with self._lock:
+            if stopped or self._stopped:
+                self._command = None
+            self._stopped = stopped
 
     def step(self) -> BaseState:
         """Send the speeds that are due, read the encoders and, from time to time, the health."""
-        now_ns = self._now_ns()
-        # The clock may be set back: a wait that was planned by the old time must not last until then.
-        config = self.config
-        self._next_connect_ns = min(self._next_connect_ns, now_ns + int(config.roboclaw.reconnect_max_s * 1e9))
-        self._next_health_ns = min(self._next_health_ns, now_ns + int(config.health_period_s * 1e9))
+        now_ns = self._steady_ns()
         if not self.roboclaw.connected:
             return self._connect(now_ns)
         dt_s = 0.0 if self._last_step_ns is None else max(0.0, (now_ns - self._last_step_ns) * 1e-9)
         self._last_step_ns = now_ns
-
-        v, w, stamp_ns = self._command
-        # A stamp from the future means that the clock was set back: such a command would never grow old.
-        fresh = stamp_ns > 0 and abs(now_ns - stamp_ns) * 1e-9 <= self.config.command_timeout_s
-        v, w = self.limiter.step(v, w, dt_s) if fresh else self.limiter.step(0.0, 0.0, dt_s)
-        kinematics = self.odometry.kinematics
-        health = None
+        if dt_s > self.config.roboclaw.watchdog_s:
+            self.limiter.reset()  # the controller has stopped the motors meanwhile
+        command = self._fresh_command()
+        stops, health = self.roboclaw.counters.stops, None
         try:
-            tracks = kinematics.tracks_from_twist(v, w)
-            self.roboclaw.drive(kinematics.motors_from_tracks(tracks).tolist(), self._ramp_pps2)
+            v, w = self._drive(command or _STOP, dt_s)
             encoders = self.roboclaw.encoders()
-            encoders_ns = self._now_ns()
+            encoders_ns, stamp_ns = self._steady_ns(), self._now_ns()
+            self._check_counts(encoders)
             if now_ns >= self._next_health_ns:
-                health = Health(now_ns, self.roboclaw.battery_v(), self.roboclaw.status())
+                self.roboclaw.check_watchdog()
+                health = Health(self._now_ns(), self.roboclaw.battery_v(), self.roboclaw.status())
                 self._next_health_ns = now_ns + int(self.config.health_period_s * 1e9)
+            rejected = self.odometry.rejected
+            estimate = self.odometry.update(encoders, encoders_ns)
+            if self.odometry.rejected != rejected and self._near_zero(encoders):
+                raise ControllerRestarted(f"{self.config.roboclaw.port}: the encoder counts jumped to {encoders}")
         except LinkError as error:
-            self._lost(now_ns)
+            restarted = isinstance(error, ControllerRestarted)
+            if restarted:
+                self.odometry.forget_counts()
+            self._lost(now_ns, 0.0 if restarted else self._backoff_s)
             return BaseState(connected=False, link=str(error))
+        if self.roboclaw.counters.stops != stops:
+            self.limiter.reset()  # a reply was missing, and the motors were stopped for it
         return BaseState(
             connected=True,
-            odometry=self.odometry.update(encoders, encoders_ns),
+            # Speeds are by the steady clock, the stamp by the other.
+            odometry=None if estimate is None else replace(estimate, stamp_ns=stamp_ns),
             health=health,
-            command_fresh=fresh,
+            command_fresh=command is not None,
             v=v,
             w=w,
         )
+
+    def _fresh_command(self) -> _Command | None:
+        """The command at hand while it is young enough; what is stale is forgotten, and never fresh again."""
+        with self._lock:
+            command = self._command
+            if command is not None:
+                age_s = (self._steady_ns() - command.given_ns) * 1e-9
+                if not 0.0 <= age_s <= self.config.command_timeout_s:
+                    command = self._command = None
+            return command
+
+    def _drive(self, command: _Command, dt_s: float) -> tuple[float, float]:
+        if self._stopped:
+            self.limiter.reset()
+            self.roboclaw.stop()
+            return 0.0, 0.0
+        v, w = self.limiter.step(command.v, command.w, dt_s, command.hard)
+        kinematics, geometry = self.odometry.kinematics, self.config.geometry
+        v_acceleration, w_acceleration = accelerations(self.config.limits, command.hard)
+        # The limiter shapes the twist; the controller's ramp is what one track needs for both parts at once.
+        ramp = v_acceleration + 0.5 * geometry.effective_width * w_acceleration
+        speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
+        self.roboclaw.drive(speeds.tolist(), geometry.pulses_per_metre * ramp)
+        return v, w
+
+    def _check_counts(self, encoders: NDArray[np.int64]) -> None:
+        """Counts of exactly zero are a place on the way, or a controller that restarted: its watchdog says which."""
+        last, self._encoders = self._encoders, encoders
+        if last is not None and last.any() and not encoders.any():
+            self.roboclaw.check_watchdog()
+
+    def _near_zero(self, encoders: NDArray[np.int64]) -> bool:
+        """Whether both counts are what a restarted controller may have counted since."""
+        metres = unwrap_counts(np.zeros(2, np.int64), encoders) / self.config.geometry.pulses_per_metre
+        return bool(np.abs(metres).max() < _COUNTED_SINCE_M)
 
     def close(self) -> str:
         """Stop the motors at once and release the port.
@@ -168,19 +245,20 @@ class BaseController:
             return BaseState(connected=False)
         try:
             version = self.roboclaw.connect()
-            # From a stand: whatever the motors still do from before is over now.
-            self.roboclaw.stop()
         except LinkError as error:
-            self._lost(now_ns)
+            self._lost(now_ns, self._backoff_s)
             return BaseState(connected=False, link=str(error))
+        if self.roboclaw.restarted:
+            self.odometry.forget_counts()
+        self._encoders = None
         self._backoff_s = self.config.roboclaw.reconnect_min_s
         self._last_step_ns = now_ns
         return BaseState(connected=True, link=f"connected to {version} at {self.config.roboclaw.port}")
 
-    def _lost(self, now_ns: int) -> None:
+    def _lost(self, now_ns: int, wait_s: float) -> None:
         self.roboclaw.close()
         self.limiter.reset()
-        self._next_connect_ns = now_ns + int(self._backoff_s * 1e9)
+        self._next_connect_ns = now_ns + int(wait_s * 1e9)
         self._backoff_s = min(2.0 * self._backoff_s, self.config.roboclaw.reconnect_max_s)
 
 
@@ -197,7 +275,7 @@ class ControllerThread(threading.Thread):
         """Not started yet.
 
         Args:
-            controller: used by this thread only, apart from `BaseController.command`.
+            controller: used by this thread only, apart from `BaseController.command` and `emergency_stop`.
             rate_hz: steps a second.
             on_state: called on this thread after each step.
             on_end: called on this thread when it ends: the exception that ended it, and what
@@ -209,6 +287,7 @@ class ControllerThread(threading.Thread):
         self._on_state = on_state
         self._on_end = on_end
         self._end = threading.Event()
+        self._wake = threading.Event()
 
     def run(self) -> None:
         """Step until `end`; the motors are stopped however it ends."""
@@ -217,16 +296,27 @@ class ControllerThread(threading.Thread):
         due_s = pace.steady_s()
         try:
             # By a grid of times, so that what a step takes does not slow the rate; steps missed are left out.
-            while not self._end.wait(pace.wait_s(max(0.0, due_s - pace.steady_s()))):
+            while not self._end.is_set():
+                self._wake.wait(pace.wait_s(max(0.0, due_s - pace.steady_s())))
+                if self._end.is_set():
+                    break
+                self._wake.clear()
+                due = pace.steady_s() >= due_s
                 self._on_state(self._controller.step())
-                due_s = max(due_s + self._period_s, pace.steady_s())
+                if due:
+                    due_s = max(due_s + self._period_s, pace.steady_s())
         except BaseException as error:  # noqa: BLE001 - handed to on_end; the motors must stop first
             fault = error
         self._on_end(fault, self._controller.close())
 
+    def hurry(self) -> None:
+        """Make a step now, beside those of the rate: a stop does not wait for its turn."""
+        self._wake.set()
+
     def end(self, timeout_s: float = 2.0) -> bool:
         """Stop the motors and the thread; False when it does not end in time."""
         self._end.set()
+        self._wake.set()
         if self.is_alive():
             self.join(timeout_s)
         return not self.is_alive()

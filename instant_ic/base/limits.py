@@ -18,8 +18,8 @@ class TwistLimiter:
         self.v = 0.0
         self.w = 0.0
 
-    def step(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
-        """Next twist towards (v, w) after ``dt_s`` seconds.
+    def step(self, v: float, w: float, dt_s: float, hard: bool = False) -> tuple[float, float]:
+        """Next twist towards (v, w) after ``dt_s`` seconds; ``hard``: by the limits of a hard stop.
 
         Too fast a twist is scaled as a whole, so that the curve that was asked for is kept; accelerations are
         limited one by one.
@@ -32,14 +32,22 @@ class TwistLimiter:
         if dt_s < 0.0:
             raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
         v, w = clamp_twist(v, w, self.config)
-        self.v = _towards(self.v, v, self.config.max_v_acceleration * dt_s)
-        self.w = _towards(self.w, w, self.config.max_w_acceleration * dt_s)
+        v_acceleration, w_acceleration = accelerations(self.config, hard)
+        self.v = _towards(self.v, v, v_acceleration * dt_s)
+        self.w = _towards(self.w, w, w_acceleration * dt_s)
         return self.v, self.w
 
     def reset(self, v: float = 0.0, w: float = 0.0) -> None:
         """Start anew from a twist, as after an emergency stop."""
         self.v = v
         self.w = w
+
+
+def accelerations(config: LimitsConfig, hard: bool) -> tuple[float, float]:
+    """Largest change of the speed, m/s^2, and of the turn rate, rad/s^2."""
+    if hard:
+        return config.hard_deceleration, config.hard_w_deceleration
+    return config.max_v_acceleration, config.max_w_acceleration
 
 
 def clamp_twist(v: float, w: float, config: LimitsConfig) -> tuple[float, float]:

@@ -60,6 +60,10 @@ class WheelOdometry:
         self._covariance = np.zeros((3, 3))
         self._last: tuple[NDArray[np.int64], int] | None = None
 
+    def forget_counts(self) -> None:
+        """Keep the pose, and count from the next reading on: the controller has lost its counts."""
+        self._last = None
+
     def update(self, encoders: ArrayLike, stamp_ns: int) -> OdometryEstimate | None:
         """Take one reading.
 

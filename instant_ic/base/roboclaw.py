@@ -28,6 +28,10 @@ class LinkError(ConnectionError):
     """The controller cannot be reached; the text says what was tried and what to look at."""
 
 
+class ControllerRestarted(LinkError):
+    """The controller lost what it was set to, as after a brown-out: it must be stopped and set up again at once."""
+
+
 class SerialPort(Protocol):
     """The part of pyserial's ``Serial`` that is used here."""
 
@@ -76,12 +80,14 @@ class LinkCounters:
         retries: repeats.
         timeouts: replies that did not come whole.
         crc_errors: replies that came damaged.
+        stops: times that the motors were stopped because a reply did not come.
     """
 
     transactions: int = 0
     retries: int = 0
     timeouts: int = 0
     crc_errors: int = 0
+    stops: int = 0
 
 
 def open_serial(config: RoboclawConfig) -> SerialPort:
@@ -107,8 +113,29 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
         ) from error
 
 
+_MOVING = (Command.DUTY_BOTH, Command.SPEED_BOTH, Command.SPEED_ACCELERATION_BOTH)
+
+
+def _tenths(timeout_s: float) -> int:
+    """Value of command 14 for a watchdog: never longer than asked for, never off."""
+    return max(1, int(timeout_s * 10 + 1e-6))
+
+
+def _acknowledged(port: SerialPort, command: int) -> bytes:
+    reply = port.read(1)
+    if not reply:
+        raise TimeoutError(f"command {command}: no acknowledgement")
+    if reply != ACKNOWLEDGE:
+        raise ProtocolError(f"command {command}: acknowledged with 0x{reply.hex()} instead of 0xff")
+    return reply
+
+
 class Roboclaw:
     """One controller: a method a command, each repeated up to ``retries`` times.
+
+    Every valid packet feeds the controller's watchdog, so a request that goes out while replies are missing could keep
+    the motors running. After a missing reply, and on each `connect`, nothing but speed zero is sent until the
+    controller has acknowledged one.
 
     Example:
         >>> with Roboclaw(RoboclawConfig(port="/dev/ttyACM0")) as roboclaw:   # doctest: +SKIP
@@ -116,10 +143,20 @@ class Roboclaw:
         ...     print(roboclaw.encoders(), roboclaw.battery_v())
     """
 
-    def __init__(self, config: RoboclawConfig, open_port: Callable[[RoboclawConfig], SerialPort] = open_serial) -> None:
+    def __init__(
+        self,
+        config: RoboclawConfig,
+        open_port: Callable[[RoboclawConfig], SerialPort] = open_serial,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
         self.config = config
         self.counters = LinkCounters()
+        self.restarted = False
+        """At the last `connect` the controller did not have the watchdog that an earlier one had set."""
+        self._was_set = False
+        self._stop_frame = write_frame(config.address, Command.SPEED_BOTH, struct.pack(">ii", 0, 0))
         self._open_port = open_port
+        self._sleep = sleep
         self._port: SerialPort | None = None
         self._status_size: int | None = None
 
@@ -129,27 +166,33 @@ class Roboclaw:
         return self._port is not None
 
     def connect(self) -> str:
-        """Open the port, ask for the firmware's version and set the controller's own watchdog.
+        """Open the port, stop the motors, ask for the firmware's version and set the controller's own watchdog.
 
         Returns:
             The version.
 
         Raises:
-            LinkError: no port, or nobody answers on it.
+            LinkError: no port, nobody answers on it, or the watchdog cannot be set.
         """
         self.close()
         self._port = self._open_port(self.config)
         self._status_size = None
         try:
+            self._stop_blind()
+            self.stop()
             version = self.version()
+            self.restarted = self._was_set and not self._watchdog_holds(self.watchdog_s())
             self.set_watchdog(self.config.watchdog_s)
+            self.check_watchdog()
+            self._was_set = True
         except LinkError:
             self.close()
             raise
         return version
 
     def close(self) -> None:
-        """Release the port. Motors go on until the watchdog: call `stop` before."""
+        """Stop the motors without waiting for an acknowledgement, and release the port."""
+        self._stop_blind()
         port, self._port = self._port, None
         if port is not None:
             port.close()
@@ -176,11 +219,25 @@ class Roboclaw:
 
     def stop(self) -> None:
         """Speed zero for both motors at once, without a ramp (command 37)."""
-        self._write(Command.SPEED_BOTH, struct.pack(">ii", 0, 0))
+        self._acknowledge(Command.SPEED_BOTH, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
-        """Let the controller stop the motors when no packet came for so long; steps of 0.1 s (command 14)."""
-        self._write(Command.SET_TIMEOUT, bytes((max(1, round(timeout_s * 10)),)))
+        """Let the controller stop the motors when no packet came for so long; whole 0.1 s, rounded down (command 14)."""
+        self._write(Command.SET_TIMEOUT, bytes((_tenths(timeout_s),)))
+
+    def check_watchdog(self) -> None:
+        """Read the watchdog back.
+
+        Raises:
+            ControllerRestarted: it is not what was set.
+            LinkError: it cannot be read.
+        """
+        found_s = self.watchdog_s()
+        if not self._watchdog_holds(found_s):
+            raise ControllerRestarted(
+                f"{self.config.port}: the controller's watchdog is {found_s:.1f} s instead of "
+                f"{_tenths(self.config.watchdog_s) / 10:.1f} s: it restarted, look at its supply voltage"
+            )
 
     def reset_encoders(self) -> None:
         """Set both counts to zero (command 20)."""
@@ -221,18 +278,27 @@ class Roboclaw:
         """Text of the firmware's version (command 21)."""
         return self._transact(Command.READ_VERSION, self._version_reply).decode("ascii", "replace").strip()
 
+    def _watchdog_holds(self, found_s: float) -> bool:
+        return round(found_s * 10) == _tenths(self.config.watchdog_s)
+
+    def _stop_blind(self) -> None:
+        """Write speed zero twice and await no reply: the first frame may meet the rest of a damaged one."""
+        if self._port is None:
+            return
+        try:
+            self._port.write(self._stop_frame)
+            self._sleep(1.5 * INTER_BYTE_GAP_S)
+            self._port.write(self._stop_frame)
+        except (OSError, termios.error):
+            # Unplugged: nothing reaches the controller any more, and its watchdog stops the motors. Whoever closes
+            # the port for that has raised a LinkError.
+            return
+
     def _write(self, command: int, data: bytes = b"") -> None:
-        frame = write_frame(self.config.address, command, data)
+        self._acknowledge(command, write_frame(self.config.address, command, data))
 
-        def acknowledged(port: SerialPort, command: int) -> bytes:
-            reply = port.read(1)
-            if not reply:
-                raise TimeoutError(f"command {command}: no acknowledgement")
-            if reply != ACKNOWLEDGE:
-                raise ProtocolError(f"command {command}: acknowledged with 0x{reply.hex()} instead of 0xff")
-            return reply
-
-        self._transact(command, acknowledged, frame)
+    def _acknowledge(self, command: int, frame: bytes) -> None:
+        self._transact(command, _acknowledged, frame)
 
     def _read(self, command: int, size: int) -> bytes:
         return self._transact(command, self._reply(size))
@@ -268,6 +334,9 @@ class Roboclaw:
     def _transact(self, command: int, receive: Callable[[SerialPort, int], bytes], frame: bytes | None = None) -> bytes:
         """Send a frame and receive its reply, with repeats.
 
+        When a reply does not come, the motors are stopped first, and a command that moves them is not repeated: an
+        acknowledged stop is its end.
+
         Raises:
             LinkError: not connected, the port failed, or no try got a good reply.
         """
@@ -277,22 +346,31 @@ class Roboclaw:
         # One write call a frame: bytes that follow one another late would be dropped by the controller.
         sent = frame or read_request(self.config.address, command)
         self.counters.transactions += 1
-        failure = ""
+        failure, silent = "", False
         for attempt in range(self.config.retries + 1):
             if attempt:
                 self.counters.retries += 1
                 # What the controller has of a damaged frame, it drops after this gap.
-                time.sleep(1.5 * INTER_BYTE_GAP_S)
+                self._sleep(1.5 * INTER_BYTE_GAP_S)
             try:
                 port.reset_input_buffer()
+                if silent:
+                    port.write(self._stop_frame)
+                    _acknowledged(port, Command.SPEED_BOTH)
+                    if command in _MOVING:
+                        return ACKNOWLEDGE
+                    silent = False
+                    port.reset_input_buffer()
                 port.write(sent)
                 return receive(port, command)
             except TimeoutError as error:
                 self.counters.timeouts += 1
-                failure = str(error)
+                self.counters.stops += not silent
+                failure, silent = failure or str(error), True
+                self._stop_blind()
             except ProtocolError as error:
                 self.counters.crc_errors += 1
-                failure = str(error)
+                failure = failure or str(error)
             # Unplugged, or the pseudo-terminal is gone; pyserial's own exception is an OSError.
             except (OSError, termios.error) as error:
                 self.close()

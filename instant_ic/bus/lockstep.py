@@ -150,18 +150,26 @@ class LockstepBus:
         self._run()
         return node
 
-    def publish(self, topic: str, message: Any, stamp_ns: int | None = None, latched: bool = False) -> None:
-        """Publishes from outside; the clock first moves to ``stamp_ns``, firing timers on the way."""
-        self.publish_bytes(topic, type_name(message), bytes(serialize(message)), stamp_ns, latched)
+    def publish(
+        self, topic: str, message: Any, stamp_ns: int | None = None, latched: bool = False, publisher: str = ""
+    ) -> None:
+        """Publishes in the name of node ``publisher``; the clock first moves to ``stamp_ns``, firing timers on the way."""
+        self.publish_bytes(topic, type_name(message), bytes(serialize(message)), stamp_ns, latched, publisher)
 
     def publish_bytes(
-        self, topic: str, name: str, payload: bytes, stamp_ns: int | None = None, latched: bool = False
+        self,
+        topic: str,
+        name: str,
+        payload: bytes,
+        stamp_ns: int | None = None,
+        latched: bool = False,
+        publisher: str = "",
     ) -> None:
         """As :meth:`publish` with CDR bytes."""
         if stamp_ns is not None:
             self.advance_to(stamp_ns)
         qos = LATCHED if latched else QoS("outside", 1000)
-        self.route(topic, name, payload, "", qos)
+        self.route(topic, name, payload, publisher, qos)
         self._run()
 
     def advance_to(self, now_ns: int) -> None:

@@ -430,7 +430,7 @@ class SimulatedStack:
             self.bus.publish("/lidar/packets", scan)
         while self._commands and self._commands[0][0] <= now_ns:
             _, record = self._commands.popleft()
-            self.bus.publish_bytes("/base/cmd_vel", record.type_name, record.payload)
+            self.bus.publish_bytes("/base/cmd_vel", record.type_name, record.payload, publisher=record.node)
         self._photograph()
         if operate is not None and self._steps % _EVERY == 0:
             command = operate()

@@ -16,8 +16,11 @@ from instant_ic.base.odometry import OdometryEstimate
 from instant_ic.base.recent import RecentCount
 from instant_ic.base.roboclaw import SerialPort, open_serial
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.bus.transport import Received
+from instant_ic.control.estop import EstopLatch
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.msg import (
+    HARD_STOP,
     BatteryState,
     Bool,
     Odometry,
@@ -33,8 +36,10 @@ from instant_ic.msg import (
 from instant_ic.pace import current
 from instant_ic.ranges import NotNegative, Positive, Range, check_ranges
 
-_TWISTS = {type_name(Twist): False, type_name(TwistStamped): True}
-"""Types that /cmd_vel may carry, and whether they have a stamp."""
+_TWISTS = (type_name(TwistStamped), type_name(Twist))
+"""Types that /cmd_vel may carry."""
+_LEAST_PERIODS = 3
+"""Commands that may be missing before the controller's watchdog stops the motors."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,8 @@ class CrawlerBaseConfig(ControllerConfig):
         battery_empty_v: main battery when it has to be charged, volts; lower is a warning.
         recent_s: repeats, dropped commands and impossible readings are a warning for this long.
         connect_grace_s: a controller that is not there yet is an error only this long after the start.
+        command_source: name of the only node whose commands are obeyed; empty: any node's.
+        accept_unstamped: commands without a stamp are obeyed too, as if given when they come.
     """
 
     rate_hz: Annotated[float, Range(5, 200)] = 30.0
@@ -58,6 +65,8 @@ class CrawlerBaseConfig(ControllerConfig):
     battery_empty_v: float = 21.0
     recent_s: Positive = 10.0
     connect_grace_s: NotNegative = 5.0
+    command_source: str = "arbiter"
+    accept_unstamped: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -67,6 +76,11 @@ class CrawlerBaseConfig(ControllerConfig):
             raise ValueError(
                 "battery_empty_v must be > 0 and below battery_full_v "
                 f"(got {self.battery_empty_v}, {self.battery_full_v})"
+            )
+        if self.roboclaw.watchdog_s < _LEAST_PERIODS / self.rate_hz:
+            raise ValueError(
+                f"roboclaw.watchdog_s must span {_LEAST_PERIODS} periods of rate_hz "
+                f"(got {self.roboclaw.watchdog_s} s at {self.rate_hz} Hz)"
             )
 
 
@@ -81,28 +95,44 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         """Topics, and the loop that talks to the controller."""
         self.thread: ControllerThread | None = None
         self.refuse_pace()
-        self.controller = BaseController(self.config, self.clock.now_ns, type(self).open_port)
+        self.controller = BaseController(self.config, self.clock.now_ns, self.clock.steady_ns, type(self).open_port)
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
         self.button: bool | None = None  # the controller's emergency stop input
+        self.latch = EstopLatch()
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
-        self.subscribe_raw("/cmd_vel", self.on_command, qos=SENSOR)
-        self.started_ns = self.clock.now_ns()
+        self.strangers: dict[str, int] = {}  # who else publishes /cmd_vel, and when last
+        self.driver = self.config.command_source  # who is obeyed; with any source allowed, who came last
+        self.hard = False  # the newest command is a hard stop
+        self.diagnose("publishers", OK, "no second publisher of /cmd_vel")
+        self.show_latch()
+        self.started_ns = self.clock.steady_ns()
         self.linked = False  # since the start, once
         self.dropped = self.retries_told = self.rejected_told = 0
         self.drops, self.repeats, self.jumps = (RecentCount(self.config.recent_s) for _ in range(3))
         self.diagnose("link", WARN, f"connecting to {self.config.roboclaw.port}")
         self.timer(1.0, self.tell_recent)
         if self.lockstep:
-            self.timer(1.0 / self.config.rate_hz, lambda: self.on_state(self.controller.step()))
-            return
-        self.thread = ControllerThread(
-            self.controller,
-            self.config.rate_hz,
-            on_state=lambda state: self.call_soon(self.on_state, state),
-            on_end=lambda fault, unstopped: self.call_soon(self.on_end, fault, unstopped),
-        )
-        self.thread.start()
+            self.timer(1.0 / self.config.rate_hz, self.hurry)
+        else:
+            self.thread = ControllerThread(
+                self.controller,
+                self.config.rate_hz,
+                on_state=lambda state: self.call_soon(self.on_state, state),
+                on_end=lambda fault, unstopped: self.call_soon(self.on_end, fault, unstopped),
+            )
+        self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
+        self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
+        self.subscribe_received("/cmd_vel", self.on_command, qos=SENSOR)
+        if self.thread is not None:
+            self.thread.start()
+
+    def hurry(self) -> None:
+        """Have the controller make a step now."""
+        if self.thread is not None:
+            self.thread.hurry()
+        else:
+            self.on_state(self.controller.step())
 
     def refuse_pace(self) -> None:
         """A real base in slow motion would be stopped late: only the simulator's, in the run directory, may be.
@@ -118,33 +148,87 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             f"not the simulator's (in {folder}): start without --pace"
         )
 
-    def on_command(self, topic: str, name: str, payload: bytes | memoryview, published_ns: int) -> None:
-        """Hand a command on, unless it is too old or no twist."""
+    def on_command(self, received: Received) -> None:
+        """Pass a command on to the controller, unless it is another node's, stale, unstamped or no twist."""
+        name = received.type_name
+        if not self.accepted(received.publisher):
+            return
         if name not in _TWISTS:
-            raise NodeError(f"{topic} carries {name}; expected {' or '.join(_TWISTS)}")
-        message: Any = deserialize(payload, name)
-        now_ns = self.clock.now_ns()
-        stamp = stamp_ns(message) if _TWISTS[name] else 0
-        stamp = stamp or now_ns
+            raise NodeError(f"{received.topic} carries {name}; expected {' or '.join(_TWISTS)}")
+        message: Any = deserialize(received.payload, name)
+        stamp = stamp_ns(message) if hasattr(message, "header") else 0
         v, w = twist_values(message)
-        age_s = (now_ns - stamp) * 1e-9
+        age_s = (received.received_ns - stamp) * 1e-9
         if not (math.isfinite(v) and math.isfinite(w)):
             self.refuse(f"command is not finite (v={v}, w={w})")
-        elif abs(age_s) > self.config.command_timeout_s:
-            self.refuse(
-                f"command is {age_s:.2f} s old"
-                if age_s > 0
-                else f"command's stamp is {-age_s:.2f} s ahead: set the clocks"
-            )
+        elif stamp == 0 and not self.config.accept_unstamped:
+            self.refuse(f"command of {received.publisher} has no stamp (accept_unstamped is false)")
+        elif stamp and age_s > self.config.command_timeout_s:
+            self.refuse(f"command is {age_s:.2f} s old")
+        elif age_s < 0:
+            self.refuse(f"command's stamp is {-age_s:.2f} s ahead: set the clocks")
         else:
-            self.controller.command(v, w, stamp)
-            if not self.drops.count(now_ns):
+            hard = stamp != 0 and message.header.frame_id == HARD_STOP
+            self.controller.command(*((0.0, 0.0) if hard else (v, w)), received.given_ns(stamp), hard)
+            if hard and not self.hard:
+                self.hurry()
+            self.hard = hard
+            if not self.drops.count(self.clock.steady_ns()):
                 self.diagnose("command", OK, "driving by /cmd_vel", dropped=self.dropped)
 
+    def accepted(self, publisher: str) -> bool:
+        """Whether a node's commands are obeyed; warns of every node beside the one that drives."""
+        if not self.config.command_source and publisher != self.driver:
+            if self.driver:
+                self.warn_of(self.driver)
+            self.driver = publisher
+        if publisher == self.driver:
+            return True
+        self.warn_of(publisher)
+        self.refuse(f"{publisher} may not drive, only {self.driver} (command_source)")
+        return False
+
+    def warn_of(self, publisher: str) -> None:
+        """Report a second publisher of /cmd_vel."""
+        if publisher not in self.strangers:
+            self.log.warning("/cmd_vel is also published by %s; it must be the arbiter alone", publisher)
+        self.strangers[publisher] = self.clock.steady_ns()
+        self.diagnose("publishers", WARN, f"/cmd_vel is also published by {publisher}: stop that node")
+
+    def on_estop(self, received: Received) -> None:
+        """Emergency stop of any client: obeyed here too, whatever the arbiter does."""
+        pressed = bool(deserialize(received.payload, received.type_name).data)
+        refused = self.latch.hear(pressed, received.publisher, received.publish_ns, received.received_ns)
+        if refused:
+            self.log.warning("emergency stop not released: %s", refused)
+        self.obey_latch()
+
+    def on_button(self, received: Received) -> None:
+        """A button of another node; that of the controller comes with its status."""
+        if received.publisher != self.node_name:
+            pressed = bool(deserialize(received.payload, received.type_name).data)
+            self.latch.hear_button(pressed, received.publisher, received.publish_ns)
+            self.obey_latch()
+
+    def obey_latch(self) -> None:
+        """Hold the motors for as long as the emergency stop is latched."""
+        self.controller.emergency_stop(self.latch.stopped)
+        if self.latch.stopped:
+            self.hurry()
+        self.show_latch()
+
+    def show_latch(self) -> None:
+        """Report the state of the emergency stop."""
+        if not self.latch.stopped:
+            self.diagnose("emergency stop", OK, "released")
+            return
+        by = "a button on the robot" if self.latch.button else self.latch.publisher
+        self.diagnose("emergency stop", WARN, f"latched by {by}: release it on the operator's page")
+
     def refuse(self, reason: str) -> None:
-        """Tell of a command that is not obeyed."""
+        """Report a command that is not obeyed."""
         self.dropped += 1
-        self.drops.add(1, self.clock.now_ns())
+        self.drops.add(1, self.clock.steady_ns())
         self.diagnose("command", WARN, f"dropped: {reason}", dropped=self.dropped)
 
     def on_state(self, state: BaseState) -> None:
@@ -159,12 +243,16 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def tell_link(self, connected: bool, text: str) -> None:
         """What happened on the line; at start, while the controller may still be coming, its absence is a warning."""
         self.linked |= connected
-        starting = not self.linked and self.clock.now_ns() - self.started_ns < self.config.connect_grace_s * 1e9
+        starting = not self.linked and self.clock.steady_ns() - self.started_ns < self.config.connect_grace_s * 1e9
         self.diagnose("link", OK if connected else WARN if starting else ERROR, text)
 
     def tell_recent(self) -> None:
         """What happened in the last ``recent_s``: repeats, impossible readings, dropped commands."""
-        now_ns, counters, window = self.clock.now_ns(), self.controller.roboclaw.counters, f"{self.config.recent_s:g} s"
+        now_ns, counters, window = (
+            self.clock.steady_ns(),
+            self.controller.roboclaw.counters,
+            f"{self.config.recent_s:g} s",
+        )
         self.repeats.add(counters.retries - self.retries_told, now_ns)
         self.retries_told = counters.retries
         repeated = self.repeats.count(now_ns)
@@ -176,6 +264,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             timeouts=counters.timeouts,
             crc_errors=counters.crc_errors,
             transactions=counters.transactions,
+            stops=counters.stops,
         )
         rejected = self.controller.odometry.rejected
         self.jumps.add(rejected - self.rejected_told, now_ns)
@@ -185,6 +274,9 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose("encoders", WARN if jumps else OK, text, rejected=rejected)
         if self.dropped and not self.drops.count(now_ns):
             self.diagnose("command", OK, f"none dropped in the last {window}", dropped=self.dropped)
+        if self.strangers and now_ns - max(self.strangers.values()) > self.config.recent_s * 1e9:
+            self.strangers.clear()
+            self.diagnose("publishers", OK, f"no second publisher of /cmd_vel in the last {window}")
 
     def publish_odometry(self, estimate: OdometryEstimate) -> None:
         """Odometry message and transform."""
@@ -236,6 +328,8 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         if pressed != self.button:
             self.button = pressed
             self.button_out.publish(Bool(data=pressed))
+            self.latch.hear_button(pressed, self.node_name, self.clock.now_ns())
+            self.obey_latch()
         self.diagnose(
             "controller",
             ERROR if faults else WARN if warnings else OK,

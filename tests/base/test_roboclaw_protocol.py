@@ -116,8 +116,8 @@ def connected(emulator: RoboclawEmulator, damage=None, **changes) -> tuple[Roboc
 def test_driver_reads_and_writes_what_the_emulator_holds() -> None:
     emulator = RoboclawEmulator()
     roboclaw, port = connected(emulator)
-    assert emulator.timeout_s == pytest.approx(0.5)
-    assert roboclaw.watchdog_s() == pytest.approx(0.5)
+    assert emulator.timeout_s == pytest.approx(0.3)
+    assert roboclaw.watchdog_s() == pytest.approx(0.3)
     assert roboclaw.version() == "USB Roboclaw 2x15a v4.2.4"
     emulator.encoder[:] = (1000.0, -256.0)
     assert roboclaw.encoders().tolist() == [1000, 2**32 - 256]
@@ -148,12 +148,13 @@ def test_driver_tells_two_and_four_byte_status_apart() -> None:
 
 def test_driver_repeats_damaged_replies_and_counts_them() -> None:
     emulator = RoboclawEmulator()
-    damages = iter([False] * 2 + [True, True, False])
+    damages = iter([True, True, False])
 
     def damage(reply: bytes) -> bytes:
         return bytes((reply[0] ^ 1,)) + reply[1:] if next(damages) else reply
 
-    roboclaw, _ = connected(emulator, damage)
+    roboclaw, port = connected(emulator)
+    port.damage = damage
     assert roboclaw.battery_v() == pytest.approx(24.1)
     assert (roboclaw.counters.retries, roboclaw.counters.crc_errors) == (2, 2)
 
