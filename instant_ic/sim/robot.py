@@ -23,8 +23,10 @@ class RobotConfig:
     Attributes:
         length, width: footprint, metres, centred on base_link.
         contact_low, contact_high: things between these heights are run into, metres.
-        track_acceleration: most that a track's speed can change, m/s².
+        track_acceleration: most that the motors can change a track's speed, m/s².
         motor_lag_s: time constant with which a track follows its set point.
+        rolling_resistance: deceleration of a track by its own friction, m/s². The speed controller makes up for it,
+            except at set point zero, where it brakes and ends the motion.
         slip: standard deviation of the share of a track's motion that is lost, 0 = none.
         turn_slip: standard deviation of the effective track width, as a share of it, 0 = none.
         slip_time_s: over which time the slip changes.
@@ -38,6 +40,7 @@ class RobotConfig:
     contact_high: float = 0.9
     track_acceleration: float = 2.0
     motor_lag_s: float = 0.06
+    rolling_resistance: float = 0.5
     slip: float = 0.02
     turn_slip: float = 0.05
     slip_time_s: float = 1.0
@@ -46,7 +49,7 @@ class RobotConfig:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        for key in ("length", "width", "track_acceleration", "motor_lag_s", "slip_time_s"):
+        for key in ("length", "width", "track_acceleration", "motor_lag_s", "rolling_resistance", "slip_time_s"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
         for key in ("slip", "turn_slip"):
@@ -114,8 +117,8 @@ class TrackedRobot:
         most = config.track_acceleration * dt_s
         before = self.tracks.copy()
         self.tracks += np.clip(follow, -most, most)
-        # The lag never quite ends; a motor at rest is at rest.
-        self.tracks[(np.abs(self.tracks) < 1e-4) & (wanted == 0)] = 0.0
+        braked = np.sign(self.tracks) * np.maximum(np.abs(self.tracks) - config.rolling_resistance * dt_s, 0.0)
+        self.tracks = np.where(wanted == 0, braked, self.tracks)
         mean = 0.5 * (before + self.tracks)
         self._travelled += mean * dt_s
         moving = np.abs(mean) > 1e-4
