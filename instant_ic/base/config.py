@@ -63,8 +63,7 @@ class LimitsConfig:
         max_w: turn rate, rad/s.
         max_v_acceleration: change of the speed, m/s^2.
         max_w_acceleration: change of the turn rate, rad/s^2.
-        hard_deceleration: of the speed when the command is lost or asks for a hard stop, m/s^2.
-        hard_w_deceleration: of the turn rate, likewise, rad/s^2.
+        hard_deceleration: of each track when the command is lost or asks for a hard stop, m/s^2.
     """
 
     max_v: Positive = 0.5
@@ -72,13 +71,16 @@ class LimitsConfig:
     max_v_acceleration: Positive = 0.8
     max_w_acceleration: Positive = 2.0
     hard_deceleration: Positive = 4.0
-    hard_w_deceleration: Positive = 10.0
 
     def __post_init__(self) -> None:
         """Check the values."""
         check_ranges(self)
-        for hard, soft in (("hard_deceleration", "max_v_acceleration"), ("hard_w_deceleration", "max_w_acceleration")):
-            _require(getattr(self, hard) >= getattr(self, soft), hard, getattr(self, hard), f"at least {soft}")
+        _require(
+            self.hard_deceleration >= self.max_v_acceleration,
+            "hard_deceleration",
+            self.hard_deceleration,
+            "at least max_v_acceleration",
+        )
 
 
 @dataclass(frozen=True)

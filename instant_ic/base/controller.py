@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawConfig, SkidSteerConfig
-from instant_ic.base.limits import TwistLimiter, accelerations
+from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
 
 from ..pace import current
 from ..ranges import Positive, Range, check_ranges
-
 
 _COUNTED_SINCE_M = 0.2
 """Metres of track that a controller may have counted between its restart and the next reading."""
@@ -87,9 +86,6 @@ class _Command:
     """By the steady clock."""
 
 
-_STOP = _Command(0.0, 0.0, True, 0)
-
-
 class BaseController:
     """Steps the base; `command` and `emergency_stop` may be called from any thread, everything else from one."""
 
@@ -130,7 +126,7 @@ class BaseController:
             v: speed along x, m/s.
             w: turn rate, rad/s.
             given_ns: when the command was given, by the steady clock.
-            hard: reach it at the hard deceleration.
+            hard: stop at the hard deceleration instead, whatever the speeds.
         """
         with self._lock:
             self._command = _Command(v, w, hard, given_ns)
@@ -153,11 +149,13 @@ class BaseController:
         dt_s = 0.0 if self._last_step_ns is None else max(0.0, (now_ns - self._last_step_ns) * 1e-9)
         self._last_step_ns = now_ns
         if dt_s > self.config.roboclaw.watchdog_s:
-            self.limiter.reset()  # the controller has stopped the motors meanwhile
+            # The controller has stopped the motors meanwhile.
+            self.limiter.reset()
+            dt_s = 0.0
         command = self._fresh_command()
         stops, health = self.roboclaw.counters.stops, None
         try:
-            v, w = self._drive(command or _STOP, dt_s)
+            v, w = self._drive(command, dt_s)
             encoders = self.roboclaw.encoders()
             encoders_ns, stamp_ns = self._steady_ns(), self._now_ns()
             self._check_counts(encoders)
@@ -197,16 +195,20 @@ class BaseController:
                     command = self._command = None
             return command
 
-    def _drive(self, command: _Command, dt_s: float) -> tuple[float, float]:
+    def _drive(self, command: _Command | None, dt_s: float) -> tuple[float, float]:
+        limits, geometry, kinematics = self.config.limits, self.config.geometry, self.odometry.kinematics
         if self._stopped:
             self.limiter.reset()
             self.roboclaw.stop()
             return 0.0, 0.0
-        v, w = self.limiter.step(command.v, command.w, dt_s, command.hard)
-        kinematics, geometry = self.odometry.kinematics, self.config.geometry
-        v_acceleration, w_acceleration = accelerations(self.config.limits, command.hard)
+        half_width = 0.5 * geometry.effective_width
+        if command is None or command.hard:
+            # The controller's own ramp down to zero: it ends even if nothing is sent any more. The limiter follows.
+            self.roboclaw.drive([0.0, 0.0], geometry.pulses_per_metre * limits.hard_deceleration)
+            return self.limiter.brake(limits.hard_deceleration, limits.hard_deceleration / half_width, dt_s)
+        v, w = self.limiter.step(command.v, command.w, dt_s)
         # The limiter shapes the twist; the controller's ramp is what one track needs for both parts at once.
-        ramp = v_acceleration + 0.5 * geometry.effective_width * w_acceleration
+        ramp = limits.max_v_acceleration + half_width * limits.max_w_acceleration
         speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
         self.roboclaw.drive(speeds.tolist(), geometry.pulses_per_metre * ramp)
         return v, w

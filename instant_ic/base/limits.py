@@ -18,8 +18,8 @@ class TwistLimiter:
         self.v = 0.0
         self.w = 0.0
 
-    def step(self, v: float, w: float, dt_s: float, hard: bool = False) -> tuple[float, float]:
-        """Next twist towards (v, w) after ``dt_s`` seconds; ``hard``: by the limits of a hard stop.
+    def step(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
+        """Next twist towards (v, w) after ``dt_s`` seconds.
 
         Too fast a twist is scaled as a whole, so that the curve that was asked for is kept; accelerations are
         limited one by one.
@@ -32,22 +32,20 @@ class TwistLimiter:
         if dt_s < 0.0:
             raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
         v, w = clamp_twist(v, w, self.config)
-        v_acceleration, w_acceleration = accelerations(self.config, hard)
-        self.v = _towards(self.v, v, v_acceleration * dt_s)
-        self.w = _towards(self.w, w, w_acceleration * dt_s)
+        self.v = _towards(self.v, v, self.config.max_v_acceleration * dt_s)
+        self.w = _towards(self.w, w, self.config.max_w_acceleration * dt_s)
+        return self.v, self.w
+
+    def brake(self, deceleration: float, w_deceleration: float, dt_s: float) -> tuple[float, float]:
+        """Next twist towards zero after ``dt_s`` seconds at other rates than the configured ones, m/s^2, rad/s^2."""
+        self.v = _towards(self.v, 0.0, deceleration * dt_s)
+        self.w = _towards(self.w, 0.0, w_deceleration * dt_s)
         return self.v, self.w
 
     def reset(self, v: float = 0.0, w: float = 0.0) -> None:
         """Start anew from a twist, as after an emergency stop."""
         self.v = v
         self.w = w
-
-
-def accelerations(config: LimitsConfig, hard: bool) -> tuple[float, float]:
-    """Largest change of the speed, m/s^2, and of the turn rate, rad/s^2."""
-    if hard:
-        return config.hard_deceleration, config.hard_w_deceleration
-    return config.max_v_acceleration, config.max_w_acceleration
 
 
 def clamp_twist(v: float, w: float, config: LimitsConfig) -> tuple[float, float]:

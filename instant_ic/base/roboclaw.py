@@ -222,7 +222,7 @@ class Roboclaw:
         self._acknowledge(Command.SPEED_BOTH, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
-        """Let the controller stop the motors when no packet came for so long; whole 0.1 s, rounded down (command 14)."""
+        """Let the controller stop the motors after a silence; rounded down to whole 0.1 s (command 14)."""
         self._write(Command.SET_TIMEOUT, bytes((_tenths(timeout_s),)))
 
     def check_watchdog(self) -> None:

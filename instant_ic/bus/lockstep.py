@@ -153,7 +153,7 @@ class LockstepBus:
     def publish(
         self, topic: str, message: Any, stamp_ns: int | None = None, latched: bool = False, publisher: str = ""
     ) -> None:
-        """Publishes in the name of node ``publisher``; the clock first moves to ``stamp_ns``, firing timers on the way."""
+        """Publishes in the name of ``publisher``; the clock first moves to ``stamp_ns``, firing timers on the way."""
         self.publish_bytes(topic, type_name(message), bytes(serialize(message)), stamp_ns, latched, publisher)
 
     def publish_bytes(

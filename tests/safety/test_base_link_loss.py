@@ -1,0 +1,132 @@
+"""The serial line breaks while the tracks run: replies lost, commands lost or damaged, or both."""
+
+import random
+from collections.abc import Callable
+
+import pytest
+from base_line import Base
+
+from instant_ic.base.config import RoboclawConfig
+from instant_ic.base.controller import ControllerConfig
+from instant_ic.base.protocol import Command
+
+STOP = bytes.fromhex("80 25 00 00 00 00 00 00 00 00 34 04")
+LOST: Callable[[bytes], bytes] = lambda data: b""  # noqa: E731 - a line, not a function
+
+
+def driving(v: float = 0.5, phase_s: float = 0.0, **roboclaw: object) -> Base:
+    base = Base(ControllerConfig(roboclaw=RoboclawConfig(port="memory", **roboclaw)))  # type: ignore[arg-type]
+    base.run(2.0 + phase_s, v)
+    assert base.line.speed == pytest.approx(v, abs=0.01)
+    return base
+
+
+@pytest.mark.parametrize("phase_s", [0.0, 0.008, 0.017, 0.025, 0.032])
+@pytest.mark.parametrize("command", [0.0, 0.5], ids=["zero", "drive"])
+def test_lost_replies_stop_the_tracks_within_0_45_s(phase_s: float, command: float) -> None:
+    base = driving(phase_s=phase_s)
+    base.line.back = LOST
+    stand_s, distance_m = base.until_standing(command)
+    assert stand_s <= 0.45
+    assert distance_m <= 0.15
+
+
+@pytest.mark.parametrize("phase_s", [0.0, 0.017])
+def test_a_cut_line_stops_the_tracks_by_the_controllers_watchdog(phase_s: float) -> None:
+    base = driving(phase_s=phase_s)
+    base.line.back = base.line.forward = LOST
+    stand_s, _ = base.until_standing(0.5)
+    assert base.line.emulator.watchdog_fired
+    assert stand_s <= 0.3 + 0.26  # the watchdog, then the motors and tracks
+
+
+def test_nothing_that_feeds_the_watchdog_but_a_stop_is_sent_until_a_stop_is_acknowledged() -> None:
+    """Noise that damages long frames lets short requests through: only speed zero may go out."""
+    base = driving()
+    base.line.forward = lambda data: data if len(data) == 2 else data[:-1] + bytes((data[-1] ^ 1,))
+    base.line.back = LOST
+    before, lost_s = len(base.line.written), base.line.time_s
+    stand_s, _ = base.until_standing(0.5)
+    first, *later = (frame for _, frame in base.line.written[before:])
+    assert first[1] in (Command.SPEED_ACCELERATION_BOTH, Command.READ_ENCODERS)  # what was under way
+    frames = set(later)
+    assert STOP in frames and len(later) > 10
+    assert frames == {STOP}
+    assert base.line.emulator.watchdog_fired and stand_s <= 0.6
+    assert base.line.opened > 2, "it went on trying"
+    assert base.line.time_s - lost_s > 1.0
+
+
+def test_a_stop_is_written_before_the_port_is_closed_and_first_on_every_reconnect() -> None:
+    base = driving()
+    closings: list[bytes] = []
+    close = base.line.close
+
+    def watch() -> None:
+        closings.append(base.line.written[-1][1])
+        close()
+
+    base.line.close = watch  # type: ignore[method-assign]
+    base.line.back = LOST
+    opened = base.line.opened
+    base.run(6.0, 0.5)
+    assert len(closings) >= 3 and set(closings) == {STOP}
+    assert base.line.opened - opened >= 3
+    base.line.back = bytes
+    base.run(2.5, 0.5)
+    assert base.states[-1].connected
+    assert base.line.emulator.timeout_s == pytest.approx(0.3)
+    assert base.line.speed > 0.3  # and it drives again
+
+
+def test_one_missing_reply_stops_and_goes_on_without_a_new_connection() -> None:
+    base = driving()
+    missing = [True]
+    base.line.back = lambda reply: b"" if missing and missing.pop() else reply
+    base.run(0.25, 0.5)
+    assert base.controller.roboclaw.counters.stops == 1
+    assert base.line.speed < 0.5
+    base.run(1.5, 0.5)
+    assert base.line.opened == 1
+    assert base.line.speed == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_command_to_drive_is_not_repeated_after_a_missing_reply() -> None:
+    base = driving(retries=5)
+    base.line.back = LOST
+    lost = len(base.line.written)
+    base.run(1.0, 0.5)
+    drives = [frame for _, frame in base.line.written[lost:] if frame[1] == Command.SPEED_ACCELERATION_BOTH]
+    assert len(drives) <= 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_noisy_line_never_lets_the_tracks_run_on(seed: int) -> None:
+    """Each frame and each reply is lost, damaged or cut at random; no command comes any more: the tracks stand."""
+    base = driving()
+    rng = random.Random(seed)
+
+    def noise(data: bytes) -> bytes:
+        kind = rng.randrange(4)
+        if not data or kind == 0:
+            return data
+        if kind == 1:
+            return b""
+        at = rng.randrange(len(data))
+        return data[:at] if kind == 2 else data[:at] + bytes((data[at] ^ 1 << rng.randrange(8),)) + data[at + 1 :]
+
+    base.line.forward = base.line.back = noise
+    stand_s, _ = base.until_standing(None, limit_s=8.0)
+    # No worse than all that there is in a row: the command's age, a step, the watchdog and the tracks' own time.
+    assert stand_s <= 0.25 + 0.034 + 0.3 + 0.26
+
+
+def test_unplugged_while_driving_the_watchdog_stops_the_tracks() -> None:
+    base = driving()
+
+    def gone(data: bytes) -> bytes:
+        raise OSError(5, "Input/output error")
+
+    base.line.forward = gone
+    stand_s, _ = base.until_standing(0.5)
+    assert stand_s <= 0.3 + 0.26
