@@ -36,6 +36,11 @@ def run_dir() -> Path:
     """
     if explicit := os.environ.get("INSTANT_IC_RUN_DIR"):
         return Path(explicit)
+    return default_run_dir()
+
+
+def default_run_dir() -> Path:
+    """The run directory where nobody names one; it does not outlive the machine's shutdown."""
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "instant_ic"
     return Path(f"/tmp/instant_ic-{os.getuid()}")

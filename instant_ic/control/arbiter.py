@@ -141,6 +141,8 @@ class ArbiterInputs:
     estop: bool = False
     estop_button: bool = False
     """The button on the robot is pressed: nothing else ends the stop."""
+    estop_why: str = ""
+    """Text for the operator where nobody pressed the stop in this run; empty: the usual one."""
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     """(N, 2) hits of the newest scan and 3D points in ``base_link``, where the robot is now."""
     costmap: Costmap | None = None
@@ -197,6 +199,8 @@ class Decision:
     vbot_action: VbotAction
     vbot_target: NDArray[np.float64]
     """(3,) to which the v-bot goes, if it does: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
+    hard: bool = False
+    """The command is zero because something is lost or in the way: the base must not take its soft ramp."""
 
 
 @dataclass
@@ -205,6 +209,8 @@ class _Situation:
 
     inputs: ArbiterInputs
     now_ns: int
+    fresh: bool
+    """The operator's command is not stale, and whoever gave it is there."""
     command: Twist2
     """The operator's, zero when stale."""
     prediction: Prediction | None
@@ -233,6 +239,8 @@ class Arbiter:
         self._agree_since_ns: int | None = None
         self._driven: _Driven | None = None  # the last command that was not zero
         self._leading_back = False
+        self._hard = False  # the last command was zero by a hard stop
+        self._monitor_stops = False  # in this step
         self._yaw_gap_before = 0.0  # of the last step
         self._slow_since_ns: int | None = None  # the v-bot drives more slowly than it is told to
         self._stop_reason = "waiting for the sensors"
@@ -279,7 +287,10 @@ class Arbiter:
             # The robot driven is another one now: its prediction, its gap.
             situation = self._assess(inputs, now_ns)
         self._yaw_gap_before = situation.yaw_gap_rad
+        self._monitor_stops = False
         command, blocked, reason = self._command(situation)
+        # A key that is let go once the robot brakes hard makes it no softer.
+        self._hard = command == (0.0, 0.0) and (self._hard or self._stops_hard(situation))
         prediction = situation.prediction
         return Decision(
             mode=self.mode,
@@ -301,6 +312,7 @@ class Arbiter:
             vbot_target=(
                 inputs.robot_pose if self._leading_back and inputs.robot_pose is not None else situation.target
             ).copy(),
+            hard=self._hard,
         )
 
     # -- what the step starts from
@@ -327,7 +339,7 @@ class Arbiter:
             prediction = self.predictor.predict(vbot, inputs.vbot_velocity, command, inputs.costmap)
         elif robot is not None:
             prediction = self.predictor.predict(robot, inputs.robot_velocity, command, inputs.costmap)
-        situation = _Situation(inputs, now_ns, command, prediction, np.asarray(target), vbot, gap, yaw_gap)
+        situation = _Situation(inputs, now_ns, fresh, command, prediction, np.asarray(target), vbot, gap, yaw_gap)
         self._watch_agreement(situation)
         self._leading_back = self._leads_back(situation)
         slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * abs(command[0])
@@ -646,6 +658,12 @@ class Arbiter:
             return self._virtual_command(situation)
         return self._real_command(situation)
 
+    def _stops_hard(self, situation: _Situation) -> bool:
+        """Whether a zero is more than the operator's wish to stop."""
+        if self.mode == Mode.STOPPED or self._hold_reason(situation) or not situation.fresh:
+            return True
+        return self._monitor_stops
+
     def _virtual_command(self, situation: _Situation) -> tuple[Twist2, bool, str]:
         inputs = situation.inputs
         reason = "you drive the virtual robot" + self._far_from_keyframe(situation)
@@ -721,7 +739,9 @@ class Arbiter:
             config = self.config.collision_monitor
             memory = inputs.costmap.memory_near(inputs.robot_pose, config.blind_radius_m, config.memory_range_m)
             points = np.concatenate([points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
-        return self.monitor.limit(command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
+        sent = self.monitor.limit(command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
+        self._monitor_stops = sent.action == "stop"
+        return sent
 
     def _slowed(self, command: Twist2, distance_m: float) -> Twist2:
         """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""
@@ -748,7 +768,7 @@ class Arbiter:
         if inputs.estop_button:
             return "emergency stop button: let it out, then release the stop here"
         if inputs.estop:
-            return "emergency stop: release it to go on"
+            return inputs.estop_why or "emergency stop: release it to go on"
         lacking = self._lacking(inputs, Mode.REAL, situation.now_ns)
         if lacking:
             return "stopped: " + _no_data(lacking)

@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from instant_ic.bus import registry
+from instant_ic.estop_state import RunMark
 from instant_ic.launch.description import LaunchDescription
 from instant_ic.launch.health import EVERY_NODES, HealthMonitor, TopicFault
 from instant_ic.launch.outlet import Outlet
@@ -40,6 +41,7 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
     Raises:
         RegistryError: a run directory cannot be used.
         StackRunningError: another stack has one.
+        EstopStateError: how this run ends could not be told at the next start.
     """
     with ExitStack() as locks:
         for folder in description.run_dirs(run_dir):
@@ -47,6 +49,7 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
             locks.enter_context(StackLock(folder, description.file.name))
             registry.sweep(folder)
             write_pace(folder, pace or Pace())
+            locks.enter_context(RunMark(folder))
         output = _Output(description, run_dir, sys.stdout.isatty() if live is None else live)
         status = 1
         try:

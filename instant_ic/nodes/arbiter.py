@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Latest, Node, main
+from instant_ic import estop_state
+from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.estop import EstopLatch
 from instant_ic.control.freshness import Rhythm
 from instant_ic.control.heights import SortedPoints, sort_points
 from instant_ic.control.kinematics import move
@@ -22,6 +24,7 @@ from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import Matrix, matrix_from_pose2, pose2_from_matrix, relative2
 from instant_ic.geometry.transforms import TransformError
 from instant_ic.msg import (
+    HARD_STOP,
     Bool,
     ControlState,
     LaserScan,
@@ -104,9 +107,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.page: tuple[int, int] = (-1, 0)  # newest camera picture there: its stamp, when it was told
         self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: its request, when it was told
         self.picture_delay_s: float | None = None  # from the camera to the operator
-        self.estop = False
-        self.stopped_by: tuple[str, int] = ("", 0)  # who asked last for the emergency stop, and when
-        self.button: tuple[bool, int] | None = None  # the robot's own emergency stop: pressed, when it was told
+        self.latch = EstopLatch()
+        self.kept: estop_state.KeptStop | None = None  # the emergency stop as the next start would find it
+        self.restore_estop()
+        self.button_ns: int | None = None  # when the robot's own emergency stop reported last
         self.ticks = 0
 
         self.cmd_vel = self.publisher("/cmd_vel", TwistStamped, qos=SENSOR)
@@ -147,7 +151,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def teardown(self) -> None:
         if hasattr(self, "cmd_vel"):
-            self.cmd_vel.publish(twist_stamped(0.0, 0.0, self.clock.now_ns()))
+            self.cmd_vel.publish(twist_stamped(0.0, 0.0, self.clock.now_ns(), HARD_STOP))
 
     # -- inputs
 
@@ -169,42 +173,50 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def on_walls(self, walls: WallMap) -> None:
         self.walls = walls
 
-    def on_estop(self, received: Received) -> None:
-        """The latest word of any client holds.
+    def restore_estop(self) -> None:
+        """Starts stopped where the emergency stop was pressed, or the last run broke off."""
+        if self.run_dir is None:
+            return
+        kept, now_ns = estop_state.read(self.run_dir), self.clock.now_ns()
+        if kept is not None:
+            # It was before now, whatever a clock said then that has been set since: a release from now on is newer.
+            self.kept = replace(kept, pressed_ns=min(kept.pressed_ns, now_ns))
+            self.latch.hear(True, self.kept.publisher, self.kept.pressed_ns, now_ns)
+            self.log.warning("emergency stop: %s", kept.why or "still pressed from before this start")
 
-        Several clients each have a latched value, and after a restart of this node or of a bridge these come in any
-        order: an old release of one client must not end the stop of another.
+    def keep_estop(self) -> None:
+        """Keeps a press and forgets a released one, so that a restart of any node or of the machine ends no stop.
+
+        After the step that obeys a press: the disk may be slow.
         """
-        publisher, stopped_ns = self.stopped_by
-        if deserialize(received.payload, received.type_name).data:
-            self.estop = True
-            same = (
-                received.publisher == publisher
-            )  # also after its clock was set back: its stop and release go together
-            self.stopped_by = (
-                received.publisher,
-                received.publish_ns if same else max(received.publish_ns, stopped_ns),
-            )
-        elif self.button is not None and self.button[0]:
-            self.log.warning("emergency stop: the button on the robot is pressed; let it out, then release here")
-        elif received.publish_ns >= stopped_ns:
-            self.estop = False
-        elif self.estop:
-            self.log.warning(
-                "emergency stop: a release by %s is older than the stop by %s and not heeded; if a clock was set back, "
-                "press stop and release again",
-                received.publisher,
-                publisher,
-            )
+        latch, before = self.latch, self.kept
+        now = estop_state.KeptStop(latch.publisher, latch.pressed_ns) if latch.pressed else None
+        same = before is not None and now is not None and before.pressed_ns == now.pressed_ns
+        if self.run_dir is None or same or now == before:
+            return
+        try:
+            estop_state.write(self.run_dir, now)
+            self.kept = now
+            self.diagnose("estop", OK, "")
+        except estop_state.EstopStateError as error:
+            self.diagnose("estop", ERROR, str(error))
+
+    def on_estop(self, received: Received) -> None:
+        """Obeys a press at once; a release only by the rule of :class:`EstopLatch`."""
+        pressed = bool(deserialize(received.payload, received.type_name).data)
+        now_ns = self.clock.now_ns()
+        if refused := self.latch.hear(pressed, received.publisher, received.publish_ns, now_ns):
+            self.log.warning("emergency stop: %s", refused)
         self.tick()  # not at the next timer: now
+        self.keep_estop()
 
     def on_button(self, received: Received) -> None:
-        """The emergency stop button on the robot: pressed it stops; let out it ends nothing, that is the operator's."""
+        """The robot's own emergency stop: pressed it stops; released it ends nothing, that is the operator's."""
         pressed = bool(deserialize(received.payload, received.type_name).data)
-        self.button = pressed, self.clock.steady_ns()
-        if pressed:
-            self.estop, self.stopped_by = True, ("button", max(received.publish_ns, self.stopped_by[1]))
+        self.button_ns = self.clock.steady_ns()
+        self.latch.hear_button(pressed, received.publisher, received.publish_ns)
         self.tick()
+        self.keep_estop()
 
     def on_command(self, message: TwistStamped) -> None:
         """Obeys a command that has changed at once: the next timer is half a period off."""
@@ -281,8 +293,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         }
         if self.points is not None and self.points_seen:
             ages["points"] = math.inf if self.sweep_error else self.age("points", self.points)
-        if self.button is not None and self.config.timeouts.estop_input > 0:
-            ages["estop_input"] = (steady_ns - self.button[1]) / 1e9
+        if self.button_ns is not None and self.config.timeouts.estop_input > 0:
+            ages["estop_input"] = (steady_ns - self.button_ns) / 1e9
         return ages
 
     def usual(self) -> dict[str, float]:
@@ -470,8 +482,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             robot_velocity=velocity,
             operator_command=_twist(self.operator),
             operator_gone=self.operator_gone(),
-            estop=self.estop,
-            estop_button=self.button is not None and self.button[0],
+            estop=self.latch.pressed,
+            estop_button=self.latch.button,
+            estop_why="" if self.kept is None else self.kept.why,
             scan_points=points,
             costmap=self.costmap,
             walls=self.walls,
@@ -489,7 +502,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.obeyed = inputs.operator_command
         # Steady time: a clock that is set back must not make what has fallen silent look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
-        self.cmd_vel.publish(twist_stamped(*decision.command, now_ns))
+        self.cmd_vel.publish(twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link"))
         self.tell(decision, inputs, now_ns)
         self.look_again(self.arbiter.stale_in_s(inputs, self.clock.steady_ns()))
 

@@ -371,9 +371,9 @@ def test_an_old_release_of_one_client_does_not_end_the_emergency_stop_of_another
     )
     for received in (release, stop) if release_first else (stop, release):
         stack.arbiter.on_estop(received)
-    assert stack.arbiter.estop
+    assert stack.arbiter.latch.pressed
     stack.arbiter.on_estop(release._replace(publish_ns=3_000))  # its latest word
-    assert not stack.arbiter.estop
+    assert not stack.arbiter.latch.pressed
 
 
 def test_the_robot_stands_when_the_navigator_or_the_vbot_dies() -> None:
