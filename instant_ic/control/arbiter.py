@@ -209,8 +209,6 @@ class _Situation:
 
     inputs: ArbiterInputs
     now_ns: int
-    fresh: bool
-    """The operator's command is not stale, and whoever gave it is there."""
     command: Twist2
     """The operator's, zero when stale."""
     prediction: Prediction | None
@@ -219,6 +217,8 @@ class _Situation:
     vbot_pose: NDArray[np.float64]
     gap_m: float
     yaw_gap_rad: float
+    fresh: bool = True
+    """The operator's command is not stale, and whoever gave it is there."""
 
 
 class _Driven(NamedTuple):
@@ -339,7 +339,7 @@ class Arbiter:
             prediction = self.predictor.predict(vbot, inputs.vbot_velocity, command, inputs.costmap)
         elif robot is not None:
             prediction = self.predictor.predict(robot, inputs.robot_velocity, command, inputs.costmap)
-        situation = _Situation(inputs, now_ns, fresh, command, prediction, np.asarray(target), vbot, gap, yaw_gap)
+        situation = _Situation(inputs, now_ns, command, prediction, np.asarray(target), vbot, gap, yaw_gap, fresh)
         self._watch_agreement(situation)
         self._leading_back = self._leads_back(situation)
         slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * abs(command[0])

@@ -18,8 +18,8 @@ _Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
 class TimeoutConfig:
     """Seconds of silence after which a source is stale and the command is zero.
 
-    A source that comes at a rate of its own (scan, points, odometry, pose, camera, view) is stale ``late_s`` after it
-    usually comes, where that is later; a source slower than ``slowest_s`` is stale between any two messages.
+    A source that comes at a rate of its own (camera, view) is stale ``late_s`` after it usually comes, where that is
+    later; a source slower than ``slowest_s`` is stale between any two messages.
 
     Attributes:
         scan: s; ``/scan``.
@@ -44,13 +44,13 @@ class TimeoutConfig:
     odometry: _Timeout = 0.3
     pose: _Timeout = 0.3
     camera: _Timeout = 0.3
-    view: _Timeout = 0.35
+    view: _Timeout = 0.3
     vbot: _Timeout = 0.3
     nav: _Timeout = 0.3
     command: _Timeout = 0.3
     estop_input: Annotated[float, Range(0, 10)] = 0.0
     vspace: _Timeout = 2.0
-    late_s: _Timeout = 0.15
+    late_s: _Timeout = 0.1
     slowest_s: _Timeout = 0.5
     stop_after_s: _Timeout = 1.5
     recover_s: _Timeout = 0.5
@@ -63,7 +63,7 @@ class TimeoutConfig:
 
         >>> timeouts = TimeoutConfig()
         >>> [round(timeouts.allowed_s("camera", usual_s), 2) for usual_s in (0.1, 0.2, 0.33, 2.0)]
-        [0.3, 0.35, 0.48, 0.65]
+        [0.3, 0.3, 0.43, 0.6]
         """
         least = float(getattr(self, key))
         return least if usual_s is None else max(least, min(usual_s, self.slowest_s) + self.late_s)

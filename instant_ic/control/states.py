@@ -130,7 +130,8 @@ class Source:
     optional: bool = False
     """Needed only once it has come: a robot without 3D points drives by its flat scan."""
     steady: bool = False
-    """It comes at a rate of its own: its time-out is longer where it usually comes rarer."""
+    """It comes at a rate of its own: its time-out is longer where it usually comes rarer. Only what the operator sees by:
+    what keeps the robot off obstacles has fixed time-outs, so that it stands in time on a slow machine too."""
 
 
 OPERATOR_LOST = "the operator's link is lost, the robot waits"
@@ -138,10 +139,10 @@ OPERATOR_LOST = "the operator's link is lost, the robot waits"
 _MOVING = (Mode.REAL, Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
 
 SOURCES: tuple[Source, ...] = (
-    Source("scan", "LiDAR scan", _MOVING, steady=True),
-    Source("points", "3D points", _MOVING, optional=True, steady=True),
-    Source("odometry", "wheel odometry", _MOVING, steady=True),
-    Source("pose", "SLAM pose", _MOVING, steady=True),
+    Source("scan", "LiDAR scan", _MOVING),
+    Source("points", "3D points", _MOVING, optional=True),
+    Source("odometry", "wheel odometry", _MOVING),
+    Source("pose", "SLAM pose", _MOVING),
     Source("camera", "camera picture", (Mode.REAL, Mode.ENTERING), steady=True),
     Source("estop_input", "word from the emergency stop button", _MOVING, optional=True),
     Source("view", "picture of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
