@@ -147,7 +147,7 @@ export function showBanner(connected, everConnected, estop, held, driver, reason
   write(byId("banner-text"), lost
     ? "The robot was told to stop. Connecting again…"
     : !estop ? "Let go of the controls to go on."
-    : reason.includes("button") ? sentence(reason) // on the robot: to be let out there first
+    : reason ? sentence(reason) // who or what holds it, and what to do
     : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
   byId("release").hidden = lost || !estop || driver !== "you";
 }

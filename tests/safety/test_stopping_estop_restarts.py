@@ -1,0 +1,208 @@
+"""The emergency stop survives restarts of console and arbiter in any order, and a run that broke off."""
+
+from __future__ import annotations
+
+import os
+import stat
+import time
+from collections.abc import Iterator
+from itertools import permutations
+from pathlib import Path
+
+import pytest
+
+from instant_ic import estop_state
+from instant_ic.bus import LATCHED
+from instant_ic.bus.lockstep import LockstepBus, _Transport
+from instant_ic.console import ConsoleServer
+from instant_ic.estop_state import EstopStateError, KeptStop, RunMark
+from instant_ic.msg import Bool, ControlState, serialize, twist_stamped, twist_values, type_name
+from instant_ic.nodes.arbiter import ArbiterNode
+from instant_ic.nodes.console import ConsoleNode
+
+S = 1_000_000_000
+
+
+class Robot:
+    """Arbiter and console on a lockstep bus with a run directory; each can be killed and started again."""
+
+    def __init__(self) -> None:
+        self.bus = LockstepBus(start_ns=1_000 * S)
+        self.nodes: dict[str, ArbiterNode | ConsoleNode] = {}
+        self.start("arbiter")
+        self.start("console")
+
+    def start(self, name: str) -> None:
+        self.nodes[name] = self.bus.add(ArbiterNode if name == "arbiter" else ConsoleNode)
+        self.bus.advance(0.1)
+
+    def kill(self, name: str) -> None:
+        """As SIGKILL: no teardown; nobody gets its latched values any more."""
+        node = self.nodes.pop(name)
+        self.bus.nodes.remove(node)
+        for subscriptions in self.bus.subscriptions.values():
+            subscriptions[:] = [each for each in subscriptions if each.transport is not node._transport]
+        for values in self.bus.latched.values():
+            values.pop(name, None)
+
+    @property
+    def console(self) -> ConsoleNode:
+        node = self.nodes["console"]
+        assert isinstance(node, ConsoleNode)
+        return node
+
+    def stopped(self) -> bool:
+        """Whether the arbiter says so, and sends nothing but zeros under a commanding operator."""
+        now_ns = self.bus.clock.now_ns()
+        self.bus.publish("/operator/cmd_vel", twist_stamped(0.3, 0.0, now_ns))
+        self.bus.advance(0.2)
+        state: ControlState = self.bus.last("/ic/state")
+        assert twist_values(self.bus.last("/cmd_vel")) == (0.0, 0.0)
+        return bool(state.estop) and state.mode == ControlState.STOPPED
+
+
+@pytest.fixture
+def run_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(_Transport, "run_dir", tmp_path)
+    monkeypatch.setattr(ConsoleServer, "start", lambda self: None)
+    return tmp_path
+
+
+@pytest.fixture
+def robot(run_dir: Path) -> Iterator[Robot]:
+    made = Robot()
+    yield made
+    made.bus.close()
+
+
+ORDERS = [
+    *(("kill " + name, "start " + name) for name in ("arbiter", "console")),
+    *(
+        order
+        for order in permutations(("kill arbiter", "kill console", "start arbiter", "start console"))
+        if all(order.index(f"kill {name}") < order.index(f"start {name}") for name in ("arbiter", "console"))
+    ),
+]
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=", ".join)
+def test_a_pressed_emergency_stop_survives_restarts(robot: Robot, order: tuple[str, ...]) -> None:
+    robot.console.on_estop(True)
+    robot.bus.advance(0.1)
+    assert robot.stopped()
+    for step in order:
+        does, name = step.split()
+        getattr(robot, does)(name)
+    assert robot.stopped()
+    # Released by hand it is over, and a further restart brings it not back.
+    robot.console.on_estop(False)
+    robot.bus.advance(0.1)
+    assert not robot.bus.last("/ic/state").estop
+    robot.kill("arbiter")
+    robot.start("arbiter")
+    assert not robot.bus.last("/ic/state").estop
+
+
+def test_a_console_that_starts_with_a_latched_release_ends_no_stop(robot: Robot) -> None:
+    released_ns = robot.bus.clock.now_ns()
+    robot.bus.advance(1.0)
+    robot.console.on_estop(True)
+    robot.bus.advance(0.1)
+    robot.kill("console")
+    robot.kill("arbiter")
+    robot.start("arbiter")
+    release = bytes(serialize(Bool(data=False)))
+    robot.bus.route("/operator/estop", type_name(Bool), release, "second_console", LATCHED, released_ns)
+    robot.bus.advance(0.1)
+    assert robot.stopped()
+
+
+def test_the_robots_own_button_stays_latched_over_a_restart_of_the_arbiter(robot: Robot) -> None:
+    robot.bus.publish("/robot/estop", Bool(data=True), publisher="crawler_base")
+    robot.bus.publish("/robot/estop", Bool(data=False), publisher="crawler_base")
+    robot.kill("arbiter")
+    robot.start("arbiter")
+    assert robot.stopped()
+    robot.console.on_estop(False)
+    robot.bus.advance(0.1)
+    assert not robot.bus.last("/ic/state").estop
+
+
+def test_after_a_run_that_broke_off_the_robot_starts_stopped_and_says_why(run_dir: Path) -> None:
+    RunMark(run_dir).__enter__()  # and the launcher was killed
+    with RunMark(run_dir):
+        robot = Robot()
+        assert robot.stopped()
+        why = "The last run did not end cleanly. Release the emergency stop to continue."
+        assert robot.bus.last("/ic/state").reason == why
+        robot.console.on_estop(False)
+        robot.bus.advance(0.1)
+        assert not robot.bus.last("/ic/state").estop
+        robot.bus.close()
+    with RunMark(run_dir):  # that one ended cleanly
+        assert estop_state.read(run_dir) is None
+
+
+def test_a_run_that_broke_off_under_a_pressed_stop_says_so(run_dir: Path) -> None:
+    RunMark(run_dir).__enter__()
+    estop_state.write(run_dir, KeptStop("console", 5))
+    with RunMark(run_dir):
+        kept = estop_state.read(run_dir)
+    assert kept is not None and "while the emergency stop was pressed" in kept.why
+    assert kept.pressed_ns > time.time_ns() - 60 * S  # no release of the last run is newer
+
+
+def test_a_clean_end_keeps_a_pressed_stop_and_makes_none(run_dir: Path) -> None:
+    with RunMark(run_dir):
+        estop_state.write(run_dir, KeptStop("console", 5))
+    with RunMark(run_dir):
+        assert estop_state.read(run_dir) == KeptStop("console", 5)
+        estop_state.write(run_dir, None)
+    with RunMark(run_dir):
+        assert estop_state.read(run_dir) is None
+
+
+def test_a_press_stamped_by_a_clock_that_was_ahead_can_be_released(run_dir: Path) -> None:
+    estop_state.write(run_dir, KeptStop("launch", 9_000 * S))
+    robot = Robot()
+    assert robot.stopped()
+    robot.console.on_estop(False)
+    robot.bus.advance(0.1)
+    assert not robot.bus.last("/ic/state").estop
+    robot.bus.close()
+
+
+def test_the_files_are_private_replaced_whole_and_a_damaged_one_means_stopped(tmp_path: Path) -> None:
+    file = tmp_path / "estop.json"
+    estop_state.write(tmp_path, KeptStop("console", 5))
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["estop.json"]
+    for damage in (b"", b"{", b"[]", b'{"publisher": 1}', b"\xff\xfe"):
+        file.write_bytes(damage)
+        kept = estop_state.read(tmp_path)
+        assert kept is not None and "cannot be read" in kept.why
+    target = tmp_path / "target"
+    target.write_text("whole")
+    (tmp_path / "estop.part").symlink_to(target)
+    estop_state.write(tmp_path, KeptStop("console", 6))
+    assert target.read_text() == "whole"
+
+
+def test_a_state_that_cannot_be_kept_is_an_error_that_says_what_to_do(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(EstopStateError, match="INSTANT_IC_RUN_DIR"):
+        estop_state.write(tmp_path / "file" / "below", KeptStop("console", 5))
+
+
+def test_the_default_run_directory_keeps_its_state_where_a_power_cut_leaves_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "runtime"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    default = tmp_path / "runtime" / "instant_ic"
+    assert estop_state.state_dir(default) == tmp_path / "state" / "instant_ic"
+    assert estop_state.state_dir(default / "robot1") == tmp_path / "state" / "instant_ic" / "robot1"
+    assert estop_state.state_dir(tmp_path / "chosen") == tmp_path / "chosen"
+    estop_state.write(default / "robot1", KeptStop("console", os.getpid()))
+    assert estop_state.read(default) is None
+    assert estop_state.read(default / "robot1") == KeptStop("console", os.getpid())
