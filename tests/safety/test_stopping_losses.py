@@ -22,7 +22,7 @@ SPEED_M_S = 0.38
 STANDS_M_S = 0.01
 ZERO_S, STAND_S = 0.3, 0.55
 ESTOP_S, ESTOP_M = 0.25, 0.06
-PHASES = (0, 2, 4)
+PHASES = (0, 3)
 """Steps of a sixtieth of a second by which the losses are put off: over a period of the 10 Hz sources."""
 
 
