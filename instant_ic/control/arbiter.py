@@ -17,7 +17,7 @@ from ..geometry.poses import wrap_angle
 from ..ranges import NotNegative, Positive, check_ranges
 from .costmap import Costmap
 from .footprint import Footprint
-from .freshness import TimeoutConfig
+from .freshness import IMAGES, TimeoutConfig
 from .kinematics import MotionLimits, clip_twist
 from .passage import Passage, PassageConfig, find_passage
 from .planner import HybridPlanner, PlannerConfig
@@ -34,6 +34,8 @@ Twist2 = tuple[float, float]
 PASSAGE_PERIOD_NS = 200_000_000
 _STANDS_M_S, _STANDS_RAD_S = 0.03, 0.1
 """Slower than this a robot counts as standing."""
+_CATCH_UP = 0.8
+"""Share of the r-bot's speed limit that is the v-bot's."""
 _SLOW_NS = 800_000_000
 """Longer than it takes to reach full speed."""
 
@@ -166,6 +168,8 @@ class ArbiterInputs:
     estop_input once they came."""
     usual: dict[str, float] = field(default_factory=dict)
     """How old a source usually is when its next message comes (``freshness.Rhythm``), s."""
+    images_late_s: float = 0.0
+    """Seconds from a camera exposure, or from the request of a view where that is longer, until the operator has it."""
 
     def age(self, key: str) -> float:
         """Age of a source; inf when it has never been seen."""
@@ -199,6 +203,8 @@ class Decision:
     vbot_action: VbotAction
     vbot_target: NDArray[np.float64]
     """(3,) to which the v-bot goes, if it does: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
+    vbot_limit_m_s: float
+    """m/s; speed limit of the v-bot by the rate of the views."""
     hard: bool = False
     """The command is zero because something is lost or in the way: the base must not take its soft ramp."""
 
@@ -249,6 +255,7 @@ class Arbiter:
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
         self._subgoal: Subgoal | None = None
         self._passage_found: tuple[int, Passage] | None = None
+        self._no_view_fits = False  # the last entry was given up
         self._guards: dict[str, Callable[[_Situation], str]] = {
             "estop_pressed": self._estop_pressed,
             "source_lost": self._source_lost,
@@ -313,6 +320,7 @@ class Arbiter:
                 inputs.robot_pose if self._leading_back and inputs.robot_pose is not None else situation.target
             ).copy(),
             hard=self._hard,
+            vbot_limit_m_s=self._vbot_limit_m_s(inputs),
         )
 
     # -- what the step starts from
@@ -341,8 +349,14 @@ class Arbiter:
             prediction = self.predictor.predict(robot, inputs.robot_velocity, command, inputs.costmap)
         situation = _Situation(inputs, now_ns, command, prediction, np.asarray(target), vbot, gap, yaw_gap, fresh)
         self._watch_agreement(situation)
+        if self._no_view_fits and self.mode == Mode.REAL:
+            # Not tried again and again under a held key: by now a view must fit, or the operator has let go.
+            switch = self.config.switch
+            fits = self._pictures_agree(situation, switch.picture_position_m, switch.picture_yaw_deg)
+            self._no_view_fits = not fits and command != (0.0, 0.0)
         self._leading_back = self._leads_back(situation)
-        slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * abs(command[0])
+        wanted_m_s = min(abs(command[0]), self._vbot_limit_m_s(inputs))
+        slow = self.mode == Mode.VIRTUAL and abs(inputs.vbot_velocity[0]) < 0.8 * wanted_m_s
         self._slow_since_ns = (self._slow_since_ns or now_ns) if slow else None
         self._subgoal = None
         if self.mode == Mode.VIRTUAL and prediction is not None and inputs.costmap is not None:
@@ -390,17 +404,20 @@ class Arbiter:
 
     def _lacking(self, inputs: ArbiterInputs, mode: Mode, now_ns: int) -> list[tuple[Source, float]]:
         """Sources that ``mode`` needs and that are stale, with their ages."""
-        lacking, switch = [], self.config.switch
-        required = {"camera": switch.require_camera, "view": switch.require_view}
-        for source in SOURCES:
-            if mode not in source.modes or (source.optional and source.key not in inputs.ages):
-                continue
-            if not required.get(source.key, True):
+        lacking = []
+        for source in self._required(mode):
+            if source.optional and source.key not in inputs.ages:
                 continue
             age = self._source_age_s(source, inputs, now_ns)
             if age > self._allowed_s(source, inputs) or (source.key == "command" and inputs.operator_gone):
                 lacking.append((source, age))
         return lacking
+
+    def _required(self, mode: Mode | None = None) -> list[Source]:
+        """Sources that a mode, else the present one, needs as this arbiter is set up."""
+        mode, switch = self.mode if mode is None else mode, self.config.switch
+        unused = {key for key, used in (("camera", switch.require_camera), ("view", switch.require_view)) if not used}
+        return [source for source in SOURCES if mode in source.modes and source.key not in unused]
 
     def _source_age_s(self, source: Source, inputs: ArbiterInputs, now_ns: int) -> float:
         age = inputs.age(source.key)
@@ -421,6 +438,30 @@ class Arbiter:
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.allowed_s(source.key, inputs.usual.get(source.key) if source.steady else None)
+
+    def _lost_s(self, source: Source, inputs: ArbiterInputs) -> float:
+        return self.config.timeouts.lost_s(source.key, inputs.usual.get(source.key) if source.steady else None)
+
+    def _speed_limit_m_s(self, inputs: ArbiterInputs) -> float:
+        """Speed at which no more than ``image_travel_m`` is driven until a missing image stops the robot.
+
+        Rare images so make the robot slow, and not stop at each that is late.
+        """
+        longest_s = max(
+            (self._allowed_s(source, inputs) for source in self._required() if source.key in IMAGES), default=0.0
+        )
+        most = self.config.limits.max_linear_m_s
+        return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
+
+    def _vbot_limit_m_s(self, inputs: ArbiterInputs) -> float:
+        """The same for the v-bot; where it is less than full speed, slow enough for the r-bot to catch up."""
+        limit = self._speed_limit_m_s(inputs)
+        return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
+
+    def _too_rare(self, inputs: ArbiterInputs) -> bool:
+        """Whether camera images come too rarely to drive by, or not yet long enough to know."""
+        usual_s = inputs.usual.get("camera", 0.0) if self.config.switch.require_camera else 0.0
+        return usual_s > self.config.timeouts.slowest_image_s
 
     def _seconds_in_mode(self, now_ns: int) -> float:
         return (now_ns - (self._since_ns or now_ns)) / 1e9
@@ -450,8 +491,7 @@ class Arbiter:
 
     def _source_lost(self, situation: _Situation) -> str:
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
-        after = self.config.timeouts.stop_after_s
-        lost = [(source, age) for source, age in lacking if age > max(after, self._allowed_s(source, situation.inputs))]
+        lost = [(source, age) for source, age in lacking if age > self._lost_s(source, situation.inputs)]
         return _no_data(lost) if lost else ""
 
     def _vspace_lost(self, situation: _Situation) -> str:
@@ -487,6 +527,8 @@ class Arbiter:
                 f"the virtual space would show this place too badly ({vspace.expected_psnr_db:.0f} dB expected, "
                 f"{switch.min_expected_psnr_db:.0f} dB needed)"
             )
+        if self._no_view_fits:
+            return "no image of the virtual space fits here; let go and drive on to try again"
         back = self._returned_ns
         if back is not None and situation.now_ns - back < switch.min_real_s * 1e9:
             return "just back from the virtual space"
@@ -521,9 +563,15 @@ class Arbiter:
         inputs = situation.inputs
         if inputs.age("vspace") > self.config.timeouts.vspace or not self._shown_vspace(situation).ready:
             return "the virtual space is not ready any more"
-        if self._seconds_in_mode(situation.now_ns) > self.config.switch.enter_timeout_s:
+        if self._seconds_in_mode(situation.now_ns) > self._entry_patience_s(inputs):
+            self._no_view_fits = True
             return "no fitting picture of the virtual space has come"
         return "you drive the robot" if self._safe_ahead(situation) else ""
+
+    def _entry_patience_s(self, inputs: ArbiterInputs) -> float:
+        """Seconds until an image and a view could have come of the place where the r-bot stands at last."""
+        slow = (self.config.timeouts.allowed_s(key, inputs.usual.get(key)) for key in IMAGES)
+        return self.config.switch.enter_timeout_s + sum(slow) + inputs.images_late_s
 
     def _view_fits(self, situation: _Situation) -> str:
         if self._hold_reason(situation) or not self._vbot_spoke(situation.inputs, situation.now_ns):
@@ -590,8 +638,6 @@ class Arbiter:
         )
 
     def _unsafe_again(self, situation: _Situation) -> str:
-        if self._lacking(situation.inputs, Mode.REAL, situation.now_ns):
-            return "you drive the virtual robot"
         prediction = situation.prediction
         if situation.command == (0.0, 0.0) or prediction is None or prediction.hit_index is None:
             return ""
@@ -618,7 +664,7 @@ class Arbiter:
         inputs = situation.inputs
         if inputs.estop or inputs.estop_button or situation.command != (0.0, 0.0) or inputs.robot_pose is None:
             return ""
-        if self._operator_missed(situation):
+        if self._operator_missed(situation) or self._too_rare(inputs):
             return ""
         since = self._fresh_since_ns
         if since is None or situation.now_ns - since < self.config.timeouts.recover_s * 1e9:
@@ -674,7 +720,7 @@ class Arbiter:
         wanted = clip_twist(*inputs.nav_command, self.config.limits)
         if inputs.age("nav") > self.config.timeouts.nav:
             wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
-        sent = self._monitored(wanted, situation)
+        sent = self._monitored(self._paced(wanted, situation), situation)
         left_s = self.config.switch.lead_back_after_s - self._idle_s(situation)
         if self._agree_since_ns is None and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
             reason = f"the robot cannot come to where you stopped: in {left_s:.0f} s the view is led back to it"
@@ -723,7 +769,10 @@ class Arbiter:
             command = (command[0] * left, command[1] * left)
         elif self.mode == Mode.RETURNING:
             reason = "you drive the robot; the real view is about to come back"
-        sent = self._monitored(command, situation)
+        paced = self._paced(command, situation)
+        if paced != command and not blocked:
+            reason += "; slower: images come rarely"
+        sent = self._monitored(paced, situation)
         if sent.action in ("approach", "stop") and not blocked:
             blocked = True
             reason = f"blocked: contact in {sent.time_to_collision_s:.1f} s"
@@ -752,6 +801,11 @@ class Arbiter:
         factor = min(1.0, allowed / speed) if speed > 0 else 1.0
         return command[0] * factor, command[1] * factor
 
+    def _paced(self, command: Twist2, situation: _Situation) -> Twist2:
+        """The command slowed to what the image rate allows; its curvature is kept."""
+        factor = min(1.0, self._speed_limit_m_s(situation.inputs) / max(abs(command[0]), 1e-9))
+        return command[0] * factor, command[1] * factor
+
     def _hold_reason(self, situation: _Situation) -> str:
         """Why nothing may move although the state would let it; "" when it may."""
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
@@ -774,6 +828,8 @@ class Arbiter:
             return "stopped: " + _no_data(lacking)
         if inputs.robot_pose is None:
             return "stopped: the robot's pose in the map is not known"
+        if self._too_rare(inputs):
+            return f"stopped: waiting for a camera image every {self.config.timeouts.slowest_image_s:g} s or more often"
         if situation.command != (0.0, 0.0):
             return f"let go of the controls to go on (stopped: {self._stop_reason})"
         return f"stopped: {self._stop_reason}"

@@ -8,18 +8,26 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from ..ranges import Range, check_ranges
+from ..ranges import Positive, Range, check_ranges
 
 _Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
 """Longer than this is no time-out: a robot must not drive on what it saw or was told so long ago."""
+
+IMAGES = ("camera", "view")
+"""Sources that show the operator where the robot is."""
+_LATE_SHARE = 0.25
+"""Images that come rarely vary by more than ``late_s``: by this share of their period."""
+_UNKNOWN_PERIOD_S = 0.5
+"""Period assumed of images until their rate is known."""
 
 
 @dataclass(frozen=True)
 class TimeoutConfig:
     """Seconds of silence after which a source is stale and the command is zero.
 
-    A source that comes at a rate of its own (camera, view) is stale ``late_s`` after it usually comes, where that is
-    later; a source slower than ``slowest_s`` is stale between any two messages.
+    An image source (camera, view) comes at a rate of its own: it is stale ``late_s`` after it usually comes, where that
+    is later. Images may come as rarely as ``slowest_image_s``: the robot then drives slower, ``image_travel_m`` per image
+    at most. Everything else keeps the robot off obstacles and has a fixed time-out.
 
     Attributes:
         scan: s; ``/scan``.
@@ -33,8 +41,9 @@ class TimeoutConfig:
         command: s; ``/operator/cmd_vel``.
         estop_input: s; ``/robot/estop``, from a button that repeats its state; 0: it speaks only on a change.
         vspace: s; ``/vspace/status``.
-        late_s: s after a source is usually there that make it late.
-        slowest_s: s between two messages of a source beyond which its own rate no longer counts.
+        late_s: s after an image is usually there that make it late.
+        slowest_image_s: s between two images beyond which the robot does not start.
+        image_travel_m: m driven at most until a missing image stops the robot; limits the speed at low image rates.
         stop_after_s: s of silence that lead to STOPPED.
         recover_s: s for which everything must be fresh before driving on.
     """
@@ -51,7 +60,8 @@ class TimeoutConfig:
     estop_input: Annotated[float, Range(0, 10)] = 0.0
     vspace: _Timeout = 2.0
     late_s: _Timeout = 0.1
-    slowest_s: _Timeout = 0.5
+    slowest_image_s: _Timeout = 1.1
+    image_travel_m: Positive = 0.33
     stop_after_s: _Timeout = 1.5
     recover_s: _Timeout = 0.5
 
@@ -62,11 +72,21 @@ class TimeoutConfig:
         """Seconds that source ``key`` may be silent, which usually is ``usual_s`` old when the next message comes.
 
         >>> timeouts = TimeoutConfig()
-        >>> [round(timeouts.allowed_s("camera", usual_s), 2) for usual_s in (0.1, 0.2, 0.33, 2.0)]
-        [0.3, 0.3, 0.43, 0.6]
+        >>> [round(timeouts.allowed_s("camera", usual_s), 2) for usual_s in (0.1, 0.2, 0.33, 1.0, 2.0, math.inf)]
+        [0.3, 0.3, 0.43, 1.25, 1.38, 0.62]
         """
         least = float(getattr(self, key))
-        return least if usual_s is None else max(least, min(usual_s, self.slowest_s) + self.late_s)
+        if usual_s is None:
+            return least
+        period_s = min(usual_s, self.slowest_image_s) if math.isfinite(usual_s) else _UNKNOWN_PERIOD_S
+        return max(least, period_s + max(self.late_s, _LATE_SHARE * period_s))
+
+    def lost_s(self, key: str, usual_s: float | None = None) -> float:
+        """Seconds of silence from which source ``key`` counts as lost: the machine goes to STOPPED.
+
+        One missing image is no loss at any image rate.
+        """
+        return max(self.stop_after_s, 2.0 * self.allowed_s(key, usual_s) if key in IMAGES else self.allowed_s(key, usual_s))
 
 
 class Rhythm:

@@ -100,7 +100,7 @@ GUARDS: dict[str, str] = {
     "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, within return_near_m or for "
     "return_patience_s, and the operator's command is safe for the r-bot over the way that switches in and over a "
     "longer and wider one",
-    "unsafe_again": "the operator's command leads the r-bot into an obstacle again, or the camera is silent",
+    "unsafe_again": "the operator's command leads the r-bot into an obstacle again",
     "picture_fits": "the v-bot has been eased onto the r-bot, the r-bot turns no faster than return_turn_rad_s, and "
     "view and picture agree as in `view_fits`, within return_picture_m and return_picture_yaw_deg (after "
     "return_timeout_s the first is enough, after twice that it goes on with what is left)",
@@ -143,7 +143,7 @@ SOURCES: tuple[Source, ...] = (
     Source("points", "3D points", _MOVING, optional=True),
     Source("odometry", "wheel odometry", _MOVING),
     Source("pose", "SLAM pose", _MOVING),
-    Source("camera", "camera picture", (Mode.REAL, Mode.ENTERING), steady=True),
+    Source("camera", "camera picture", (Mode.REAL, Mode.ENTERING, Mode.RETURNING), steady=True),
     Source("estop_input", "word from the emergency stop button", _MOVING, optional=True),
     Source("view", "picture of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
     Source("vbot", "v-bot", (Mode.VIRTUAL, Mode.RETURNING)),

@@ -80,9 +80,12 @@ class VirtualRobot:
         robot_pose: NDArray[np.float64],
         dt_s: float,
         walls: WallMap | None = None,
+        speed_limit_m_s: float = math.inf,
     ) -> NDArray[np.float64]:
         """Moves by ``dt_s`` under the operator's command; returns the new pose (3,) in the map frame."""
         linear, angular = clip_twist(*command, self.limits)
+        slower = min(1.0, speed_limit_m_s / max(abs(linear), 1e-9))
+        linear, angular = linear * slower, angular * slower
         factor = self.lead_factor(linear, robot_pose)
         self.slowed_by = "lead" if factor < 1.0 - self.config.trail_slow else ""
         # Curvature is kept, as far as the v-bot moves: the operator's line stays the same line.

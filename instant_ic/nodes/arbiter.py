@@ -94,8 +94,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         finder = WallFinder(self.config.wall_min_length_m, self.config.costmap.lethal_cost_threshold)
         self.wall_worker = self.background(finder.find, self.on_walls)
         self.map_from_odom: Matrix | None = None
+        self.placed_scan: NDArray[np.float64] | None = None  # (N, 2) hits of the newest that could be placed, in odom
+        self.used: dict[str, tuple[int, int]] = {}  # scan and points that could be placed last: stamp, when they came
         self.sweep: SortedPoints | None = None  # the newest 3D points, in odom
-        self.sweep_error = ""
         self.points_seen = False
         self.taken: tuple[int, int] = (-1, -1)  # stamps of the scan and the points that the costmap holds
         self.costmap_sent_ns: int | None = None
@@ -106,6 +107,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.lost_told = False  # a step was made for the driver's loss
         self.page: tuple[int, int] = (-1, 0)  # newest camera picture there: its stamp, when it was told
         self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: its request, when it was told
+        self.views_wanted = False  # the newest view was asked for to be shown
         self.picture_delay_s: float | None = None  # from the camera to the operator
         self.latch = EstopLatch()
         self.kept: estop_state.KeptStop | None = None  # the emergency stop as the next start would find it
@@ -262,11 +264,11 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.page = stamp, now_ns
             self.picture_delay_s = min(max((self.clock.now_ns() - stamp) / 1e9, 0.0), 1.0)
         if view != self.view[0]:
-            if self.arbiter.mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING):
+            # In REAL views are asked for rarely, which says nothing of their rate.
+            wanted = self.arbiter.mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
+            if wanted and self.views_wanted:
                 self.rhythms["view"].heard((now_ns - self.view[1]) / 1e9)
-            else:
-                self.rhythms["view"] = Rhythm()  # in REAL views are asked for rarely
-            self.view = view, now_ns
+            self.view, self.views_wanted = (view, now_ns), wanted
         gone, told = self.operator_gone(), self.lost_told
         self.lost_told = gone
         if (new and self.arbiter.mode in (Mode.ENTERING, Mode.RETURNING)) or (gone and not told):
@@ -292,7 +294,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             "vspace": self.vspace.age_s,
         }
         if self.points is not None and self.points_seen:
-            ages["points"] = math.inf if self.sweep_error else self.age("points", self.points)
+            ages["points"] = max(self.age("points", self.points), self.used_age_s("points"))
         if self.button_ns is not None and self.config.timeouts.estop_input > 0:
             ages["estop_input"] = (steady_ns - self.button_ns) / 1e9
         return ages
@@ -352,23 +354,47 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def scan_in_base(self) -> NDArray[np.float64] | None:
         """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now; by odometry, which does not jump."""
-        scan = self.scan.message
-        if scan is None:
+        self.place_scan()
+        if self.placed_scan is None:
             return None
+        near = self.placed_scan
+        if self.sweep is not None:
+            near = np.concatenate([near, self.sweep.nearest])
         try:
-            odom_from_lidar = self.tf.lookup("odom", scan.header.frame_id, stamp_ns(scan))
-            base_from_lidar = np.linalg.inv(self.tf.lookup("odom", "base_link")) @ odom_from_lidar
+            base_from_odom = np.linalg.inv(self.tf.lookup("odom", "base_link"))
         except TransformError as error:
             self.diagnose("scan", WARN, f"scan cannot be placed: {error}")
             return None
+        return np.asarray(near @ base_from_odom[:2, :2].T + base_from_odom[:2, 3])
+
+    def place_scan(self) -> None:
+        """Puts the newest scan into ``odom``. Until its transform has come, the scan before holds, at its own age."""
+        scan = self.scan.message
+        if scan is None:
+            self.placed_scan = None
+            return
+        if self.placed_scan is not None and self.used["scan"][0] == stamp_ns(scan):
+            return
+        try:
+            odom_from_lidar = self.tf.lookup("odom", scan.header.frame_id, stamp_ns(scan))
+        except TransformError as error:
+            self.diagnose("scan", WARN, f"scan cannot be placed: {error}")
+            return
         points = scan_points(scan.ranges, scan.angle_min, scan.angle_increment, scan.range_min, scan.range_max)
         self.diagnose("scan", OK, f"{len(points)} points")
-        placed: NDArray[np.float64] = points @ base_from_lidar[:2, :2].T + base_from_lidar[:2, 3]
-        if self.sweep is None:
-            return placed
-        base_from_odom = np.linalg.inv(self.tf.lookup("odom", "base_link"))
-        near = self.sweep.nearest @ base_from_odom[:2, :2].T + base_from_odom[:2, 3]
-        return np.concatenate([placed, near])
+        self.placed_scan = np.asarray(points @ odom_from_lidar[:2, :2].T + odom_from_lidar[:2, 3])
+        self.note_used("scan", self.scan)
+
+    def note_used(self, key: str, latest: Latest) -> None:
+        """Notes that the newest message of a source could be placed: what counts is the age of the last such one."""
+        self.used[key] = stamp_ns(latest.message), self.clock.steady_ns() - round(latest.age_s * 1e9)
+
+    def used_age_s(self, key: str) -> float:
+        """Seconds since the last message that could be placed came, or was measured where that is longer."""
+        if key not in self.used:
+            return math.inf
+        stamp, came_ns = self.used[key]
+        return max(self.clock.now_ns() - stamp, self.clock.steady_ns() - came_ns) / 1e9
 
     # -- 3D points
 
@@ -387,10 +413,11 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         try:
             self.sweep = self.sorted(message)
         except (MessageError, TransformError) as error:
-            self.sweep_error = str(error)
+            if isinstance(error, MessageError):
+                self.used.pop("points", None)  # no later transform makes these usable
             self.diagnose("points", WARN, f"3D points cannot be used: {error}")
             return -1
-        self.sweep_error = ""
+        self.note_used("points", self.points)
         counts = self.sweep.counts
         self.diagnose("points", OK, f"{counts['obstacle']} points in the way", **counts)
         return stamp_ns(message)
@@ -470,6 +497,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         points = self.scan_in_base()
         if points is None:
             points, ages["scan"] = np.zeros((0, 2)), math.inf
+        else:
+            ages["scan"] = max(ages["scan"], self.used_age_s("scan"))
         pose = self.robot_pose()
         vbot, status, shown, velocity = (
             self.vbot.message,
@@ -498,6 +527,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             view_after_picture_s=0.0 if shown is None else _between_s(shown),
             ages=ages,
             usual=self.usual(),
+            images_late_s=max(self.picture_delay_s or 0.0, 0.0 if shown is None else float(shown.view_delay_s)),
         )
         self.obeyed = inputs.operator_command
         # Steady time: a clock that is set back must not make what has fallen silent look fresh.
@@ -538,6 +568,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 vbot_action=int(decision.vbot_action),
                 vbot_target=pose_message(matrix_from_pose2(decision.vbot_target)),
                 robot_twist=twist_message(*inputs.robot_velocity),
+                vbot_limit_m_s=decision.vbot_limit_m_s,
             )
         )
         if decision.changed:

@@ -129,7 +129,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self._told_ns = 0
         self._lost_ns: int | None = None  # when the driver was lost last
         self._wanted: tuple[Matrix, Look] | None = None  # what the last view was asked for
-        self._asked = (0, 0)  # the last request: its number, when it went out
+        self._asked: dict[int, int] = {}  # the last requests: number -> when it went out
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
         self._diagnoses_seen: dict[str, tuple[int, str, float]] = {}
@@ -279,8 +279,8 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.views.answered(int(message.request_id), came_ns / 1e9)
         page = self.views.page_of(int(message.request_id))
         if page is None:
-            number, asked_ns = self._asked
-            delay_s = (came_ns - asked_ns) / 1e9 if number == message.request_id else 0.0
+            # A slow renderer answers a request that has timed out: that is when its delay matters most.
+            delay_s = (came_ns - self._asked.get(int(message.request_id), came_ns)) / 1e9
             self._view = int(message.request_id), came_ns, delay_s
             self._drawn = camera, knows and len(message.depth_png) > 0
             self._displayed = self.displayed()
@@ -337,7 +337,9 @@ class ConsoleNode(Node[ConsoleConfig]):
         steady_ns = self.clock.steady_ns()
         number = self.views.asked(steady_ns / 1e9, page)
         if page is None:
-            self._asked = number, steady_ns
+            self._asked[number] = steady_ns
+            while len(self._asked) > 8:
+                del self._asked[next(iter(self._asked))]
         self.request_out.publish(
             ViewRequest(
                 header=header("map", self.clock.now_ns()),

@@ -134,7 +134,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
             self.obeyed = self.operator()
-            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls)
+            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls, float(state.vbot_limit_m_s))
         elif action == VbotAction.HELD:
             self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls)
         elif action == VbotAction.EASED:

@@ -96,6 +96,7 @@ def control(bus, mode, **values):
         "vbot_action": 0,
         "vbot_target": pose,
         "robot_twist": twist_message(),
+        "vbot_limit_m_s": 0.5,
     }
     return ControlState(**(fields | values))
 

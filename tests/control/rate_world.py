@@ -1,0 +1,320 @@
+"""The control nodes and the console in simulated time, with images at any rate, delay, jitter and loss.
+
+Real are the arbiter, the v-bot, the navigator and the console, on a lockstep bus. Simulated are the base, the LiDAR, a
+camera, a renderer and an operator. Everything comes from a queue of events, so nothing depends on the machine.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import heapq
+import itertools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
+
+from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.console.server import ServerConfig
+from instant_ic.msg import (
+    ControlState,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    RenderedView,
+    TFMessage,
+    VspaceStatus,
+    compressed_image_message,
+    deserialize,
+    grid_message,
+    header,
+    odometry_message,
+    pose_message,
+    scan_message,
+    stamp_ns,
+    to_time,
+    transform_message,
+    twist_values,
+)
+from instant_ic.nodes.arbiter import ArbiterNode
+from instant_ic.nodes.console import ConsoleConfig, ConsoleNode
+from instant_ic.nodes.navigator import NavigatorNode
+from instant_ic.nodes.virtual_robot import VirtualRobotNode
+
+START_NS = 1_000_000_000_000
+FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Rates:
+    """What comes how often and how late.
+
+    Attributes:
+        camera_hz: images per second.
+        camera_delay_s: from the exposure to the console.
+        view_hz: views per second that the renderer makes at most.
+        view_delay_s: from a request to its view.
+        jitter: share of a period by which images come late at random; of a delay likewise.
+        lost: share of images that never come.
+        scan_jitter_s: s by which scans and poses come late, at most.
+        stall_s: s for which everything stands still every few seconds, as on a busy machine; it then comes at once.
+    """
+
+    camera_hz: float = 10.0
+    camera_delay_s: float = 0.2
+    view_hz: float = 10.0
+    view_delay_s: float = 0.05
+    jitter: float = 0.0
+    lost: float = 0.0
+    scan_jitter_s: float = 0.0
+    stall_s: float = 0.0
+    seed: int = 0
+
+
+class _Page:
+    """Stands in for the console's server."""
+
+    def now_ms(self) -> float:
+        return 0.0
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        pass
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        pass
+
+    def show(self, *kinds: Any) -> None:
+        pass
+
+    def watching(self) -> dict[int, Any]:
+        return {}
+
+    def stop(self) -> None:
+        pass
+
+
+class RateWorld:
+    """A corridor with boxes, a robot that drives in it, and what the operator sees of it."""
+
+    def __init__(self, boxes: list[tuple[float, float, float, float]], rates: Rates, length_m: float = 20.0) -> None:
+        self.rates = rates
+        self.rng = np.random.default_rng([17, rates.seed])
+        walls = corridor(length_m)
+        self.world = World(np.concatenate([walls, *(rectangle(*box) for box in boxes)]))
+        self.base = Base()
+        self.contact = False
+        self.silent: set[str] = set()
+        self.states: list[ControlState] = []
+        self.changes: list[tuple[float, str, str]] = []
+        self.log: list[tuple[float, float, float, float]] = []
+        self.command = NOTHING
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
+        self._orders = itertools.count()
+        self._rendering = False
+        self._request: Any = None
+        self._last: dict[str, int] = {}
+        self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
+        for node in (VirtualRobotNode, NavigatorNode):
+            self.bus.add(node)
+        self.arbiter = self.bus.add(ArbiterNode)
+        self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ServerConfig(port=0)))
+        self.console.server.stop()
+        self.console.server = _Page()
+        static = draw_map(walls, (-2, -1.2, length_m - 2, 1.2))
+        self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
+        mounts = [("velodyne", 0.6), ("camera", 1.2)]
+        places = []
+        for frame, height_m in mounts:
+            place = np.eye(4)
+            place[2, 3] = height_m
+            places.append(transform_message(place, "base_link", frame, self.now))
+        self.bus.publish("/tf_static", TFMessage(places), latched=True)
+        self._every(0.05, self._move)
+        self._every(0.05, self._operate)
+        self._every(0.1, self._scan, 0.003)
+        self._every(0.5, self._status)
+        self._every(1.0 / rates.camera_hz, self._expose, 0.007)
+
+    def close(self) -> None:
+        self.bus.close()
+
+    # -- time
+
+    @property
+    def now(self) -> int:
+        return self.bus.clock.now_ns()
+
+    @property
+    def time_s(self) -> float:
+        return (self.now - START_NS) / 1e9
+
+    def _at(self, when_ns: int, do: Callable[[], None]) -> None:
+        heapq.heappush(self._events, (when_ns, next(self._orders), do))
+
+    def _every(self, period_s: float, do: Callable[[], None], first_s: float = 0.0) -> None:
+        count = itertools.count(1)
+        begin_ns = self.now + round(first_s * 1e9)
+
+        def again() -> None:
+            do()
+            self._at(begin_ns + round(next(count) * period_s * 1e9), again)
+
+        self._at(begin_ns, again)
+
+    def run(self, seconds: float, until: Callable[[], bool] | None = None) -> bool:
+        """Goes on for so long, or until a condition holds; whether it does."""
+        end_ns = self.now + round(seconds * 1e9)
+        while self._events and self._events[0][0] <= end_ns:
+            when_ns, _, do = heapq.heappop(self._events)
+            self.bus.advance_to(when_ns)
+            do()
+            if until is not None and until():
+                return True
+        self.bus.advance_to(end_ns)
+        return False
+
+    def drive(self, command: tuple[float, float], seconds: float, until: Callable[[], bool] | None = None) -> bool:
+        self.command = command
+        return self.run(seconds, until)
+
+    # -- what the stack says
+
+    def _on_record(self, record: Record) -> None:
+        if record.topic == "/ic/state":
+            state = deserialize(record.payload, record.type_name)
+            before = self.states[-1].mode if self.states else None
+            self.states.append(state)
+            if state.mode != before:
+                self.changes.append((round(self.time_s, 3), MODES[state.mode], state.reason))
+        elif record.topic == "/cmd_vel":
+            self.base_command = twist_values(deserialize(record.payload, record.type_name))
+        elif record.topic == "/view/request":
+            self._request = deserialize(record.payload, record.type_name)
+            self._at(self.now, self._render)
+
+    @property
+    def modes(self) -> list[str]:
+        return [mode for _, mode, _ in self.changes]
+
+    @property
+    def state(self) -> ControlState:
+        return self.states[-1]
+
+    # -- the world
+
+    def _operate(self) -> None:
+        if "operator" not in self.silent:
+            self.console.on_drive(*self.command)
+            self.bus.advance_to(self.now)
+
+    def _late(self, what: str, delay_s: float, do: Callable[[], None]) -> None:
+        """Has something come later, but not before what came before it."""
+        when = max(self.now + round(delay_s * 1e9), self._last.get(what, 0))
+        if self.rates.stall_s:
+            # Every 2.7 s the machine does nothing else for a while.
+            phase = ((when - START_NS) / 1e9 + 0.37 * (len(what) % 5)) % 2.7
+            if phase < self.rates.stall_s:
+                when += round((self.rates.stall_s - phase) * 1e9)
+        self._last[what] = when
+        self._at(when, do)
+
+    def _move(self) -> None:
+        self.base.step(getattr(self, "base_command", NOTHING), 0.05)
+        self.contact |= self.world.contact(self.base.pose)
+        now, map_from_base = self.now, matrix(self.base.pose)
+        frames = [
+            transform_message(np.eye(4), "map", "odom", now),
+            transform_message(map_from_base, "odom", "base_link", now),
+        ]
+        odometry = odometry_message(map_from_base, self.base.v, self.base.w, "odom", "base_link", now)
+
+        def send() -> None:
+            self.bus.publish("/tf", TFMessage(frames))
+            self.bus.publish("/wheel/odom", odometry)
+
+        self._late("odometry", self.rates.scan_jitter_s * 0.3 * self.rng.random(), send)
+        if self.states:
+            self.log.append((self.time_s, self.base.pose[0], self.base.pose[1], self.base.v))
+
+    def _scan(self) -> None:
+        now, pose = self.now, matrix(self.base.pose)
+        ranges = self.world.cast(*self.base.pose)
+        scan = scan_message(ranges, -math.pi, 2 * math.pi / BEAMS, LIDAR_MIN_M, LIDAR_MAX_M, "velodyne", now)
+        covariance = PoseWithCovariance(pose=pose_message(pose), covariance=np.zeros(36))
+        message = PoseWithCovarianceStamped(header=header("map", now), pose=covariance)
+
+        def send() -> None:
+            self.bus.publish("/scan", scan)
+            self.bus.publish("/pose", message)
+
+        self._late("scan", 0.01 + self.rates.scan_jitter_s * self.rng.random(), send)
+
+    def _expose(self) -> None:
+        rates, now = self.rates, self.now
+        if self.rng.random() < rates.lost or "camera" in self.silent:
+            return
+        delay_s = rates.camera_delay_s * (1 + rates.jitter * self.rng.random())
+        delay_s += rates.jitter * self.rng.random() / rates.camera_hz
+        message = compressed_image_message(b"", "camera", now)
+        self._late("camera", delay_s, lambda: self.bus.publish("/camera/image/compressed", message))
+
+    def _render(self) -> None:
+        if self._rendering or self._request is None:
+            return
+        rates, (request, self._request) = self.rates, (self._request, None)
+        self._rendering = True
+        takes_s = rates.view_delay_s * (1 + rates.jitter * self.rng.random())
+        free_s = max(takes_s, 1.0 / rates.view_hz * (1 + rates.jitter * self.rng.random()))
+        lost = self.rng.random() < rates.lost
+        view = RenderedView(
+            header=header("map", self.now),
+            request_id=request.id,
+            keyframe_id=1,
+            pose=request.pose,
+            fov_rad=request.fov_rad,
+            width=request.width,
+            height=request.height,
+            confidence=1.0,
+            render_ms=1000 * takes_s,
+            image=compressed_image_message(b"", "map", self.now),
+            confidence_png=np.zeros(0, np.uint8),
+            depth_near_m=0.0,
+            depth_png=np.zeros(0, np.uint8),
+        )
+
+        def send() -> None:
+            if not lost and "view" not in self.silent:
+                self.bus.publish("/vspace/view", view)
+
+        def free() -> None:
+            self._rendering = False
+            self._render()
+
+        self._late("view", takes_s, send)
+        self._at(self.now + round(free_s * 1e9), free)
+
+    def _status(self) -> None:
+        fields = {field.name: 0 for field in dataclasses.fields(VspaceStatus)}
+        fields |= dict.fromkeys(
+            ("ready_radius_m", "psnr_db", "expected_psnr_db", "unseen_share", "train_seconds", "ready_seconds"), 0.0
+        )
+        fields |= dict.fromkeys(("ms_per_iteration", "render_ms", "render_fps"), 0.0)
+        fields.pop("__msgtype__", None)
+        message = VspaceStatus(
+            **fields
+            | {
+                "header": header("map", self.now),
+                "state": VspaceStatus.READY,
+                "keyframe_pose": pose_message(np.eye(4)),
+                "keyframe_stamp": to_time(self.now),
+                "ready_radius_m": 100.0,
+                "device": "cpu",
+                "message": "",
+            }
+        )
+        self.bus.publish("/vspace/status", message, latched=True)
+
+
+MODES = {0: "REAL", 1: "VIRTUAL", 2: "STOPPED", 3: "ENTERING", 4: "RETURNING"}
+__all__ = ["FORWARD", "MODES", "NOTHING", "START_NS", "RateWorld", "Rates", "stamp_ns"]
