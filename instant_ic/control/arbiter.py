@@ -55,7 +55,8 @@ class SwitchConfig:
         return_picture_m: m, likewise at the return, where the v-bot is still being drawn on until it is seen and done.
         return_picture_yaw_deg: degrees, likewise.
         return_turn_rad_s: rad/s; the camera is not shown again while the r-bot turns faster: its heading is known late.
-        enter_timeout_s: s that a fitting view is waited for, while the r-bot slows to a stand.
+        enter_timeout_s: s in which the r-bot slows to a stand while a fitting view is awaited; an image and a view of
+            that place are waited for after it.
         return_timeout_s: s after which the return ends although view and picture do not meet: they come too rarely.
         min_virtual_s: s; shortest stay in the virtual space.
         min_real_s: s after a return, or an entry given up, before the next entry.

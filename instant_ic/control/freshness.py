@@ -86,7 +86,9 @@ class TimeoutConfig:
 
         One missing image is no loss at any image rate.
         """
-        return max(self.stop_after_s, 2.0 * self.allowed_s(key, usual_s) if key in IMAGES else self.allowed_s(key, usual_s))
+        return max(
+            self.stop_after_s, 2.0 * self.allowed_s(key, usual_s) if key in IMAGES else self.allowed_s(key, usual_s)
+        )
 
 
 class Rhythm:

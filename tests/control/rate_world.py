@@ -18,6 +18,7 @@ from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor
 
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.server import ServerConfig
+from instant_ic.control.states import Mode
 from instant_ic.msg import (
     ControlState,
     PoseWithCovariance,
@@ -32,7 +33,6 @@ from instant_ic.msg import (
     odometry_message,
     pose_message,
     scan_message,
-    stamp_ns,
     to_time,
     transform_message,
     twist_values,
@@ -105,10 +105,13 @@ class RateWorld:
         self.base = Base()
         self.contact = False
         self.silent: set[str] = set()
+        """Of camera, view, tf and operator: does not come any more."""
         self.states: list[ControlState] = []
         self.changes: list[tuple[float, str, str]] = []
-        self.log: list[tuple[float, float, float, float]] = []
-        self.command = NOTHING
+        """Each change of mode: when, to which, why."""
+        self.speeds: list[tuple[float, float]] = []
+        """Of the r-bot: when, m/s."""
+        self.command = self.base_command = NOTHING
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._orders = itertools.count()
         self._rendering = False
@@ -175,6 +178,7 @@ class RateWorld:
         return False
 
     def drive(self, command: tuple[float, float], seconds: float, until: Callable[[], bool] | None = None) -> bool:
+        """As :meth:`run`, with the operator's keys held so."""
         self.command = command
         return self.run(seconds, until)
 
@@ -186,7 +190,7 @@ class RateWorld:
             before = self.states[-1].mode if self.states else None
             self.states.append(state)
             if state.mode != before:
-                self.changes.append((round(self.time_s, 3), MODES[state.mode], state.reason))
+                self.changes.append((round(self.time_s, 3), Mode(state.mode).name, state.reason))
         elif record.topic == "/cmd_vel":
             self.base_command = twist_values(deserialize(record.payload, record.type_name))
         elif record.topic == "/view/request":
@@ -220,7 +224,7 @@ class RateWorld:
         self._at(when, do)
 
     def _move(self) -> None:
-        self.base.step(getattr(self, "base_command", NOTHING), 0.05)
+        self.base.step(self.base_command, 0.05)
         self.contact |= self.world.contact(self.base.pose)
         now, map_from_base = self.now, matrix(self.base.pose)
         frames = [
@@ -230,12 +234,12 @@ class RateWorld:
         odometry = odometry_message(map_from_base, self.base.v, self.base.w, "odom", "base_link", now)
 
         def send() -> None:
-            self.bus.publish("/tf", TFMessage(frames))
+            if "tf" not in self.silent:
+                self.bus.publish("/tf", TFMessage(frames))
             self.bus.publish("/wheel/odom", odometry)
 
         self._late("odometry", self.rates.scan_jitter_s * 0.3 * self.rng.random(), send)
-        if self.states:
-            self.log.append((self.time_s, self.base.pose[0], self.base.pose[1], self.base.v))
+        self.speeds.append((self.time_s, self.base.v))
 
     def _scan(self) -> None:
         now, pose = self.now, matrix(self.base.pose)
@@ -252,12 +256,17 @@ class RateWorld:
 
     def _expose(self) -> None:
         rates, now = self.rates, self.now
-        if self.rng.random() < rates.lost or "camera" in self.silent:
+        if self.rng.random() < rates.lost:
             return
         delay_s = rates.camera_delay_s * (1 + rates.jitter * self.rng.random())
         delay_s += rates.jitter * self.rng.random() / rates.camera_hz
         message = compressed_image_message(b"", "camera", now)
-        self._late("camera", delay_s, lambda: self.bus.publish("/camera/image/compressed", message))
+
+        def send() -> None:
+            if "camera" not in self.silent:
+                self.bus.publish("/camera/image/compressed", message)
+
+        self._late("camera", delay_s, send)
 
     def _render(self) -> None:
         if self._rendering or self._request is None:
@@ -317,4 +326,3 @@ class RateWorld:
 
 
 MODES = {0: "REAL", 1: "VIRTUAL", 2: "STOPPED", 3: "ENTERING", 4: "RETURNING"}
-__all__ = ["FORWARD", "MODES", "NOTHING", "START_NS", "RateWorld", "Rates", "stamp_ns"]

@@ -407,15 +407,15 @@ def test_the_way_back_does_not_lead_through_a_wall() -> None:
 
 def test_a_source_is_late_by_its_own_rhythm() -> None:
     timeouts, rhythm = TimeoutConfig(), Rhythm()
-    assert timeouts.allowed_s("camera", rhythm.usual_s) == pytest.approx(0.6)  # not known yet
+    assert timeouts.allowed_s("camera", rhythm.usual_s) == pytest.approx(0.625)  # not known yet
     for age in (0.1, 0.1, 0.12, 0.1, 7.0, -3.0, 0.1):  # a pause and a clock that was set tell nothing
         rhythm.heard(age)
     assert timeouts.allowed_s("camera", rhythm.usual_s) == pytest.approx(0.3)
     for _ in range(20):
         rhythm.heard(0.33)
     assert timeouts.allowed_s("camera", rhythm.usual_s) == pytest.approx(0.43)
-    # Whatever the rhythm, a stop comes within 0.3 s of when the next message was due, up to slowest_s.
-    for period in np.linspace(0.01, timeouts.slowest_s, 50):
+    # Whatever the rhythm, a stop comes within 0.3 s of when the next image was due, up to slowest_image_s.
+    for period in np.linspace(0.01, timeouts.slowest_image_s, 50):
         assert timeouts.allowed_s("camera", float(period)) <= period + 0.3
 
 
