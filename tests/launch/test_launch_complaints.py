@@ -14,7 +14,7 @@ import psutil
 import pytest
 
 from instant_ic.cli.main import main
-from instant_ic.launch import NodeSpec, process
+from instant_ic.launch import NodeSpec, outlet, process
 from instant_ic.launch import supervisor as supervision
 from instant_ic.launch.outlet import LogFile, Outlet
 from instant_ic.launch.process import ManagedProcess, RespawnLimit, State
@@ -377,15 +377,18 @@ def test_output_whose_reader_has_gone_is_given_up_and_the_stack_goes_on() -> Non
     assert isinstance(outlet.broken, BrokenPipeError) and not outlet.put(lambda: None)
 
 
-def test_full_disk_for_a_log_is_told_once_and_what_is_missing_is_noted(tmp_path: Path) -> None:
+def test_full_disk_for_a_log_is_told_once_and_what_is_missing_is_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     told: list[str] = []
     path = tmp_path / "node.log"
     log = LogFile(path, told.append)
-    path.symlink_to("/dev/full")
-    for _ in range(3):
-        log.write(b"lost line\n")
+    with monkeypatch.context() as full_disk:
+        path.write_bytes(b"")
+        full_disk.setattr(outlet, "open_file", lambda path, flags: os.open("/dev/full", os.O_WRONLY))
+        for _ in range(3):
+            log.write(b"lost line\n")
     assert told == [f"{path} cannot be written (No space left on device): make room, until then its lines are lost"]
-    path.unlink()  # somebody has made room
     log._next_try_s = 0.0
     log.write(b"kept line\n")
     assert told[1] == f"{path} is written again; 30 bytes are missing in it"
