@@ -67,7 +67,9 @@ class SharedControl(Arbiter):
         points = np.concatenate([inputs.scan_points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
         sent = self.monitor.limit(step.command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
         hard = sent.action == "stop"
-        return replace(decision, command=sent.command, hard=hard, blocked=False, reason="the robot goes round by itself")
+        return replace(
+            decision, command=sent.command, hard=hard, blocked=False, reason="the robot goes round by itself"
+        )
 
     def _given_back(self, decision: Decision) -> Decision:
         self.goal, self._speed_m_s = None, 0.0
