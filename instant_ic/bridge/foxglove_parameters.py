@@ -30,10 +30,11 @@ class Parameters:
         return NodeControl(self._run_dir, node, _TIMEOUT_S)
 
     def _of(self, node: str) -> tuple[dict[str, Any], str]:
+        if node not in self.nodes:  # its name becomes part of a path
+            return {}, f"node {node!r:.100} does not run"
         try:
-            registry.check_node_name(node)  # it becomes part of a path
             return {f"/{node}.{key}": value for key, value in self._control(node).get().items()}, ""
-        except (ControlError, ParameterError, registry.RegistryError) as error:
+        except (ControlError, ParameterError) as error:
             return {}, str(error)
 
     def get(self, names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:

@@ -37,7 +37,7 @@ _HANDSHAKE_S = 5.0
 _HEARTBEAT_S = 30.0
 _MAX_CLIENT_FRAME = 64 * 1024
 _MAX_TEXTS = 1000  # answers that wait for a client; one that reads none of them is let go
-_MAX_BACKLOG_BYTES = 64 << 20
+_MAX_BACKLOG_BYTES = 32 << 20
 _MAX_CHANNELS = 16  # that one client may publish on
 _MAX_PARAMETER_REQUESTS = 16
 _MAX_MESSAGES_PER_S = 200.0
@@ -128,6 +128,7 @@ class FoxgloveServer:
         self._clients: list[_Client] = []
         self._next_client = 1
         self._dropped_before = 0
+        self._newcomers: set[str] = set()
         self._graph = protocol.Graph({}, {})
         self._time_ns: int | None = None
         self._flush_due = False
@@ -176,6 +177,10 @@ class FoxgloveServer:
 
     def reconcile(self, present: Sequence[TopicInfo], nodes: Sequence[NodeInfo]) -> None:
         """Offers what has appeared, takes back what has left, listens to what is watched and to nothing else."""
+        with self._lock:
+            newcomers, self._newcomers = self._newcomers, set()
+        for topic in newcomers & self._channels.keys():
+            self._channels[topic].renew()
         wanted = {info.topic: info for info in present if self._takes(info.topic)}
         for topic, info in wanted.items():
             channel = self._channels.get(topic)
@@ -222,11 +227,6 @@ class FoxgloveServer:
             self._graph = now
             if update is not None:
                 self._to_all(update, lambda client: client.wants_graph)
-
-    def _joined(self, topic: str) -> None:
-        """Somebody watches a topic from now on, maybe beside others: fetches latched values again for the newcomer."""
-        if topic in self._channels:
-            self._channels[topic].renew()
 
     def hand_out(self, channel: _Channel, received: Received) -> None:
         """Queues a message for everybody who watches its channel."""
@@ -502,10 +502,10 @@ class FoxgloveServer:
                 problem = ""
                 client.subscriptions[number] = channel
                 channel.watchers[client] = number
+                self._newcomers.add(channel.topic)
         if channel is None or problem:
             self._tell_client(client.number, problem, ERROR if channel is None else WARN)
             return
-        self._node.call_soon(self._joined, channel.topic)
         self.wake.set()
 
     def _on_advertise(self, client: _Client, op: str, content: dict[str, Any]) -> None:
@@ -657,7 +657,7 @@ class _Channel:
             self.drop()
 
     def renew(self) -> None:
-        """Subscribes anew, which brings the latched value of every publisher once more."""
+        """Subscribes anew, which brings newcomers the latched value of every publisher; the others get it once more."""
         if self._latched and (old := self.subscription) is not None:
             self.subscription = self._node.subscribe_received(old.raw.topic, self._forward, old.raw.qos)
             self._node.drop(old)

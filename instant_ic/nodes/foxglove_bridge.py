@@ -18,6 +18,7 @@ from instant_ic.ranges import Range, check_ranges
 
 _TIME_S = 0.05
 _REFUSED_S = 1.0
+_LEAST_S = 0.02
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
                 next_s = now_s + self.config.discovery_period_s
                 self.server.wake.clear()
                 self.call_soon(self.reconcile)
+                time.sleep(_LEAST_S)  # a client that comes and goes without end costs no more than this
             if self.use_sim_time and (now_ns := self.clock.now_ns()) != told_ns:
                 told_ns = now_ns
                 self.server.tell_time(now_ns)

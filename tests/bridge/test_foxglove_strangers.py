@@ -20,6 +20,7 @@ from instant_ic.bridge import foxglove_server
 from instant_ic.bridge.parameter_guard import never_set
 from instant_ic.bridge.web_access import is_loopback, refusal
 from instant_ic.bus import LATCHED, RELIABLE
+from instant_ic.bus.control import NodeControl
 from instant_ic.bus.node import Node
 from instant_ic.msg import String, deserialize
 
@@ -325,6 +326,15 @@ def test_frames_of_any_shape_are_answered_and_the_connection_goes_on(world, fram
     client.socket.send(frame)
     client.until(lambda: client.text("status"), "the refusal")
     assert client.parameters() == {}
+
+
+def test_parameters_of_nodes_that_do_not_run_cost_no_look_for_them(world, monkeypatch):
+    world.bridge()
+    client = world.client()
+    monkeypatch.setattr(NodeControl, "get", lambda control: pytest.fail(f"{control.node} was asked"))
+    client.send(op="getParameters", parameterNames=[f"/nobody{number}.x" for number in range(500)], id="all")
+    client.until(lambda: client.text("parameterValues"), "the answer")
+    assert len([t for t in client.texts if "does not run" in t.get("message", "")]) == 500
 
 
 def test_a_frame_that_is_too_long_ends_the_connection(world):
