@@ -104,6 +104,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         self.misses = RecentCount(RECENT_S)
         self.missed = 0
         self.clock_told: set[str] = set()
+        self.next_step_s = 0.0
         self.troubled: set[str] = set()
         self.listed = {*to_station, *to_robot}
         self.outgoing.look()
@@ -150,7 +151,9 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 where = "here" if event.here else f"by {peer}"
                 self.trouble(event.topic, f"refused {where}: {event.reason}")
             case ClockStepped():
-                self.log.warning("the clock of %s jumped by %+.3f s", peer, event.step_ns / 1e9)
+                if time.monotonic() >= self.next_step_s:  # a peer must not fill the disk
+                    self.next_step_s = time.monotonic() + 1.0
+                    self.log.warning("the clock of %s jumped by %+.3f s", peer, event.step_ns / 1e9)
             case Stranger():
                 self.strangers.add(1, time.time_ns())
                 self.log.warning(

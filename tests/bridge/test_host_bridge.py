@@ -10,7 +10,7 @@ from instant_ic.bridge import host_listener
 from instant_ic.bridge.host_bus import ImportedTopics
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_protocol import Announce
-from instant_ic.bridge.host_session import Arrived, LinkTimes
+from instant_ic.bridge.host_session import Arrived, ClockStepped, LinkTimes
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, params, registry
 from instant_ic.bus.lockstep import LockstepBus
@@ -337,6 +337,15 @@ def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
     robot.trouble("/operator/cmd_vel", "refused here: other fields")
     assert set(robot.diagnoses()) - before == {"topic of no list", "topic /operator/cmd_vel"}
     assert robot.diagnoses()["topic of no list"][1].startswith("/x99: refused")
+
+
+def test_a_peers_clock_that_jumps_without_end_fills_no_log(hosts, caplog):
+    hosts.host("robot")
+    robot = hosts.bridge("robot").node
+    began_s = time.monotonic()
+    for _ in range(1000):
+        robot.on_change("station", ClockStepped(1_000_000_000))
+    assert 1 <= caplog.text.count("jumped by") <= 1 + (time.monotonic() - began_s)
 
 
 def test_the_latest_emergency_stop_holds_whoever_comes_back_first(hosts):
