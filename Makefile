@@ -2,6 +2,7 @@
 # make test   format, lint, types and all tests
 # make check  format, lint and types alone
 # make lock   write requirements.lock anew after a change of constraints.txt or pyproject.toml (needs network)
+# make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
 # make clean  take away what these made
 PYTHON ?= python3
 VENV   := .venv
@@ -9,7 +10,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 ARGS   ?=
 
-.PHONY: run test check clean install lock chromium
+.PHONY: run test check fuzz clean install lock chromium
 
 run: $(STAMP)
 	@exec $(BIN)/ic launch sim $(ARGS)
@@ -27,6 +28,9 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+fuzz: $(STAMP)
+	$(BIN)/python -m tests.fuzz $(ARGS)
 
 install: $(STAMP)
 

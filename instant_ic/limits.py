@@ -18,6 +18,7 @@ MOST_FILE_PIXELS = 160 << 20
 MOST_ARRAY_BYTES = 4 << 30
 """Of all arrays of an ``.npz`` file together, decompressed."""
 
+_MOST_CHUNKS = 20_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -40,6 +41,8 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
 
     head = bytes(data[: len(_PNG) + 16])
     if head.startswith(_PNG):
+        if not _chunks_fit(data):
+            return None
         width, height = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
     else:
         try:
@@ -64,20 +67,40 @@ def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
     import cv2
 
     try:
+        with Path(path).open("rb") as file:
+            is_png = file.read(len(_PNG)) == _PNG
+        if is_png and not _chunks_fit(Path(path).read_bytes()):
+            return None
         return cv2.imread(str(path), flags)
+    except OSError:
+        return None
     except cv2.error:  # larger than the limit
         return None
+
+
+def _chunks_fit(data: bytes | bytearray | NDArray[np.uint8]) -> bool:
+    """Whether the chunks of a PNG are in it: OpenCV takes memory for what a chunk declares, 1 GB in 120 bytes."""
+    view, at = memoryview(data), len(_PNG)
+    for _ in range(_MOST_CHUNKS):
+        if at + 12 > len(view):
+            return True
+        at += 12 + int.from_bytes(view[at : at + 4], "big")
+        if at > len(view):
+            return False
+    return False
 
 
 def check_arrays(path: str | Path) -> None:
     """See that an ``.npz`` file does not unpack to more than `MOST_ARRAY_BYTES`.
 
     Raises:
-        ValueError: it does.
-        zipfile.BadZipFile: it is none.
+        ValueError: it does, or it is damaged.
         OSError: it cannot be read.
     """
-    with zipfile.ZipFile(path) as archive:
-        size = sum(entry.file_size for entry in archive.infolist())
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+    except zipfile.BadZipFile as error:
+        raise ValueError(str(error)) from None
     if size > MOST_ARRAY_BYTES:
         raise ValueError(f"its arrays unpack to {size >> 20} MB; {MOST_ARRAY_BYTES >> 20} at most are read")

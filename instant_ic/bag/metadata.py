@@ -22,7 +22,7 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2.metadata import dump_qos_v9
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
@@ -165,12 +165,15 @@ def store_of(schema: Schema) -> Any:
 
 @functools.lru_cache(maxsize=200)
 def with_hash(schema: Schema) -> Schema:
-    """The same with its RIHS01 hash, where the definition gives it; ours where there is no definition."""
+    """The same with its RIHS01 hash, where the definition gives it; ours without one, none for a damaged one."""
     if not schema.encoding or not schema.text:  # old SQLite bags hold none
         return schema_or_unknown(schema.name)
     if schema.type_hash or schema.encoding != "ros2msg":
         return schema
-    return dataclasses.replace(schema, type_hash=store_of(schema).hash_rihs01(schema.name))
+    try:
+        return dataclasses.replace(schema, type_hash=store_of(schema).hash_rihs01(schema.name))
+    except Exception:  # noqa: BLE001 - whatever a parser raises on a damaged definition
+        return Schema(schema.name, "", "", "")
 
 
 def schema_of(connection: Connection) -> Schema:
@@ -198,6 +201,14 @@ def ros_qos(qos: QoS) -> Qos:
         _FOREVER,
         False,
     )
+
+
+def preset_of_text(profiles: str) -> QoS:
+    """As :func:`preset_of`, of what an MCAP file notes with a topic; ``reliable`` where that is damaged."""
+    try:
+        return preset_of(parse_qos(profiles))
+    except Exception:  # noqa: BLE001 - whatever a parser raises on damaged YAML
+        return RELIABLE
 
 
 def preset_of(profiles: Collection[Qos]) -> QoS:

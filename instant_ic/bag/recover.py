@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.reader import make_reader
-from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.storage_mcap import McapReader
 
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_scan import McapScan
 from instant_ic.bag.mcap_writer import Schema
-from instant_ic.bag.metadata import PartInfo, Topic, preset_of, schema_of, with_hash, write_metadata
+from instant_ic.bag.metadata import PartInfo, Topic, preset_of, preset_of_text, schema_of, with_hash, write_metadata
 from instant_ic.bag.writer import CUSTOM_RECORD, BagWriter
 from instant_ic.bus.qos import QoS
 
@@ -58,7 +57,7 @@ def recover(source: Path, target: Path, compressed: bool = False) -> Recovered:
                 if message.encoding != "cdr":
                     skipped[message.topic] = f"encoding {message.encoding!r}"
                 elif not message.repeated:  # the writer repeats by itself
-                    qos = preset_of(parse_qos(message.metadata.get("offered_qos_profiles", "")))
+                    qos = preset_of_text(message.metadata.get("offered_qos_profiles", ""))
                     schema = with_hash(message.schema)
                     writer.write(message.topic, schema.name, message.payload, message.stamp_ns, qos, schema)
             for key, value in scan.metadata.get(CUSTOM_RECORD, {}).items():
@@ -93,12 +92,23 @@ def reindex(folder: Path) -> tuple[int, int]:
     topics: dict[Topic, tuple[QoS, Schema]] = {}
     custom: dict[str, str] = {}
     for file in mcap_files(folder):
-        reader = McapReader(file)
         try:
-            reader.open()
+            parts.append(_part(file, topics, custom))
         except Exception as error:  # noqa: BLE001 - whatever a parser raises on bytes that are no bag
             raise BagError(f"{file} is not whole: {error}; ic bag recover {folder}") from None
-        part = PartInfo(file.name)
+    try:
+        write_metadata(folder, parts, topics, custom)
+    except OSError as error:
+        raise BagError(f"{folder}/metadata.yaml cannot be written: {error.strerror}") from None
+    return len(parts), sum(part.count - sum(part.repeated.values()) for part in parts)
+
+
+def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str, str]) -> PartInfo:
+    """What a file tells of itself; its topics and custom data go into those given."""
+    part = PartInfo(file.name)
+    reader = McapReader(file)
+    reader.open()
+    try:
         for connection in reader.connections:
             key = (connection.topic, connection.msgtype)
             part.counts[key] = part.counts.get(key, 0) + connection.msgcount
@@ -106,21 +116,17 @@ def reindex(folder: Path) -> tuple[int, int]:
             topics.setdefault(key, (qos, schema_of(connection)))
         if reader.metadata.message_count:
             part.start_ns, part.end_ns = reader.metadata.start_time, reader.metadata.end_time - 1
+    finally:
         reader.close()
-        for message in McapScan(file).messages():
-            if not message.repeated:  # those that are stand first
-                break
-            part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
-            part.repeated_ns = message.stamp_ns
-        parts.append(part)
-        with file.open("rb") as stream:
-            records = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-        custom.update(records.get(CUSTOM_RECORD, {}))
-    try:
-        write_metadata(folder, parts, topics, custom)
-    except OSError as error:
-        raise BagError(f"{folder}/metadata.yaml cannot be written: {error.strerror}") from None
-    return len(parts), sum(part.count - sum(part.repeated.values()) for part in parts)
+    for message in McapScan(file).messages():
+        if not message.repeated:  # those that are stand first
+            break
+        part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
+        part.repeated_ns = message.stamp_ns
+    with file.open("rb") as stream:
+        records = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    custom.update(records.get(CUSTOM_RECORD, {}))
+    return part
 
 
 def mcap_files(source: Path) -> list[Path]:

@@ -70,6 +70,8 @@ def load_file(path: Path, node: str) -> Values:
         text = path.read_text()
     except OSError as error:
         raise ParameterError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ParameterError(f"{path}: cannot be read as UTF-8: {error}") from error
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
         return {} if root is None else _sections(root, path, node)

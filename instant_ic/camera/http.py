@@ -138,6 +138,9 @@ class Session(requests.Session):
         self.adapters.clear()
         self.mount("http://", _Adapter(self.deadline))
 
+    def get_redirect_target(self, resp: requests.Response) -> None:
+        """None: no redirect is followed, nor even read."""
+
     def ask(
         self,
         method: str,

@@ -172,7 +172,7 @@ def _parts(scene: Any, turn: NDArray[np.float64], path: Path, max_triangles: int
         count += len(mesh.faces)
         if count > max_triangles:
             raise MeshError(
-                f"mesh {path}: {count} triangles or more, space.mesh_max_triangles is {max_triangles};"
+                f"mesh {path}: at least {count} triangles, space.mesh_max_triangles is {max_triangles};"
                 " simplify the mesh, or raise the limit"
             )
         vertices = (np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]) @ turn.T

@@ -93,7 +93,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     path = path if path.suffix in (".yaml", ".yml") else path.with_name(path.name + ".yaml")
     try:
         content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise MapError(f"map {path} cannot be read: {error}") from None
     if not isinstance(content, dict):
         raise MapError(f"{path}: keys image, resolution, origin expected")
@@ -113,7 +113,11 @@ def load_grid(path: Path) -> OccupancyGrid:
     if mode not in ("trinary", "scale", "raw"):
         raise MapError(f"{path}: mode must be trinary, scale or raw (got {mode!r})")
     image = path.parent / str(content.get("image", ""))
-    if not image.is_file():
+    try:
+        found = image.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        found = False
+    if not found:
         raise MapError(f"{path}: image {image} does not exist")
     picture: Any = load_image(image, cv2.IMREAD_GRAYSCALE)
     if picture is None:

@@ -1,0 +1,1 @@
+"""Mutated bytes for every parser of what comes from outside (``make fuzz``)."""
