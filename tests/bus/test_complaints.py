@@ -513,7 +513,7 @@ def test_full_disk_under_the_run_directory_is_told(bus: Bus, monkeypatch: pytest
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(registry, "open_file", full)
     with pytest.raises(
         RegistryError, match=r"publisher of /x by node sender cannot be told to others: .*No space left on device"
     ):
