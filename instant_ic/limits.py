@@ -39,20 +39,20 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
 
     from instant_ic.camera.jpeg import JpegError, jpeg_size
 
-    head = bytes(data[: len(_PNG) + 16])
-    if head.startswith(_PNG):
-        if not _chunks_fit(data):
+    content = data if isinstance(data, bytes | bytearray) else data.tobytes()
+    if content.startswith(_PNG):
+        if not _chunks_fit(content):
             return None
-        width, height = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+        width, height = int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
     else:
         try:
-            width, height = jpeg_size(data if isinstance(data, bytes | bytearray) else data.tobytes())
+            width, height = jpeg_size(content)
         except JpegError:
             return None
     if not 0 < width * height <= MOST_PIXELS:
         return None
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
         return None
 
@@ -78,7 +78,7 @@ def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
         return None
 
 
-def _chunks_fit(data: bytes | bytearray | NDArray[np.uint8]) -> bool:
+def _chunks_fit(data: bytes | bytearray) -> bool:
     """Whether the chunks of a PNG are in it: OpenCV takes memory for what a chunk declares, 1 GB in 120 bytes."""
     view, at = memoryview(data), len(_PNG)
     for _ in range(_MOST_CHUNKS):

@@ -74,7 +74,7 @@ class Hello:
         try:
             values = json.loads(body)
             hello = cls(**values)
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             raise FrameError(f"a greeting that cannot be read: {error}") from None
         if not all(isinstance(value, str) for value in values.values()):
             raise FrameError("a greeting whose fields are not text")

@@ -72,7 +72,7 @@ def decode_frame(data: bytes) -> Frame:
     try:
         frame_kind = FrameKind(kind)
         header = json.loads(data[PREFIX.size : end])
-    except ValueError as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError and JSONDecodeError are ValueErrors too
         raise ProtocolError(f"binary frame: {error}") from None
     if not isinstance(header, dict):
         raise ProtocolError(f"binary frame: header is {type(header).__name__}, not an object")

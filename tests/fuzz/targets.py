@@ -372,8 +372,8 @@ _JSON_WORDS = tuple(
 
 
 def _parse_console() -> Callable[[bytes], object]:
-    from instant_ic.console.protocol import ProtocolError, parse_text
     from instant_ic.console.drive import DriveGate
+    from instant_ic.console.protocol import ProtocolError, parse_text
     from instant_ic.console.server import ConsoleServer
     from instant_ic.console.session import Session
 
@@ -484,6 +484,22 @@ def _parse_bus() -> Callable[[bytes], object]:
                 inlet.close()
 
     return parse
+
+
+def _fix_hello(data: bytes, rng: random.Random) -> bytes:
+    """The greeting's length: whatever stands before the next frame."""
+    from instant_ic.bus.frame import HEADER, HELLO
+
+    end = data.find(b"IIC\0", HEADER.size)
+    end = len(data) if end < 0 else end
+    return HEADER.pack(HELLO, 0, max(0, end - HEADER.size), 0, 0) + data[HEADER.size :]
+
+
+def _fix_prefix(data: bytes, rng: random.Random) -> bytes:
+    """The header's length of a console frame: all that follows."""
+    from instant_ic.console.protocol import PREFIX, VERSION
+
+    return PREFIX.pack(VERSION, rng.randrange(6), 0, 5, max(0, len(data) - PREFIX.size)) + data[PREFIX.size :]
 
 
 def _frame_errors() -> tuple[type[BaseException], ...]:
@@ -724,7 +740,7 @@ def _bag_errors() -> tuple[type[BaseException], ...]:
     return (BagError,)
 
 
-def _fix_chunk(data: bytes, rng: random.Random) -> bytes:
+def fix_chunk(data: bytes, rng: random.Random) -> bytes:
     """Take away the check sums of chunks, so that what is inside is read."""
     from instant_ic.bag.mcap_writer import CHUNK
 
@@ -1019,7 +1035,8 @@ TARGETS = {
             share=400,
         ),
         Target("console-messages", lambda: _lines(_MESSAGES), _parse_console, dictionary=_JSON_WORDS, share=3000),
-        Target("console-frames", _console_frames, _parse_console_frame, _console_errors(), _JSON_WORDS, share=3000),
+        Target("console-frames", _console_frames, _parse_console_frame, _console_errors(), _JSON_WORDS,
+               fix=_fix_prefix, share=3000),
         Target(
             "console-headers",
             lambda: [b"127.0.0.1:8080\nhttp://127.0.0.1:8080", b"[::1]:80\nhttps://[::1]:80", b"robot.local\nnull"],
@@ -1033,6 +1050,7 @@ TARGETS = {
             _parse_bus,
             _frame_errors(),
             (b"IIC\0\2\1", b"IIC\0\2\2", b"IIC\0\2\3"),
+               fix=_fix_hello,
             share=1000,
         ),
         Target("cdr", _cdr, _parse_cdr, _message_errors(), share=2000),
@@ -1045,10 +1063,10 @@ TARGETS = {
         ),
         Target("bridge-frames", _bridge_frames, _parse_bridge, _bridge_errors(), _JSON_WORDS, share=800),
         Target("zenoh", _zenoh, _parse_zenoh, share=2000),
-        Target("mcap-scan", _mcaps, _parse_scan, _bag_errors(), fix=_fix_chunk, share=800),
-        Target("mcap-recover", _mcaps, _parse_recover, _bag_errors(), fix=_fix_chunk, share=60),
-        Target("mcap-read", _mcaps, _parse_bag, _bag_errors(), fix=_fix_chunk, share=150),
-        Target("mcap-reindex", _mcaps, _parse_reindex, _bag_errors(), fix=_fix_chunk, share=100),
+        Target("mcap-scan", _mcaps, _parse_scan, _bag_errors(), fix=fix_chunk, share=800),
+        Target("mcap-recover", _mcaps, _parse_recover, _bag_errors(), fix=fix_chunk, share=60),
+        Target("mcap-read", _mcaps, _parse_bag, _bag_errors(), fix=fix_chunk, share=150),
+        Target("mcap-reindex", _mcaps, _parse_reindex, _bag_errors(), fix=fix_chunk, share=100),
         Target("ros1-bag", _ros1_bags, _parse_ros1, _bag_errors(), share=12),
         Target("sqlite-bag", _sqlite_bags, _parse_sqlite, _bag_errors(), share=100),
         Target("parameters", _parameter_samples, _parse_parameters, _parameter_errors(), _YAML_WORDS, share=100),

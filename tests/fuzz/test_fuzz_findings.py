@@ -1,0 +1,131 @@
+"""What `make fuzz` found, each by name: these inputs once ended in another error than the parser's own."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+from pathlib import Path
+
+import cv2
+import pytest
+
+from instant_ic.bag import BagError, BagReader, BagWriter
+from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.metadata import preset_of_text, with_hash
+from instant_ic.bag.recover import recover, reindex
+from instant_ic.bus.frame import FrameError, Hello
+from instant_ic.bus.params import ParameterError, load_file
+from instant_ic.bus.qos import RELIABLE, SENSOR
+from instant_ic.camera.http import Session
+from instant_ic.console.protocol import PREFIX, VERSION, ProtocolError, decode_frame
+from instant_ic.depth.manifest import ManifestError, load_manifest
+from instant_ic.limits import decode_image, load_image
+from instant_ic.msg import message_type, serialize
+from instant_ic.slam.map_files import MapError, load_grid
+from tests.fuzz.targets import fix_chunk
+
+NESTED = b"[" * 100_000
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    """A bag of three texts."""
+    text = message_type("String")
+    with BagWriter(tmp_path / "bag") as writer:
+        for stamp in range(3):
+            writer.write("/text", "std_msgs/msg/String", bytes(serialize(text("x"))), 1 + stamp, SENSOR)
+    return tmp_path / "bag"
+
+
+def test_png_whose_chunk_declares_a_gigabyte_is_not_decoded(tmp_path: Path) -> None:
+    import numpy as np
+
+    good = cv2.imencode(".png", np.zeros((16, 16), np.uint8))[1].tobytes()
+    assert decode_image(good, cv2.IMREAD_COLOR) is not None
+    bomb = good[:33] + struct.pack(">I", 0x40000000) + good[37:]
+    assert decode_image(bomb, cv2.IMREAD_COLOR) is None
+    (tmp_path / "bomb.png").write_bytes(bomb)
+    assert load_image(tmp_path / "bomb.png", cv2.IMREAD_COLOR) is None
+
+
+@pytest.mark.parametrize("profiles", ["\0", "- history: [", "- {}", "- lifespan: {sec: 1}", "5", "x: y"])
+def test_damaged_qos_in_a_bag_costs_no_message(profiles: str) -> None:
+    assert preset_of_text(profiles) == RELIABLE
+
+
+def test_damaged_definition_in_a_bag_is_an_unknown_type() -> None:
+    damaged = Schema("a/msg/B", "ros2msg", "MSG: std_ms's/msg/String\nstring data\n", "")
+    assert with_hash(damaged).encoding == ""
+
+
+def test_recover_takes_messages_whose_definition_is_damaged(bag: Path, tmp_path: Path) -> None:
+    file = next(bag.glob("*.mcap"))
+    content = file.read_bytes().replace(b"string data", b"str'ng data")
+    file.write_bytes(fix_chunk(content, random.Random(0)))  # without check sums, or the chunk would be left out
+    recover(file, tmp_path / "new")
+    with BagReader(tmp_path / "new") as found:
+        assert found.count == 3
+
+
+def test_reindex_of_a_damaged_summary_says_what_to_do(bag: Path) -> None:
+    file = next(bag.glob("*.mcap"))
+    content = bytearray(file.read_bytes())
+    (start,) = struct.unpack_from("<Q", content, len(content) - 28)
+    for at in range(start, len(content) - 37):
+        content[at] ^= 0x80
+    file.write_bytes(content)
+    with pytest.raises(BagError, match="ic bag recover"):
+        reindex(bag)
+
+
+def test_parameter_file_that_is_no_utf8_is_an_error_with_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "params.yaml"
+    path.write_bytes(b"node:\n  ros__parameters:\n    name: \x92\n")
+    with pytest.raises(ParameterError, match=r"params\.yaml: cannot be read as UTF-8"):
+        load_file(path, "node")
+
+
+@pytest.mark.parametrize("value", ["1" * 5000, "2001-13-45", "!!timestamp x", "{[]: 1}", "[" * 3000])
+def test_manifest_with_a_value_that_is_none_is_an_error(tmp_path: Path, value: str) -> None:
+    path = tmp_path / "model.yaml"
+    path.write_text(f"name: {value}\n")
+    with pytest.raises(ManifestError):
+        load_manifest(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image: " + "x" * 5000,
+        'image: "a\\0b"',
+        "image: m.pgm\nresolution: !!timestamp x",
+        "resolution: " + "1" * 5000,
+        "[" * 3000,
+    ],
+)
+def test_map_file_with_a_value_that_is_none_is_an_error(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "map.yaml"
+    path.write_text("origin: [0, 0]\n" + ("" if "resolution" in text else "resolution: 0.05\n") + text + "\n")
+    with pytest.raises(MapError):
+        load_grid(path)
+
+
+def test_redirect_of_the_camera_is_not_even_read() -> None:
+    import requests
+
+    response = requests.Response()
+    response.status_code, response.headers["Location"] = 302, "http://\xbe/"
+    assert Session("", "").get_redirect_target(response) is None
+
+
+def test_nested_greeting_of_a_publisher_is_a_frame_error() -> None:
+    with pytest.raises(FrameError, match="greeting"):
+        Hello.unpack(NESTED)
+
+
+def test_nested_header_of_a_console_frame_is_a_protocol_error() -> None:
+    with pytest.raises(ProtocolError, match="binary frame"):
+        decode_frame(PREFIX.pack(VERSION, 1, 0, 1, len(NESTED)) + NESTED)
+    good = json.dumps({"a": 1}).encode()
+    assert decode_frame(PREFIX.pack(VERSION, 1, 0, 1, len(good)) + good).header == {"a": 1}
