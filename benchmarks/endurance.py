@@ -542,7 +542,8 @@ def main(words: Sequence[str] | None = None) -> int:
         parser.error(f"--only must be part of one of: {', '.join(FAULTS)}")
     folder = Path(tempfile.mkdtemp(prefix="ic-soak-"))
     note(f"logs and bags in {folder}, pace {factor:g}")
-    with contextlib.suppress(KeyboardInterrupt):
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with contextlib.suppress(KeyboardInterrupt):  # what has been seen so far is printed all the same
         soak.run(folder)
     figures, levels = soak.figures, soak.levels.judge()
     for name, level in levels.items():

@@ -22,6 +22,7 @@ from ..bus import LATCHED, SENSOR
 from ..geometry.poses import inverse, pose_matrix, yaw_of
 from ..msg import grid_array, image_array, message_type, pose_message, stamp_ns, to_time
 from ..msg import pose_matrix as matrix_of_pose
+from ..pace import read as read_pace
 from .pictures import correlation, perspective_crop, psnr_db, save_depth, save_map, save_view_strip
 from .stack import Stack, StackError, free_ports
 
@@ -38,6 +39,7 @@ def evaluate_recordings(
     timeout_s: float = 240.0,
     tell: Callable[[str], None] = lambda text: None,
     same_place: bool = False,
+    pace: float = 1.0,
 ) -> dict[str, Any]:
     """Runs ``launch/sim.yaml`` on recordings and writes a bag, pictures and a summary into ``out``.
 
@@ -48,9 +50,10 @@ def evaluate_recordings(
         pcap: VLP-16 capture.
         panorama: equirect photo.
         out: folder for what is written.
-        timeout_s: for all of it.
+        timeout_s: for all of it, in seconds of the stack.
         tell: called with what is waited for.
         same_place: photo and capture are of one place and moment: the depth is scaled by the LiDAR, as on the robot.
+        pace: of the stack's time, see :mod:`instant_ic.pace`.
 
     Raises:
         FileNotFoundError: a recording is missing.
@@ -74,7 +77,7 @@ def evaluate_recordings(
         "trust_depth": not same_place,
     }
     try:
-        with Stack("sim.yaml", run_dir, arguments, out / "launch.log") as stack:
+        with Stack("sim.yaml", run_dir, arguments, out / "launch.log", pace=pace) as stack:
             summary = _watch(stack, out, timeout_s, tell)
             tell("stopping the stack")
             status = stack.stop()
@@ -102,7 +105,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
 
     def wait(condition: Callable[[], Any], what: str) -> Any:
         tell(f"waiting for {what}")
-        return stack.wait_for(condition, max(1.0, timeout_s - (time.monotonic() - started)), what)
+        return stack.wait_for(condition, max(1.0, timeout_s - (time.monotonic() - started) * stack.pace), what)
 
     wait(lambda: len(scans) >= 5, "laser scans of the capture")
     wait(lambda: maps and poses, "a map")
@@ -116,7 +119,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     wait(is_ready, "a virtual space that is fit to show")
     time_to_ready_s = float(statuses[-1].ready_seconds)
     # A little longer than fit to show: what an operator sees after the first moments.
-    settled = time.monotonic() + 10.0
+    settled = time.monotonic() + 10.0 / stack.pace
     wait(lambda: time.monotonic() > settled, "ten more seconds of training")
     keyframe = keyframes[-1]
 
@@ -128,7 +131,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     places = [(yaw, 0.0) for yaw in _YAWS_DEG] + [(yaw, _AHEAD_M) for yaw in (0, -90)]
     for number, (yaw_deg, ahead_m) in enumerate(places, start=1):
         map_from_view = map_from_camera @ pose_matrix(yaw=math.radians(yaw_deg)) @ pose_matrix(x=ahead_m)
-        request = _request(number, map_from_view)
+        request = _request(number, map_from_view, read_pace(stack.run_dir).now_ns())
         next_try = 0.0
 
         def view_of(number: int = number, request: Any = request) -> Any:
@@ -174,10 +177,10 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     }
 
 
-def _request(number: int, map_from_view: Any) -> Any:
+def _request(number: int, map_from_view: Any, now_ns: int) -> Any:
     request, head = message_type("ViewRequest"), message_type("Header")
     return request(
-        header=head(stamp=to_time(time.time_ns()), frame_id="map"),
+        header=head(stamp=to_time(now_ns), frame_id="map"),
         id=number,
         pose=pose_message(map_from_view),
         fov_rad=_FOV,

@@ -10,6 +10,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from instant_ic.evaluation.recordings import evaluate_recordings
+from instant_ic.evaluation.stack import machine_pace
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 PCAP, PHOTO = DATA / "vlp16" / "einride_recording.pcap", DATA / "pano" / "library_a.jpg"
@@ -18,7 +19,7 @@ pytestmark = [
     pytest.mark.system,
     pytest.mark.real_data,
     pytest.mark.xdist_group("stack"),
-    pytest.mark.timeout(400),
+    pytest.mark.timeout(900),
     pytest.mark.skipif(bool(MISSING), reason=f"recordings are missing: {', '.join(MISSING)}"),
 ]
 
@@ -26,7 +27,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings") / "out"
-    evaluate_recordings(PCAP, PHOTO, folder, timeout_s=300.0)
+    evaluate_recordings(PCAP, PHOTO, folder, timeout_s=300.0, pace=machine_pace())
     return folder
 
 
