@@ -223,8 +223,8 @@ def test_fault_wrong_tokens_lock_out_the_right_one_of_the_same_address(serve, fi
 
 async def drive_signed_in(http, server):
     """Signs in and drives by a page's WebSocket, which is returned."""
-    async with http.post(server.url + "sign-in", data={"token": DRIVE}) as response:
-        assert response.status == 200
+    async with http.post(server.url + "sign-in", data={"token": DRIVE}, allow_redirects=False) as response:
+        assert response.status == 303
     socket = await http.ws_connect(server.url + "ws")
     await socket.send_json({"type": "lease", "take": True})
     await socket.send_json({"type": "drive", "seq": 1, "time_ms": server.now_ms(), "linear": 0.2, "angular": 0.0})
