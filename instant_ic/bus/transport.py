@@ -42,9 +42,9 @@ class Received(NamedTuple):
         """When its content was measured or given, by the node's steady clock; every age counts from there.
 
         The stamp is compared with the machine's clock once, on arrival. From then on only the steady clock counts, so
-        setting the machine's clock makes nothing older or younger. A stamp that is ahead, or 0, counts as the arrival.
+        setting the machine's clock makes nothing older or younger. A stamp that is ahead counts as the arrival.
         """
-        return self.steady_ns - max(0, self.received_ns - stamp_ns) if stamp_ns > 0 else self.steady_ns
+        return self.steady_ns - max(0, self.received_ns - stamp_ns)
 
 
 _TOLERANCE_S = 0.1  # simulated time may go back a little

@@ -64,7 +64,7 @@ class FileCamera(Camera):
         """
         period_ns = round(1e9 / self.config.rate_hz)
         now_ns = self._now_ns()
-        if self._due_ns is None:
+        if self._due_ns is None or self._due_ns > now_ns + period_ns:  # the first, or the clock was set back
             self._due_ns = now_ns
         if now_ns < self._due_ns:
             self._sleep((self._due_ns - now_ns) * 1e-9)

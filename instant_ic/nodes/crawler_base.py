@@ -169,7 +169,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.refuse(f"command's stamp is {-age_s:.2f} s ahead: set the clocks")
         else:
             hard = stamp != 0 and message.header.frame_id == HARD_STOP
-            self.controller.command(v, w, received.given_ns(stamp), hard)
+            self.controller.command(v, w, received.given_ns(stamp) if stamp else received.steady_ns, hard)
             if hard and not self.hard:
                 self.hurry()
             self.hard = hard

@@ -149,6 +149,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.limiter = CorrectionLimiter(self.config.correction_speed_mps, self.config.correction_yaw_rate_radps)
         self.pending: deque[_Pending] = deque()
         self.last_scan_ns: int | None = None
+        self.scan_came_ns = 0
         self.first_wait_ns: int | None = None
         self.dropped = 0
         self.map_out = self.publisher("/map", OccupancyGrid, qos=LATCHED)
@@ -231,7 +232,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self._drop(f"the scan cannot be used: {error}")
             return
         self.diagnose("scan", OK, "fresh", dropped=self.dropped)
-        self.last_scan_ns = stamp
+        self.last_scan_ns, self.scan_came_ns = stamp, self.clock.steady_ns()
         self.pending.append(_Pending(scan, base_from_laser, self.clock.now_ns()))
         self.place_pending()
 
@@ -388,7 +389,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         if self.placed_ns is None:
             return
         if version == self.published_version:
-            due = self.clock.now_ns() - self.full_map_ns >= self.config.map_full_period_s * 1e9 * 0.99
+            due = self.clock.steady_ns() - self.full_map_ns >= self.config.map_full_period_s * 1e9 * 0.99
             if self.partly and due and self.published is not None:
                 self._publish_whole(self.published, self.placed_ns)  # what late joiners get
             return
@@ -415,7 +416,7 @@ class GridSlamNode(Node[GridSlamConfig]):
                     data=np.ascontiguousarray(grid.values[y:y1, x:x1]).reshape(-1),
                 )
             )
-            if self.clock.now_ns() - self.full_map_ns < self.config.map_full_period_s * 1e9 * 0.99:
+            if self.clock.steady_ns() - self.full_map_ns < self.config.map_full_period_s * 1e9 * 0.99:
                 self.partly = True
                 return
         self._publish_whole(grid, stamp)
@@ -423,7 +424,7 @@ class GridSlamNode(Node[GridSlamConfig]):
     def _publish_whole(self, grid: OccupancyGridArray, stamp: int) -> None:
         origin = (float(grid.origin[0]), float(grid.origin[1]))
         self.map_out.publish(grid_message(grid.values, grid.resolution, origin, self.config.map_frame, stamp))
-        self.full_map_ns, self.partly = self.clock.now_ns(), False
+        self.full_map_ns, self.partly = self.clock.steady_ns(), False
 
     def watch(self) -> None:
         """Tell when no scan comes."""
@@ -431,7 +432,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             if self.dropped == 0:
                 self.diagnose("scan", WARN, "no scan has come yet on /scan: is vlp16_driver running?")
             return
-        age_s = (self.clock.now_ns() - self.last_scan_ns) * 1e-9
+        age_s = (self.clock.steady_ns() - self.scan_came_ns) * 1e-9
         if age_s > self.config.max_scan_age_s:
             self.diagnose("scan", ERROR, f"no scan for {age_s:.1f} s", dropped=self.dropped)
 

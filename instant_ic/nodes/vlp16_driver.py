@@ -164,11 +164,11 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         if self.next_datagram is None:
             raise NodeError(f"{self.config.pcap}: holds no UDP datagram ({dict(self.capture.counters.skipped)})")
         self.first_ns = self.next_datagram.stamp_ns
-        self.play_start_ns = self.clock.now_ns()
+        self.play_start_ns, self.play_start_steady_ns = self.clock.now_ns(), self.clock.steady_ns()
 
     def play(self) -> None:
         """Take the capture's packets that are due by now."""
-        elapsed_ns = (self.clock.now_ns() - self.play_start_ns) * self.config.rate
+        elapsed_ns = (self.clock.steady_ns() - self.play_start_steady_ns) * self.config.rate
         while self.next_datagram is not None and self.next_datagram.stamp_ns - self.first_ns <= elapsed_ns:
             stamp, port, payload = self.next_datagram
             # Stamps run at the sensor's own pace, whatever the rate, or its clock would seem to drift.
