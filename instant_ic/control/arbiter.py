@@ -435,7 +435,8 @@ class Arbiter:
             if self.mode in source.modes:
                 left.append(self._allowed_s(source, inputs) - self._source_age_s(source, inputs, now_ns))
         left.append(self.config.timeouts.command - inputs.age("command"))
-        return min(one for one in left if one > 0.0)
+        # 0: it is not stale yet, and will be right after this step.
+        return min(one for one in left if one >= 0.0)
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.allowed_s(source.key, inputs.usual.get(source.key) if source.steady else None)

@@ -1,0 +1,55 @@
+"""In VIRTUAL too each loss commands a hard zero within 0.3 s, in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from control_world import rectangle
+from test_control_nodes import Stack
+
+from instant_ic.msg import HARD_STOP, ControlState, twist_values
+from instant_ic.nodes.navigator import NavigatorNode
+from instant_ic.nodes.virtual_robot import VirtualRobotNode
+
+STEP_OF_TIMEOUT_S = 0.002
+"""A time-out is seen by the step after it."""
+
+
+def die(node_class: type) -> Callable[[Stack], None]:
+    def lose(stack: Stack) -> None:
+        victim = next(node for node in stack.bus.nodes if isinstance(node, node_class))
+        stack.bus.nodes.remove(victim)
+
+    return lose
+
+
+def silence(*topics: str) -> Callable[[Stack], None]:
+    return lambda stack: stack.silent.update(topics)
+
+
+LOSSES: dict[str, Callable[[Stack], None]] = {
+    "navigator": die(NavigatorNode),
+    "virtual_robot": die(VirtualRobotNode),
+    "nerf (its views)": silence("views"),
+    "operator": silence("/operator/cmd_vel"),
+    "LiDAR": silence("/scan"),
+    "SLAM": silence("/pose"),
+    "odometry": silence("/wheel/odom"),
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_each_loss_in_virtual_commands_a_hard_zero_within_0_3_s(loss: str) -> None:
+    stack = Stack(rectangle(2.5, -0.25, 3.0, 0.25))
+    stack.drive(1.5, None)
+    assert stack.drive(6.0, (0.4, 0.0))[-1].mode == ControlState.VIRTUAL
+    assert twist_values(stack.bus.last("/cmd_vel")) != (0.0, 0.0)
+    LOSSES[loss](stack)
+    began_ns, before = stack.now, len(stack.bus.records("/cmd_vel"))
+    stack.drive(0.6, (0.4, 0.0))
+    sent = list(zip(stack.bus.records("/cmd_vel"), stack.bus.messages("/cmd_vel"), strict=True))[before:]
+    moving = [record.stamp_ns for record, message in sent if twist_values(message) != (0.0, 0.0)]
+    stopped = [(record.stamp_ns, message) for record, message in sent if record.stamp_ns > max(moving, default=0)]
+    assert (stopped[0][0] - began_ns) / 1e9 <= 0.3 + STEP_OF_TIMEOUT_S
+    assert {message.header.frame_id for _, message in stopped} == {HARD_STOP}
