@@ -44,6 +44,18 @@ def test_fault_robot_runs_its_last_command_after_the_link_is_lost():
     assert [t for t, c in given if c == (0.0, 0.0)] == [0.25]
 
 
+def test_a_driver_that_stops_commanding_while_driving_counts_as_lost():
+    """Its page lives and beats, but the commands cease: the arbiter is told, so that the stop is a hard one."""
+    gate = driving_gate()
+    for i in range(1, 26):
+        gate.touch(1, i * 0.01)
+        gate.take_due(i * 0.01)
+        assert gate.driver_alive(i * 0.01) is (i < 25)
+    assert gate.watchdog_trips == 1
+    assert gate.touch(1, 0.3)  # with the next beat it is back
+    assert gate.driver_alive(0.3)
+
+
 def test_watchdog_counts_and_lets_a_fresh_command_through():
     gate = driving_gate()
     run(gate, 0.0, 0.5)
