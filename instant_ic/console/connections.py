@@ -225,6 +225,8 @@ class Listener:
             self._close_sockets()
             raise
         self._tasks = [asyncio.create_task(self._accept_forever(listener)) for listener in self._sockets]
+        for task in self._tasks:
+            task.add_done_callback(_report_end)
         return int(self._sockets[0].getsockname()[1])
 
     async def close(self) -> None:
@@ -296,3 +298,8 @@ class Listener:
             if connection.transport is None:  # cut off, or failed, before it began
                 accepted.close()
                 self._forget(connection)
+
+
+def _report_end(task: asyncio.Task[None]) -> None:
+    if not task.cancelled() and task.exception() is not None:
+        logger.critical("no more connections are accepted: %r; restart the console", task.exception())
