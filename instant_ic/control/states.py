@@ -131,8 +131,8 @@ class Source:
     optional: bool = False
     """Needed only once it has come: a robot without 3D points drives by its flat scan."""
     steady: bool = False
-    """It comes at a rate of its own: its time-out is longer where it usually comes rarer. Only what the operator sees by:
-    what keeps the robot off obstacles has fixed time-outs, so that it stands in time on a slow machine too."""
+    """It comes at a rate of its own: its time-out is longer where it usually comes rarer. Images only: what keeps the
+    robot off obstacles has fixed time-outs, so that it stands in time on a slow machine too."""
 
 
 OPERATOR_LOST = "the operator's link is lost, the robot waits"
