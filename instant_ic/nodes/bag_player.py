@@ -22,6 +22,8 @@ _BASE = "instant_ic.nodes.crawler_base"
 _BASE_PERIOD_S = 0.5
 _ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
 """What a robot's nodes act on, in the namespace of its base."""
+_HARMLESS = {"/clock", "/rosout", "/diagnostics", "/heartbeat", "/parameter_events"}
+"""What every node publishes. Of all else a second publisher would mix the bag's world with the robot's."""
 
 
 @dataclass(frozen=True)
@@ -133,11 +135,13 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         assert self.player is not None
         if self.run_dir is None or self.config.force:
             return
-        for base in registry.list_nodes(self.run_dir):
+        nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
+        live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
+        for base in nodes:
             if base.module != _BASE:
                 continue
             spaces = {"", *(topic.removesuffix("/cmd_vel") for topic in base.subscribes if topic.endswith("/cmd_vel"))}
-            acted_on = {*base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
+            acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
             played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
             wrong = [
                 played[topic]

@@ -51,9 +51,12 @@ def base(run_dir):
     """Puts a live base into the registry, under a name and in a namespace."""
     claims = []
 
-    def start(name="crawler_base", namespace="", module="instant_ic.nodes.crawler_base", command="/cmd_vel"):
+    def start(
+        name="crawler_base", namespace="", module="instant_ic.nodes.crawler_base", command="/cmd_vel", publishes=()
+    ):
         claims.append(registry.Claim(run_dir / "nodes" / name, f"node {name}"))
-        entry = {"name": name, "module": module, "pid": 1, "started_ns": 1, "params": {}, "publishes": {}}
+        entry = {"name": name, "module": module, "pid": 1, "started_ns": 1, "params": {}}
+        entry["publishes"] = dict.fromkeys(publishes, "any/msg/Type")
         claims[-1].write({**entry, "subscribes": {f"{namespace}{command}": "geometry_msgs/msg/TwistStamped"}})
         return claims[-1]
 
@@ -110,6 +113,15 @@ def test_it_is_played_without_a_base_and_where_it_is_left_out_renamed_or_forced(
     player(all_of_it, force=True)
     with pytest.raises(NodeError, match=r"/cmd_vel.*robot of renamed"):
         player(bag("/cmd_vel"))
+
+
+def test_what_a_live_node_publishes_is_not_played_beside_a_running_base(bag, base, player):
+    base()
+    player(bag("/scan"))  # nobody else publishes it: one node is tried with a bag
+    base("vlp16_driver", module="instant_ic.nodes.vlp16_driver", publishes=("/scan", "/rosout"))
+    with pytest.raises(NodeError, match=r"/scan would reach the robot"):
+        player(bag("/scan"))
+    player(bag("/rosout", "/played"))
 
 
 def test_namespaces_and_renamed_commands_count(bag, base, player):
