@@ -417,6 +417,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
                 self.used.pop("points", None)  # no later transform makes these usable
             self.diagnose("points", WARN, f"3D points cannot be used: {error}")
             return -1
+        assert self.points is not None  # the message came from it
         self.note_used("points", self.points)
         counts = self.sweep.counts
         self.diagnose("points", OK, f"{counts['obstacle']} points in the way", **counts)
