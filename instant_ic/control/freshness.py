@@ -26,8 +26,8 @@ class TimeoutConfig:
     """Seconds of silence after which a source is stale and the command is zero.
 
     An image source (camera, view) comes at a rate of its own: it is stale ``late_s`` after it usually comes, where that
-    is later. Images may come as rarely as ``slowest_image_s``: the robot then drives slower, ``image_travel_m`` per image
-    at most. Everything else keeps the robot off obstacles and has a fixed time-out.
+    is later. Images may come as rarely as ``slowest_image_s``: the robot then drives slower, ``image_travel_m`` per
+    image at most. Everything else keeps the robot off obstacles and has a fixed time-out.
 
     Attributes:
         scan: s; ``/scan``.

@@ -95,7 +95,8 @@ GUARDS: dict[str, str] = {
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready here, and there is a way "
     "round for the r-bot; after an entry that was given up, a view must fit first, or the operator let go",
     "entry_moot": "the virtual space is no longer ready, no fitting view has come within enter_timeout_s and the "
-    "time in which an image and a view of the standing r-bot can come, or the operator's command is safe for the r-bot over the way that `rejoined` looks at",
+    "time in which an image and a view of the standing r-bot can come, or the operator's command is safe for the r-bot "
+    "over the way that `rejoined` looks at",
     "view_fits": "the newest rendered view and the newest camera picture were taken within picture_position_m and "
     "picture_yaw_deg of each other",
     "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, within return_near_m or for "
@@ -106,7 +107,8 @@ GUARDS: dict[str, str] = {
     "view and picture agree as in `view_fits`, within return_picture_m and return_picture_yaw_deg (after "
     "return_timeout_s the first is enough, after twice that it goes on with what is left)",
     "may_resume": "the emergency stop is released, every source is fresh for recover_s, camera images come every "
-    "slowest_image_s or more often, the operator's command is zero (silence counts as zero), and the operator's link is back where its loss was the reason",
+    "slowest_image_s or more often, the operator's command is zero (silence counts as zero), and the operator's link is "
+    "back where its loss was the reason",
 }
 
 ACTIONS: dict[str, str] = {
