@@ -107,8 +107,8 @@ GUARDS: dict[str, str] = {
     "view and picture agree as in `view_fits`, within return_picture_m and return_picture_yaw_deg (after "
     "return_timeout_s the first is enough, after twice that it goes on with what is left)",
     "may_resume": "the emergency stop is released, every source is fresh for recover_s, camera images come every "
-    "slowest_image_s or more often, the operator's command is zero (silence counts as zero), and the operator's link is "
-    "back where its loss was the reason",
+    "slowest_image_s or more often, the operator's command is zero (silence counts as zero), and the operator's link "
+    "is back where its loss was the reason",
 }
 
 ACTIONS: dict[str, str] = {
