@@ -8,6 +8,7 @@ from instant_ic.bus import SENSOR
 from instant_ic.bus.clock import JumpDetector, ManualClock, SystemClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.node import Node
+from instant_ic.bus.transport import Received
 from instant_ic.msg import String
 
 S = 1_000_000_000
@@ -82,7 +83,8 @@ def test_age_of_the_latest_message_is_not_changed_by_setting_the_clock(bus: Lock
 
 def test_waiting_in_the_queue_counts_as_age(bus: LockstepBus) -> None:
     node = bus.add(Ticker)
-    node.heard.put(String(data="old"), steady_ns=bus.clock.steady_ns() - 3 * S // 10)
+    came_ns = bus.clock.steady_ns() - 3 * S // 10
+    node.heard.put(String(data="old"), Received("/chatter", "", b"", 0, 0, 0, steady_ns=came_ns))
     assert node.heard.age_s == pytest.approx(0.3)
 
 
