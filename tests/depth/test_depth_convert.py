@@ -170,7 +170,7 @@ def test_what_onnx_computes_otherwise_is_not_written(tmp_path: Path, monkeypatch
     path.write_bytes(b"the model before")
     honest = export._run
     monkeypatch.setattr(export, "_run", lambda *args: honest(*args) * np.float32(1.0001))
-    with pytest.raises(ExportError, match=r"difference to torch: 1\.0e-04 .* to float64"):
+    with pytest.raises(ExportError, match=r"difference to torch: (9\.\de-05|1\.[0-2]e-04) .* to float64"):
         export_onnx(random_network(), path)
     assert path.read_bytes() == b"the model before"
     assert list(tmp_path.iterdir()) == [path]
