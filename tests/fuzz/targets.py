@@ -1064,10 +1064,10 @@ TARGETS = {
         Target("bridge-frames", _bridge_frames, _parse_bridge, _bridge_errors(), _JSON_WORDS, share=800),
         Target("zenoh", _zenoh, _parse_zenoh, share=2000),
         Target("mcap-scan", _mcaps, _parse_scan, _bag_errors(), fix=fix_chunk, share=800),
-        Target("mcap-recover", _mcaps, _parse_recover, _bag_errors(), fix=fix_chunk, share=60),
+        Target("mcap-recover", _mcaps, _parse_recover, _bag_errors(), fix=fix_chunk, share=30),
         Target("mcap-read", _mcaps, _parse_bag, _bag_errors(), fix=fix_chunk, share=150),
         Target("mcap-reindex", _mcaps, _parse_reindex, _bag_errors(), fix=fix_chunk, share=100),
-        Target("ros1-bag", _ros1_bags, _parse_ros1, _bag_errors(), share=12),
+        Target("ros1-bag", _ros1_bags, _parse_ros1, _bag_errors(), share=6),
         Target("sqlite-bag", _sqlite_bags, _parse_sqlite, _bag_errors(), share=100),
         Target("parameters", _parameter_samples, _parse_parameters, _parameter_errors(), _YAML_WORDS, share=100),
         Target(
