@@ -23,6 +23,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+from rosbags.typesys import TypesysError
 
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
@@ -149,7 +150,7 @@ def schema_or_unknown(type_name: str) -> Schema:
     """As :func:`own_schema`; without definition where the type is not known, as rosbag2 does."""
     try:
         return own_schema(type_name)
-    except MessageError:
+    except (MessageError, TypesysError):  # the second: our type, but not by this full name
         return Schema(type_name, "", "", "")
 
 

@@ -5,7 +5,6 @@ The picture follows map_saver and map_server (nav2): 0 occupied, 254 free, 205 u
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -105,7 +104,11 @@ def load_grid(path: Path) -> OccupancyGrid:
     if not 0 <= free < occupied <= 1:
         raise MapError(f"{path}: need 0 <= free_thresh < occupied_thresh <= 1 (got {free}, {occupied})")
     origin = content.get("origin")
-    if not (isinstance(origin, list) and len(origin) >= 2 and all(isinstance(v, int | float) for v in origin)):
+    if not (
+        isinstance(origin, list)
+        and len(origin) >= 2
+        and all(isinstance(v, int | float) and abs(v) < _MOST_NUMBER for v in origin)
+    ):
         raise MapError(f"{path}: origin must be [x, y, yaw] (got {origin!r})")
     if len(origin) > 2 and abs(origin[2]) > 1e-6:
         raise MapError(f"{path}: a turned map (origin yaw {origin[2]}) is not supported: turn the picture instead")
@@ -139,9 +142,13 @@ def load_grid(path: Path) -> OccupancyGrid:
     return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
 
 
+_MOST_NUMBER = 1e9
+"""Above any coordinate in metres; YAML has NaN, infinity, and whole numbers that no float can hold."""
+
+
 def _number(path: Path, content: dict[str, Any], key: str, default: float | None) -> float:
     value = content.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _MOST_NUMBER:
         raise MapError(f"{path}: {key} must be a number (got {value!r})")
     return float(value)
 

@@ -12,7 +12,7 @@ import pytest
 
 from instant_ic.bag import BagError, BagReader, BagWriter
 from instant_ic.bag.mcap_writer import Schema
-from instant_ic.bag.metadata import preset_of_text, with_hash
+from instant_ic.bag.metadata import preset_of_text, schema_or_unknown, with_hash
 from instant_ic.bag.recover import recover, reindex
 from instant_ic.bus.frame import FrameError, Hello
 from instant_ic.bus.params import ParameterError, load_file
@@ -59,6 +59,10 @@ def test_damaged_definition_in_a_bag_is_an_unknown_type() -> None:
     assert with_hash(damaged).encoding == ""
 
 
+def test_type_whose_full_name_is_damaged_is_unknown() -> None:
+    assert schema_or_unknown("std_msgs/msc/String").encoding == ""
+
+
 def test_recover_takes_messages_whose_definition_is_damaged(bag: Path, tmp_path: Path) -> None:
     file = next(bag.glob("*.mcap"))
     content = file.read_bytes().replace(b"string data", b"str'ng data")
@@ -101,6 +105,8 @@ def test_manifest_with_a_value_that_is_none_is_an_error(tmp_path: Path, value: s
         'image: "a\\0b"',
         "image: m.pgm\nresolution: !!timestamp x",
         "resolution: " + "1" * 5000,
+        "resolution: " + "1" * 400,
+        "resolution: 0.1\noccupied_thresh: .nan",
         "[" * 3000,
     ],
 )
@@ -109,6 +115,20 @@ def test_map_file_with_a_value_that_is_none_is_an_error(tmp_path: Path, text: st
     path.write_text("origin: [0, 0]\n" + ("" if "resolution" in text else "resolution: 0.05\n") + text + "\n")
     with pytest.raises(MapError):
         load_grid(path)
+
+
+def test_map_origin_that_no_float_can_hold_is_an_error(tmp_path: Path) -> None:
+    path = tmp_path / "map.yaml"
+    path.write_text(f"image: m.pgm\nresolution: 0.05\norigin: [{'1' * 400}, 0]\n")
+    with pytest.raises(MapError, match="origin"):
+        load_grid(path)
+
+
+def test_manifest_number_that_no_float_can_hold_is_refused() -> None:
+    from instant_ic.depth.manifest import _is_number
+
+    assert _is_number(1.5)
+    assert not any(_is_number(value) for value in (10**400, float("nan"), float("inf"), True, "1"))
 
 
 def test_redirect_of_the_camera_is_not_even_read() -> None:
