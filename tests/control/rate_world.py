@@ -75,6 +75,8 @@ class Rates:
 class _Page:
     """Stands in for the console's server."""
 
+    plain_http = False
+
     def now_ms(self) -> float:
         return 0.0
 
