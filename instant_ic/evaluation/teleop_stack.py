@@ -138,8 +138,32 @@ class _Port:
         pass
 
 
-class _Page:
-    """Stands in the console's server: keeps what it is told to show."""
+class SilentPage:
+    """Stands in for the console's server; nobody looks at it."""
+
+    plain_http = False
+
+    def now_ms(self) -> float:
+        return 0.0
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        pass
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        pass
+
+    def show(self, *kinds: Any) -> None:
+        pass
+
+    def watching(self) -> dict[int, Any]:
+        return {}
+
+    def stop(self) -> None:
+        pass
+
+
+class _Page(SilentPage):
+    """Keeps what the console's server is given to show."""
 
     def __init__(self, stack: SimulatedStack) -> None:
         self._stack = stack
@@ -159,15 +183,6 @@ class _Page:
     def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
         if kind.name in ("VIEW", "PANORAMA"):  # and not the map
             self._stack.on_frame(kind.name == "VIEW", header, payload)
-
-    def show(self, *kinds: Any) -> None:
-        pass
-
-    def watching(self) -> dict[int, Any]:
-        return {}
-
-    def stop(self) -> None:
-        pass
 
 
 @dataclass

@@ -19,6 +19,7 @@ from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.server import ServerConfig
 from instant_ic.control.states import Mode
+from instant_ic.evaluation.teleop_stack import SilentPage
 from instant_ic.msg import (
     ControlState,
     PoseWithCovariance,
@@ -72,30 +73,6 @@ class Rates:
     seed: int = 0
 
 
-class _Page:
-    """Stands in for the console's server."""
-
-    plain_http = False
-
-    def now_ms(self) -> float:
-        return 0.0
-
-    def publish(self, kind: str, message: dict[str, Any]) -> None:
-        pass
-
-    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
-        pass
-
-    def show(self, *kinds: Any) -> None:
-        pass
-
-    def watching(self) -> dict[int, Any]:
-        return {}
-
-    def stop(self) -> None:
-        pass
-
-
 class RateWorld:
     """A corridor with boxes, a robot that drives in it, and what the operator sees of it."""
 
@@ -125,7 +102,7 @@ class RateWorld:
         self.arbiter = self.bus.add(ArbiterNode)
         self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ServerConfig(port=0)))
         self.console.server.stop()
-        self.console.server = _Page()
+        self.console.server = SilentPage()
         static = draw_map(walls, (-2, -1.2, length_m - 2, 1.2))
         self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
         mounts = [("velodyne", 0.6), ("camera", 1.2)]
