@@ -1,11 +1,14 @@
 """``make test`` reports unit and system tests, whichever of them fail."""
 
+import os
 import subprocess
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+ENVIRONMENT = {name: value for name, value in os.environ.items() if not name.startswith(("MAKE", "MFLAGS"))}
+"""Without what the make that runs these tests hands on to one below it."""
 
 
 @pytest.mark.parametrize("unit", [0, 1])
@@ -22,6 +25,7 @@ def test_both_halves_run_and_either_failure_counts(unit: int, system: int, tmp_p
         capture_output=True,
         text=True,
         timeout=60,
+        env=ENVIRONMENT,
     )
     outcome = ["passed", "FAILED"]
     assert made.stdout.splitlines()[:3] == [
@@ -34,6 +38,6 @@ def test_both_halves_run_and_either_failure_counts(unit: int, system: int, tmp_p
 
 def test_the_check_comes_first() -> None:
     recipe = subprocess.run(
-        ["make", "-n", "test"], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+        ["make", "-n", "test"], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True, env=ENVIRONMENT
     ).stdout
     assert -1 < recipe.index("ruff check") < recipe.index("-m pytest")

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 from tests.fuzz.harness import Target
 
@@ -147,17 +148,16 @@ def _roboclaw_session() -> tuple[bytes, bytes]:
     pending = bytearray()
 
     def write(data: bytes) -> None:
-        reply = emulator.feed(data)
         sent.extend(data)
-        received.extend(reply)
-        pending.extend(reply)
+        pending.extend(emulator.feed(data))
 
     def read(size: int) -> bytes:
         data = bytes(pending[:size])
         del pending[:size]
+        received.extend(data)  # and not the acknowledgement of a blind stop, which nobody reads
         return data
 
-    port: Any = SimpleNamespace(write=write, read=read, reset_input_buffer=lambda: None, close=lambda: None)
+    port: Any = SimpleNamespace(write=write, read=read, reset_input_buffer=pending.clear, close=lambda: None)
     _drive_session(Roboclaw(RoboclawConfig(port="fuzz", retries=0), lambda _: port))
     return bytes(sent), bytes(received)
 
@@ -330,7 +330,6 @@ def _parse_http() -> Callable[[bytes], object]:
         return here
 
     kept: list[socket.socket] = []
-    urllib3.connection.connection.create_connection = connected  # type: ignore[assignment]
     config = ThetaConfig(busy_retries=0)
 
     def parse(data: bytes) -> None:
@@ -338,7 +337,8 @@ def _parse_http() -> Callable[[bytes], object]:
         content = data
         client = ThetaClient("http://theta", config, "user", "password")
         try:
-            client.state()
+            with mock.patch.object(urllib3.connection.connection, "create_connection", connected):
+                client.state()
         finally:
             client.close()
             for other in kept:
@@ -388,7 +388,7 @@ def _parse_console() -> Callable[[bytes], object]:
             text = data.decode()
         except UnicodeDecodeError:  # aiohttp closes such a socket
             return
-        session = Session(1, None, True)  # type: ignore[arg-type]
+        session = Session(1, None, None, None)  # type: ignore[arg-type]
         server.gate = DriveGate(server.config.drive)  # nothing of an input is left for the next
         for line in text.split("\n")[:20]:
             try:
