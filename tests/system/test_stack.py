@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -123,16 +124,15 @@ def test_bag_opens_with_rosbags_and_holds_the_run(outcome):
 
 @pytest.mark.timeout(900)
 def test_lockstep_replay_is_the_same_twice(outcome, tmp_path):
-    for name in ("a", "b"):
-        subprocess.run(
-            [
-                *(sys.executable, "-m", "instant_ic.cli.main", "replay", str(outcome.bag)),
-                *("--nodes", "grid_slam,depth_estimator,depth_scaler", "-o", str(tmp_path / name)),
-            ],
-            check=True,
-            timeout=400,
-            stdin=subprocess.DEVNULL,
-        )
+    def replay(name):
+        command = [
+            *(sys.executable, "-m", "instant_ic.cli.main", "replay", str(outcome.bag)),
+            *("--nodes", "grid_slam,depth_estimator,depth_scaler", "-o", str(tmp_path / name)),
+        ]
+        subprocess.run(command, check=True, timeout=800, stdin=subprocess.DEVNULL)
+
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(replay, ("a", "b")))
     command = [sys.executable, "-m", "instant_ic.cli.main", "bag", "diff", str(tmp_path / "a"), str(tmp_path / "b")]
     assert subprocess.run(command, timeout=120).returncode == 0
     with AnyReader([tmp_path / "a"]) as reader:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,13 @@ def poses_in_truth(bag: Path) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("replay")
-    for name in ("first", "second"):
-        done = ic("replay", BAG, "--nodes", NODES, "-p", "vlp16_driver.source:=topic", "-o", folder / name)
+
+    def replay(name: str) -> subprocess.CompletedProcess[str]:
+        return ic("replay", BAG, "--nodes", NODES, "-p", "vlp16_driver.source:=topic", "-o", folder / name)
+
+    with ThreadPoolExecutor() as pool:
+        runs = list(pool.map(replay, ("first", "second")))
+    for done in runs:
         assert done.returncode == 0, done.stderr
         # A WARNING or ERROR of a node would stand here.
         assert [line for line in done.stderr.splitlines() if not line.startswith("replaying ")] == []
