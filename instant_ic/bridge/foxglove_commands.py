@@ -69,7 +69,7 @@ class Commands:
                 self._drive_by(client, channel.schema_name.rsplit("/", 1)[-1], channel.encoding, data)
         except CommandRefused as error:
             self._refused(client, f"command refused: {error}")
-        except (MessageError, AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:  # any JSON
+        except (MessageError, AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:  # any JSON
             self._refused(client, f"command refused: {channel.topic}: {type(error).__name__}: {error}")
 
     def _stop_by(self, client: int, encoding: str, data: bytes) -> None:
@@ -115,7 +115,10 @@ def _name(client: int) -> str:
 
 
 def _json(data: bytes) -> dict[str, Any]:
-    content = json.loads(data)
+    try:
+        content = json.loads(data)
+    except RecursionError:
+        raise MessageError("JSON nested too deeply") from None
     if not isinstance(content, dict):
         raise MessageError("not a JSON object")
     return content
