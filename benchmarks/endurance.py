@@ -360,8 +360,7 @@ class Soak:
                     await self._lose(made, page, until, recording, fault, lets_go, holds_s)
         if self.ending:
             await until(lambda: False, 0.0, "end")
-        await self._release(made, until)
-        await until(lambda: made.state.mode != ControlState.STOPPED and fresh(made), BACK_S, f"drive after {fault}")
+        await self._again(made, fault)
 
     async def _onward(self, made: Rig, page: ConsoleClient, until: Any, seconds: float) -> None:
         """Drive to and fro through the obstacle for so long, and on until the robot moves; 30 s at most."""
@@ -463,18 +462,18 @@ class Soak:
             await other.stop()
         self._stood(made, fault, pressed_ns + round(ESTOP_STANDS_S * 1e9), made.pace.now_ns())
 
-    async def _release(self, made: Rig, until: Any) -> None:
-        """Release an emergency stop that is latched, also one that is set after an unclean end."""
-        await until(lambda: fresh(made), BACK_S, "state of the arbiter")
+    async def _again(self, made: Rig, fault: str) -> None:
+        """Have an operator at the page release what is latched, until the robot can be driven again."""
         deadline = time.monotonic() + made.pace.wait_s(BACK_S)
-        while made.state.estop:
+        while not (fresh(made) and made.state.mode != ControlState.STOPPED):
             if time.monotonic() > deadline:
-                raise StackError(f"the emergency stop stayed latched: {made.state.reason}\n{made.stack.log_tail()}")
+                raise StackError(f"not drivable after {fault}: {made.state.reason}\n{made.stack.log_tail()}")
             with contextlib.suppress(ConnectionError, OSError, TimeoutError, aiohttp.ClientError):
-                async with driver(made) as page:
+                async with driver(made) as page:  # an operator who is away ends the virtual drive, and must come back
                     await page.stop()
-                    await page.release_estop()
-                    await asyncio.sleep(made.pace.wait_s(1.0))
+                    if made.state.estop:
+                        await page.release_estop()
+                    await asyncio.sleep(made.pace.wait_s(2.0))
 
     def _stood(self, made: Rig, fault: str, from_ns: int, until_ns: int) -> None:
         rows = [row for row in made.truth if from_ns < row.at_ns < until_ns]
