@@ -235,7 +235,7 @@ class Recording:
         shutil.rmtree(bag, ignore_errors=True)
 
     async def fill_disk(self, seconds: float) -> None:
-        """Leave no room for so long, then make room again."""
+        """Fill the disk for `seconds`, then make room again."""
         filler = self._disk / "filler"
         with contextlib.suppress(OSError), filler.open("wb") as out:
             while True:
@@ -363,7 +363,7 @@ class Soak:
         await self._again(made, fault)
 
     async def _onward(self, made: Rig, page: ConsoleClient, until: Any, seconds: float) -> None:
-        """Drive to and fro through the obstacle for so long, and on until the robot moves; 30 s at most."""
+        """Drive to and fro through the obstacle for `seconds`, and on until the robot moves; 30 s at most."""
         began_ns = made.pace.now_ns()
         place = made.truth[-1]
 

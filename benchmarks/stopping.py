@@ -59,7 +59,7 @@ from instant_ic.paths import share_dir
 SPEED_M_S = 0.38
 STANDS_M_S = 0.01
 STANDS_S = 0.3
-"""It must be slow for so long to count as standing."""
+"""Seconds below the limit that count as standing."""
 LONGEST_S = 4.0
 AFTER_S = 1.0
 _TRIES = 5

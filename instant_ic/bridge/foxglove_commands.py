@@ -101,7 +101,7 @@ class Commands:
             self._node.call_soon(self._node.diagnose, "commands", OK, "commands come in")
 
     def _refused(self, client: int, words: str) -> None:
-        """Tells the client, once until other words are due."""
+        """Sends a refusal to the client, once until its text changes."""
         words = words[:300]
         if self._told.get(client) == words:
             return

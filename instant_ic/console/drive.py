@@ -180,7 +180,7 @@ class DriveGate:
         if self.moving and now - self._received >= self.config.watchdog_s:
             self.watchdog_trips += 1
             self.stop(now)
-            self._driver_beat = -math.inf  # a loss, no wish to stop: the arbiter is told, and the base brakes hard
+            self._driver_beat = -math.inf  # a loss, no wish to stop: the arbiter is informed, and the base brakes hard
         if self.driver is not None and now - self._driver_seen >= self.config.lease_timeout_s:
             self.leave(self.driver, now)
         # The one zero after a stop goes out even when nobody is there any more.

@@ -41,7 +41,7 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
     Raises:
         RegistryError: a run directory cannot be used.
         StackRunningError: another stack has one.
-        EstopStateError: how this run ends could not be told at the next start.
+        EstopStateError: how this run ends could not be kept for the next start.
     """
     with ExitStack() as locks:
         for folder in description.run_dirs(run_dir):
