@@ -32,6 +32,8 @@ Twist2 = tuple[float, float]
 
 
 PASSAGE_PERIOD_NS = 200_000_000
+STEP_AFTER_S = 0.001
+"""The step that finds a time-out over comes this long after it, to be surely after it: so each ends that much sooner."""
 _STANDS_M_S, _STANDS_RAD_S = 0.03, 0.1
 """Slower than this a robot counts as standing."""
 _CATCH_UP = 0.8
@@ -327,7 +329,7 @@ class Arbiter:
     # -- what the step starts from
 
     def _assess(self, inputs: ArbiterInputs, now_ns: int) -> _Situation:
-        fresh = inputs.age("command") <= self.config.timeouts.command and not inputs.operator_gone
+        fresh = inputs.age("command") <= self._command_s and not inputs.operator_gone
         command = clip_twist(*inputs.operator_command, self.config.limits) if fresh else (0.0, 0.0)
         if command != (0.0, 0.0):
             self._driven = _Driven(command, now_ns)
@@ -434,12 +436,18 @@ class Arbiter:
         for source in SOURCES:
             if self.mode in source.modes:
                 left.append(self._allowed_s(source, inputs) - self._source_age_s(source, inputs, now_ns))
-        left.append(self.config.timeouts.command - inputs.age("command"))
+        left.append(self._command_s - inputs.age("command"))
         # 0: it is not stale yet, and will be right after this step.
         return min(one for one in left if one >= 0.0)
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
-        return self.config.timeouts.allowed_s(source.key, inputs.usual.get(source.key) if source.steady else None)
+        usual_s = inputs.usual.get(source.key) if source.steady else None
+        return self.config.timeouts.allowed_s(source.key, usual_s) - STEP_AFTER_S
+
+    @property
+    def _command_s(self) -> float:
+        """Age up to which the operator's command counts, s."""
+        return self.config.timeouts.command - STEP_AFTER_S
 
     def _lost_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.lost_s(source.key, inputs.usual.get(source.key) if source.steady else None)
@@ -676,7 +684,7 @@ class Arbiter:
     def _operator_missed(self, situation: _Situation) -> bool:
         """Whether the machine stopped because of the operator's silence, which goes on."""
         inputs = situation.inputs
-        return self._await_operator and (inputs.operator_gone or inputs.age("command") > self.config.timeouts.command)
+        return self._await_operator and (inputs.operator_gone or inputs.age("command") > self._command_s)
 
     # Actions
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from instant_ic import estop_state
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
-from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
+from instant_ic.control.arbiter import STEP_AFTER_S, Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
 from instant_ic.control.estop import EstopLatch
 from instant_ic.control.freshness import Rhythm
@@ -234,7 +234,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         """Has one step made in ``in_s`` where the next timer may be later: time-outs are exact."""
         self.cancel_extra()
         if in_s < 1.0 / self.config.rate_hz:
-            self.cancel_extra = self.timer(in_s + 0.001, self.tick).cancel
+            self.cancel_extra = self.timer(in_s + STEP_AFTER_S, self.tick).cancel
 
     def on_camera(self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int) -> None:
         now_ns = self.clock.steady_ns()

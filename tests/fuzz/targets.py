@@ -158,7 +158,7 @@ def _roboclaw_session() -> tuple[bytes, bytes]:
         return data
 
     port: Any = SimpleNamespace(write=write, read=read, reset_input_buffer=pending.clear, close=lambda: None)
-    _drive_session(Roboclaw(RoboclawConfig(port="fuzz", retries=0), lambda _: port))
+    _drive_session(Roboclaw(RoboclawConfig(port="fuzz", retries=0), lambda _: port, sleep=lambda _: None))
     return bytes(sent), bytes(received)
 
 
@@ -192,7 +192,7 @@ def _parse_replies() -> Callable[[bytes], object]:
         port: Any = SimpleNamespace(
             write=lambda data: None, read=read, reset_input_buffer=lambda: None, close=lambda: None
         )
-        roboclaw = Roboclaw(config, lambda _: port)
+        roboclaw = Roboclaw(config, lambda _: port, sleep=lambda _: None)
         try:
             _drive_session(roboclaw)
         except LinkError:
