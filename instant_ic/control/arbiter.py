@@ -33,7 +33,7 @@ Twist2 = tuple[float, float]
 
 PASSAGE_PERIOD_NS = 200_000_000
 STEP_AFTER_S = 0.001
-"""The step that finds a time-out over comes this long after it, to be surely after it: so each ends that much sooner."""
+"""The step that finds a time-out over comes this long after it, to be surely late: so each ends that much sooner."""
 _STANDS_M_S, _STANDS_RAD_S = 0.03, 0.1
 """Slower than this a robot counts as standing."""
 _CATCH_UP = 0.8
