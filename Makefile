@@ -15,12 +15,12 @@ ARGS   ?=
 run: $(STAMP)
 	@exec $(BIN)/ic launch sim $(ARGS)
 
-# The system tests start whole stacks: they run after the others, one stack at a time (xdist_group), and also where one of
-# the others failed.
+# The system tests start whole stacks, which want the machine for themselves: they run after the others, one by one,
+# and also where one of the others failed.
 test: check chromium
 	@units=passed; systems=passed; \
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not system" --durations 10 || units=FAILED; \
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m system --durations 10 || systems=FAILED; \
+	$(BIN)/python -m pytest -m system --durations 10 || systems=FAILED; \
 	echo "make test: unit tests $$units, system tests $$systems"; \
 	test $$units$$systems = passedpassed
 

@@ -76,6 +76,8 @@ class SimulatorNode(Node[SimulatorConfig]):
 
     def teardown(self) -> None:
         """Stops the world and closes the devices."""
+        if not hasattr(self, "_stopped"):  # the node failed before its setup
+            return
         self._stopped.set()
         if self._thread is not None:
             self._thread.join(_MOST_WAIT_S)

