@@ -183,7 +183,9 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             payload = without_children(message, self.config.drop_transforms)
         self._tell_time(message.stamp_ns)
         if payload is not None:
-            self._out[message.topic].publish_bytes(payload)
+            # Not by the clock: this node hears its own /clock too, a little later, which sets the time back.
+            stamp_ns = message.stamp_ns if isinstance(self.clock, ManualClock) else None
+            self._out[message.topic].publish_bytes(payload, stamp_ns)
 
     def _tell_time(self, stamp_ns: int) -> None:
         """The time goes before what happens at it, and goes on where nothing does."""

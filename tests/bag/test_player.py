@@ -1,3 +1,4 @@
+import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,8 @@ from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
+from instant_ic.bus.clock import ManualClock
+from instant_ic.nodes.bag_player import BagPlayerConfig, BagPlayerNode
 
 BOOL, TF = "std_msgs/msg/Bool", "tf2_msgs/msg/TFMessage"
 
@@ -261,3 +264,21 @@ def test_types_that_cannot_be_sent_are_named(tmp_path: Path) -> None:
     assert [t.topic for t in player.topics] == ["/cells"]  # its definition is in the bag
     assert player.left_out == {f"/other ({BOOL}, 1 messages)": "its type has another definition in the bag than here"}
     player.close()
+
+
+def test_a_message_is_published_at_the_bags_time_also_when_the_players_own_clock_comes_back_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sent: list[tuple[bytes, int | None]] = []
+
+    class Out:
+        def publish_bytes(self, payload: bytes, publish_ns: int | None = None) -> None:
+            sent.append((payload, publish_ns))
+
+    node = BagPlayerNode.__new__(BagPlayerNode)
+    node.clock, node.config, node._next_base_s = ManualClock(), BagPlayerConfig(bag="drive"), math.inf
+    node._out = {"/a": Out()}  # type: ignore[dict-item]
+    # What the node hears of its own /clock on another thread sets the time back between these two steps.
+    monkeypatch.setattr(node, "_tell_time", lambda stamp_ns: node.clock.set(stamp_ns - 700_000))
+    node._send(BagMessage("/a", BOOL, b"x", 5_000_000_000, SENSOR))
+    assert sent == [(b"x", 5_000_000_000)]

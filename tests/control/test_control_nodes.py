@@ -257,7 +257,7 @@ def test_a_camera_at_5_hz_is_late_by_its_own_rhythm() -> None:
             last_ns = stack.now
         state = stack.step((0.4, 0.0) if k > 30 else None)
         age_s = (stack.now - last_ns) / 1e9
-        if k > 32 and age_s <= 0.3:
+        if k > 32 and age_s < 0.299:  # the step at 0.3 s commands zero
             assert "picture" not in state.reason
         if age_s > 0.31:
             assert twist_values(state.applied_command) == (0.0, 0.0)
