@@ -2,6 +2,7 @@
 
 python benchmarks/bridge.py [SECONDS]     # a scenario, default 20
 python benchmarks/bridge.py --cut         # as root: real stacks in two network namespaces, the cable pulled
+python benchmarks/bridge.py --losses      # seconds until the link notices a loss and until it is back
 
 Commands go 20 times a second from the station to the robot; pictures (200 kB, 10 a second) and states (20 a second) the
 other way. Two bridges with CURVE and the shipped lists, in processes of their own; the network is
@@ -14,6 +15,7 @@ import contextlib
 import dataclasses
 import json
 import platform
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -26,10 +28,15 @@ from typing import Any
 import numpy as np
 import psutil
 
+from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyStore, Peer
+from instant_ic.bridge.host_listener import ListeningLink
+from instant_ic.bridge.host_session import Ended, LinkTimes, Side, Up
+from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import SENSOR, Node
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
+from instant_ic.evaluation.impaired_link import ImpairedLink, Impairment
 from instant_ic.evaluation.stack import Observer, _NoParameters, free_port
 from instant_ic.evaluation.two_machines import TwoMachines, drive_and_cut, missing
 from instant_ic.msg import (
@@ -172,6 +179,79 @@ def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
         return report
 
 
+class LinkEnd:
+    """One end of a link alone, with the steady time of each event of it."""
+
+    def __init__(self, link_class: Any, *where: Any, name: str, store: KeyStore, exports: Any, imports: Any) -> None:
+        self.events: list[tuple[float, Any]] = []
+        side = Side(name, f"{name}-{time.monotonic_ns()}", {imports.topic: imports}, lambda type_name: "same")
+        self.link = link_class(*where, side, {exports.topic: exports}, store, self._note, LinkTimes())
+        self.link.start()
+
+    def _note(self, event: Any) -> None:
+        self.events.append((time.monotonic(), event.event))
+
+    def since(self, begin_s: float, kind: Any) -> float:
+        """Seconds from a moment to the first event of a kind after it.
+
+        Raises:
+            SystemExit: there is none within 30 s.
+        """
+        give_up_s = time.monotonic() + 30
+        while time.monotonic() < give_up_s:
+            for at_s, event in self.events:
+                if at_s >= begin_s and isinstance(event, kind):
+                    return at_s - begin_s
+            time.sleep(0.001)
+        raise SystemExit(f"no {kind.__name__} within 30 s")
+
+
+def losses(repeat: int) -> dict[str, Any]:
+    """A hole in the network, a robot's bridge that starts again, a key that is revoked: seconds, median and worst."""
+    seconds: dict[str, list[float]] = {name: [] for name in ("hole_noticed", "hole_back", "restart_back", "revoked")}
+    command, state = TopicRule(COMMAND, lane="command", max_age_s=0.25), TopicRule(STATE)
+    for _ in range(repeat):
+        with tempfile.TemporaryDirectory(prefix="icb") as name, contextlib.ExitStack() as ends:
+            stores = {host: KeyStore(Path(name) / host) for host in ("robot", "station")}
+            keys = {host: store.create(host) for host, store in stores.items()}
+            peers = {host: Peer(host, "driver", key.public_key) for host, key in keys.items()}
+            stores["robot"].allow(peers["station"])
+            port = free_port()
+
+            def robot(stores: Any = stores, port: int = port) -> LinkEnd:
+                address = f"tcp://127.0.0.1:{port}"
+                return LinkEnd(
+                    ListeningLink, address, name="robot", store=stores["robot"], exports=state, imports=command
+                )
+
+            first = robot()
+            network = ends.enter_context(ImpairedLink(("127.0.0.1", port), Impairment(delay_s=0.01)))
+            station = LinkEnd(
+                ConnectingLink, f"tcp://127.0.0.1:{network.port}", peers["robot"],
+                name="station", store=stores["station"], exports=command, imports=state,
+            )  # fmt: skip
+            ends.callback(station.link.stop)
+            station.since(0.0, Up)
+            began = time.monotonic()
+            network.cut()
+            seconds["hole_noticed"].append(max(first.since(began, Ended), station.since(began, Ended)))
+            began = time.monotonic()
+            network.mend()
+            seconds["hole_back"].append(station.since(began, Up))
+            first.link.stop()
+            began = time.monotonic()
+            second = robot()
+            ends.callback(second.link.stop)
+            seconds["restart_back"].append(station.since(began, Up))
+            began = time.monotonic()
+            stores["robot"].revoke("station")
+            seconds["revoked"].append(second.since(began, Ended))
+    return {
+        f"{name}_s": {"median": round(statistics.median(each), 2), "worst": round(max(each), 2)}
+        for name, each in seconds.items()
+    }
+
+
 def cut() -> dict[str, Any]:
     """Robot and station in two network namespaces; the cable is pulled while the robot drives."""
     if why := missing():
@@ -185,6 +265,9 @@ def main() -> None:
     """Prints one JSON object."""
     if sys.argv[1:] == ["--cut"]:
         print(json.dumps(cut(), indent=2))
+        return
+    if sys.argv[1:] == ["--losses"]:
+        print(json.dumps({"repeat": 10, **losses(10)}, indent=2))
         return
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 20.0
     scenarios = {name: run(network, seconds) for name, network in SCENARIOS.items()}

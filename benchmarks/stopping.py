@@ -8,7 +8,8 @@ A simulated stack of real processes (no depth, no virtual space: they do not mov
 space at 0.38 m/s. Then one thing is lost: a process is frozen (SIGSTOP) or killed (SIGKILL), a device or link is cut,
 the page goes away, or the emergency stop is pressed. Measured from that moment, by the simulator's true motion:
 
-    detect_s    to the first sign of the stop: /cmd_vel or the true speed falls by a tenth
+    detect_s    to the first sign of the stop: /cmd_vel, the speed commanded to the motor controller, or the true speed
+                falls by a tenth
     stand_s     to a true speed below 0.01 m/s that stays there
     distance_m  from the place at the loss to the place where it stands
     after_m     that it moves in the second after it stands: must be nothing
@@ -42,10 +43,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import aiohttp
+import numpy as np
 import yaml
 
 from instant_ic import pace
 from instant_ic.base.config import RoboclawConfig
+from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.bus import LATCHED, registry
 from instant_ic.console.client import ConsoleClient
 from instant_ic.console.drive import DriveConfig
@@ -139,6 +142,9 @@ class SerialRelay:
     def __init__(self, link: Path, controller: Path) -> None:
         self.mute = False
         """The controller's replies are lost."""
+        self.speeds: list[tuple[int, float]] = []
+        """Each request that changes the commanded speed: machine time in ns, encoder counts per second."""
+        self._listener = RoboclawEmulator()
         self._link, self._controller = link, controller
         self._lock = threading.Lock()
         self._master = self._slave = self._far = -1
@@ -188,12 +194,19 @@ class SerialRelay:
         ready, _, _ = select.select(ends, [], [], 0.005)
         if self._master in ready:
             data = os.read(self._master, 4096)
+            self._listen(data)
             if self._far >= 0:
                 os.write(self._far, data)
         if self._far in ready:
             data = os.read(self._far, 4096)
             if self._master >= 0 and not self.mute:
                 os.write(self._master, data)
+
+    def _listen(self, data: bytes) -> None:
+        self._listener.feed(data)
+        speed = float(np.abs(self._listener.target_speed_pps).mean())
+        if not self.speeds or speed != self.speeds[-1][1]:
+            self.speeds.append((time.time_ns(), speed))
 
 
 @dataclass
@@ -457,6 +470,9 @@ def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
     gap_s = (lost_ns - start.at_ns) / 1e9  # it drove on for that long before the loss
     signs = [at for at, speed in rig.commands if at >= lost_ns and speed < 0.9 * cruise]
     signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
+    requests = [(rig.pace.stamp_ns(at), speed) for at, speed in rig.serial.speeds]
+    driven = max((request for request in requests if request[0] <= lost_ns), default=(0, 0.0))[1]
+    signs += [at for at, speed in requests if at > lost_ns and speed < 0.9 * driven]
     stand_ns = stands_ns(rows, lost_ns)
     found: dict[str, Any] = {
         "cruise_m_s": round(cruise, 3),
@@ -488,7 +504,7 @@ async def drives(rig: Rig, faults: Sequence[Fault], repeat: int, seed: int) -> d
                     continue
                 found[fault.name].append(figures)
                 print(f"{turn + 1}/{repeat} {fault.name}: {figures}", file=sys.stderr, flush=True)
-                del rig.truth[:-1], rig.commands[:]
+                del rig.truth[:-1], rig.commands[:], rig.serial.speeds[:-1]
     return found
 
 
