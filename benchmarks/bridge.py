@@ -6,7 +6,7 @@ python benchmarks/bridge.py --losses      # seconds until the link notices a los
 
 Commands go 20 times a second from the station to the robot; pictures (200 kB, 10 a second) and states (20 a second) the
 other way. Two bridges with CURVE and the shipped lists, in processes of their own; the network is
-``instant_ic.evaluation.impaired_link`` in a third.
+``instant_ic.experiments.impaired_link`` in a third.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import SENSOR, Node
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.evaluation.impaired_link import ImpairedLink, Impairment
-from instant_ic.evaluation.stack import Observer, _NoParameters, free_port
-from instant_ic.evaluation.two_machines import TwoMachines, drive_and_cut, missing
+from instant_ic.experiments.impaired_link import ImpairedLink, Impairment
+from instant_ic.experiments.stack import Observer, _NoParameters, free_port
+from instant_ic.experiments.two_machines import TwoMachines, drive_and_cut, missing
 from instant_ic.msg import (
     CompressedImage,
     Odometry,
@@ -99,12 +99,12 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
     stores["station"].allow(Peer("robot", "driver", made["robot"].public_key))
     listen, through = free_port(), free_port()
     ends = {"robot": f"listen:=tcp://127.0.0.1:{listen}", "station": f"connect:=tcp://127.0.0.1:{through}"}
-    commands = [["instant_ic.evaluation.impaired_link", str(through), "127.0.0.1", str(listen), *network]]
+    commands = [["instant_ic.experiments.impaired_link", str(through), "127.0.0.1", str(listen), *network]]
     for host, end in ends.items():
         parameters = ["-p", end, "-p", f"keys:={stores[host].folder}"]
         config = str(shipped_file("config", "bridge.yaml"))
         run_dir = str(folder / host[0])
-        commands.append(["instant_ic.nodes.host_bridge", "--run-dir", run_dir, "--params-file", config, *parameters])
+        commands.append(["nodes.host_bridge", "--run-dir", run_dir, "--params-file", config, *parameters])
     processes = [subprocess.Popen([sys.executable, "-m", *words], stderr=subprocess.DEVNULL) for words in commands]
     try:
         yield [psutil.Process(process.pid) for process in processes[1:]]

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from instant_ic.depth.calibration import AXES, calibrate
-from instant_ic.evaluation.calibration_bag import read_recording
-from instant_ic.evaluation.calibration_sim import BASE_FROM_CAMERA, perturbed, record
+from instant_ic.calibration.bag import read_recording
+from instant_ic.calibration.mount import AXES, calibrate
+from instant_ic.experiments.calibration_sim import BASE_FROM_CAMERA, perturbed, record
 
 
 def main() -> None:

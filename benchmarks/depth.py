@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-from instant_ic.evaluation.depth import Evaluator, LidarSettings, Settings
-from instant_ic.evaluation.depth_lidar import Errors, measure_world
-from instant_ic.evaluation.depth_pictures import Sheets
-from instant_ic.evaluation.depth_worlds import KINDS, LIDAR_HEIGHT_M, Scene, scenes
+from instant_ic.experiments.depth import Evaluator, LidarSettings, Settings
+from instant_ic.experiments.depth_lidar import Errors, measure_world
+from instant_ic.experiments.depth_pictures import Sheets
+from instant_ic.experiments.depth_worlds import KINDS, LIDAR_HEIGHT_M, Scene, scenes
 from instant_ic.paths import shipped_file
 
 SOURCES = ("as estimated", "network", "lidar", "fused")

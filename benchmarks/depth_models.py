@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.depth.interiors import interior_world
 from instant_ic.depth.metrics import depth_metrics, mean_metrics
 from instant_ic.depth.model import DepthModel
-from instant_ic.evaluation.depth_worlds import CAMERA_HEIGHT_M, FIRST_SEED, KINDS, held_out
+from instant_ic.experiments.depth_worlds import CAMERA_HEIGHT_M, FIRST_SEED, KINDS, held_out
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
+from instant_ic.training.interiors import interior_world
 
 MAX_RANGE_M = 16.0
 WORST = 1.05

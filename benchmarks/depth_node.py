@@ -19,8 +19,8 @@ from instant_ic.depth.deskew import points_at
 from instant_ic.depth.keyframes import encode_sigma
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.sources import SOURCES, DepthSource, SourceConfig
-from instant_ic.evaluation.depth_lidar import Errors, measure_world
-from instant_ic.evaluation.depth_worlds import LIDAR_HEIGHT_M, scenes
+from instant_ic.experiments.depth_lidar import Errors, measure_world
+from instant_ic.experiments.depth_worlds import LIDAR_HEIGHT_M, scenes
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.paths import shipped_file
 

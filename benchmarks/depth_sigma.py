@@ -19,8 +19,8 @@ from instant_ic.depth.fusion import fuse, fused_sigma
 from instant_ic.depth.lidar_depth import Origin, structure_sigma
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.sources import DepthSource
-from instant_ic.evaluation.depth_lidar import Errors, measure_world
-from instant_ic.evaluation.depth_worlds import LIDAR_HEIGHT_M
+from instant_ic.experiments.depth_lidar import Errors, measure_world
+from instant_ic.experiments.depth_worlds import LIDAR_HEIGHT_M
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.paths import shipped_file
 from instant_ic.sim.render import EquirectRenderer

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from instant_ic.bus import LATCHED
-from instant_ic.evaluation.stack import Stack, free_ports
+from instant_ic.experiments.stack import Stack, free_ports
 from instant_ic.msg import message_type, stamp_ns, twist_stamped
 
 TARGET_S = 0.6

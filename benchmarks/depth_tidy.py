@@ -21,7 +21,7 @@ from instant_ic import paths
 from instant_ic.depth.metrics import depth_metrics
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.depth.tidy import tidy
-from instant_ic.evaluation.depth_worlds import CAMERA_HEIGHT_M, held_out
+from instant_ic.experiments.depth_worlds import CAMERA_HEIGHT_M, held_out
 
 
 def shape_and_scale(depth: NDArray[np.floating], truth: NDArray[np.floating]) -> tuple[float, float, float]:

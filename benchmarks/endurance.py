@@ -50,8 +50,8 @@ from instant_ic.bag.recover import recover
 from instant_ic.bus import registry
 from instant_ic.bus.control import ControlError, NodeControl
 from instant_ic.console.client import ConsoleClient
-from instant_ic.evaluation.drive import pump
-from instant_ic.evaluation.stack import StackError, machine_pace, processes_of
+from instant_ic.experiments.drive import pump
+from instant_ic.experiments.stack import StackError, machine_pace, processes_of
 from instant_ic.launch.process import dies_with_us
 from instant_ic.msg import ControlState
 
@@ -170,7 +170,7 @@ class Recording:
         self._number += 1
         self._acknowledged = []
         words = {"path": self._bag, "exclude": LARGE_TOPICS, "min_free_mb": 8}
-        command = [*dies_with_us(), sys.executable, "-m", "instant_ic.nodes.bag_recorder", "--name", "soak_recorder"]
+        command = [*dies_with_us(), sys.executable, "-m", "nodes.bag_recorder", "--name", "soak_recorder"]
         command += ["--run-dir", str(self._rig.run_dir), *(w for k, v in words.items() for w in ("-p", f"{k}:={v}"))]
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self._rig.run_dir)}
         self._process = subprocess.Popen(

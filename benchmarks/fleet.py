@@ -24,7 +24,7 @@ import psutil
 from instant_ic.bus import RELIABLE, SENSOR, Node
 from instant_ic.bus.registry import list_topics
 from instant_ic.bus.transport import Received
-from instant_ic.evaluation.stack import Observer, Stack, free_port, free_ports, observer
+from instant_ic.experiments.stack import Observer, Stack, free_port, free_ports, observer
 
 ROBOTS = ("robot1", "robot2", "robot3")
 DELAYS = ("/scan", "/pose", "/map", "/camera/image/compressed", "/lidar/points", "/robot2/pose", "/robot3/pose")

@@ -19,7 +19,7 @@ from typing import Any
 import psutil
 
 from instant_ic.bus.registry import list_nodes, list_topics
-from instant_ic.evaluation.stack import Stack, free_port, free_ports
+from instant_ic.experiments.stack import Stack, free_port, free_ports
 
 
 class Viewer:

@@ -22,8 +22,8 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import VirtualSpace, VirtualSpaceConfig
-from instant_ic.nerf.config import PictureConfig
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.config import PictureConfig
 
 SIZE, FOV, PANORAMA = (320, 180), math.pi / 2, 1024
 VIEWS = (pose_matrix(2.0), pose_matrix(2.0, 0.3, yaw=0.5), pose_matrix(2.0, yaw=-1.2))

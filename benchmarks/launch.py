@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.bus import RELIABLE
-from instant_ic.evaluation.stack import Stack, free_ports, processes_of
+from instant_ic.experiments.stack import Stack, free_ports, processes_of
 from instant_ic.msg import message_type
 
 RUNNING = 1

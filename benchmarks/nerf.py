@@ -31,11 +31,13 @@ from skimage.metrics import structural_similarity
 
 from instant_ic import paths
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.nerf import FieldConfig, PictureConfig, VirtualSpace, VirtualSpaceConfig, box_room, kernels
-from instant_ic.nerf.prior import fill_holes
-from instant_ic.nerf.warm_up import warm_up
+from instant_ic.vspace import FieldConfig, PictureConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.nerf import kernels
+from instant_ic.vspace.prior import fill_holes
+from instant_ic.vspace.warm_up import warm_up
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
 FOV = math.pi / 2

@@ -21,8 +21,8 @@ import numpy as np
 from nerf import FOV, psnr_db, scene
 
 from instant_ic import paths
-from instant_ic.nerf import PictureConfig, VirtualSpace, VirtualSpaceConfig
-from instant_ic.nerf.view import perspective_rays
+from instant_ic.vspace import PictureConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.view import perspective_rays
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
 TARGETS = {

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from scipy.optimize import nnls
 
-from instant_ic.evaluation.depth_worlds import Scene, scenes
+from instant_ic.experiments.depth_worlds import Scene, scenes
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import VirtualSpace, VirtualSpaceConfig, readiness
-from instant_ic.nerf.view import perspective_rays
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig, readiness
+from instant_ic.vspace.view import perspective_rays
 
 SIZE, FOV = (160, 90), math.pi / 2
 DISTANCES_M = (0.0, 0.4, 0.8, 1.4, 2.0)

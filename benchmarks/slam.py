@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
-from instant_ic.evaluation.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
-from instant_ic.evaluation.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
+from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
+from instant_ic.experiments.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
 from instant_ic.geometry.poses import compose2
 from instant_ic.slam import GridSlam, Scan, SlamConfig
 from instant_ic.slam.backend import warm_up
@@ -109,7 +109,7 @@ def worlds() -> dict[str, object]:
 
 def simulated() -> list[dict[str, object]]:
     """Five round trips of the simulated crawler, 20 % slip."""
-    from instant_ic.evaluation.slam_sim import evaluate_round_trip, round_trip
+    from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
     from instant_ic.sim.worlds import make_world
 
     world = make_world("corridor")

@@ -48,16 +48,16 @@ import yaml
 
 from instant_ic import pace
 from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.bus import LATCHED, registry
 from instant_ic.console.client import ConsoleClient
 from instant_ic.console.drive import DriveConfig
-from instant_ic.evaluation.drive import pump
-from instant_ic.evaluation.impaired_link import ImpairedLink
-from instant_ic.evaluation.stack import Stack, StackError, free_port, machine_pace
+from instant_ic.experiments.drive import pump
+from instant_ic.experiments.impaired_link import ImpairedLink
+from instant_ic.experiments.stack import Stack, StackError, free_port, machine_pace
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import ControlState, message_type, pose_matrix, stamp_ns, twist_values
 from instant_ic.paths import share_dir
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
 SPEED_M_S = 0.38
 STANDS_M_S = 0.01

@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.evaluation.vspace import Settings, evaluate, path_poses, scores, start_pose
-from instant_ic.evaluation.vspace_sources import CAMERA_HEIGHT_M
+from instant_ic.experiments.vspace import Settings, evaluate, path_poses, scores, start_pose
+from instant_ic.experiments.vspace_sources import CAMERA_HEIGHT_M
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import VirtualSpace, VirtualSpaceConfig
-from instant_ic.nerf.warm_up import warm_up
-from instant_ic.nerf.warp import PanoramaWarp
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
+from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.warm_up import warm_up
+from instant_ic.vspace.warp import PanoramaWarp
 
 SIZES = ((320, 180), (640, 360), (1280, 720))
 FOV = math.pi / 2

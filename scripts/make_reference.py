@@ -68,7 +68,7 @@ def cell(text: str) -> str:
 
 def render() -> str:
     """The page."""
-    from instant_ic.bus.parameter_info import parameter_infos
+    from instant_ic.config.parameter_info import parameter_infos
 
     lines = [
         "# Nodes, topics, parameters",

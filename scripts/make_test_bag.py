@@ -37,8 +37,8 @@ from instant_ic.msg import (
     twist_stamped,
     type_name,
 )
-from instant_ic.nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 from instant_ic.sim.simulation import Simulation, SimulationConfig
+from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
 START_NS = 1_760_000_000_000_000_000
 STEP_S = 0.002

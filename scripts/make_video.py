@@ -20,8 +20,8 @@ from typing import Any
 
 from instant_ic.console import ConsoleServer, Look, ServerConfig
 from instant_ic.console.drive import DriveConfig
-from instant_ic.evaluation.teleop_stack import CAMERA_HEIGHT_M, STEP_S, SimulatedStack, StackConfig, _Page
-from instant_ic.evaluation.teleop_worlds import make_course
+from instant_ic.experiments.teleop_stack import CAMERA_HEIGHT_M, STEP_S, SimulatedStack, StackConfig, _Page
+from instant_ic.experiments.teleop_worlds import make_course
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import ControlState
 

@@ -4,8 +4,7 @@ import math
 from dataclasses import dataclass
 
 from instant_ic.base.protocol import ADDRESSES, BAUD_RATES
-
-from ..ranges import NotNegative, Positive, check_ranges
+from instant_ic.config.ranges import NotNegative, Positive, check_ranges
 
 
 def _require(ok: bool, key: str, value: object, rule: str) -> None:

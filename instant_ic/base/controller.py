@@ -12,9 +12,8 @@ from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawCo
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
-
-from ..pace import current
-from ..ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.pace import current
 
 _COUNTED_SINCE_M = 0.2
 """Metres of track that a controller may have counted between its restart and the next reading."""

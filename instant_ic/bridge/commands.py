@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ..ranges import Positive, check_ranges
+from instant_ic.config.ranges import Positive, check_ranges
 
 
 class CommandRefused(ValueError):

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ..bus import ERROR, LATCHED, OK, SENSOR, Node, Publisher
-from ..msg import MessageError, deserialize, message_type, stamp_ns, twist_stamped, twist_values
-from .commands import CommandGate, CommandRefused
-from .foxglove_protocol import ClientChannel
+from instant_ic.bridge.commands import CommandGate, CommandRefused
+from instant_ic.bridge.foxglove_protocol import ClientChannel
+from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, Node, Publisher
+from instant_ic.msg import MessageError, deserialize, message_type, stamp_ns, twist_stamped, twist_values
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 _COMMAND_TYPES = {DRIVE: ("TwistStamped", "Twist"), STOP: ("Bool",)}

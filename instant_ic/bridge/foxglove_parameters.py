@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..bus import ParameterError, registry
-from ..bus.control import ControlError, NodeControl
-from .parameter_guard import never_set
+from instant_ic.bridge.parameter_guard import never_set
+from instant_ic.bus import ParameterError, registry
+from instant_ic.bus.control import ControlError, NodeControl
 
 _TIMEOUT_S = 1.0
 

@@ -20,16 +20,16 @@ from typing import Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from ..bus import ERROR, OK, WARN, Node, Subscription
-from ..bus.qos import PRESETS, RELIABLE
-from ..bus.registry import NodeInfo, TopicInfo
-from ..bus.transport import Received
-from ..msg import MessageError, typestore
-from . import foxglove_protocol as protocol
-from .commands import CommandGate
-from .foxglove_commands import Commands
-from .foxglove_parameters import Parameters
-from .web_access import refusal
+from instant_ic.bridge import foxglove_protocol as protocol
+from instant_ic.bridge.commands import CommandGate
+from instant_ic.bridge.foxglove_commands import Commands
+from instant_ic.bridge.foxglove_parameters import Parameters
+from instant_ic.bridge.web_access import refusal
+from instant_ic.bus import ERROR, OK, WARN, Node, Subscription
+from instant_ic.bus.qos import PRESETS, RELIABLE
+from instant_ic.bus.registry import NodeInfo, TopicInfo
+from instant_ic.bus.transport import Received
+from instant_ic.msg import MessageError, typestore
 
 _START_S = 10.0
 _END_S = 2.0

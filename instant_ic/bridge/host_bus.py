@@ -10,16 +10,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
-from ..bus.qos import PRESETS
-from ..bus.transport import Received, TransportError
-from ..msg import MessageError, deserialize
-from .host_link import HostLink
-from .host_protocol import Announce
-from .host_session import Arrived
-from .host_topics import TopicRule
+from instant_ic.bridge.host_link import HostLink
+from instant_ic.bridge.host_protocol import Announce
+from instant_ic.bridge.host_session import Arrived
+from instant_ic.bridge.host_topics import TopicRule
+from instant_ic.bus import RELIABLE, SENSOR, Node, Publisher, QoS, RegistryError, registry
+from instant_ic.bus.qos import PRESETS
+from instant_ic.bus.transport import Received, TransportError
+from instant_ic.msg import MessageError, deserialize
 
-BRIDGES = ("instant_ic.nodes.host_bridge", "instant_ic.nodes.zenoh_gateway")
+BRIDGES = ("nodes.host_bridge", "nodes.zenoh_gateway")
 """Nodes that publish here what was published elsewhere: it is not sent on, or it would come back."""
 
 OLD_NEWS_NS = 1_000_000_000

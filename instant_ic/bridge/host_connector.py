@@ -10,10 +10,18 @@ import zmq
 from zmq.utils import z85
 from zmq.utils.monitor import parse_monitor_message
 
-from .host_keys import KeyStore, Peer, fingerprint
-from .host_link import GREETING_S, RECEIVE_MOST, Connection, HostLink, LinkEvent, Problem, check_endpoint
-from .host_session import Ended, Event, LinkTimes, Side, Up
-from .host_topics import TopicRule
+from instant_ic.bridge.host_keys import KeyStore, Peer, fingerprint
+from instant_ic.bridge.host_link import (
+    GREETING_S,
+    RECEIVE_MOST,
+    Connection,
+    HostLink,
+    LinkEvent,
+    Problem,
+    check_endpoint,
+)
+from instant_ic.bridge.host_session import Ended, Event, LinkTimes, Side, Up
+from instant_ic.bridge.host_topics import TopicRule
 
 _RETRY_S = 0.2
 _UNPROVED_RETRY_S = 0.7

@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from .host_protocol import DATA_OVERHEAD, LANES, MAX_CHUNK, Announce, Data
-from .host_topics import TopicCounts, TopicRule
+from instant_ic.bridge.host_protocol import DATA_OVERHEAD, LANES, MAX_CHUNK, Announce, Data
+from instant_ic.bridge.host_topics import TopicCounts, TopicRule
 
 QUEUE_DEPTH = 1000
 """Messages of a reliable topic that wait for the link; then the oldest is dropped and counted."""

@@ -15,11 +15,11 @@ from typing import Any
 import zmq
 from zmq.utils import z85
 
-from .host_flow import Channel, Item
-from .host_keys import AllowList, KeyFileError, KeyStore, Peer
-from .host_protocol import MAX_FRAME
-from .host_session import Event, LinkTimes, Memory, Session, Side
-from .host_topics import TopicCounts, TopicRule
+from instant_ic.bridge.host_flow import Channel, Item
+from instant_ic.bridge.host_keys import AllowList, KeyFileError, KeyStore, Peer
+from instant_ic.bridge.host_protocol import MAX_FRAME
+from instant_ic.bridge.host_session import Event, LinkTimes, Memory, Session, Side
+from instant_ic.bridge.host_topics import TopicCounts, TopicRule
 
 _ENDPOINT = re.compile(r"tcp://(\[[0-9A-Fa-f:.]+(%\w+)?\]|[A-Za-z0-9_.*-]+):(\d{1,5})\Z")
 GREETING_S = 4.0  # CURVE and the greeting take four round trips

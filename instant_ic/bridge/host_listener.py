@@ -12,11 +12,20 @@ from typing import Any
 import zmq
 from zmq.utils import z85
 
-from .host_keys import KeyStore, fingerprint
-from .host_link import RECEIVE_MOST, Connection, HostLink, LinkError, LinkEvent, Problem, Stranger, check_endpoint
-from .host_protocol import Bye, Hello, ProtocolError, decode
-from .host_session import Event, LinkTimes, Side, Up
-from .host_topics import TopicRule
+from instant_ic.bridge.host_keys import KeyStore, fingerprint
+from instant_ic.bridge.host_link import (
+    RECEIVE_MOST,
+    Connection,
+    HostLink,
+    LinkError,
+    LinkEvent,
+    Problem,
+    Stranger,
+    check_endpoint,
+)
+from instant_ic.bridge.host_protocol import Bye, Hello, ProtocolError, decode
+from instant_ic.bridge.host_session import Event, LinkTimes, Side, Up
+from instant_ic.bridge.host_topics import TopicRule
 
 _ZAP = "inproc://zeromq.zap.01"
 _ALLOW_LIST_S = 0.25

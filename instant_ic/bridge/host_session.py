@@ -9,10 +9,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from ..ranges import Range, check_ranges
-from .host_clock import ClockFilter
-from .host_flow import Channel, Item, Outbox, Window
-from .host_protocol import (
+from instant_ic.bridge.host_clock import ClockFilter
+from instant_ic.bridge.host_flow import Channel, Item, Outbox, Window
+from instant_ic.bridge.host_protocol import (
     DATA_OVERHEAD,
     LANES,
     VERSION,
@@ -30,7 +29,8 @@ from .host_protocol import (
     Welcome,
     decode,
 )
-from .host_topics import TopicCounts, TopicRule
+from instant_ic.bridge.host_topics import TopicCounts, TopicRule
+from instant_ic.config.ranges import Range, check_ranges
 
 MAX_MESSAGE = 64 << 20
 """Bytes of the longest message that is put together."""

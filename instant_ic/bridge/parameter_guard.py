@@ -22,7 +22,7 @@ def never_set(module: str, key: str) -> bool:
     """Whether a parameter can be changed only on this machine (``ic param set``).
 
     Args:
-        module: of the node, ``instant_ic.nodes.arbiter``.
+        module: of the node, ``nodes.arbiter``.
         key: of the parameter, groups with dots.
     """
     name = f"{module.rsplit('.', 1)[-1]}.{key}".lower()

@@ -6,7 +6,7 @@ import os
 import time
 from pathlib import Path
 
-from ..bus import registry
+from instant_ic.bus import registry
 
 _FULL_LOOK_S = 1.0  # what a killed process leaves behind changes no folder
 

@@ -8,13 +8,23 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..bus import ERROR, OK, Node, Publisher
-from ..bus.registry import RegistryError
-from ..msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
-from .commands import CommandGate, CommandRefused
-from .zenoh_format import Attachment, Token, TopicQoS
-from .zenoh_session import RosNode, RosSubscription
-from .zenoh_topics import ACTED_ON, COMMANDS, GRACE_S, STOP, Namespace, bus_qos, known_hash, parse_subscribe, takes
+from instant_ic.bridge.commands import CommandGate, CommandRefused
+from instant_ic.bridge.zenoh_format import Attachment, Token, TopicQoS
+from instant_ic.bridge.zenoh_session import RosNode, RosSubscription
+from instant_ic.bridge.zenoh_topics import (
+    ACTED_ON,
+    COMMANDS,
+    GRACE_S,
+    STOP,
+    Namespace,
+    bus_qos,
+    known_hash,
+    parse_subscribe,
+    takes,
+)
+from instant_ic.bus import ERROR, OK, Node, Publisher
+from instant_ic.bus.registry import RegistryError
+from instant_ic.msg import MessageError, deserialize, message_type, serialize, twist_stamped, twist_values, type_hash
 
 _TF = "tf2_msgs/msg/TFMessage"
 MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..bus import ERROR, RELIABLE, Node, QoS, Subscription
-from ..bus.qos import PRESETS
-from ..bus.registry import PublisherInfo, TopicInfo
-from ..bus.transport import Received
-from .zenoh_session import RosNode, RosPublisher, RosSession
-from .zenoh_topics import GRACE_S, Namespace, known_hash, parse_publish, ros_qos, takes
+from instant_ic.bridge.zenoh_session import RosNode, RosPublisher, RosSession
+from instant_ic.bridge.zenoh_topics import GRACE_S, Namespace, known_hash, parse_publish, ros_qos, takes
+from instant_ic.bus import ERROR, RELIABLE, Node, QoS, Subscription
+from instant_ic.bus.qos import PRESETS
+from instant_ic.bus.registry import PublisherInfo, TopicInfo
+from instant_ic.bus.transport import Received
 
 
 @dataclass

@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any
 
-from .web_access import is_loopback
+from instant_ic.bridge.web_access import is_loopback
 
 _ENDPOINT = re.compile(r"(?P<link>\w+)/(\[(?P<ipv6>[^\]]+)\]|(?P<host>[^:\[\]/]+)):\d+(\?[^#]*)?\Z")
 _TLS_LINKS = ("tls", "quic")

@@ -17,8 +17,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ..paths import shipped_file
-from .zenoh_format import ADMIN_SPACE, GID_SIZE, SENDER_SIZE, Attachment, FormatError, Kind, Token, TopicQoS, data_key
+from instant_ic.bridge.zenoh_format import (
+    ADMIN_SPACE,
+    GID_SIZE,
+    SENDER_SIZE,
+    Attachment,
+    FormatError,
+    Kind,
+    Token,
+    TopicQoS,
+    data_key,
+)
+from instant_ic.paths import shipped_file
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 MAX_PUBLISHERS = 256

@@ -7,10 +7,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ..bus import LATCHED, RELIABLE, SENSOR, QoS
-from ..bus.registry import RegistryError, check_topic
-from ..msg import MessageError, message_type, type_hash
-from .zenoh_format import TopicQoS
+from instant_ic.bridge.zenoh_format import TopicQoS
+from instant_ic.bus import LATCHED, RELIABLE, SENSOR, QoS
+from instant_ic.bus.registry import RegistryError, check_topic
+from instant_ic.msg import MessageError, message_type, type_hash
 
 STOP = "/operator/estop"
 COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}

@@ -7,11 +7,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .node import ERROR, OK, STALE, WARN, Latest, Node, NodeError, Publisher, Subscription, Worker
-    from .params import ParameterError
-    from .process import main
-    from .qos import LATCHED, RECORD, RELIABLE, SENSOR, QoS
-    from .registry import RegistryError
+    from instant_ic.bus.node import ERROR, OK, STALE, WARN, Latest, Node, NodeError, Publisher, Subscription, Worker
+    from instant_ic.bus.process import main
+    from instant_ic.bus.qos import LATCHED, RECORD, RELIABLE, SENSOR, QoS
+    from instant_ic.bus.registry import RegistryError
+    from instant_ic.config.params import ParameterError
 
 _NAMES = {
     "node": "ERROR OK STALE WARN Latest Node NodeError Publisher Subscription Worker",

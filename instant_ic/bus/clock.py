@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
-from .. import pace
+from instant_ic import pace
 
 
 class Clock(Protocol):

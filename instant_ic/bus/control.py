@@ -20,13 +20,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from . import registry
-from .node import NodeError
-from .parameter_info import ParameterInfo, plain
-from .params import ParameterError
+from instant_ic.bus import registry
+from instant_ic.bus.node import NodeError
+from instant_ic.config.parameter_info import ParameterInfo, plain
+from instant_ic.config.params import ParameterError
 
 if TYPE_CHECKING:
-    from .node import Node
+    from instant_ic.bus.node import Node
 
 MAX_REQUEST_BYTES = 256 * 1024
 MAX_ANSWER_BYTES = 16 * 1024 * 1024

@@ -14,7 +14,7 @@ import json
 import struct
 from dataclasses import dataclass
 
-from ..msg import type_hash
+from instant_ic.msg import type_hash
 
 VERSION = 2
 MAGIC = b"IIC\0"

@@ -17,8 +17,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
-from . import registry
-from .frame import (
+from instant_ic.bus import registry
+from instant_ic.bus.frame import (
     BUFFER_ID,
     DATA,
     GREETING,
@@ -32,12 +32,12 @@ from .frame import (
     Hello,
     type_digest,
 )
-from .qos import QoS
-from .shm import BufferPool, SharedBuffer
-from .transport import Payload, PublisherStats, TransportError
+from instant_ic.bus.qos import QoS
+from instant_ic.bus.shm import BufferPool, SharedBuffer
+from instant_ic.bus.transport import Payload, PublisherStats, TransportError
 
 if TYPE_CHECKING:
-    from .local_transport import LocalTransport
+    from instant_ic.bus.local_transport import LocalTransport
 
 SHARED_FROM_BYTES = 96 << 10
 """Messages of this size and more go through shared memory: below, the copies through a socket cost less than the

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from . import registry
-from .frame import (
+from instant_ic.bus import registry
+from instant_ic.bus.frame import (
     BUFFER_ID,
     DATA,
     GREETING,
@@ -33,12 +33,12 @@ from .frame import (
     check_kind,
     type_digest,
 )
-from .qos import QoS
-from .shm import SharedMapping
-from .transport import Received, Stats
+from instant_ic.bus.qos import QoS
+from instant_ic.bus.shm import SharedMapping
+from instant_ic.bus.transport import Received, Stats
 
 if TYPE_CHECKING:
-    from .local_transport import LocalTransport
+    from instant_ic.bus.local_transport import LocalTransport
 
 VIEWS_HELD = 4
 """Views into shared memory that one reader keeps; what comes beyond them is copied, so that a queue or a node that

@@ -17,11 +17,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from . import registry
-from .frame import FrameError
-from .local_publisher import LocalPublisher
-from .local_subscription import Inlet, LocalSubscription
-from .qos import QoS
+from instant_ic.bus import registry
+from instant_ic.bus.frame import FrameError
+from instant_ic.bus.local_publisher import LocalPublisher
+from instant_ic.bus.local_subscription import Inlet, LocalSubscription
+from instant_ic.bus.qos import QoS
 
 _DISCOVERY_S = 0.1
 _IDLE_S = 5.0

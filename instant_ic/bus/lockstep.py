@@ -15,11 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..msg import deserialize, serialize, type_name
-from .clock import ManualClock
-from .node import Node
-from .qos import LATCHED, QoS
-from .transport import Payload, PublisherStats, Received, Stats, joined
+from instant_ic.bus.clock import ManualClock
+from instant_ic.bus.node import Node
+from instant_ic.bus.qos import LATCHED, QoS
+from instant_ic.bus.transport import Payload, PublisherStats, Received, Stats, joined
+from instant_ic.msg import deserialize, serialize, type_name
 
 NodeT = TypeVar("NodeT", bound=Node[Any])
 

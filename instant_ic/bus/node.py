@@ -14,9 +14,16 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar, get_args
 
-from ..geometry.poses import Matrix
-from ..geometry.transforms import TransformBuffer, TransformError
-from ..msg import (
+from instant_ic.bus.clock import Clock, JumpDetector, ManualClock
+from instant_ic.bus.parameter_event import TOPIC as PARAMETER_EVENTS
+from instant_ic.bus.parameter_event import parameter_event
+from instant_ic.bus.qos import LATCHED, RELIABLE, SENSOR, QoS
+from instant_ic.bus.transport import Payload, RawPublisher, RawSubscription, Received, Transport
+from instant_ic.config import params
+from instant_ic.config.parameter_info import ParameterInfo, is_live, parameter_infos, plain
+from instant_ic.geometry.poses import Matrix
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.msg import (
     MessageError,
     deserialize,
     header,
@@ -28,14 +35,7 @@ from ..msg import (
     transform_message,
     type_name,
 )
-from ..pace import current
-from . import params
-from .clock import Clock, JumpDetector, ManualClock
-from .parameter_event import TOPIC as PARAMETER_EVENTS
-from .parameter_event import parameter_event
-from .parameter_info import ParameterInfo, is_live, parameter_infos, plain
-from .qos import LATCHED, RELIABLE, SENSOR, QoS
-from .transport import Payload, RawPublisher, RawSubscription, Received, Transport
+from instant_ic.pace import current
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of a diagnosis (diagnostic_msgs/DiagnosticStatus)."""

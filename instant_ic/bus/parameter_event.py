@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from ..msg import message_type, to_time
+from instant_ic.msg import message_type, to_time
 
 TOPIC = "/parameter_events"
 

@@ -14,13 +14,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
 
-from .. import pace, paths
-from ..msg import MessageError
-from . import params, registry
-from .clock import Clock, ManualClock, SystemClock
-from .control import ControlServer
-from .local_transport import LocalTransport
-from .node import Node, NodeError
+from instant_ic import pace, paths
+from instant_ic.bus import registry
+from instant_ic.bus.clock import Clock, ManualClock, SystemClock
+from instant_ic.bus.control import ControlServer
+from instant_ic.bus.local_transport import LocalTransport
+from instant_ic.bus.node import Node, NodeError
+from instant_ic.config import params
+from instant_ic.msg import MessageError
 
 
 def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:

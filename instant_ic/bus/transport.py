@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from .qos import QoS
+from instant_ic.bus.qos import QoS
 
 Buffer = bytes | bytearray | memoryview
 

@@ -5,8 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from instant_ic.camera.source import Camera, CameraError, Frame
-
-from ..ranges import Positive, check_ranges
+from instant_ic.config.ranges import Positive, check_ranges
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,8 @@ def nodes(args: Any) -> Iterable[str]:
 def parameters(args: Any) -> Iterable[str]:
     """Parameters of the node that stands before on the command line."""
     from instant_ic import paths
-    from instant_ic.bus import params, registry
+    from instant_ic.bus import registry
+    from instant_ic.config import params
 
     for node in registry.list_nodes(paths.run_dir()):
         if args is not None and node.name == str(args.node).strip("/"):

@@ -20,11 +20,11 @@ from instant_ic.cli.arguments import not_negative, positive, positive_int
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
-    from instant_ic.depth.dataset import PanoramaDataset
-    from instant_ic.depth.feeds import Feed, Samples
-    from instant_ic.depth.rooms import RoomsConfig
-    from instant_ic.depth.slicenet import SliceNetConfig
-    from instant_ic.depth.training import Team, Trainer
+    from instant_ic.training.dataset import PanoramaDataset
+    from instant_ic.training.feeds import Feed, Samples
+    from instant_ic.training.rooms import RoomsConfig
+    from instant_ic.training.slicenet import SliceNetConfig
+    from instant_ic.training.trainer import Team, Trainer
 
 LICENCE = "Apache-2.0"
 _EPILOG = """examples:
@@ -98,7 +98,7 @@ def add_parser(commands: Any) -> None:
 def train(args: argparse.Namespace) -> int:
     """``ic depth train``."""
     from instant_ic.cli.progress import progress
-    from instant_ic.depth.training import Team
+    from instant_ic.training.trainer import Team
 
     for path in (args.checkpoint, args.export):
         if path is not None and path.is_dir():
@@ -131,8 +131,8 @@ def train(args: argparse.Namespace) -> int:
         return 0
     print(json.dumps(metrics.as_dict()), flush=True)
     if args.export:
-        from instant_ic.depth.export import export_model
-        from instant_ic.depth.slicenet import load_checkpoint
+        from instant_ic.training.export import export_model
+        from instant_ic.training.slicenet import load_checkpoint
 
         manifest = export_model(
             load_checkpoint(args.checkpoint), args.export, args.export.stem, LICENCE, trainer.config.max_range_m,
@@ -143,7 +143,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def _network(name: str) -> SliceNetConfig:
-    from instant_ic.depth.slicenet import SMALL, SliceNetConfig
+    from instant_ic.training.slicenet import SMALL, SliceNetConfig
 
     if name == "small":
         return SMALL
@@ -154,8 +154,8 @@ def _network(name: str) -> SliceNetConfig:
 
 
 def _trainer(args: argparse.Namespace, network: SliceNetConfig, team: Team, report: Any) -> Trainer:
-    from instant_ic.depth.training import Trainer, TrainingConfig
-    from instant_ic.depth.weights import load_start
+    from instant_ic.training.trainer import Trainer, TrainingConfig
+    from instant_ic.training.weights import load_start
 
     config = TrainingConfig(
         minutes=args.minutes, epochs=args.epochs, batch_size=args.batch_size, learning_rate=args.learning_rate,
@@ -175,15 +175,15 @@ def _trainer(args: argparse.Namespace, network: SliceNetConfig, team: Team, repo
 
 def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
     """Training batches and panoramas for evaluation, as the command line asks for."""
-    from instant_ic.depth.dataset import Subset
-    from instant_ic.depth.feeds import FileFeed, MixedFeed, RenderedFeed
-    from instant_ic.depth.rooms import FIRST_HELD_OUT, RoomsConfig
+    from instant_ic.training.dataset import Subset
+    from instant_ic.training.feeds import FileFeed, MixedFeed, RenderedFeed
+    from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
 
     generated = args.generated or ("none" if args.data else "wide")
     if generated == "none" and not args.data:
         raise ValueError("nothing to train on: give --data LAYOUT:FOLDER, or --generated wide")
     if args.data:
-        from instant_ic.depth.folders import open_folder
+        from instant_ic.training.folders import open_folder
     folders = [open_folder(name, (network.height, network.width)) for name in args.data]
     size = args.batch_size
     own = (
@@ -225,7 +225,7 @@ def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report:
 
 
 def _rendered(recipe: RoomsConfig, workers: int) -> list[Any]:
-    from instant_ic.depth.feeds import Renderers
+    from instant_ic.training.feeds import Renderers
 
     with Renderers(recipe, workers, lambda place: recipe.first_world + place % recipe.worlds) as renderers:
         return [sample for _ in range(recipe.worlds) for sample in renderers.world()]
@@ -237,8 +237,8 @@ def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, repo
     Raises:
         UserError: it was rendered by another recipe.
     """
-    from instant_ic.depth.dataset import PanoramaDataset, write_dataset
-    from instant_ic.depth.feeds import WORLD_TIMEOUT_S, Renderers
+    from instant_ic.training.dataset import PanoramaDataset, write_dataset
+    from instant_ic.training.feeds import WORLD_TIMEOUT_S, Renderers
 
     done = folder / "complete"
     if not done.exists() and team.rank == 0:

@@ -7,11 +7,10 @@ from pathlib import Path
 
 from instant_ic import pace
 from instant_ic.bus import ERROR, OK, registry
+from instant_ic.cli.doctor import FAIL, Finding
+from instant_ic.cli.doctor import OK as FINE
+from instant_ic.cli.doctor import WARN as DOUBTFUL
 from instant_ic.msg import DiagnosticArray, deserialize
-
-from .doctor import FAIL, Finding
-from .doctor import OK as FINE
-from .doctor import WARN as DOUBTFUL
 
 _LONGEST_S = 20.0
 
@@ -39,7 +38,7 @@ ADVICE: tuple[tuple[str, str], ...] = (
 
 def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
     """The faults that the nodes of a running stack tell within some seconds of its time; nothing where none runs."""
-    from .observer import Observer
+    from instant_ic.cli.observer import Observer
 
     nodes = registry.list_nodes(run_dir)
     if not nodes:

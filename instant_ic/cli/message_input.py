@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.bus.params import ParameterError, yaml_value
 from instant_ic.cli.errors import UserError
+from instant_ic.config.params import ParameterError, yaml_value
 from instant_ic.msg import MessageError, message_type, to_time, type_name, typestore
 
 _INTEGERS = {

@@ -1,7 +1,7 @@
 """The operator's console: a web page, its server, and a client for tests.
 
 The folder knows neither the bus nor the messages: :class:`ConsoleServer` takes a :class:`Backend` and
-plain values; :mod:`instant_ic.nodes.console` joins it to the topics.
+plain values; :mod:`nodes.console` joins it to the topics.
 """
 
 from instant_ic.console.client import ConsoleClient

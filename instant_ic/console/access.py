@@ -18,7 +18,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
-from ..ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Positive, Range, check_ranges
 
 COOKIE = "instant_ic_session"
 SIGN_IN = ("auto", "always", "never")

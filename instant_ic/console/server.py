@@ -25,6 +25,7 @@ from urllib.parse import quote, urlsplit
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
+from instant_ic.config.ranges import Positive, PositiveInt, Range, check_ranges
 from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, is_loopback, tls_context
 from instant_ic.console.connections import (
     CLOSE_S,
@@ -41,8 +42,6 @@ from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, whole, words
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
-
-from ..ranges import Positive, PositiveInt, Range, check_ranges
 
 STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096

@@ -9,9 +9,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.geometry.poses import pose_matrix
-
-from ..ranges import NotNegative, Positive, Range, check_ranges
 
 MAX_FOV_RAD = math.radians(150)
 WATCHER_APART_RAD = math.radians(15)

@@ -13,19 +13,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.poses import wrap_angle
-from ..ranges import NotNegative, Positive, check_ranges
-from .costmap import Costmap
-from .footprint import Footprint
-from .freshness import IMAGES, TimeoutConfig
-from .kinematics import MotionLimits, clip_twist
-from .passage import Passage, PassageConfig, find_passage
-from .planner import HybridPlanner, PlannerConfig
-from .prediction import Prediction, PredictionConfig, Predictor
-from .safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
-from .states import OPERATOR_LOST, SOURCES, TRANSITIONS, Mode, Source, VbotAction
-from .subgoal import Subgoal, SubgoalConfig, choose_subgoal
-from .walls import WallMap
+from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.freshness import IMAGES, TimeoutConfig
+from instant_ic.control.kinematics import MotionLimits, clip_twist
+from instant_ic.control.passage import Passage, PassageConfig, find_passage
+from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.prediction import Prediction, PredictionConfig, Predictor
+from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, MonitoredCommand
+from instant_ic.control.states import OPERATOR_LOST, SOURCES, TRANSITIONS, Mode, Source, VbotAction
+from instant_ic.control.subgoal import Subgoal, SubgoalConfig, choose_subgoal
+from instant_ic.control.walls import WallMap
+from instant_ic.geometry.poses import wrap_angle
 
 Twist2 = tuple[float, float]
 """Linear m/s, angular rad/s."""

@@ -14,9 +14,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Percent, Positive, Range, check_ranges
-from .footprint import Footprint
-from .heights import HeightConfig, HeightLayer, SortedPoints, shifted
+from instant_ic.config.ranges import NotNegative, Percent, Positive, Range, check_ranges
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.heights import HeightConfig, HeightLayer, SortedPoints, shifted
 
 FREE = 0
 INSCRIBED = 253

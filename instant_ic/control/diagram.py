@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .freshness import TimeoutConfig
-from .states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS
+from instant_ic.control.freshness import TimeoutConfig
+from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS
 
 
 def state_diagram() -> str:

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.poses import relative2, wrap_angle
-from ..ranges import Positive, check_ranges
-from .costmap import Costmap
-from .footprint import Footprint
-from .kinematics import MotionLimits, clip_twist, move
-from .planner import Plan
+from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits, clip_twist, move
+from instant_ic.control.planner import Plan
+from instant_ic.geometry.poses import relative2, wrap_angle
 
 _BESIDE_M = 0.3
 """Nearer than this a goal that moves is tracked whatever the path to it."""

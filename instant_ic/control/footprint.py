@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import Positive, check_ranges
+from instant_ic.config.ranges import Positive, check_ranges
 
 
 @dataclass(frozen=True)

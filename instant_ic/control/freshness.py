@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from ..ranges import Positive, Range, check_ranges
+from instant_ic.config.ranges import Positive, Range, check_ranges
 
 _Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
 """Longer than this is no time-out: a robot must not drive on what it saw or was told so long ago."""

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 
 Cell = TypeVar("Cell", bound=np.generic)
 

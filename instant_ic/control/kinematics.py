@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.poses import wrap_angle
-from ..ranges import Positive, check_ranges
+from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.geometry.poses import wrap_angle
 
 
 @dataclass(frozen=True)

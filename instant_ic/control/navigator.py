@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.poses import relative2
-from ..ranges import NotNegative, Positive, check_ranges
-from .costmap import Costmap
-from .follower import FollowerCommand, PathFollower
-from .kinematics import move
-from .planner import HybridPlanner, Plan, no_plan
+from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.follower import FollowerCommand, PathFollower
+from instant_ic.control.kinematics import move
+from instant_ic.control.planner import HybridPlanner, Plan, no_plan
+from instant_ic.geometry.poses import relative2
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..ranges import NotNegative, NotNegativeInt, check_ranges
-from .costmap import Costmap
-from .planner import HybridPlanner, Plan
-from .prediction import Prediction
-from .subgoal import behind_obstacle, extend_ahead
-from .walls import WallMap
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, check_ranges
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.planner import HybridPlanner, Plan
+from instant_ic.control.prediction import Prediction
+from instant_ic.control.subgoal import behind_obstacle, extend_ahead
+from instant_ic.control.walls import WallMap
 
 
 @dataclass(frozen=True)

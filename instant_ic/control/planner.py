@@ -17,9 +17,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, PositiveInt, Range, check_ranges
-from .costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
-from .footprint import Footprint
+from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges
+from instant_ic.control.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
+from instant_ic.control.footprint import Footprint
 
 SPACING_M = 0.05
 """Between the poses of a path."""

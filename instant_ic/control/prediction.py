@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Positive, check_ranges
-from .costmap import Costmap
-from .footprint import Footprint
-from .kinematics import MotionLimits, accelerate, clip_twist, move
+from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
 
 
 @dataclass(frozen=True)

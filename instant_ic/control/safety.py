@@ -15,8 +15,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
-from .footprint import Footprint
+from instant_ic.config.ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
+from instant_ic.control.footprint import Footprint
 
 ActionType = Literal["stop", "slowdown", "limit", "approach"]
 

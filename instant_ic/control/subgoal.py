@@ -9,10 +9,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import NotNegative, Range, check_ranges
-from .costmap import LETHAL, UNKNOWN, Costmap
-from .prediction import Prediction
-from .walls import WallMap
+from instant_ic.config.ranges import NotNegative, Range, check_ranges
+from instant_ic.control.costmap import LETHAL, UNKNOWN, Costmap
+from instant_ic.control.prediction import Prediction
+from instant_ic.control.walls import WallMap
 
 
 @dataclass(frozen=True)

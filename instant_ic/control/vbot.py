@@ -9,11 +9,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.poses import wrap_angle
-from ..ranges import NotNegative, Positive, Range, check_ranges
-from .footprint import Footprint
-from .kinematics import MotionLimits, accelerate, clip_twist, move
-from .walls import WallMap
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
+from instant_ic.control.walls import WallMap
+from instant_ic.geometry.poses import wrap_angle
 
 _TRACK_M = 0.1
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .costmap import StaticMap
+from instant_ic.control.costmap import StaticMap
 
 
 def occupied_cells(static: StaticMap, occupied_threshold: int) -> NDArray[np.bool_]:

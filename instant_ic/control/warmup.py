@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 
-from .costmap import CostmapConfig, RollingCostmap, scan_rays
-from .footprint import Footprint
-from .heights import sort_points
-from .kinematics import MotionLimits
-from .planner import HybridPlanner, PlannerConfig
-from .prediction import PredictionConfig, Predictor
-from .safety import CollisionMonitor, CollisionMonitorConfig
+from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_rays
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.heights import sort_points
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.prediction import PredictionConfig, Predictor
+from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 
 
 def warm_up() -> None:

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import Positive, check_ranges
-from .lidar_depth import LEAST_SIGMA, LidarDepth, Origin
+from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.depth.lidar_depth import LEAST_SIGMA, LidarDepth, Origin
 
 Floats = NDArray[np.floating]
 

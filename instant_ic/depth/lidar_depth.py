@@ -15,10 +15,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
+from instant_ic.depth.visibility import project_points
 from instant_ic.geometry.projections import equirect_directions, equirect_pixels
-
-from ..ranges import NotNegative, Positive, Range, Share, check_ranges
-from .visibility import project_points
 
 Floats = NDArray[np.floating]
 Indices = NDArray[np.signedinteger]

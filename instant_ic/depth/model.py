@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.depth.manifest import ManifestError, ModelManifest, load_manifest, manifest_path
+from instant_ic.depth.providers import OpenSession, open_session
 from instant_ic.geometry.projections import equirect_directions
-
-from .manifest import ManifestError, ModelManifest, load_manifest, manifest_path
-from .providers import OpenSession, open_session
 
 DEFAULT_MODEL = "slicenet_small.onnx"
 MAX_GAIN = 2.5

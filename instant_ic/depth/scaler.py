@@ -8,9 +8,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.ranges import NotNegative, Positive, Range, Share, check_ranges
-
-from .scale_rules import (
+from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
+from instant_ic.depth.scale_rules import (
     MIN_VALUES,
     Floats,
     ScaleError,
@@ -21,7 +20,7 @@ from .scale_rules import (
     sector_factors,
     solid_angle_quantile,
 )
-from .visibility import hidden, nearest_points, on_depth_edge
+from instant_ic.depth.visibility import hidden, nearest_points, on_depth_edge
 
 METHODS = ("max_ratio", "median_ratio", "ransac", "sector", "as_estimated")
 MAXIMA = ("lidar", "image")

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import check_ranges
-from .fusion import Corrected, FusionConfig, ceiling_height, correct, fuse, fused_sigma, likely_ceiling
-from .lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, rays
-from .scaler import DepthScaler, ScaleFit, ScalerConfig
-from .visibility import nearest_points
+from instant_ic.config.ranges import check_ranges
+from instant_ic.depth.fusion import Corrected, FusionConfig, ceiling_height, correct, fuse, fused_sigma, likely_ceiling
+from instant_ic.depth.lidar_depth import LidarDepth, LidarDepthConfig, LidarStructure, rays
+from instant_ic.depth.scaler import DepthScaler, ScaleFit, ScalerConfig
+from instant_ic.depth.visibility import nearest_points
 
 Floats = NDArray[np.floating]
 SOURCES = ("network", "lidar", "fused")

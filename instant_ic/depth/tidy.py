@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from ..ranges import Positive, Range, Share, check_ranges
+from instant_ic.config.ranges import Positive, Range, Share, check_ranges
 
 Floats = NDArray[np.float32]
 _PAD = 64  # columns that the picture is continued by on both sides, so that its edge is none

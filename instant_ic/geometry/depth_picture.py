@@ -13,9 +13,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.projections import perspective_directions
 from instant_ic.limits import decode_image
-
-from .projections import perspective_directions
 
 WIDTH = 96
 NEAREST_M = 0.2

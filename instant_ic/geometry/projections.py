@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .poses import rotation_matrix
+from instant_ic.geometry.poses import rotation_matrix
 
 Floats = NDArray[np.floating]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .poses import Matrix, interpolate, inverse
+from instant_ic.geometry.poses import Matrix, interpolate, inverse
 
 
 class TransformError(LookupError):

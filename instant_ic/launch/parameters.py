@@ -143,8 +143,8 @@ def _check_apart(nodes: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
 def _problems(node: _Node) -> list[str]:
     """All that is wrong with one node's command line."""
     from instant_ic.bag.replay import ReplayError, find_node_class
-    from instant_ic.bus.params import ParameterError, ProcessParameters
     from instant_ic.bus.process import argument_parser, parse_remaps
+    from instant_ic.config.params import ParameterError, ProcessParameters
 
     where = f"{node.at}: node {node.label}"
     try:
@@ -172,7 +172,7 @@ def _problems(node: _Node) -> list[str]:
 
 
 def _values(node: _Node, args: Any, problems: list[str], where: str) -> dict[str, Any]:
-    from instant_ic.bus.params import ParameterError, Values, load_file, parse_override
+    from instant_ic.config.params import ParameterError, Values, load_file, parse_override
 
     values: Values = {}
     for path in args.params_file:
@@ -191,7 +191,7 @@ def _values(node: _Node, args: Any, problems: list[str], where: str) -> dict[str
 
 def _refused(config_class: type[Any], values: dict[str, Any], node: _Node, where: str) -> list[str]:
     """What a configuration refuses: the value that is to blame is left out, and the rest tried again."""
-    from instant_ic.bus.params import ParameterError, build
+    from instant_ic.config.params import ParameterError, build
 
     problems: list[str] = []
     while True:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-from ..ranges import NotNegative, Positive, Range, Share, check_ranges
+from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .convert import (
+from instant_ic.msg.convert import (
     HARD_STOP,
     POINT_DTYPE,
     cloud_array,
@@ -37,7 +37,7 @@ from .convert import (
     twist_stamped,
     twist_values,
 )
-from .types import (
+from instant_ic.msg.types import (
     MessageError,
     deserialize,
     message_type,

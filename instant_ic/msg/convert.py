@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.poses import (
+from instant_ic.geometry.poses import (
     Matrix,
     matrix_from_pose2,
     matrix_from_quaternion,
     pose2_from_matrix,
     quaternion_from_matrix,
 )
-from .types import MessageError, message_type
+from instant_ic.msg.types import MessageError, message_type
 
 POINT_DTYPE = np.dtype(
     {

@@ -8,7 +8,7 @@ import threading
 import tty
 from pathlib import Path
 
-from instant_ic.base.emulator import RoboclawEmulator
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
 log = logging.getLogger(__name__)
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer, Frame
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
 from instant_ic.sim.theta import ThetaConfig
 from instant_ic.sim.vlp16 import Vlp16, Vlp16Config

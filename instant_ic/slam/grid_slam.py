@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2
-from instant_ic.slam.back_end import BackEnd, correction, gather
 from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.front_end import FrontEnd, Guess, Track, TrackStatus, constant_velocity
 from instant_ic.slam.keyframes import NO_SCAN, Keyframe, grown_drift
 from instant_ic.slam.localization import Localizer
+from instant_ic.slam.loop_closure import BackEnd, correction, gather
 from instant_ic.slam.loop_search import Found
 from instant_ic.slam.map_files import save_graph, save_grid
 from instant_ic.slam.motion import MotionMonitor

@@ -25,7 +25,7 @@ from instant_ic.bag.recover import recover
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Publisher, registry
 from instant_ic.bus.control import NodeControl
 from instant_ic.cli.main import main
-from instant_ic.evaluation.stack import Observer, observer
+from instant_ic.experiments.stack import Observer, observer
 from instant_ic.msg import Bool, Clock, Float32, NodeStatus, deserialize, serialize
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(120)]

@@ -12,7 +12,7 @@ from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR
 from instant_ic.bus.clock import ManualClock
-from instant_ic.nodes.bag_player import BagPlayerConfig, BagPlayerNode
+from nodes.bag_player import BagPlayerConfig, BagPlayerNode
 
 BOOL, TF = "std_msgs/msg/Bool", "tf2_msgs/msg/TFMessage"
 

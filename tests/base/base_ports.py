@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.emulator import RoboclawEmulator
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
 
 class EmulatorPort:

@@ -11,12 +11,12 @@ from base_ports import EmulatorPort, opener
 
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.controller import BaseController, ControllerConfig, ControllerThread
-from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.base.recent import RecentCount
 from instant_ic.bus import ERROR, OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import Twist, Vector3, pose_matrix, stamp_ns, twist_stamped, twist_values
-from instant_ic.nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
 MILLISECOND = 1_000_000
 
@@ -246,7 +246,7 @@ def test_thread_stops_the_motors_when_its_work_fails() -> None:
 def test_shipped_parameters_are_the_defaults() -> None:
     from pathlib import Path
 
-    from instant_ic.bus.params import build, load_file
+    from instant_ic.config.params import build, load_file
 
     path = Path(__file__).resolve().parents[2] / "config" / "base.yaml"
     assert build(CrawlerBaseConfig, load_file(path, "crawler_base")) == CrawlerBaseConfig()

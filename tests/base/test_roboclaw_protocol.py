@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.base.protocol import (
     Command,
     ProtocolError,
@@ -23,6 +22,7 @@ from instant_ic.base.protocol import (
     write_frame,
 )
 from instant_ic.base.roboclaw import LinkError, Roboclaw
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
 
 def test_crc_has_the_check_value_of_xmodem() -> None:

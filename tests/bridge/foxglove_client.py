@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 from instant_ic.bus import registry
 from instant_ic.bus.control import ControlServer
 from instant_ic.bus.node import Node
-from instant_ic.nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
+from nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
 
 
 class Client:

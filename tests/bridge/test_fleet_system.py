@@ -12,7 +12,7 @@ import pytest
 
 from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.registry import list_topics
-from instant_ic.evaluation.stack import Stack, free_port, free_ports, machine_pace, observer
+from instant_ic.experiments.stack import Stack, free_port, free_ports, machine_pace, observer
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.msg import ControlState, Odometry, TwistStamped, pose_matrix, twist_stamped
 from instant_ic.pace import read as read_pace

@@ -12,7 +12,7 @@ from live_nodes import LiveNode, cdr, wait_for
 from websockets.exceptions import ConnectionClosed
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
-from instant_ic.evaluation.stack import free_port
+from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
     Bool,
     Clock,
@@ -29,7 +29,7 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
-from instant_ic.nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
+from nodes.foxglove_bridge import FoxgloveBridgeConfig, FoxgloveBridgeNode
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 

@@ -12,10 +12,11 @@ from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_protocol import Announce
 from instant_ic.bridge.host_session import Arrived, ClockStepped, LinkTimes
 from instant_ic.bridge.host_topics import TopicRule
-from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, params, registry
+from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, registry
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.config import params
 from instant_ic.msg import Bool, String, TFMessage, TwistStamped, deserialize, serialize, twist_stamped
-from instant_ic.nodes.host_bridge import HostBridgeConfig, HostBridgeNode, judge_clock
+from nodes.host_bridge import HostBridgeConfig, HostBridgeNode, judge_clock
 
 TO_STATION = ("/picture lane=bulk", "/state", "/tf_static", "/log shared=true", "/queue")
 TO_ROBOT = (
@@ -223,7 +224,7 @@ def test_command_reaches_the_robot_and_an_old_one_does_not(hosts):
 
 
 def test_other_type_on_a_topic_is_refused_and_told(hosts, monkeypatch):
-    from instant_ic.nodes import host_bridge
+    from nodes import host_bridge
 
     hosts.host("robot")
     hosts.host("station")

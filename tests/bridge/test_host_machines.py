@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from instant_ic.bus import registry
-from instant_ic.evaluation.stack import processes_of
-from instant_ic.evaluation.two_machines import TwoMachines, drive_and_cut, missing
+from instant_ic.experiments.stack import processes_of
+from instant_ic.experiments.two_machines import TwoMachines, drive_and_cut, missing
 
 pytestmark = [
     pytest.mark.system,

@@ -23,12 +23,12 @@ from instant_ic.bridge.zenoh_session import (
     open_zenoh,
 )
 from instant_ic.bus import LATCHED
-from instant_ic.bus.params import load_file
 from instant_ic.bus.registry import list_topics
-from instant_ic.evaluation.stack import free_port
+from instant_ic.config.params import load_file
+from instant_ic.experiments.stack import free_port
 from instant_ic.msg import String, deserialize, serialize, twist_stamped, type_hash
-from instant_ic.nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
-from instant_ic.nodes.zenoh_router import ZenohRouterConfig, ZenohRouterNode
+from nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
+from nodes.zenoh_router import ZenohRouterConfig, ZenohRouterNode
 
 zenoh = pytest.importorskip("zenoh")
 pytestmark = pytest.mark.xdist_group("zenoh")

@@ -19,7 +19,7 @@ from instant_ic.bridge.zenoh_session import (
     open_zenoh,
 )
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, NodeError, registry
-from instant_ic.evaluation.stack import free_port
+from instant_ic.experiments.stack import free_port
 from instant_ic.msg import (
     Bool,
     DiagnosticArray,
@@ -33,7 +33,7 @@ from instant_ic.msg import (
     twist_values,
     type_hash,
 )
-from instant_ic.nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
+from nodes.zenoh_gateway import ZenohGatewayConfig, ZenohGatewayNode
 
 zenoh = pytest.importorskip("zenoh")
 pytestmark = pytest.mark.xdist_group("zenoh")
@@ -542,7 +542,7 @@ def test_a_missing_router_is_told_and_found_when_it_comes(tmp_path_factory):
 def test_a_client_waits_for_its_router_and_finds_it(waits_itself, tmp_path, tmp_path_factory, monkeypatch):
     """A Zenoh client cannot be opened without its router, and by its configuration may wait for it for ever."""
     monkeypatch.setattr("instant_ic.bridge.zenoh_session._OPEN_S", 3.0)
-    monkeypatch.setattr("instant_ic.nodes.zenoh_gateway._AGAIN_S", 0.2)
+    monkeypatch.setattr("nodes.zenoh_gateway._AGAIN_S", 0.2)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = ZenohGatewayConfig(mode="client", connect=(endpoint,), publish=("/chatter",))
     if waits_itself:

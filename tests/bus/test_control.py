@@ -22,8 +22,8 @@ from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.control import ControlError, ControlServer, NodeBusyError, NodeControl
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.msg import deserialize
-from instant_ic.ranges import Positive, Range, check_ranges
 
 
 @dataclass(frozen=True)

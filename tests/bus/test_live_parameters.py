@@ -10,7 +10,7 @@ import pytest
 import instant_ic
 from instant_ic.bus import Node, ParameterError
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.bus.parameter_info import is_live, parameter_infos
+from instant_ic.config.parameter_info import is_live, parameter_infos
 from instant_ic.msg import image_message, transform_matrix
 
 NODES = sorted(path.stem for path in (Path(instant_ic.__file__).parent / "nodes").glob("[a-z]*.py"))

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from instant_ic import pace
 from instant_ic.bus import NodeError
 from instant_ic.bus.clock import SystemClock
-from instant_ic.nodes.crawler_base import CrawlerBaseNode
 from instant_ic.pace import Pace, PaceError
+from nodes.crawler_base import CrawlerBaseNode
 
 
 @pytest.fixture(autouse=True)

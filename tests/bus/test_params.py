@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from instant_ic.bus import params
+from instant_ic.config import params
 
 
 @dataclass(frozen=True)

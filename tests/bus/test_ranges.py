@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from instant_ic.bus import ParameterError, params
-from instant_ic.bus.params import ProcessParameters
-from instant_ic.ranges import NotNegative, Positive, Range, Share, check_ranges, range_of
+from instant_ic.bus import ParameterError
+from instant_ic.config import params
+from instant_ic.config.params import ProcessParameters
+from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges, range_of
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node, main
+from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.msg import Bool, LaserScan, String, TwistStamped, scan_message, twist_stamped
-from instant_ic.ranges import Positive, Range, check_ranges
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from instant_ic.msg import (
     twist_values,
 )
 from instant_ic.msg import pose_matrix as matrix_of
-from instant_ic.nodes.console import ConsoleConfig, ConsoleNode
+from nodes.console import ConsoleConfig, ConsoleNode
 
 START = 1_000_000_000
 MS = 1_000_000

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from instant_ic.nerf.view import View
+from instant_ic.vspace.view import View
 
 
 def seen(confidence):

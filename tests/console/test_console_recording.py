@@ -19,7 +19,7 @@ from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerCo
 from instant_ic.console.access import AccessConfig
 from instant_ic.console.recording import MAX_BOOKMARKS, RecorderError, RecordingDesk
 from instant_ic.msg import grid_message
-from instant_ic.nodes.console import ConsoleConfig, ConsoleNode
+from nodes.console import ConsoleConfig, ConsoleNode
 
 WAIT_S = 20.0
 

@@ -19,7 +19,7 @@ from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.console.server import ServerConfig
 from instant_ic.control.states import Mode
-from instant_ic.evaluation.teleop_stack import SilentPage
+from instant_ic.experiments.teleop_stack import SilentPage
 from instant_ic.msg import (
     ControlState,
     PoseWithCovariance,
@@ -38,10 +38,10 @@ from instant_ic.msg import (
     transform_message,
     twist_values,
 )
-from instant_ic.nodes.arbiter import ArbiterNode
-from instant_ic.nodes.console import ConsoleConfig, ConsoleNode
-from instant_ic.nodes.navigator import NavigatorNode
-from instant_ic.nodes.virtual_robot import VirtualRobotNode
+from nodes.arbiter import ArbiterNode
+from nodes.console import ConsoleConfig, ConsoleNode
+from nodes.navigator import NavigatorNode
+from nodes.virtual_robot import VirtualRobotNode
 
 START_NS = 1_000_000_000_000
 FORWARD, NOTHING = (0.4, 0.0), (0.0, 0.0)

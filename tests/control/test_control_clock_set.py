@@ -5,8 +5,8 @@ import pytest
 from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import ControlState, compressed_image_message
-from instant_ic.nodes.arbiter import ArbiterNode
-from instant_ic.nodes.virtual_robot import VirtualRobotNode
+from nodes.arbiter import ArbiterNode
+from nodes.virtual_robot import VirtualRobotNode
 
 S = 1_000_000_000
 

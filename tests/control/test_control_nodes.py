@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
 
-from instant_ic.bus import OK, WARN, params
+from instant_ic.bus import OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.bus.transport import Received
+from instant_ic.config import params
 from instant_ic.console.drive import DriveConfig, DriveGate
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.geometry.poses import pose2_from_matrix
@@ -42,9 +43,9 @@ from instant_ic.msg import (
     twist_stamped,
     twist_values,
 )
-from instant_ic.nodes.arbiter import ArbiterNode, ArbiterNodeConfig
-from instant_ic.nodes.navigator import NavigatorConfig, NavigatorNode
-from instant_ic.nodes.virtual_robot import VirtualRobotConfig, VirtualRobotNode
+from nodes.arbiter import ArbiterNode, ArbiterNodeConfig
+from nodes.navigator import NavigatorConfig, NavigatorNode
+from nodes.virtual_robot import VirtualRobotConfig, VirtualRobotNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "control.yaml"
 STEP_NS = 50_000_000

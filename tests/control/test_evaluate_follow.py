@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from instant_ic.cli.main import main
-from instant_ic.evaluation import follow
-from instant_ic.evaluation import follow_worlds as worlds
-from instant_ic.evaluation.follow_worlds import Person, Room
+from instant_ic.experiments import follow
+from instant_ic.experiments import follow_worlds as worlds
+from instant_ic.experiments.follow_worlds import Person, Room
 
 
 def room(*shapes: tuple[float, ...]) -> Room:

@@ -9,8 +9,8 @@ from control_world import rectangle
 from test_control_nodes import Stack
 
 from instant_ic.msg import HARD_STOP, ControlState, twist_values
-from instant_ic.nodes.navigator import NavigatorNode
-from instant_ic.nodes.virtual_robot import VirtualRobotNode
+from nodes.navigator import NavigatorNode
+from nodes.virtual_robot import VirtualRobotNode
 
 
 def die(node_class: type) -> Callable[[Stack], None]:

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from instant_ic.bag import BagReader, BagWriter
-from instant_ic.bus.params import load_file
-from instant_ic.cli.main import main
-from instant_ic.depth.calibration import (
+from instant_ic.calibration.bag import Selection, read_recording
+from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
+from instant_ic.calibration.mount import (
     AXES,
     CalibrationConfig,
     CalibrationError,
@@ -20,10 +20,10 @@ from instant_ic.depth.calibration import (
     _moved,
     calibrate,
 )
-from instant_ic.depth.calibration_edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
-from instant_ic.depth.calibration_overlay import before_and_after, overlay
-from instant_ic.evaluation.calibration_bag import Selection, read_recording
-from instant_ic.evaluation.calibration_sim import BASE_FROM_CAMERA, BASE_FROM_LIDAR, perturbed, record
+from instant_ic.calibration.overlay import before_and_after, overlay
+from instant_ic.cli.main import main
+from instant_ic.config.params import load_file
+from instant_ic.experiments.calibration_sim import BASE_FROM_CAMERA, BASE_FROM_LIDAR, perturbed, record
 from instant_ic.geometry.poses import inverse, pose_matrix
 
 QUICK = CalibrationConfig(blur_px=(8.0, 2.0, 1.0), yaw_step_deg=4.0)

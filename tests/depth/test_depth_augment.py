@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.depth.augment import (
+from instant_ic.training.augment import (
     camera_colours,
     floor_reflection,
     jpeg,

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from instant_ic.cli.main import main
-from instant_ic.depth import export
-from instant_ic.depth.export import ExportError, export_onnx
-from instant_ic.depth.folding import fold_kernel, fold_upsampling, unfold_kernel
 from instant_ic.depth.manifest import load_manifest
 from instant_ic.depth.model import DepthModel
-from instant_ic.depth.slicenet import ConvStage, SliceNet, SliceNetConfig
+from instant_ic.training import export
+from instant_ic.training.export import ExportError, export_onnx
+from instant_ic.training.folding import fold_kernel, fold_upsampling, unfold_kernel
+from instant_ic.training.slicenet import ConvStage, SliceNet, SliceNetConfig
 
 torch.set_num_threads(1)
 TINY = SliceNetConfig(

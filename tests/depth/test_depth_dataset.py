@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instant_ic.depth.dataset import DatasetError, PanoramaDataset, Sample, Subset, write_dataset
+from instant_ic.training.dataset import DatasetError, PanoramaDataset, Sample, Subset, write_dataset
 
 
 def stripes(count: int, worlds: int, height: int = 8) -> list[Sample]:

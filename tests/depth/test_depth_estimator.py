@@ -13,7 +13,7 @@ from instant_ic.camera.jpeg import JpegError, decode_rgb
 from instant_ic.depth.manifest import ModelManifest, save_manifest
 from instant_ic.depth.model import InferenceError
 from instant_ic.msg import compressed_image_message, image_array
-from instant_ic.nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
+from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
 
 S = 1_000_000_000
 START = 1_700_000_000 * S

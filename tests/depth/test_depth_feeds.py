@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from instant_ic.depth import feeds
-from instant_ic.depth.dataset import Sample
-from instant_ic.depth.feeds import Ahead, FeedError, FileFeed, MixedFeed, RenderedFeed, Renderers
-from instant_ic.depth.rooms import RoomsConfig, render_rooms
+from instant_ic.training import feeds
+from instant_ic.training.dataset import Sample
+from instant_ic.training.feeds import Ahead, FeedError, FileFeed, MixedFeed, RenderedFeed, Renderers
+from instant_ic.training.rooms import RoomsConfig, render_rooms
 
 RECIPE = RoomsConfig(worlds=50, poses=2, height=32, first_world=300_000, interiors="random")
 

@@ -7,8 +7,8 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from instant_ic.depth.dataset import DatasetError
-from instant_ic.depth.folders import LAYOUTS, open_folder
+from instant_ic.training.dataset import DatasetError
+from instant_ic.training.folders import LAYOUTS, open_folder
 
 SIZE = (8, 16)
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from instant_ic.depth.interiors import KINDS, interior_world
-from instant_ic.depth.rooms import FIRST_HELD_OUT, RoomsConfig, render_rooms
-from instant_ic.evaluation import depth_worlds
+from instant_ic.experiments import depth_worlds
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
+from instant_ic.training.interiors import KINDS, interior_world
+from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig, render_rooms
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from instant_ic.depth.losses import berhu, depth_loss, edge_loss, weighted_mean
+from instant_ic.training.losses import berhu, depth_loss, edge_loss, weighted_mean
 
 
 def test_berhu_by_hand() -> None:

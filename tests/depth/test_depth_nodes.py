@@ -9,11 +9,9 @@ import torch
 
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.depth.export import export_model
 from instant_ic.depth.keyframes import KeyframeConfig, KeyframeSelector, decode_sigma, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.scaler import ScalerConfig
-from instant_ic.depth.slicenet import SliceNet, SliceNetConfig
 from instant_ic.geometry.poses import inverse, pose_matrix, transform_points
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.msg import (
@@ -31,8 +29,10 @@ from instant_ic.msg import (
 from instant_ic.msg import (
     pose_matrix as message_pose,
 )
-from instant_ic.nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
-from instant_ic.nodes.depth_scaler import DepthScalerConfig, DepthScalerNode
+from instant_ic.training.export import export_model
+from instant_ic.training.slicenet import SliceNet, SliceNetConfig
+from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
+from nodes.depth_scaler import DepthScalerConfig, DepthScalerNode
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -400,7 +400,7 @@ def test_selector_by_hand() -> None:
 
 
 def test_shipped_configuration_is_the_default() -> None:
-    from instant_ic.bus.params import build, load_file
+    from instant_ic.config.params import build, load_file
     from instant_ic.paths import shipped_file
 
     path = shipped_file("config", "depth.yaml")

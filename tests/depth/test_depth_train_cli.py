@@ -17,10 +17,10 @@ import torch
 
 from instant_ic.cli import depth_train
 from instant_ic.cli.errors import UserError
-from instant_ic.depth import feeds
-from instant_ic.depth.dataset import DatasetError, Sample
-from instant_ic.depth.rooms import FIRST_HELD_OUT, RoomsConfig
-from instant_ic.depth.slicenet import CheckpointError, SliceNetConfig
+from instant_ic.training import feeds
+from instant_ic.training.dataset import DatasetError, Sample
+from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
+from instant_ic.training.slicenet import CheckpointError, SliceNetConfig
 
 SEEDS: list[int] = []
 
@@ -46,7 +46,7 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
     SEEDS.clear()
     monkeypatch.setattr(feeds, "render_rooms", render)
     small = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, decoder_floor=8)
-    monkeypatch.setattr("instant_ic.depth.slicenet.SMALL", small)
+    monkeypatch.setattr("instant_ic.training.slicenet.SMALL", small)
 
 
 def plain_folder(root: Path) -> str:

@@ -9,9 +9,9 @@ import pytest
 import torch
 from torch import nn
 
-from instant_ic.depth.export import export_onnx
-from instant_ic.depth.slicenet import CheckpointError, SliceNet, SliceNetConfig
-from instant_ic.depth.weights import Start, load_start, unfold_norms
+from instant_ic.training.export import export_onnx
+from instant_ic.training.slicenet import CheckpointError, SliceNet, SliceNetConfig
+from instant_ic.training.weights import Start, load_start, unfold_norms
 
 TINY = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.125, lstm_hidden=8, column_stride=2,
                       decoder_floor=8)  # fmt: skip

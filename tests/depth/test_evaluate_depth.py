@@ -14,12 +14,12 @@ from hypothesis.extra.numpy import arrays
 from instant_ic.cli.main import main
 from instant_ic.depth.files import DepthFileError
 from instant_ic.depth.metrics import depth_metrics
-from instant_ic.evaluation import depth_pictures, depth_worlds
-from instant_ic.evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, look_up, report
-from instant_ic.evaluation.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
-from instant_ic.evaluation.depth_lidar import Errors, measure, measure_world
-from instant_ic.evaluation.depth_pictures import Sheets
-from instant_ic.evaluation.depth_worlds import FIRST_SEED, held_out, scenes
+from instant_ic.experiments import depth_pictures, depth_worlds
+from instant_ic.experiments.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, look_up, report
+from instant_ic.experiments.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
+from instant_ic.experiments.depth_lidar import Errors, measure, measure_world
+from instant_ic.experiments.depth_pictures import Sheets
+from instant_ic.experiments.depth_worlds import FIRST_SEED, held_out, scenes
 from instant_ic.geometry.projections import equirect_directions
 
 CAMERA_M, LIDAR_M = 1.2, 0.6

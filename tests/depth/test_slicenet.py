@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from instant_ic.depth.slicenet import (
+from instant_ic.training.slicenet import (
     SMALL,
     CheckpointError,
     CircularPad,

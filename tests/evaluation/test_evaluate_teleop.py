@@ -16,11 +16,11 @@ import pytest
 from instant_ic.bag.writer import BagWriter
 from instant_ic.cli.main import main
 from instant_ic.control.arbiter import Mode
-from instant_ic.evaluation import teleop, teleop_figures, teleop_results, teleop_worlds
-from instant_ic.evaluation.teleop_figures import Drive, Switch
-from instant_ic.evaluation.teleop_operator import RecordedOperator, ScriptedOperator, Sight, read_commands
-from instant_ic.evaluation.teleop_plot import Video, save_plot
-from instant_ic.evaluation.teleop_stack import Log, Shown, SimulatedStack, StackConfig
+from instant_ic.experiments import teleop, teleop_figures, teleop_results, teleop_worlds
+from instant_ic.experiments.teleop_figures import Drive, Switch
+from instant_ic.experiments.teleop_operator import RecordedOperator, ScriptedOperator, Sight, read_commands
+from instant_ic.experiments.teleop_plot import Video, save_plot
+from instant_ic.experiments.teleop_stack import Log, Shown, SimulatedStack, StackConfig
 from instant_ic.msg import message_type, serialize
 from instant_ic.sim.building import Building, Zone
 from instant_ic.sim.contact import OccupancyMask
@@ -492,7 +492,7 @@ def test_shared_control_goes_round_by_itself_and_gives_back() -> None:
     from instant_ic.control.arbiter import ArbiterInputs
     from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_rays
     from instant_ic.control.footprint import Footprint
-    from instant_ic.evaluation.teleop_shared import SharedControl
+    from instant_ic.experiments.teleop_shared import SharedControl
 
     angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
     ranges = np.minimum(4.0, 1.5 / np.maximum(np.abs(np.sin(angles)), 1e-6))  # walls 1.5 m to either side

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from instant_ic.cli.main import main
-from instant_ic.evaluation import vspace, vspace_sources
-from instant_ic.evaluation.colour_only import ColourOnlyField, composite_gradient, density
-from instant_ic.evaluation.vspace import Report, Row, Settings, evaluate, path_poses, scores, start_pose
+from instant_ic.experiments import box_room, vspace, vspace_sources
+from instant_ic.experiments.colour_only import ColourOnlyField, composite_gradient, density
+from instant_ic.experiments.vspace import Report, Row, Settings, evaluate, path_poses, scores, start_pose
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpaceConfig, box_room
 from instant_ic.sim.worlds import corridor_world
+from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
 
 SMALL = VirtualSpaceConfig(
     device="cpu",
@@ -190,7 +190,7 @@ def test_every_source_has_its_rows(report):
 
 
 def test_plot_and_strip_are_written(report, tmp_path):
-    from instant_ic.evaluation.vspace_plot import save_plot, save_strip
+    from instant_ic.experiments.vspace_plot import save_plot, save_strip
 
     report, _ = report
     save_plot(tmp_path / "plot.png", report)

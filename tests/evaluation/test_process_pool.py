@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.evaluation.processes import process_pool
+from instant_ic.experiments.processes import process_pool
 
 
 @pytest.fixture

@@ -141,8 +141,8 @@ def _capture_errors() -> tuple[type[BaseException], ...]:
 def _roboclaw_session() -> tuple[bytes, bytes]:
     """What a driver sends in a session with the emulator, and what comes back."""
     from instant_ic.base.config import RoboclawConfig
-    from instant_ic.base.emulator import RoboclawEmulator
     from instant_ic.base.roboclaw import Roboclaw
+    from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
     emulator, sent, received = RoboclawEmulator(), bytearray(), bytearray()
     pending = bytearray()
@@ -208,7 +208,7 @@ def _parse_replies() -> Callable[[bytes], object]:
 
 
 def _parse_requests() -> Callable[[bytes], object]:
-    from instant_ic.base.emulator import RoboclawEmulator
+    from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 
     def parse(data: bytes) -> None:
         emulator = RoboclawEmulator()
@@ -554,7 +554,7 @@ def _parse_control() -> Callable[[bytes], object]:
     """Answers are refusals for whatever is no request; only a bug is ``internal``."""
     from instant_ic.bus.control import ControlServer
     from instant_ic.bus.lockstep import LockstepBus
-    from instant_ic.nodes.vlp16_driver import Vlp16DriverConfig, Vlp16DriverNode
+    from nodes.vlp16_driver import Vlp16DriverConfig, Vlp16DriverNode
 
     node = LockstepBus().add(Vlp16DriverNode, Vlp16DriverConfig(source="topic"))
     node.commands["go"] = lambda speed=0: speed
@@ -766,8 +766,8 @@ _BOMB = b"a: &a [x,x,x,x,x,x,x,x,x]\n" + b"".join(
 
 
 def _parse_parameters() -> Callable[[bytes], object]:
-    from instant_ic.bus.params import build, load_file
-    from instant_ic.nodes.vlp16_driver import Vlp16DriverConfig
+    from instant_ic.config.params import build, load_file
+    from nodes.vlp16_driver import Vlp16DriverConfig
 
     return _by_file("params.yaml", lambda path: build(Vlp16DriverConfig, load_file(path, "vlp16_driver")))
 
@@ -778,7 +778,7 @@ def _parameter_samples() -> list[bytes]:
 
 
 def _parameter_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.bus.params import ParameterError
+    from instant_ic.config.params import ParameterError
 
     return (ParameterError,)
 
@@ -926,14 +926,14 @@ def _meshes() -> list[bytes]:
 
 
 def _parse_mesh() -> Callable[[bytes], object]:
-    from instant_ic.nerf.mesh_file import load_mesh
+    from instant_ic.vspace.mesh_file import load_mesh
 
     logging.getLogger("trimesh").setLevel(logging.CRITICAL)
     return _by_file("mesh.glb", lambda path: load_mesh(path, 100_000))
 
 
 def _mesh_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.nerf.mesh_file import MeshError
+    from instant_ic.vspace.mesh_file import MeshError
 
     return (MeshError,)
 

@@ -15,9 +15,9 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import preset_of_text, schema_or_unknown, with_hash
 from instant_ic.bag.recover import recover, reindex
 from instant_ic.bus.frame import FrameError, Hello
-from instant_ic.bus.params import ParameterError, load_file
 from instant_ic.bus.qos import RELIABLE, SENSOR
 from instant_ic.camera.http import Session
+from instant_ic.config.params import ParameterError, load_file
 from instant_ic.console.protocol import PREFIX, VERSION, ProtocolError, decode_frame
 from instant_ic.depth.manifest import ManifestError, load_manifest
 from instant_ic.limits import decode_image, load_image

@@ -5,7 +5,7 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from instant_ic.bus.params import parse_override
+from instant_ic.config.params import parse_override
 from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
 from instant_ic.launch.substitutions import Context, SubstitutionError, substitute, truth
 from instant_ic.launch.values import as_yaml

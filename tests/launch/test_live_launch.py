@@ -15,7 +15,7 @@ import pytest
 
 from instant_ic.bus import RELIABLE, registry
 from instant_ic.bus.local_transport import LocalTransport
-from instant_ic.evaluation.stack import processes_of
+from instant_ic.experiments.stack import processes_of
 from instant_ic.msg import deserialize
 
 pytestmark = pytest.mark.system
@@ -109,7 +109,7 @@ def test_hang_respawn_groups_and_the_end_by_a_required_node(launched: Launched) 
 PROGRAM = """
 import signal, sys
 from pathlib import Path
-from instant_ic.evaluation.stack import Stack
+from instant_ic.experiments.stack import Stack
 with Stack("stack.yaml", Path(sys.argv[1]), {}):
     print("started", flush=True)
     signal.pause()

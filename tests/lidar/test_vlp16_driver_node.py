@@ -18,7 +18,7 @@ from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.bus.params import build, load_file
+from instant_ic.config.params import build, load_file
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.packets import PACKET_PERIOD_US, encode_position_packet
@@ -31,7 +31,7 @@ from instant_ic.msg import (
     transform_matrix,
     transform_message,
 )
-from instant_ic.nodes.vlp16_driver import Vlp16DriverConfig, Vlp16DriverNode
+from nodes.vlp16_driver import Vlp16DriverConfig, Vlp16DriverNode
 
 RECORDED = 1_600_000_000 * SECOND
 START = 1_700_000_000 * SECOND

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.nerf import FieldConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room, devices
-from instant_ic.nerf.canvas import CpuCanvas
-from instant_ic.nerf.devices import DeviceError, check_canvas, check_device, make_device
-from instant_ic.nerf.numba_device import NumbaDevice
-from instant_ic.nerf.torch_canvas import TorchCanvas
-from instant_ic.nerf.torch_device import TorchDevice
+from instant_ic.experiments import box_room
+from instant_ic.vspace import FieldConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig, devices
+from instant_ic.vspace.canvas import CpuCanvas
+from instant_ic.vspace.devices import DeviceError, check_canvas, check_device, make_device
+from instant_ic.vspace.nerf.numba_device import NumbaDevice
+from instant_ic.vspace.nerf.torch_device import TorchDevice
+from instant_ic.vspace.torch_canvas import TorchCanvas
 
 CONFIG = VirtualSpaceConfig(
     field=FieldConfig(levels=2, log2_table=10, hidden=8), train=TrainConfig(ray_columns=16, ray_rows=16)
@@ -46,8 +47,8 @@ def gpu(monkeypatch):
     kind = type("Fake", (Broken,), {})
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(devices, "_may_have_cuda", lambda: True)
-    monkeypatch.setitem(sys.modules, "instant_ic.nerf.triton_device", types.SimpleNamespace(TritonDevice=kind))
-    monkeypatch.setattr("instant_ic.nerf.torch_device.TorchDevice", plain)
+    monkeypatch.setitem(sys.modules, "instant_ic.vspace.nerf.triton_device", types.SimpleNamespace(TritonDevice=kind))
+    monkeypatch.setattr("instant_ic.vspace.nerf.torch_device.TorchDevice", plain)
     return kind
 
 
@@ -114,7 +115,7 @@ def test_kernels_that_fail_are_left_for_plain_torch_with_a_warning(gpu, fault, w
 
 
 def test_a_missing_triton_is_told(gpu, monkeypatch):
-    monkeypatch.setitem(sys.modules, "instant_ic.nerf.triton_device", None)  # importing it is an ImportError
+    monkeypatch.setitem(sys.modules, "instant_ic.vspace.nerf.triton_device", None)  # importing it is an ImportError
     device, warning = make_device(with_device("auto"))
     assert isinstance(device, TorchDevice)
     assert "pip install 'instant-ic[triton]'" in warning

@@ -9,8 +9,8 @@ import pytest
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import Keyframe, ViewRequest, compressed_image_message, header, image_message, pose_message
-from instant_ic.nerf import VirtualSpaceConfig
-from instant_ic.nodes.nerf import NerfConfig, NerfNode
+from instant_ic.vspace import VirtualSpaceConfig
+from nodes.nerf import NerfConfig, NerfNode
 
 trimesh = pytest.importorskip("trimesh")
 READY, FAILED = 2, 3

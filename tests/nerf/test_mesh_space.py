@@ -6,12 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES, equirect_directions
-from instant_ic.nerf import KeyframeError, State, VirtualSpaceConfig, box_room
-from instant_ic.nerf.mesh_file import MeshError, load_mesh
-from instant_ic.nerf.mesh_space import MeshSpace, make_space
-from instant_ic.nerf.space import VirtualSpace
+from instant_ic.vspace import KeyframeError, State, VirtualSpaceConfig
+from instant_ic.vspace.mesh_file import MeshError, load_mesh
+from instant_ic.vspace.mesh_space import MeshSpace, make_space
+from instant_ic.vspace.space import VirtualSpace
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -240,7 +241,7 @@ def test_a_mesh_too_large_is_refused(tmp_path, monkeypatch):
     path = wall_file(tmp_path)
     with pytest.raises(MeshError, match=r"2 triangles, space\.mesh_max_triangles is 1"):
         load_mesh(path, max_triangles=1)
-    monkeypatch.setattr("instant_ic.nerf.mesh_file.MAX_FILE_BYTES", 10)
+    monkeypatch.setattr("instant_ic.vspace.mesh_file.MAX_FILE_BYTES", 10)
     with pytest.raises(MeshError, match="GiB"):
         load_mesh(path)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import KeyframeError, VirtualSpace, VirtualSpaceConfig
-from instant_ic.nerf.background import Background, level_planes, mixed_in
-from instant_ic.nerf.background_kernels import in_front
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
-from instant_ic.nerf.view import perspective_rays
+from instant_ic.vspace import KeyframeError, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.background import Background, level_planes, mixed_in
+from instant_ic.vspace.background_kernels import in_front
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.prior import ROBOT, ROOM, SKY, prepare, robot_region, sky_region
+from instant_ic.vspace.view import perspective_rays
 
 H, W = 64, 128
 THING = np.s_[26:38, 56:72]  # rows and columns round the middle of the picture

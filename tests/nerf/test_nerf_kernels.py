@@ -6,24 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES
-from instant_ic.nerf import (
-    FieldConfig,
-    TrainConfig,
-    box_room,
-    kernels,
-    march,
-    reference,
-)
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.field import FieldParameters, Lattice, Scene, StackedPriors, ray_sources
-from instant_ic.nerf.numba_device import NumbaDevice
-from instant_ic.nerf.occupancy import build_occupancy, surface_points
-from instant_ic.nerf.prior import prepare
-from instant_ic.nerf.reference import TorchField
-from instant_ic.nerf.torch_device import TorchDevice, torch_priors
-from instant_ic.nerf.view import perspective_rays
+from instant_ic.vspace import FieldConfig, TrainConfig
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf import kernels, march, reference
+from instant_ic.vspace.nerf.field import FieldParameters, Lattice, Scene, StackedPriors, ray_sources
+from instant_ic.vspace.nerf.numba_device import NumbaDevice
+from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
+from instant_ic.vspace.nerf.reference import TorchField
+from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
+from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.view import perspective_rays
 
 F = np.float32
 FOCUS = np.array(

@@ -6,22 +6,15 @@ import math
 import numpy as np
 import pytest
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import (
-    FieldConfig,
-    ReadinessConfig,
-    State,
-    TrainConfig,
-    VirtualSpace,
-    VirtualSpaceConfig,
-    box_room,
-)
-from instant_ic.nerf import compose as composing
-from instant_ic.nerf.compose import Layer, compose, exposure_gain, exposure_gains, moved
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.field import Rays
-from instant_ic.nerf.prior import MOVED, prepare
-from instant_ic.nerf.view import perspective_rays
+from instant_ic.vspace import FieldConfig, ReadinessConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace import compose as composing
+from instant_ic.vspace.compose import Layer, compose, exposure_gain, exposure_gains, moved
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf.field import Rays
+from instant_ic.vspace.prior import MOVED, prepare
+from instant_ic.vspace.view import perspective_rays
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",
@@ -358,7 +351,7 @@ def composed_plainly(layers, rays):
 
 
 def test_the_kernel_composes_as_plain_numpy_does():
-    from instant_ic.nerf import PanoramaWarp
+    from instant_ic.vspace import PanoramaWarp
 
     rays = perspective_rays(VIEW, 48, 32, 1.5)
     layers = []

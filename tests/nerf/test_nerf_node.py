@@ -9,6 +9,7 @@ import pytest
 
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.experiments import box_room
 from instant_ic.geometry.depth_picture import decode_depth, encode_depth
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import (
@@ -19,8 +20,8 @@ from instant_ic.msg import (
     image_message,
     pose_message,
 )
-from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpaceConfig, box_room
-from instant_ic.nodes.nerf import Job, NerfConfig, NerfNode, read_mask
+from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
+from nodes.nerf import Job, NerfConfig, NerfNode, read_mask
 
 EMPTY, TRAINING, READY = 0, 1, 2
 S = 1_000_000_000

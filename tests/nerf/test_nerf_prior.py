@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from instant_ic.nerf import KeyframeError, box_room
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.prior import prepare, torn_quads
+from instant_ic.experiments import box_room
+from instant_ic.vspace import KeyframeError
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.prior import prepare, torn_quads
 
 CAMERA = np.eye(4)
 PICTURE = box_room.panorama(CAMERA, 64)

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import (
+from instant_ic.vspace import (
     FieldConfig,
     NotReadyError,
     SpaceFileError,
@@ -16,7 +17,6 @@ from instant_ic.nerf import (
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
-    box_room,
     saved,
 )
 

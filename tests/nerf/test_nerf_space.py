@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import (
+from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
     NotReadyError,
@@ -17,13 +18,12 @@ from instant_ic.nerf import (
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
-    box_room,
 )
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.occupancy import build_occupancy, surface_points
-from instant_ic.nerf.prior import area_average, fill_holes, prepare, torn_quads
-from instant_ic.nerf.view import perspective_rays
-from instant_ic.nerf.warm_up import warm_up
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
+from instant_ic.vspace.prior import area_average, fill_holes, prepare, torn_quads
+from instant_ic.vspace.view import perspective_rays
+from instant_ic.vspace.warm_up import warm_up
 
 CONFIG = VirtualSpaceConfig(
     device="cpu",
@@ -302,7 +302,7 @@ def once(call):
 
 @pytest.mark.parametrize("call", ["step", "drawn", "set_scene"])
 def test_a_gpu_without_memory_is_left_for_the_cpu_with_what_is_learnt(call, monkeypatch):
-    monkeypatch.setattr("instant_ic.nerf.devices._may_have_cuda", lambda: False)
+    monkeypatch.setattr("instant_ic.vspace.devices._may_have_cuda", lambda: False)
     # Pictures by the field.
     ready = dataclasses.replace(SMALL, readiness=ReadinessConfig(psnr_db=1), picture=FIELD_ONLY.picture)
     space, whole = trained(6, ready), trained(6, ready)
@@ -342,7 +342,8 @@ def test_a_gpu_that_was_asked_for_fails_aloud_and_the_next_keyframe_recovers(mon
 
 @pytest.mark.parametrize("keyframes", [1, 2])
 def test_warm_up_leaves_nothing_to_compile(keyframes):
-    from instant_ic.nerf import background_kernels, compose_kernels, fill_kernels, kernels, march, warp_kernels
+    from instant_ic.vspace import background_kernels, compose_kernels, fill_kernels, warp_kernels
+    from instant_ic.vspace.nerf import kernels, march
 
     modules = (background_kernels, compose_kernels, fill_kernels, kernels, march, warp_kernels)
     compiled = [value for module in modules for value in vars(module).values() if hasattr(value, "signatures")]

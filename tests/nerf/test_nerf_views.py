@@ -5,10 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES, equirect_to_cube
-from instant_ic.nerf import FieldConfig, NotReadyError, TrainConfig, View, VirtualSpace, VirtualSpaceConfig, box_room
-from instant_ic.nerf.view import continue_unseen, equirect_rays, perspective_rays
+from instant_ic.vspace import FieldConfig, NotReadyError, TrainConfig, View, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace.view import continue_unseen, equirect_rays, perspective_rays
 
 CONFIG = VirtualSpaceConfig(
     device="cpu", field=FieldConfig(log2_table=13), train=TrainConfig(ray_columns=64, ray_rows=32, iterations=80)

@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 import torch
 
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import FieldConfig, TrainConfig, VirtualSpaceConfig, box_room, volume, volume_reference
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.field import VOLUME_SAMPLES, FieldParameters, Lattice, Scene, ray_sources
-from instant_ic.nerf.kernels import no_marks
-from instant_ic.nerf.numba_device import NumbaDevice
-from instant_ic.nerf.occupancy import build_occupancy
-from instant_ic.nerf.prior import prepare
-from instant_ic.nerf.reference import TorchField, query, sample_rays
-from instant_ic.nerf.torch_device import TorchDevice, torch_priors
-from instant_ic.nerf.view import perspective_rays
+from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf import volume, volume_reference
+from instant_ic.vspace.nerf.field import VOLUME_SAMPLES, FieldParameters, Lattice, Scene, ray_sources
+from instant_ic.vspace.nerf.kernels import no_marks
+from instant_ic.vspace.nerf.numba_device import NumbaDevice
+from instant_ic.vspace.nerf.occupancy import build_occupancy
+from instant_ic.vspace.nerf.reference import TorchField, query, sample_rays
+from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors
+from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.view import perspective_rays
 
 F = np.float32
 FIELD = FieldConfig(levels=4, log2_table=12, hidden=16, geometry="density")

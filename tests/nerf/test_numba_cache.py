@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from instant_ic.nerf.numba_cache import forget_stale
+from instant_ic.vspace.nerf.numba_cache import forget_stale
 
 
 def placed(path: Path, age_s: float) -> Path:

@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from instant_ic.evaluation.pictures import psnr_db
+from instant_ic.experiments import box_room
+from instant_ic.experiments.pictures import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import FieldConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig, box_room
-from instant_ic.nerf import torch_warp as kernels
-from instant_ic.nerf.canvas import CpuCanvas
-from instant_ic.nerf.config import GeometryConfig
-from instant_ic.nerf.field import Rays
-from instant_ic.nerf.prior import SKY, prepare
-from instant_ic.nerf.store import KeyframeSet, ready
-from instant_ic.nerf.torch_canvas import TorchCanvas
-from instant_ic.nerf.torch_device import TorchDevice
-from instant_ic.nerf.view import equirect_rays, perspective_rays
-from instant_ic.nerf.warp import Pyramid
+from instant_ic.vspace import FieldConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
+from instant_ic.vspace import torch_warp as kernels
+from instant_ic.vspace.canvas import CpuCanvas
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf.field import Rays
+from instant_ic.vspace.nerf.torch_device import TorchDevice
+from instant_ic.vspace.prior import SKY, prepare
+from instant_ic.vspace.store import KeyframeSet, ready
+from instant_ic.vspace.torch_canvas import TorchCanvas
+from instant_ic.vspace.view import equirect_rays, perspective_rays
+from instant_ic.vspace.warp import Pyramid
 
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 CAMERA = pose_matrix(0.3, -0.2, 0.1, 0.4)
@@ -268,7 +269,7 @@ def test_a_space_shows_the_same_by_either(picture):
 
 
 def test_a_gpu_without_memory_for_a_picture_is_left_for_the_cpu(monkeypatch):
-    monkeypatch.setattr("instant_ic.nerf.devices._may_have_cuda", lambda: False)
+    monkeypatch.setattr("instant_ic.vspace.devices._may_have_cuda", lambda: False)
     space = space_on(TorchCanvas(DEVICE))
     space.config = dataclasses.replace(space.config, device="auto")
     pose = CAMERA @ pose_matrix(0.4, 0.2)

@@ -18,22 +18,24 @@ triton = pytest.importorskip("triton", reason="triton is not installed: pip inst
 
 import triton.language as tl  # noqa: E402
 
+from instant_ic.experiments import box_room  # noqa: E402
 from instant_ic.geometry.poses import pose_matrix  # noqa: E402
-from instant_ic.nerf import FieldConfig, TrainConfig, box_room, devices, reference, torch_warp, triton_warp  # noqa: E402
-from instant_ic.nerf import triton_kernels as kernels  # noqa: E402
-from instant_ic.nerf.canvas import CpuCanvas  # noqa: E402
-from instant_ic.nerf.config import GeometryConfig  # noqa: E402
-from instant_ic.nerf.devices import check_device  # noqa: E402
-from instant_ic.nerf.field import FieldParameters, Lattice, Scene, ray_sources  # noqa: E402
-from instant_ic.nerf.occupancy import build_occupancy  # noqa: E402
-from instant_ic.nerf.prior import prepare  # noqa: E402
-from instant_ic.nerf.reference import TorchField  # noqa: E402
-from instant_ic.nerf.store import KeyframeSet, ready  # noqa: E402
-from instant_ic.nerf.torch_canvas import TorchCanvas  # noqa: E402
-from instant_ic.nerf.torch_device import TorchDevice, torch_priors  # noqa: E402
-from instant_ic.nerf.triton_device import TritonDevice  # noqa: E402
-from instant_ic.nerf.view import perspective_rays  # noqa: E402
-from instant_ic.nerf.warp import Pyramid  # noqa: E402
+from instant_ic.vspace import FieldConfig, TrainConfig, devices, torch_warp, triton_warp  # noqa: E402
+from instant_ic.vspace.canvas import CpuCanvas  # noqa: E402
+from instant_ic.vspace.config import GeometryConfig  # noqa: E402
+from instant_ic.vspace.devices import check_device  # noqa: E402
+from instant_ic.vspace.nerf import reference  # noqa: E402
+from instant_ic.vspace.nerf import triton_kernels as kernels  # noqa: E402
+from instant_ic.vspace.nerf.field import FieldParameters, Lattice, Scene, ray_sources  # noqa: E402
+from instant_ic.vspace.nerf.occupancy import build_occupancy  # noqa: E402
+from instant_ic.vspace.nerf.reference import TorchField  # noqa: E402
+from instant_ic.vspace.nerf.torch_device import TorchDevice, torch_priors  # noqa: E402
+from instant_ic.vspace.nerf.triton_device import TritonDevice  # noqa: E402
+from instant_ic.vspace.prior import prepare  # noqa: E402
+from instant_ic.vspace.store import KeyframeSet, ready  # noqa: E402
+from instant_ic.vspace.torch_canvas import TorchCanvas  # noqa: E402
+from instant_ic.vspace.view import perspective_rays  # noqa: E402
+from instant_ic.vspace.warp import Pyramid  # noqa: E402
 
 DEVICE = "cuda" if CUDA else "cpu"
 F = np.float32

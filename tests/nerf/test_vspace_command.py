@@ -6,10 +6,11 @@ import pytest
 import trimesh
 
 from instant_ic.cli.main import main
+from instant_ic.experiments import box_room
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import VirtualSpace, box_room
-from instant_ic.nerf.export import flight, surface, write_ply
-from instant_ic.nerf.space import NotReadyError
+from instant_ic.vspace import VirtualSpace
+from instant_ic.vspace.export import flight, surface, write_ply
+from instant_ic.vspace.space import NotReadyError
 
 
 def write_rgb(path, rgb):
@@ -229,7 +230,7 @@ def test_a_folder_without_a_space(tmp_path, capsys):
 
 
 def test_ply_without_faces_by_hand(tmp_path):
-    from instant_ic.nerf.export import Surface
+    from instant_ic.vspace.export import Surface
 
     cloud = Surface(np.array([[1, 2, 3]], np.float32), np.array([[255, 0, 7]], np.uint8), np.zeros((0, 3), np.int32))
     write_ply(tmp_path / "a.ply", cloud, mesh=False)

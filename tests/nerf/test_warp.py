@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.evaluation.pictures import psnr_db
+from instant_ic.experiments import box_room
+from instant_ic.experiments.pictures import psnr_db
 from instant_ic.geometry.poses import pose_matrix
-from instant_ic.nerf import (
+from instant_ic.vspace import (
     FieldConfig,
     KeyframeError,
     PictureConfig,
@@ -15,12 +16,11 @@ from instant_ic.nerf import (
     TrainConfig,
     VirtualSpace,
     VirtualSpaceConfig,
-    box_room,
     fill_kernels,
 )
-from instant_ic.nerf.prior import _fill
-from instant_ic.nerf.view import perspective_rays
-from instant_ic.nerf.warp import PanoramaWarp, Pyramid, dissolve
+from instant_ic.vspace.prior import _fill
+from instant_ic.vspace.view import perspective_rays
+from instant_ic.vspace.warp import PanoramaWarp, Pyramid, dissolve
 
 FOV = math.pi / 2
 
@@ -211,7 +211,7 @@ def test_a_dissolve_by_hand():
 
 
 def test_a_views_pose_follows_from_its_rays(warp):
-    from instant_ic.nerf.warp import pinhole
+    from instant_ic.vspace.warp import pinhole
 
     pose = pose_matrix(1.0, 2.0, 0.3, 0.1, -0.2, 0.7)
     found, half = pinhole(perspective_rays(pose, 96, 54, 1.2))

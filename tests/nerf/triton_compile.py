@@ -6,8 +6,9 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from instant_ic.nerf import triton_kernels, triton_warp
-from instant_ic.nerf.triton_device import ENTRIES, TILE, TRAIN_BLOCK
+from instant_ic.vspace import triton_warp
+from instant_ic.vspace.nerf import triton_kernels
+from instant_ic.vspace.nerf.triton_device import ENTRIES, TILE, TRAIN_BLOCK
 
 FIELD = {"LEVELS": 8, "LP": 8, "F": 4, "HIDDEN": 32, "HP": 32}
 KERNELS = [

@@ -14,14 +14,14 @@ import numpy as np
 
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.controller import BaseController, BaseState, ControllerConfig
-from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.base.roboclaw import Roboclaw
 from instant_ic.bus.clock import ManualClock
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.msg import Bool, twist_stamped
-from instant_ic.nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 from instant_ic.sim.contact import OccupancyMask
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from instant_ic.sim.robot import RobotConfig, TrackedRobot
+from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
 TICK_S = 0.001
 RATE_HZ = 30.0

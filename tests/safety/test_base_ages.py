@@ -12,9 +12,9 @@ from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.camera.files import FileCamera
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import TFMessage, odometry_message, scan_message, transform_message, twist_stamped
-from instant_ic.nodes.arbiter import ArbiterNode
-from instant_ic.nodes.grid_slam import GridSlamNode
-from instant_ic.nodes.virtual_robot import VirtualRobotNode
+from nodes.arbiter import ArbiterNode
+from nodes.grid_slam import GridSlamNode
+from nodes.virtual_robot import VirtualRobotNode
 
 S = 1_000_000_000
 START_NS = 1_700_000_000 * S

@@ -7,7 +7,7 @@ from base_line import RATE_HZ, Base
 from instant_ic.base.config import RoboclawConfig
 from instant_ic.base.controller import ControllerConfig
 from instant_ic.base.protocol import Command
-from instant_ic.nodes.crawler_base import CrawlerBaseConfig
+from nodes.crawler_base import CrawlerBaseConfig
 
 
 def test_the_shipped_watchdog_stops_the_motors_within_0_3_s_and_outlasts_missed_commands() -> None:

@@ -2,10 +2,10 @@
 
 import pytest
 
-from instant_ic.bus import params
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.bus.parameter_info import parameter_infos
-from instant_ic.nodes.arbiter import ArbiterNode
+from instant_ic.config import params
+from instant_ic.config.parameter_info import parameter_infos
+from nodes.arbiter import ArbiterNode
 
 CONFIG = ArbiterNode.config_class()
 EXPECTED = {

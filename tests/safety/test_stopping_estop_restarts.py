@@ -17,8 +17,8 @@ from instant_ic.bus.lockstep import LockstepBus, _Transport
 from instant_ic.console import ConsoleServer
 from instant_ic.estop_state import EstopStateError, KeptStop, RunMark
 from instant_ic.msg import Bool, ControlState, serialize, twist_stamped, twist_values, type_name
-from instant_ic.nodes.arbiter import ArbiterNode
-from instant_ic.nodes.console import ConsoleNode
+from nodes.arbiter import ArbiterNode
+from nodes.console import ConsoleNode
 
 S = 1_000_000_000
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import pytest
 
 from instant_ic.bus.lockstep import LockstepBus, Record
-from instant_ic.evaluation.teleop_stack import STEP_S, SimulatedStack, StackConfig
+from instant_ic.experiments.teleop_stack import STEP_S, SimulatedStack, StackConfig
 from instant_ic.msg import HARD_STOP, ControlState, deserialize, twist_values
 from instant_ic.sim.worlds import corridor_world
 

@@ -17,7 +17,7 @@ import pytest
 
 from instant_ic.bus import LATCHED, registry
 from instant_ic.console.client import ConsoleClient
-from instant_ic.evaluation.stack import Stack, free_port, processes_of
+from instant_ic.experiments.stack import Stack, free_port, processes_of
 from instant_ic.msg import ControlState, stamp_ns
 
 pytestmark = [pytest.mark.system, pytest.mark.timeout(600)]

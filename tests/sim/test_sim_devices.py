@@ -16,10 +16,10 @@ import serial
 from requests.auth import HTTPDigestAuth
 
 from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.emulator import RoboclawEmulator
 from instant_ic.base.roboclaw import Roboclaw
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.sim.roboclaw import RoboClawServer
+from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from instant_ic.sim.theta import ThetaConfig, ThetaServer, panorama_file
 
 TIMEOUT_S = 20.0

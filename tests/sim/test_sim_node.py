@@ -13,8 +13,8 @@ import pytest
 
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.bus.params import build, load_file
-from instant_ic.nodes.simulator import SimulatorConfig, SimulatorNode
+from instant_ic.config.params import build, load_file
+from nodes.simulator import SimulatorConfig, SimulatorNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "sim.yaml"
 
@@ -35,7 +35,7 @@ def test_process_starts_serves_and_ends(tmp_path: Path) -> None:
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "instant_ic.nodes.simulator",
+            [sys.executable, "-m", "nodes.simulator",
              "--run-dir", str(tmp_path),
              "--params-file", str(CONFIG), "-p", "world:=random:3", "-p", "camera.port:=0",
              "-p", "lidar.enabled:=false",

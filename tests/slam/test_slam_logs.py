@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from slam_planar_world import box_room
 
-from instant_ic.evaluation.slam import (
+from instant_ic.experiments.slam import (
     Relations,
     evaluate_log,
     interpolate_trajectory,

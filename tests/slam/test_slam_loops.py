@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from slam_planar_world import PlanarWorld, rectangle
 
-from instant_ic.evaluation.slam_worlds import LASERS, Drive, Laser, cells, drive, trajectory_errors
+from instant_ic.experiments.slam_worlds import LASERS, Drive, Laser, cells, drive, trajectory_errors
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
-from instant_ic.slam.back_end import BackEnd, _Candidate, _chained, _reversed
 from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
+from instant_ic.slam.loop_closure import BackEnd, _Candidate, _chained, _reversed
 from instant_ic.slam.loop_search import LoopSearch, peaks, pool, score_volume, spread
 from instant_ic.slam.pose_graph import Edge
 

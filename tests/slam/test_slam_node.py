@@ -11,8 +11,8 @@ import pytest
 from slam_planar_world import PlanarWorld, box_room
 
 from instant_ic.bus import ERROR, OK, WARN
-from instant_ic.bus import params as bus_params
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.config import params as bus_params
 from instant_ic.geometry.poses import compose2, matrix_from_pose2, pose2_from_matrix, pose_matrix, relative2
 from instant_ic.geometry.transforms import TransformBuffer
 from instant_ic.msg import (
@@ -30,8 +30,8 @@ from instant_ic.msg import (
     transform_message,
 )
 from instant_ic.msg import pose_matrix as message_pose
-from instant_ic.nodes.grid_slam import GridSlamConfig, GridSlamNode
 from instant_ic.slam import ParticleConfig
+from nodes.grid_slam import GridSlamConfig, GridSlamNode
 
 START_NS = 1_700_000_000_000_000_000
 MOUNT = np.array([0.1, 0.0, 0.0])

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from slam_planar_world import box_room, rectangle
 
-from instant_ic.evaluation.slam import run_log
-from instant_ic.evaluation.slam_worlds import Laser, drive, trajectory_errors
+from instant_ic.experiments.slam import run_log
+from instant_ic.experiments.slam_worlds import Laser, drive, trajectory_errors
 from instant_ic.slam import ParticleConfig, SlamConfig, SlamStatus
 from instant_ic.slam.rbpf import ParticleSlam
 from instant_ic.slam.tile_maps import TILE, TileMaps, climb, score

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from slam_planar_world import rectangle
 
-from instant_ic.evaluation.slam_worlds import Drive, Laser, drive
+from instant_ic.experiments.slam_worlds import Drive, Laser, drive
 from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, OccupancyGrid, SlamConfig, SlamResult, SlamStatus
 from instant_ic.slam.backend import make_slam

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from instant_ic.evaluation.recordings import evaluate_recordings
-from instant_ic.evaluation.stack import machine_pace
+from instant_ic.experiments.recordings import evaluate_recordings
+from instant_ic.experiments.stack import machine_pace
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 PCAP, PHOTO = DATA / "vlp16" / "einride_recording.pcap", DATA / "pano" / "library_a.jpg"

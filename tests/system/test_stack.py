@@ -17,8 +17,8 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from instant_ic.bus import registry
-from instant_ic.evaluation.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
-from instant_ic.evaluation.stack import Stack, free_ports, machine_pace, processes_of
+from instant_ic.experiments.drive import DriveRecord, DriveRecorder, drive_through_obstacle, footprint_clearance
+from instant_ic.experiments.stack import Stack, free_ports, machine_pace, processes_of
 from instant_ic.msg import ControlState
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import corridor_world

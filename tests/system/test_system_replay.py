@@ -13,7 +13,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from instant_ic.bag import BagReader
-from instant_ic.evaluation.stack import machine_pace
+from instant_ic.experiments.stack import machine_pace
 from instant_ic.geometry.poses import pose2_from_matrix, relative2
 from instant_ic.msg import deserialize, grid_array, pose_matrix, stamp_ns
 

@@ -11,8 +11,8 @@ from instant_ic.cli import completion
 from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
-    from instant_ic.depth.calibration import Calibration
-    from instant_ic.evaluation.calibration_bag import CalibrationRecording
+    from instant_ic.calibration.bag import CalibrationRecording
+    from instant_ic.calibration.mount import Calibration
     from instant_ic.geometry.poses import Matrix
 
 
@@ -52,8 +52,8 @@ def add_parser(subparsers: Any) -> None:
 
 def camera_lidar(args: argparse.Namespace) -> int:
     """Runs ``ic calibrate camera-lidar``; returns the exit status."""
-    from instant_ic.depth.calibration import CalibrationConfig, calibrate
-    from instant_ic.evaluation.calibration_bag import Selection, read_recording
+    from instant_ic.calibration.bag import Selection, read_recording
+    from instant_ic.calibration.mount import CalibrationConfig, calibrate
 
     if args.frames < 1:
         raise UserError(f"--frames must be at least 1 (got {args.frames})", 2)
@@ -118,7 +118,7 @@ def _xyz_rpy(pose: Matrix) -> tuple[list[float], list[float]]:
 def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: Calibration) -> dict[str, Any]:
     import numpy as np
 
-    from instant_ic.depth.calibration import AXES
+    from instant_ic.calibration.mount import AXES
     from instant_ic.geometry.poses import inverse, pose_matrix
 
     # Without a mount of the LiDAR in the bag: the one of config/lidar.yaml.
@@ -173,7 +173,7 @@ def _yaml(summary: dict[str, Any]) -> str:
 def _plot(path: Path, recording: CalibrationRecording, given: Matrix, result: Calibration) -> None:
     import cv2
 
-    from instant_ic.depth.calibration_overlay import before_and_after
+    from instant_ic.calibration.overlay import before_and_after
 
     sheet = before_and_after(recording.frames, given, result.camera_from_lidar)
     if not cv2.imwrite(str(path), sheet[..., ::-1]):

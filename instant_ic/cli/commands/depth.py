@@ -92,8 +92,8 @@ def convert(args: argparse.Namespace) -> int:
     """``ic depth convert``."""
     import torch
 
-    from instant_ic.depth.export import ExportError, export_model
-    from instant_ic.depth.slicenet import CheckpointError, load_checkpoint
+    from instant_ic.training.export import ExportError, export_model
+    from instant_ic.training.slicenet import CheckpointError, load_checkpoint
 
     output = args.output or args.weights.with_suffix(".onnx")
     if output.suffix != ".onnx":

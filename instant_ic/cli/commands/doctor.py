@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
 def _expectation(args: argparse.Namespace) -> Any:
     """Addresses from the command line, else as the shipped configuration has them."""
     from instant_ic import paths
-    from instant_ic.bus.params import ParameterError, load_file
     from instant_ic.cli.doctor import Expectation
+    from instant_ic.config.params import ParameterError, load_file
 
     def shipped(file: str, node: str, key: str, default: Any) -> Any:
         try:

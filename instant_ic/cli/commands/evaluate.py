@@ -51,8 +51,8 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
     """Runs ``ic evaluate recordings``; returns the exit status."""
     from rich.console import Console
 
-    from ...evaluation.recordings import evaluate_recordings as run
-    from ...evaluation.stack import StackError
+    from instant_ic.experiments.recordings import evaluate_recordings as run
+    from instant_ic.experiments.stack import StackError
 
     console = Console(stderr=True)
     try:

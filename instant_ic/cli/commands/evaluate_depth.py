@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..errors import UserError
+from instant_ic.cli.errors import UserError
 
 
 def add_kind(kinds: Any) -> None:
@@ -61,14 +61,14 @@ def add_kind(kinds: Any) -> None:
 
 def evaluate_depth(args: argparse.Namespace) -> int:
     """Runs ``ic evaluate depth``; returns the exit status."""
-    from ...depth.files import DepthFileError, load_picture
-    from ...depth.manifest import ManifestError
-    from ...depth.model import DEFAULT_MODEL, DepthModel, InferenceError
-    from ...evaluation.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, report
-    from ...evaluation.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
-    from ...evaluation.depth_pictures import Sheets
-    from ...paths import shipped_file
-    from ..progress import progress
+    from instant_ic.cli.progress import progress
+    from instant_ic.depth.files import DepthFileError, load_picture
+    from instant_ic.depth.manifest import ManifestError
+    from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
+    from instant_ic.experiments.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, report
+    from instant_ic.experiments.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
+    from instant_ic.experiments.depth_pictures import Sheets
+    from instant_ic.paths import shipped_file
 
     for file in (args.json, args.plot, args.side):
         if file is not None and not file.parent.is_dir():

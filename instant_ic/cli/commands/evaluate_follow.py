@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         TimeRemainingColumn,
     )
 
-    from ...evaluation import follow
+    from instant_ic.experiments import follow
 
     console = Console(stderr=True)
     for path in (args.json, args.plot):

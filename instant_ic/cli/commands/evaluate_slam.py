@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import UserError
+from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
-    from ...evaluation.slam import LogResult
-    from ...slam.logs import LogEntry
+    from instant_ic.experiments.slam import LogResult
+    from instant_ic.slam.logs import LogEntry
 
 
 def add_kind(kinds: Any) -> None:
@@ -54,10 +54,16 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from ...bag.replay import make_node
-    from ...evaluation.slam import evaluate_log, perturb_odometry, read_relations, read_stamps, write_trajectory
-    from ...evaluation.slam_bag import is_bag, read_bag
-    from ...slam.logs import LogError, read_log
+    from instant_ic.bag.replay import make_node
+    from instant_ic.experiments.slam import (
+        evaluate_log,
+        perturb_odometry,
+        read_relations,
+        read_stamps,
+        write_trajectory,
+    )
+    from instant_ic.experiments.slam_bag import is_bag, read_bag
+    from instant_ic.slam.logs import LogError, read_log
 
     if args.stamps and not args.relations:
         raise UserError("--stamps chooses among relations: give --relations too", 2)
@@ -114,7 +120,7 @@ def _stem(log: Path) -> str:
 
 
 def _plot(path: Path, run: LogResult) -> None:
-    from ...evaluation.pictures import save_map
+    from instant_ic.experiments.pictures import save_map
 
     grid = run.slam.grid()
     save_map(

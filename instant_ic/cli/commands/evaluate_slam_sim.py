@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..errors import UserError
+from instant_ic.cli.errors import UserError
 
 
 def add_kind(kinds: Any) -> None:
@@ -38,10 +38,10 @@ def evaluate_slam_sim(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from ...evaluation.pictures import save_map
-    from ...evaluation.slam_sim import evaluate_round_trip, round_trip
-    from ...sim.worlds import make_world
-    from ...slam import SlamConfig
+    from instant_ic.experiments.pictures import save_map
+    from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
+    from instant_ic.sim.worlds import make_world
+    from instant_ic.slam import SlamConfig
 
     if args.seeds < 1 or args.rounds < 1:
         raise UserError("--seeds and --rounds must be at least 1", 2)

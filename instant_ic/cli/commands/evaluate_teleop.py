@@ -115,7 +115,7 @@ def _wrong_usage(args: argparse.Namespace) -> str:
 
 
 def _evaluate(args: argparse.Namespace, console: Any) -> int:
-    from ...evaluation import teleop, teleop_results
+    from instant_ic.experiments import teleop, teleop_results
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
     settings = teleop.Settings(
@@ -130,11 +130,11 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     drives = teleop_results.in_order(drives)
     figures = teleop_results.report(drives, settings)
     if args.plot:
-        from ...evaluation.teleop_plot import save_plot
+        from instant_ic.experiments.teleop_plot import save_plot
 
         save_plot(args.plot, drives, figures, settings)
     if args.video and not status:
-        from ...evaluation.teleop_plot import Video
+        from instant_ic.experiments.teleop_plot import Video
 
         with Video(args.video) as video, console.status("drawing the video"):
             teleop.run_episode(settings, 0, video.on_step, methods[:1])
@@ -161,7 +161,7 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
         TimeRemainingColumn,
     )
 
-    from ...evaluation import teleop, teleop_results
+    from instant_ic.experiments import teleop, teleop_results
 
     planned, known = settings.episodes * len(settings.methods), len(drives)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())

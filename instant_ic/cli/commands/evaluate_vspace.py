@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from ..errors import UserError
+from instant_ic.cli.errors import UserError
 
 
 def add_kind(kinds: Any) -> None:
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
-    from ...evaluation import vspace
+    from instant_ic.experiments import vspace
 
     for file in (args.json, args.plot, args.strip):
         if file is not None and not file.parent.is_dir():
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             args.json.write_text(json.dumps(figures, indent=2) + "\n")
         if args.plot or args.strip:
-            from ...evaluation.vspace_plot import save_plot, save_strip
+            from instant_ic.experiments.vspace_plot import save_plot, save_strip
 
             if args.plot:
                 save_plot(args.plot, report)

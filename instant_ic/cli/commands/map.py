@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from ..errors import UserError
+from instant_ic.cli.errors import UserError
 
 SAVE, SAVED = "/slam/save", "/slam/saved"
 

@@ -11,7 +11,7 @@ from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
     from instant_ic.bus.control import NodeControl
-    from instant_ic.bus.parameter_info import ParameterInfo
+    from instant_ic.config.parameter_info import ParameterInfo
 
 
 def add_parser(subparsers: Any) -> None:
@@ -70,8 +70,9 @@ def _control(node: str) -> NodeControl:
 def list_parameters(args: argparse.Namespace) -> int:
     """Prints names (and values) by node, out of the registry: also where a node hangs."""
     from instant_ic import paths
-    from instant_ic.bus import params, registry
+    from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
+    from instant_ic.config import params
 
     nodes = [find_node(args.node)] if args.node else registry.list_nodes(paths.run_dir())
     if not nodes:
@@ -85,8 +86,8 @@ def list_parameters(args: argparse.Namespace) -> int:
 
 def get_parameter(args: argparse.Namespace) -> int:
     """Prints one value, or those of a group."""
-    from instant_ic.bus import params
     from instant_ic.cli.names import find_node
+    from instant_ic.config import params
 
     values = params.flatten(find_node(args.node).params)
     group = {key: value for key, value in values.items() if key.startswith(f"{args.key}.")}
@@ -107,7 +108,7 @@ def _no_parameter(node: str, key: str, known: Any) -> UserError:
 
 def set_parameters(args: argparse.Namespace) -> int:
     """Changes parameters together."""
-    from instant_ic.bus import params
+    from instant_ic.config import params
 
     words = args.pairs
     if len(words) % 2:
@@ -174,8 +175,8 @@ def dump(args: argparse.Namespace) -> int:
 
 def load(args: argparse.Namespace) -> int:
     """Changes parameters to those of a file; those that are as in the file need not be live."""
-    from instant_ic.bus import params
     from instant_ic.cli.names import find_node
+    from instant_ic.config import params
 
     name = find_node(args.node).name
     values = params.load_file(args.file, name)

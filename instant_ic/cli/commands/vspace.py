@@ -11,14 +11,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..arguments import positive, positive_int
-from ..errors import UserError
+from instant_ic.cli.arguments import positive, positive_int
+from instant_ic.cli.errors import UserError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from instant_ic.nerf import View, VirtualSpace, VirtualSpaceConfig
+    from instant_ic.vspace import View, VirtualSpace, VirtualSpaceConfig
 
 DEVICES = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
 """As in ``VirtualSpaceConfig``, whose module is not loaded for this."""
@@ -178,11 +178,10 @@ def _add_video(verbs: Any) -> None:
 
 def train(args: argparse.Namespace) -> int:
     """``ic vspace train``."""
+    from instant_ic.cli.progress import progress
     from instant_ic.depth.files import load_depth, load_picture
-    from instant_ic.nerf import KeyframeError, VirtualSpaceConfig
-    from instant_ic.nerf.warm_up import warm_up
-
-    from ..progress import progress
+    from instant_ic.vspace import KeyframeError, VirtualSpaceConfig
+    from instant_ic.vspace.warm_up import warm_up
 
     if args.camera_height and (args.depth or args.as_estimated):
         other = "--depth" if args.depth else "--as-estimated"
@@ -252,7 +251,7 @@ def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args:
     """A space with the panorama as its keyframe, and a schedule as long as asked for."""
     import numpy as np
 
-    from instant_ic.nerf import VirtualSpace
+    from instant_ic.vspace import VirtualSpace
 
     iterations = args.iterations or config.train.iterations
     if args.seconds:
@@ -288,7 +287,7 @@ def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
 
 def open_space(args: argparse.Namespace) -> VirtualSpace:
     """The saved space that a command is about."""
-    from instant_ic.nerf import VirtualSpace
+    from instant_ic.vspace import VirtualSpace
 
     return VirtualSpace.load(args.space, args.device)
 
@@ -351,7 +350,7 @@ def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> 
 
 def export(args: argparse.Namespace) -> int:
     """``ic vspace export``."""
-    from instant_ic.nerf.export import surface, write_ply
+    from instant_ic.vspace.export import surface, write_ply
 
     space, out = open_space(args), args.points or args.mesh
     try:
@@ -368,9 +367,8 @@ def video(args: argparse.Namespace) -> int:
     """``ic vspace video``."""
     import cv2
 
-    from instant_ic.nerf.export import default_flight, flight
-
-    from ..progress import progress
+    from instant_ic.cli.progress import progress
+    from instant_ic.vspace.export import default_flight, flight
 
     if args.out.suffix.lower() != ".mp4":
         raise UserError(f"{args.out}: the video is an .mp4", 2)
@@ -406,7 +404,7 @@ def video(args: argparse.Namespace) -> int:
 
 def info_(args: argparse.Namespace) -> int:
     """``ic vspace info``."""
-    from instant_ic.nerf.saved import read, space_file
+    from instant_ic.vspace.saved import read, space_file
 
     saved = read(args.space)
     field, progress = saved.config.field, saved.progress

@@ -1,0 +1,310 @@
+"""Pairs of panorama and LiDAR revolution out of a bag, for the calibration of the camera against the LiDAR."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.bag import BagError, BagReader
+from instant_ic.calibration.mount import CalibrationError, Frame
+from instant_ic.depth.deskew import points_at
+from instant_ic.geometry.poses import Matrix, inverse, wrap_angle, yaw_of
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.limits import decode_image
+from instant_ic.msg import MessageError, cloud_array, deserialize, stamp_ns, transform_matrix
+
+PICTURE, CLOUD, PACKETS = (
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/PointCloud2",
+    "velodyne_msgs/msg/VelodyneScan",
+)
+_FIELDS = ("x", "y", "z", "intensity", "ring", "time")
+_NEAREST_M = 0.3
+_FEW = 12
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What is taken out of a recording.
+
+    Attributes:
+        image_topic, points_topic: empty: the usual ones (``/camera/image/compressed``, ``/lidar/points``, else
+            ``/lidar/packets``).
+        base_frame, odom_frame: of the transforms.
+        most_frames: most pictures.
+        distance_m, angle_deg: a place is another one after so much motion.
+        most_gap_s: between a picture and the middle of its revolution.
+    """
+
+    image_topic: str = ""
+    points_topic: str = ""
+    base_frame: str = "base_link"
+    odom_frame: str = "odom"
+    most_frames: int = 24
+    distance_m: float = 0.25
+    angle_deg: float = 15.0
+    most_gap_s: float = 0.15
+
+
+@dataclass(frozen=True)
+class CalibrationRecording:
+    """What a bag holds for the calibration.
+
+    Attributes:
+        frames: the pairs, of as many places as the recording has.
+        camera_from_lidar: (4, 4) as the transforms in the bag tell; None where they do not.
+        base_from_lidar: (4, 4) likewise.
+        pictures, places: number of pictures in the bag, and of places that it was made from.
+        moves: whether odometry was there to compensate the motion.
+    """
+
+    frames: list[Frame]
+    camera_from_lidar: Matrix | None
+    base_from_lidar: Matrix | None
+    pictures: int
+    places: int
+    moves: bool
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    points: NDArray[Any]
+    stamp_ns: int
+    frame_id: str
+
+    @property
+    def middle_ns(self) -> int:
+        """Time of the middle of the revolution."""
+        time = self.points["time"]
+        return self.stamp_ns + round(0.5e9 * float(time.min() + time.max()))
+
+
+def read_recording(path: Path, selection: Selection | None = None) -> CalibrationRecording:
+    """Reads a bag.
+
+    Raises:
+        BagError: no bag, or a damaged one.
+        CalibrationError: it lacks pictures or revolutions, or none are of the same time.
+    """
+    selection = selection or Selection()
+    with BagReader(path) as bag:
+        types = {topic.topic: topic.type_name for topic in bag.topics}
+        image_topic = _choose(path, types, (PICTURE,), selection.image_topic, ("/camera/image/compressed",))
+        points_topic = _choose(
+            path, types, (CLOUD, PACKETS), selection.points_topic, ("/lidar/points", "/lidar/packets")
+        )
+        transforms = _transforms(bag, types)
+        stamps, camera = _stamps(path, bag, image_topic)
+        moves = _knows(transforms, selection)
+        chosen, places = _places(stamps, transforms if moves else None, selection)
+        if not chosen:
+            raise CalibrationError(f"{path}: odometry on /tf and the {len(stamps)} pictures are not of the same time")
+        clouds = _nearest_clouds(path, bag, points_topic, types[points_topic], list(chosen), selection)
+        frames = []
+        for message in bag.messages([image_topic]):
+            picture = deserialize(message.payload, message.type_name)
+            stamp = stamp_ns(picture)
+            if stamp in clouds:
+                rgb = _decoded(path, picture)
+                try:
+                    frames.append(
+                        _frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None, selection)
+                    )
+                except TransformError as error:
+                    raise CalibrationError(f"{path}: the motion at {stamp / 1e9:.3f} s is not known: {error}") from None
+    lidar = next(iter(clouds.values())).frame_id
+    return CalibrationRecording(
+        frames=frames,
+        camera_from_lidar=_known(transforms, camera, lidar),
+        base_from_lidar=_known(transforms, selection.base_frame, lidar),
+        pictures=len(stamps),
+        places=places,
+        moves=moves,
+    )
+
+
+def _choose(path: Path, types: dict[str, str], kinds: tuple[str, ...], wanted: str, usual: tuple[str, ...]) -> str:
+    found = sorted(topic for topic, kind in types.items() if kind in kinds)
+    names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)
+    if wanted and wanted not in found:
+        raise CalibrationError(f"{path}: no topic {wanted} of type {names}; there is {', '.join(found) or 'none'}")
+    choice = wanted or next((topic for topic in usual if topic in found), "") or (found[0] if len(found) == 1 else "")
+    if not choice:
+        there = (
+            f"several of them ({', '.join(found)}): choose one" if found else f"it has {', '.join(types) or 'nothing'}"
+        )
+        raise CalibrationError(f"{path}: no {' or '.join(usual)} ({names}); {there}")
+    return choice
+
+
+def _transforms(bag: BagReader, types: dict[str, str]) -> TransformBuffer:
+    buffer = TransformBuffer(cache_s=1e9)
+    for message in bag.messages([topic for topic in ("/tf_static", "/tf") if topic in types]):
+        for one in deserialize(message.payload, message.type_name).transforms:
+            try:
+                buffer.set(
+                    one.header.frame_id, one.child_frame_id, stamp_ns(one), transform_matrix(one),
+                    static=message.topic == "/tf_static",
+                )  # fmt: skip
+            except (TransformError, MessageError) as error:
+                raise BagError(f"{bag.path}: {message.topic}: {error}") from None
+    return buffer
+
+
+def _stamps(path: Path, bag: BagReader, topic: str) -> tuple[list[int], str]:
+    """Rising stamps of the pictures, and their frame."""
+    stamps, frame = set(), ""
+    for message in bag.messages([topic]):
+        picture = deserialize(message.payload, message.type_name)
+        stamps.add(stamp_ns(picture))
+        frame = picture.header.frame_id
+    if not stamps:
+        raise CalibrationError(f"{path}: no picture on {topic}")
+    return sorted(stamps), frame
+
+
+def _knows(transforms: TransformBuffer, selection: Selection) -> bool:
+    return {selection.base_frame, selection.odom_frame} <= transforms.frames()
+
+
+def _known(transforms: TransformBuffer, target: str, source: str) -> Matrix | None:
+    try:
+        return transforms.lookup(target, source)
+    except TransformError:
+        return None
+
+
+def _places(stamps: list[int], transforms: TransformBuffer | None, selection: Selection) -> tuple[dict[int, int], int]:
+    """Stamps of the pictures to take, each with the number of its place; and how many places there are.
+
+    A stretch ends when the robot has moved or turned enough; of each the picture of the slowest moment is taken,
+    because what is left of wrong stamps shows least there. A place is a position, whatever the heading.
+    """
+    centres: list[NDArray[np.float64]] = []
+    place: dict[int, int] = {}
+    best: list[tuple[float, int]] = []  # of each stretch: speed and stamp
+    start: Matrix | None = None
+    for stamp in stamps:
+        speed = 0.0
+        if transforms is not None:
+            try:
+                before, pose, after = (
+                    transforms.lookup(selection.odom_frame, selection.base_frame, stamp + shift)
+                    for shift in (-50_000_000, 0, 50_000_000)
+                )
+            except TransformError:
+                continue  # before the odometry or after it: cannot be compensated
+            speed = sum(_moved(before, after)) / 0.1
+        else:
+            pose = np.eye(4)
+        near = [k for k, xyz in enumerate(centres) if np.linalg.norm(xyz - pose[:3, 3]) < selection.distance_m]
+        if not near:
+            centres.append(pose[:3, 3])
+        place[stamp] = near[0] if near else len(centres) - 1
+        distance, angle = (np.inf, 0.0) if start is None else _moved(start, pose)
+        if distance >= selection.distance_m or np.degrees(angle) >= selection.angle_deg:
+            start = pose
+            best.append((speed, stamp))
+        elif speed < best[-1][0]:
+            best[-1] = (speed, stamp)
+    chosen = _evenly([stamp for _, stamp in best], selection.most_frames)
+    rest = [stamp for stamp in place if stamp not in chosen]
+    chosen += _evenly(rest, max(min(_FEW, selection.most_frames) - len(chosen), 0))
+    return {stamp: place[stamp] for stamp in sorted(chosen)}, len(centres)
+
+
+def _moved(a: Matrix, b: Matrix) -> tuple[float, float]:
+    """Metres and radians of yaw between two poses."""
+    return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), abs(wrap_angle(yaw_of(b) - yaw_of(a)))
+
+
+def _evenly(values: list[int], most: int) -> list[int]:
+    if len(values) <= most:
+        return list(values)
+    return [values[round(k)] for k in np.linspace(0, len(values) - 1, most)] if most else []
+
+
+def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[_Cloud]:
+    """Revolutions whose message is near a picture, from points or from packets."""
+    if kind == CLOUD:
+        for message in bag.messages([topic]):
+            if near(message.stamp_ns):
+                cloud = deserialize(message.payload, message.type_name)
+                yield _Cloud(cloud_array(cloud), stamp_ns(cloud), cloud.header.frame_id)
+        return
+    from instant_ic.lidar.stream import PacketStream
+
+    stream = PacketStream()
+    for message in bag.messages([topic]):
+        scan = deserialize(message.payload, message.type_name)
+        for packet in scan.packets:
+            revolution = stream.feed(bytes(packet.data), stamp_ns(packet))
+            if revolution is not None and revolution.complete and near(revolution.end_ns):
+                yield _Cloud(revolution.points, revolution.stamp_ns, scan.header.frame_id)
+
+
+def _nearest_clouds(
+    path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int], selection: Selection
+) -> dict[int, _Cloud]:
+    """For each stamp the revolution nearest in time, where one is near enough."""
+    # A bag's own stamp is of the arrival, up to a second late on a busy machine.
+    at = np.array(stamps)
+    found: dict[int, _Cloud] = {}
+    count = 0
+    for cloud in _clouds(bag, topic, kind, lambda ns: bool((np.abs(at - ns) < 1_500_000_000).any())):
+        missing = [name for name in _FIELDS if name not in (cloud.points.dtype.names or ())]
+        if missing:
+            raise CalibrationError(f"{path}: {topic}: the points lack the field {', '.join(missing)}")
+        count += 1
+        if len(cloud.points) == 0:
+            continue
+        middle = cloud.middle_ns
+        for stamp in stamps:
+            gap = abs(middle - stamp)
+            if gap <= selection.most_gap_s * 1e9 and (stamp not in found or gap < abs(found[stamp].middle_ns - stamp)):
+                found[stamp] = cloud
+    if not found:
+        raise CalibrationError(
+            f"{path}: {count} revolutions on {topic}, none within {selection.most_gap_s} s of "
+            f"one of the {len(stamps)} pictures chosen: were both clocks set?"
+        )
+    return found
+
+
+def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
+    import cv2
+
+    bgr = decode_image(bytes(picture.data), cv2.IMREAD_COLOR)
+    if bgr is None:
+        raise CalibrationError(f"{path}: the picture of {stamp_ns(picture) / 1e9:.3f} s cannot be decoded")
+    if bgr.shape[1] != 2 * bgr.shape[0]:
+        raise CalibrationError(f"{path}: a picture of {bgr.shape[1]} x {bgr.shape[0]} is no whole panorama (2:1)")
+    return np.ascontiguousarray(bgr[..., ::-1])
+
+
+def _frame(
+    rgb: NDArray[np.uint8],
+    cloud: _Cloud,
+    stamp: int,
+    place: int,
+    transforms: TransformBuffer | None,
+    selection: Selection,
+) -> Frame:
+    """The revolution as the LiDAR would have seen it from where it was at the picture's time."""
+    cloud_points = cloud.points
+    xyz = np.stack([cloud_points[name] for name in "xyz"], axis=1).astype(np.float64)
+    usable = np.isfinite(xyz).all(axis=1) & np.isfinite(cloud_points["time"])
+    usable &= np.linalg.norm(np.where(usable[:, None], xyz, 0), axis=1) > _NEAREST_M
+    xyz, kept = xyz[usable], cloud_points[usable]
+    if transforms is not None:
+        odom = selection.odom_frame
+        lidar_from_odom = inverse(transforms.lookup(odom, cloud.frame_id, stamp))
+        xyz = points_at(
+            xyz, kept["time"], cloud.stamp_ns, lambda at: lidar_from_odom @ transforms.lookup(odom, cloud.frame_id, at)
+        )
+    return Frame(rgb, xyz, kept["intensity"].astype(np.float64), kept["ring"].astype(np.int64), place)

@@ -1,0 +1,378 @@
+"""Camera from LiDAR by the edges that both see: in yaw around the full circle first, then in six degrees of freedom.
+
+Edges of the LiDAR's revolutions (``calibration_edges``) are projected into the panoramas of the same moments; the pose
+under which they fall on the strongest edges there, over all frames, is the calibration. The edges of the pictures
+are blurred, less from level to level, so that the way to the maximum is smooth. In the manner of Levinson and Thrun
+(RSS 2013), with the foot of the walls as a cue of its own, because rings two degrees apart locate lying edges badly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.calibration.edges import CUES, UPRIGHT, find_floor, lidar_edges, picture_edges
+from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.geometry.poses import Matrix, pose_matrix, transform_points
+
+Floats = NDArray[np.floating]
+_SECTORS = 16
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+_WEIGHTS = {"jump": 1.0, "shade": 1.0, "floor": 0.5, "shade_across": 0.25}
+_SYSTEMATIC = np.array([0.01] * 3 + [math.radians(0.1)] * 3)
+"""What no scatter shows: a skirting board stands before its wall, an edge is round. Measured: docs/calibration.md."""
+_PLACES_FOR_HEIGHT, _UNCHECKED_HEIGHT = 3, 5.0
+"""From fewer places a skirting board's upper edge may pass for the foot of its wall: so many units of doubt in z."""
+_RIVAL_REACH = 12
+"""So many units around the maximum are searched for others: 12 cm, 2.4 degrees."""
+_UNIT = np.array([0.01] * 3 + [math.radians(0.2)] * 3)
+"""A step of the search: a centimetre, and the angle that moves an edge 3 m away by as much."""
+
+
+class CalibrationError(ValueError):
+    """The recording does not give a calibration; the text says why and what to record."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A panorama and the revolution of the same moment.
+
+    Attributes:
+        rgb: (H, W, 3) uint8 panorama.
+        points: (N, 3) in the LiDAR's frame at the picture's time, metres, finite.
+        intensity: (N,).
+        ring: number of the laser, rising upwards, (N,).
+        place: frames of one place carry the same number: what they see is the same and counts once in the uncertainty.
+    """
+
+    rgb: NDArray[np.uint8]
+    points: Floats
+    intensity: Floats
+    ring: NDArray[np.integer]
+    place: int = 0
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """How the pose is searched.
+
+    Attributes:
+        blur_px: of the pictures' edges, from level to level, at 1024 columns.
+        yaw_step_deg: of the search around the full circle.
+        full_circle: false: the yaw given is right within a few degrees.
+        reach_m, reach_deg: standard deviations of the pose given; a weak pull towards it, for what nothing else tells.
+        most_sigma_m, most_sigma_deg: what stays less certain than this is not constrained, and kept as given.
+        min_edges: fewer edge points in all frames give no calibration.
+        intensity_step: least step of the LiDAR's intensity that is an edge.
+    """
+
+    blur_px: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0)
+    yaw_step_deg: Annotated[float, Range(0.5, 10)] = 2.0
+    full_circle: bool = True
+    reach_m: Positive = 0.15
+    reach_deg: Positive = 5.0
+    most_sigma_m: Positive = 0.03
+    most_sigma_deg: Positive = 0.5
+    min_edges: Annotated[int, Range(50)] = 500
+    intensity_step: Positive = 6.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_ranges(self)
+        if not self.blur_px or min(self.blur_px) <= 0:
+            raise ValueError(f"blur_px must hold values > 0 (got {self.blur_px})")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Result.
+
+    Attributes:
+        camera_from_lidar: (4, 4).
+        sigma: standard deviations in x, y, z (metres), roll, pitch, yaw (radians) in the camera's frame, (6,).
+        constrained: for each of them whether the recording constrains it, (6,). Directions that it does not constrain
+            are as they were given.
+        score_before, score_after: mean strength of the pictures' edges under the LiDAR's; 1 is what chance gives.
+        edges: number of edge points used, by cue.
+        yaw_rival: score of the best yaw more than 20 degrees away over the best one's, both above chance; near 1 the
+            place looks alike in two directions.
+    """
+
+    camera_from_lidar: Matrix
+    sigma: NDArray[np.float64]
+    constrained: NDArray[np.bool_]
+    score_before: float
+    score_after: float
+    edges: dict[str, int]
+    yaw_rival: float
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """The LiDAR's edges of all frames, and in which block of the uncertainty each lies."""
+
+    points: NDArray[np.float64]
+    frame: NDArray[np.intp]
+    upright: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+    block: NDArray[np.intp]
+    counts: dict[str, int]
+
+
+class _Level:
+    """Score of a pose at one blur of the pictures' edges."""
+
+    def __init__(self, edges: _Edges, frames: Sequence[Frame], blur_px: float) -> None:
+        sigma_px = blur_px * frames[0].rgb.shape[1] / 1024.0
+        # What is blurred that much needs no more pixels.
+        smaller = 2 ** max(int(math.log2(sigma_px / 2)), 0) if sigma_px >= 4 else 1
+        strengths = [picture_edges(_reduced(frame.rgb, smaller), sigma_px / smaller) for frame in frames]
+        stack = np.stack([pair[kind] for kind in (0, 1) for pair in strengths])
+        # One column more, so that a point on the seam lies between the last and the first.
+        self.strengths = np.ascontiguousarray(np.concatenate([stack, stack[:, :, :1]], axis=2))
+        self.edges = edges
+        self.plane = (edges.frame + np.where(edges.upright, 0, len(frames))).astype(np.int64)
+
+    def each(self, camera_from_lidar: Matrix) -> NDArray[np.float64]:
+        """Weighted strength under each edge point, (N,)."""
+        from instant_ic.calibration.kernels import strength_under
+
+        strength = np.empty(len(self.plane))
+        strength_under(self.edges.points, self.plane, self.strengths, camera_from_lidar, strength)
+        return np.asarray(self.edges.weight * strength)
+
+    def score(self, camera_from_lidar: Matrix) -> float:
+        """Weighted mean strength under the edge points."""
+        return float(self.each(camera_from_lidar).sum() / self.edges.weight.sum())
+
+
+def _reduced(rgb: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    import cv2
+
+    height, width = rgb.shape[:2]
+    small = cv2.resize(rgb, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, np.uint8)
+
+
+def calibrate(
+    frames: Sequence[Frame],
+    camera_from_lidar: Matrix,
+    config: CalibrationConfig | None = None,
+    report: Callable[[str], None] = lambda line: None,
+) -> Calibration:
+    """Estimates the pose of the LiDAR in the camera's frame.
+
+    Args:
+        frames: pairs of picture and revolution, best from many places.
+        camera_from_lidar: (4, 4) as measured by hand; yaw may be far off with ``full_circle``.
+        config: how it is searched.
+        report: told what is being done.
+
+    Raises:
+        CalibrationError: no frames, too few edges, or edges that fit nowhere better than by chance.
+    """
+    config = config or CalibrationConfig()
+    if not frames:
+        raise CalibrationError("no pair of picture and LiDAR revolution")
+    if len({frame.rgb.shape for frame in frames}) != 1:
+        raise CalibrationError(f"pictures of different sizes: {sorted({frame.rgb.shape for frame in frames})}")
+    edges = _edges(frames, camera_from_lidar, config)
+    report(f"{len(frames)} frames, edges: " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
+    start, rival = camera_from_lidar, 0.0
+    level = _Level(edges, frames, config.blur_px[0])
+    if config.full_circle:
+        start, rival = _around(level, camera_from_lidar, config.yaw_step_deg)
+        report(f"yaw {_correction(camera_from_lidar, start)[5] / math.radians(1):+.1f} deg around the full circle")
+    found = start
+    for number, blur_px in enumerate(config.blur_px):
+        level = level if number == 0 else _Level(edges, frames, blur_px)
+        found = _climb(level, start, found, config)
+        report(f"blur {blur_px:g} px: score {level.score(found):.3f}")
+    found, rivals = _among_rivals(level, start, found, config)
+    for other in rivals:
+        shift = _correction(found, other)
+        centimetres = ", ".join(f"{value:+.1f}" for value in shift[:3] * 100)
+        report(f"a pose {centimetres} cm away fits as well")
+    chance = float(np.mean([level.score(_turned(found, yaw)) for yaw in np.radians(np.arange(15, 360, 15))]))
+    chance = max(chance, 1e-9)  # a picture without any edge
+    before, after = level.score(camera_from_lidar) / chance, level.score(found) / chance
+    if after < 1.05:
+        raise CalibrationError(
+            f"the LiDAR's edges fit the pictures' nowhere better than by chance ({after:.2f} times): record in a "
+            "furnished room, with light, and see that pictures and LiDAR are of the same time"
+        )
+    covariance = _covariance(level, found)
+    if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
+        covariance[2, 2] += _UNCHECKED_HEIGHT**2
+    for other in rivals:  # either may be true: the one believed is off by nothing or by all of the way
+        shift = _correction(found, other) / _UNIT
+        covariance += 0.5 * np.outer(shift, shift)
+    units = _correction(start, found) / _UNIT
+    values, vectors = np.linalg.eigh(covariance)
+    limit = np.array([config.most_sigma_m] * 3 + [math.radians(config.most_sigma_deg)] * 3)
+    loose = vectors[:, np.sqrt(values) > (limit / _UNIT).max()]
+    units = units - loose @ (loose.T @ units)
+    sigma = np.hypot(np.sqrt(np.diag(covariance)) * _UNIT, _SYSTEMATIC)
+    return Calibration(
+        camera_from_lidar=_moved(start, units),
+        sigma=sigma,
+        constrained=sigma <= limit,
+        score_before=before,
+        score_after=after,
+        edges=edges.counts,
+        yaw_rival=rival,
+    )
+
+
+def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix, config: CalibrationConfig) -> _Edges:
+    floor = find_floor(np.concatenate([frame.points[::7] for frame in frames]))
+    found = [lidar_edges(f.points, f.intensity, f.ring, floor, config.intensity_step) for f in frames]
+    cue = np.concatenate([edges.cue for edges in found])
+    counts = {name: int((cue == k).sum()) for k, name in enumerate(CUES)}
+    if len(cue) < config.min_edges:
+        raise CalibrationError(
+            f"only {len(cue)} edge points in {len(frames)} frames, {config.min_edges} are needed: "
+            "record in a furnished room, from several places"
+        )
+    points = np.concatenate([edges.points for edges in found]).astype(np.float64)
+    number = np.repeat(np.arange(len(frames)), [len(edges.cue) for edges in found])
+    # Edges of one direction at one place are one sample: they err together.
+    place = np.array([frame.place for frame in frames])[number]
+    in_camera = transform_points(camera_from_lidar, points)
+    azimuth = np.arctan2(in_camera[:, 1], in_camera[:, 0])
+    sector = ((azimuth + np.pi) * (_SECTORS / (2 * np.pi))).astype(np.intp) % _SECTORS
+    upright = np.isin(cue, [CUES.index(name) for name in UPRIGHT])
+    block = np.unique((place * _SECTORS + sector) * 2 + upright, return_inverse=True)[1].astype(np.intp)
+    return _Edges(
+        points=points,
+        frame=number,
+        upright=upright,
+        weight=np.array([_WEIGHTS[name] for name in CUES])[cue],
+        block=block,
+        counts=counts,
+    )
+
+
+def _turned(camera_from_lidar: Matrix, yaw_rad: float) -> Matrix:
+    """The camera turned about its own axis."""
+    return pose_matrix(yaw=yaw_rad) @ camera_from_lidar
+
+
+def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
+    """Pose after a small motion (6,) in ``_UNIT`` in the camera's frame."""
+    step = np.asarray(units) * _UNIT
+    angle = float(np.linalg.norm(step[3:]))
+    change = np.eye(4)
+    if angle > 1e-12:
+        k = step[3:] / angle
+        cross = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
+        change[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    change[:3, 3] = step[:3]
+    return np.asarray(change @ camera_from_lidar)
+
+
+def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
+    """Motion (6,) in the camera's frame, metres and radians, that ``_moved`` takes from one pose to another."""
+    change = after @ np.linalg.inv(before)
+    angle = math.acos(float(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)))
+    axis = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
+    factor = angle / math.sin(angle) if 1e-9 < angle < math.pi - 1e-6 else 1.0
+    return np.asarray(np.concatenate([change[:3, 3], axis * factor]), np.float64)
+
+
+def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[Matrix, float]:
+    """Pose turned to the best yaw of the full circle, and how near another one comes."""
+    count = round(360 / step_deg)
+    yaws = np.arange(count) * (2 * np.pi / count)
+    scores = np.array([level.score(_turned(camera_from_lidar, yaw)) for yaw in yaws])
+    best = int(np.argmax(scores))
+    apart = np.abs((yaws - yaws[best] + np.pi) % (2 * np.pi) - np.pi)
+    usual = float(np.median(scores))
+    rival = float(scores[apart > math.radians(20)].max() - usual) / max(float(scores[best]) - usual, 1e-9)
+    return _turned(camera_from_lidar, float(yaws[best])), max(rival, 0.0)
+
+
+def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfig) -> Matrix:
+    """Pose of the highest score near ``found``, weakly pulled towards ``start``."""
+    from scipy.optimize import minimize
+
+    reach = np.array([config.reach_m] * 3 + [math.radians(config.reach_deg)] * 3) / _UNIT
+    base = max(level.score(found), 1e-9)
+
+    def cost(units: Floats) -> float:
+        return -level.score(_moved(start, units)) / base + 0.005 * float(((units / reach) ** 2).sum())
+
+    def slope(units: Floats) -> NDArray[np.float64]:
+        # Over a third of a unit: nearer, the steps of the bilinear pictures would be seen.
+        steps = np.eye(6) / 3
+        return np.array([(cost(units + step) - cost(units - step)) * 1.5 for step in steps])
+
+    first = _correction(start, found) / _UNIT
+    result = minimize(cost, first, jac=slope, method="BFGS", options={"gtol": 2e-4, "maxiter": 25})
+    return _moved(start, result.x)
+
+
+def _among_rivals(
+    level: _Level, start: Matrix, found: Matrix, config: CalibrationConfig
+) -> tuple[Matrix, list[Matrix]]:
+    """The maximum to believe, and others that fit as well: parallel edges can be taken for each other.
+
+    The foot of a wall falls on the upper edge of its skirting board when the camera is taken to be that much lower.
+    From several places only one of the two fits; from one, both may. Of those that cannot be told apart by the scatter
+    over the blocks, the one nearest to the pose given is believed.
+    """
+    peaks = []
+    for axis in np.eye(6):
+        offsets = np.arange(-_RIVAL_REACH, _RIVAL_REACH + 1)
+        scores = np.array([level.score(_moved(found, k * axis)) for k in offsets])
+        for k in range(1, len(offsets) - 1):
+            if abs(offsets[k]) >= 3 and scores[k] >= max(scores[k - 1], scores[k + 1], 0.9 * scores[_RIVAL_REACH]):
+                peaks.append((scores[k], _moved(found, offsets[k] * axis)))
+    peaks.sort(key=lambda peak: -peak[0])
+    maxima = [found]
+    up_and_down = [_moved(found, k * np.eye(6)[2]) for k in (-8, 8)]
+    for pose in [pose for _, pose in peaks[:2]] + up_and_down:
+        other = _climb(level, start, pose, config)
+        if all(np.abs(_correction(known, other) / _UNIT).max() > 2 for known in maxima):
+            maxima.append(other)
+    best = max(maxima, key=level.score)
+    tied = [other for other in maxima if other is best or _difference(level, best, other) < 3.0]
+    tied.sort(key=lambda pose: float(np.linalg.norm(_correction(start, pose) / _UNIT)))
+    return tied[0], tied[1:]
+
+
+def _difference(level: _Level, best: Matrix, other: Matrix) -> float:
+    """How many standard deviations of the blocks' scatter one pose scores above another."""
+    apart = np.bincount(level.edges.block, level.each(best) - level.each(other))
+    return float(apart.sum() / max(float(np.sqrt((apart**2).sum())), 1e-12))
+
+
+def _covariance(level: _Level, found: Matrix) -> NDArray[np.float64]:
+    """Covariance (6, 6) of the maximum in ``_UNIT``: H^-1 G H^-1 with the scatter G of the blocks' gradients."""
+    edges, step = level.edges, 1.0
+
+    def at(units: Floats) -> NDArray[np.float64]:
+        return np.asarray(np.bincount(edges.block, level.each(_moved(found, units))), np.float64)
+
+    unit = np.eye(6) * step
+    centre = at(np.zeros(6))
+    ahead, back = [at(d) for d in unit], [at(-d) for d in unit]
+    gradients = np.stack([(a - b) / (2 * step) for a, b in zip(ahead, back, strict=True)], axis=1)
+    hessian = np.empty((6, 6))
+    for i in range(6):
+        hessian[i, i] = (2 * centre - ahead[i] - back[i]).sum() / step**2
+        for j in range(i):
+            mixed = at(unit[i] + unit[j]) + at(-unit[i] - unit[j]) - at(unit[i] - unit[j]) - at(unit[j] - unit[i])
+            hessian[i, j] = hessian[j, i] = -mixed.sum() / (4 * step**2)
+    blocks = len(centre)
+    scatter = gradients.T @ gradients * (blocks / max(blocks - 6, 1e-3))
+    values, vectors = np.linalg.eigh(hessian)
+    # A score that does not fall in some direction tells nothing of it.
+    values = np.maximum(values, 1e-3 * max(float(values.max()), 1e-9))
+    inverse = vectors @ np.diag(1 / values) @ vectors.T
+    return np.asarray(inverse @ scatter @ inverse)

@@ -1,0 +1,44 @@
+"""LiDAR points over the panorama, before and after the calibration, for people."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.calibration.mount import Frame
+from instant_ic.depth.colour import depth_picture
+from instant_ic.depth.visibility import hidden, nearest_points
+from instant_ic.geometry.poses import Matrix, transform_points
+
+
+def overlay(frame: Frame, camera_from_lidar: Matrix, width: int = 1600) -> NDArray[np.uint8]:
+    """Points coloured by range (near bright, far dark) over a dimmed panorama, (width / 2, width, 3) RGB."""
+    import cv2
+
+    picture = cv2.resize(frame.rgb, (width, width // 2), interpolation=cv2.INTER_AREA)
+    picture = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB) // 3 * 2
+    points = transform_points(camera_from_lidar, np.asarray(frame.points, np.float64))
+    rows, columns, range_m = nearest_points(points[~hidden(points)], width, width // 2)
+    colours = depth_picture(range_m[None], near=0.5, far=12.0)[0]
+    for shift in (0, 1):
+        picture[np.minimum(rows + shift, width // 2 - 1), columns] = colours
+    return np.asarray(picture, np.uint8)
+
+
+def before_and_after(
+    frames: list[Frame], before: Matrix, after: Matrix, most: int = 3, width: int = 1600
+) -> NDArray[np.uint8]:
+    """Sheet of some frames, each with the overlay before and after; the band that the LiDAR sees."""
+    import cv2
+
+    places = np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int)
+    strips = []
+    for number in places:
+        for name, pose in (("before", before), ("after", after)):
+            picture = overlay(frames[number], pose, width)
+            band = np.ascontiguousarray(picture[round(0.25 * len(picture)) : round(0.72 * len(picture))])
+            cv2.putText(
+                band, f"{name}, picture {number + 1}", (12, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2
+            )
+            strips.append(band)
+    return np.concatenate(strips)

@@ -1,0 +1,182 @@
+"""The paper's "Ours (-depth)": a radiance field learnt from the panorama's colours alone.
+
+Density and colour on the same hash grid and network as the virtual space, composited along each ray (paper, III.B). No
+depth enters, so nothing tells where on its ray a colour belongs: that is what the ablation shows.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace import View, VirtualSpaceConfig
+from instant_ic.vspace.nerf import kernels
+from instant_ic.vspace.nerf.field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FieldParameters,
+    Lattice,
+    Schedule,
+    adam_step_size,
+    level_rates,
+)
+from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.view import check_size, checked_pose, perspective_rays
+
+Floats = NDArray[np.float32]
+NEAR_M, FAR_M = 0.2, 12.0
+RAYS, SAMPLES = 512, 32
+"""Of a training step: as many field queries as a step of the virtual space has."""
+_DRAWN_SAMPLES = 64
+
+
+class ColourOnlyField:
+    """Trained by ``train``, drawn by ``render``, on one CPU thread."""
+
+    def __init__(
+        self, rgb: NDArray[np.uint8], map_from_camera: NDArray[np.floating], config: VirtualSpaceConfig | None = None
+    ) -> None:
+        """Takes a panorama (H, 2 H, 3) uint8 and its pose (4, 4)."""
+        config = config or VirtualSpaceConfig()
+        # A sphere gives the lattice its scale; where surfaces are is not taken from it.
+        sphere = np.full((32, 64), FAR_M / 3, np.float32)
+        prior = prepare(rgb, sphere, map_from_camera, 0.1, config.geometry, config.panorama_width)
+        self._rgb, self._pose = prior.rgb, prior.map_from_camera
+        lattice = Lattice.for_prior(prior, config.field)
+        focus = np.array([[*self._pose[:3, 3], 2 * math.pi / prior.rgb.shape[1]]], np.float32)
+        self._lattice = lattice.cells_per_m, lattice.origin, focus
+        self._p = FieldParameters.random(config.field, config.train.seed)
+        self._rng = np.random.default_rng(config.train.seed)
+        self._schedule = Schedule(config.train)
+        self._level_rates = level_rates(config.train, config.field.levels)
+        self._grads = [np.zeros_like(a) for a in (self._p.table, *self._p.network())]
+        self._moments = [(np.zeros_like(g), np.zeros_like(g)) for g in self._grads]
+        self._touched = kernels.no_marks(self._p.table)
+
+    @property
+    def iterations(self) -> int:
+        return self._schedule.iteration
+
+    def train(self, cpu_seconds: float = math.inf, iterations: int | None = None) -> float:
+        """Trains until the CPU time is spent, the iterations are done or the schedule has ended.
+
+        Returns:
+            PSNR of the last step's rays, dB.
+        """
+        limit = self.iterations + (iterations if iterations is not None else self._schedule.config.iterations)
+        start, error = time.process_time(), math.nan
+        while not self._schedule.finished and self.iterations < limit:
+            error = self._step()
+            self._schedule.iteration += 1
+            if time.process_time() - start >= cpu_seconds:
+                break
+        return -10 * math.log10(max(error, 1e-10)) if not math.isnan(error) else math.nan
+
+    def _step(self) -> float:
+        height, width = self._rgb.shape[:2]
+        z, turn = self._rng.uniform(-1, 1, RAYS), self._rng.uniform(0, 1, RAYS)
+        rows = np.minimum(((0.5 - np.arcsin(z) / math.pi) * height).astype(int), height - 1)
+        columns = (turn * width).astype(int)
+        azimuth, flat = math.pi * (1 - 2 * turn), np.sqrt(1 - z * z)
+        directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], axis=1) @ self._pose[:3, :3].T
+        target = self._rgb[rows, columns].astype(np.float32) / 255 - np.float32(0.5)
+        depth, step = _samples(RAYS, SAMPLES, self._rng.random((RAYS, SAMPLES)))
+        points = (self._pose[:3, 3] + depth[..., None] * directions[:, None]).astype(np.float32).reshape(-1, 3)
+        out = np.empty((len(points), 4), np.float32)
+        kernels.query(self._p.table, *self._p.network(), *self._lattice, points, out)
+        field = out.reshape(RAYS, SAMPLES, 4)
+        error, upstream = composite_gradient(field, step, target)
+        # The kernel takes a weighted squared error: this target makes its gradient the one wanted. The weight keeps
+        # target and output of one size, so that their difference keeps its digits.
+        weight = np.float32(1 / RAYS)
+        aim = out - (upstream / (2 * weight)).reshape(-1, 4)
+        same = np.full(len(points), weight, np.float32)
+        table_grad, *network_grads = self._grads
+        kernels.gradient(
+            self._p.table, *self._p.network(), *self._lattice, points, aim.astype(np.float32), same, same,
+            table_grad, self._touched, *network_grads,
+        )  # fmt: skip
+        self._adam()
+        return error
+
+    def _adam(self) -> None:
+        table_lr, network_lr = self._schedule.rates()
+        count = self.iterations + 1
+        betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
+        step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, count))
+        kernels.adam_touched(self._p.table, self._grads[0], self._touched, *self._moments[0], step_sizes, *betas)
+        step_size = np.float32(adam_step_size(network_lr, count))
+        for value, grad, (m, v) in zip(self._p.network(), self._grads[1:], self._moments[1:], strict=True):
+            m += (1 - betas[0]) * (grad - m)
+            v += (1 - betas[1]) * (grad * grad - v)
+            value -= step_size * m / (np.sqrt(v) + betas[2])
+            grad[...] = 0
+
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
+        """A perspective picture; depth is the mean over the ray, confidence its opacity."""
+        check_size(width, height)
+        rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
+        count = width * height
+        depth, step = _samples(1, _DRAWN_SAMPLES, np.full((1, _DRAWN_SAMPLES), 0.5))
+        left = np.ones(count, np.float32)
+        colour, mean_depth = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+        for i in range(_DRAWN_SAMPLES):
+            active = np.flatnonzero(left > 0.005)
+            if not len(active):
+                break
+            points = rays.origin + np.float32(depth[0, i]) * rays.directions[active]
+            out = np.empty((len(active), 4), np.float32)
+            kernels.query(self._p.table, *self._p.network(), *self._lattice, points.astype(np.float32), out)
+            alpha = 1 - np.exp(-density(out[:, 3]) * np.float32(step[0, i]))
+            weight = left[active] * alpha
+            colour[active] += weight[:, None] * (out[:, :3] + np.float32(0.5))
+            mean_depth[active] += weight * np.float32(depth[0, i])
+            left[active] *= 1 - alpha
+        opacity = 1 - left
+        rgb = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8).reshape(height, width, 3)
+        known = np.divide(mean_depth, opacity, out=np.zeros_like(mean_depth), where=opacity > 0.05)
+        return View(rgb, known.reshape(height, width), opacity.reshape(height, width))
+
+
+def density(raw: Floats) -> Floats:
+    """Density, 1/m, of the network's fourth output: an exponential as in instant-ngp, bounded."""
+    return np.asarray(np.exp(np.clip(raw, -10, 6)), np.float32)
+
+
+def _samples(rays: int, samples: int, place: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """Depths and the lengths that they stand for, (rays, samples) metres: strata of equal ratio, ``place`` in each."""
+    edges = np.geomspace(NEAR_M, FAR_M, samples + 1)
+    depth = edges[:-1] * (edges[1:] / edges[:-1]) ** place
+    step = np.broadcast_to(np.diff(edges), (rays, samples)).copy()
+    step[:, -1] = 1e3  # what reaches the end is the far wall's
+    return depth.astype(np.float32), step.astype(np.float32)
+
+
+def composite_gradient(field: Floats, step: Floats, target: Floats) -> tuple[float, Floats]:
+    """Mean squared colour error of composited rays, and its gradient by the field's outputs.
+
+    Args:
+        field: (N, S, 4), colours minus 0.5 and raw density; step: (N, S) metres; target: (N, 3), minus 0.5.
+
+    Returns:
+        The error, and the gradient (N, S, 4).
+    """
+    colour, sigma = field[..., :3], density(field[..., 3])
+    keep = np.exp(-sigma * step)
+    left = np.cumprod(keep, axis=1)
+    before = np.concatenate([np.ones_like(left[:, :1]), left[:, :-1]], axis=1)
+    weight = before - left
+    difference = (weight[..., None] * colour).sum(axis=1) - target
+    by_colour = 2 * difference / difference.size
+    upstream = np.empty_like(field)
+    upstream[..., :3] = weight[..., None] * by_colour[:, None]
+    shade = (colour * by_colour[:, None]).sum(axis=2)  # (N, S): what a unit of this sample's weight adds to the error
+    behind = np.cumsum((weight * shade)[:, ::-1], axis=1)[:, ::-1] - weight * shade
+    inside = np.abs(field[..., 3] + 2) < 8  # where the exponential is not cut off
+    # The last sample's weight is what is left, for any density: no gradient there.
+    upstream[..., 3] = np.where(inside, sigma * step * (left * shade - behind), 0)
+    return float(np.mean(difference**2)), upstream

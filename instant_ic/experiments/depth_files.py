@@ -1,0 +1,110 @@
+"""Which depth file belongs to which picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.depth.files import DEPTH_SUFFIXES, PICTURE_SUFFIXES, DepthFileError, load_depth
+
+_PNG_UNKNOWN_M = 65.5345
+_NEAREST_MEDIAN_M, _FARTHEST_MEDIAN_M = 0.05, 150.0
+
+
+class PairError(ValueError):
+    """Pictures and depth files do not go together; the message names them."""
+
+
+def find_pictures(paths: Sequence[Path]) -> list[Path]:
+    """The pictures among files and folders, those of a folder by name and without what ends in ``_depth``.
+
+    Raises:
+        PairError: a path is missing, or a folder holds no picture.
+    """
+    return _found(paths, PICTURE_SUFFIXES, "picture")
+
+
+def pair(pictures: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, Path | None]]:
+    """Each picture with the depth of the same stem (``room.jpg``, ``room.npy``), or None where there is none.
+
+    One picture and one depth file belong together whatever they are called. A stem may end in ``_rgb`` or ``_depth``.
+
+    Raises:
+        PairError: a path is missing, no picture has a depth, or two files claim the same one.
+    """
+    if len(pictures) == len(truths) == 1 and truths[0].is_file():
+        return [(pictures[0], truths[0])]
+    own = {path.resolve() for path in pictures}
+    found = [path for path in _found(truths, DEPTH_SUFFIXES, "depth") if path.resolve() not in own]
+    by_stem = _by_stem(found, "depth")
+    _by_stem(pictures, "picture")
+    pairs = [(picture, by_stem.get(_stem(picture))) for picture in pictures]
+    if all(truth is None for _, truth in pairs):
+        names = ", ".join(sorted(path.name for path in found)[:5]) or "nothing"
+        raise PairError(f"no depth file has the stem of a picture ({pictures[0].name}, ... against {names}, ...)")
+    return pairs
+
+
+def load_truth(path: Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
+    """True radial depth (H, W) in metres, 0 = unknown; see ``depth.files.load_depth``.
+
+    Args:
+        path: of the file.
+        png_unit_m: metres of one step of a PNG (Stanford2D3D: 1/512, Matterport3D: 1/4000). Its largest value, 65535,
+            is unknown.
+
+    Raises:
+        DepthFileError: as ``load_depth``; also when everything is unknown.
+    """
+    depth = load_depth(path)
+    if path.suffix.lower() == ".png":
+        depth = np.where(depth < _PNG_UNKNOWN_M, depth * np.float32(png_unit_m / 1e-3), np.float32(0))
+        if not depth.any():
+            raise DepthFileError(f"{path}: no known depth in it: all values are 0 or 65535")
+    return depth
+
+
+def unit_warning(depth_m: NDArray[np.floating]) -> str:
+    """What looks wrong about the unit of a true depth in metres (0 = unknown); empty where nothing does."""
+    median = float(np.median(depth_m[depth_m > 0]))
+    if median < _NEAREST_MEDIAN_M:
+        return f"median {median:.4f} m: metres where millimetres belong (a PNG holds millimetres)?"
+    if median > _FARTHEST_MEDIAN_M:
+        return f"median {median:.0f} m: millimetres where metres belong (only a PNG holds millimetres)?"
+    return ""
+
+
+def _found(paths: Sequence[Path], suffixes: tuple[str, ...], what: str) -> list[Path]:
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(file for file in path.iterdir() if file.is_file() and file.suffix.lower() in suffixes)
+            if what == "picture":
+                inside = [file for file in inside if not file.stem.endswith("_depth")]
+            if not inside:
+                raise PairError(f"{path}: no {what} in this folder ({', '.join(suffixes)})")
+            found += inside
+        elif path.is_file():
+            found.append(path)
+        else:
+            raise PairError(f"{path}: no such file or folder")
+    return list(dict.fromkeys(found))
+
+
+def _stem(path: Path) -> str:
+    stem = path.stem
+    for ending in ("_rgb", "_color", "_depth"):
+        stem = stem.removesuffix(ending)
+    return stem
+
+
+def _by_stem(paths: Iterable[Path], what: str) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for path in paths:
+        other = found.setdefault(_stem(path), path)
+        if other != path:
+            raise PairError(f"{other} and {path}: two {what} files of one stem; give the files one by one")
+    return found

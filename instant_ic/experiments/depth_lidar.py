@@ -1,0 +1,188 @@
+"""What a VLP-16 above or below the camera would measure: from a depth picture alone, or from a world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from instant_ic.sim.render import EquirectRenderer
+
+Floats = NDArray[np.floating]
+AZIMUTHS = 900
+"""Directions of a revolution: 0.4 degrees apart, as at 600 rpm."""
+MIN_RANGE_M, MAX_RANGE_M = 0.4, 100.0
+
+
+@dataclass(frozen=True)
+class Errors:
+    """What goes wrong with measured ranges.
+
+    Attributes:
+        noise_m: standard deviation of a range, metres.
+        outliers: share of the points, 0..1, that are somewhere else on their ray: half of them nearer than what is
+            there (dust, rain, mixed pixels), half up to three times as far (glass, mirrors).
+        seed: of both.
+    """
+
+    noise_m: float = 0.02
+    outliers: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not self.noise_m >= 0:
+            raise ValueError(f"noise_m must be >= 0 (got {self.noise_m})")
+        if not 0 <= self.outliers <= 1:
+            raise ValueError(f"outliers must lie between 0 and 1 (got {self.outliers})")
+
+    def apply(self, range_m: Floats) -> NDArray[np.float64]:
+        """Measured for true ranges, both (N,) metres."""
+        rng = np.random.default_rng([53, self.seed])
+        measured = range_m + rng.normal(0, 1, len(range_m)) * self.noise_m
+        wrong = rng.permutation(len(range_m))[: round(self.outliers * len(range_m))]
+        nearer, share = rng.random(len(wrong)) < 0.5, rng.random(len(wrong))
+        true = range_m[wrong]
+        measured[wrong] = np.where(nearer, MIN_RANGE_M + share * (true - MIN_RANGE_M), true * (1 + 2 * share))
+        return np.maximum(measured, MIN_RANGE_M)
+
+
+def measure(
+    depth_m: Floats,
+    lidar_height_m: float,
+    camera_height_m: float,
+    rings: int = 16,
+    noise_m: float = 0.02,
+    outliers: float = 0.0,
+    seed: int = 0,
+) -> NDArray[np.float32]:
+    """One revolution of a LiDAR on the camera's vertical, as far as a level depth picture tells.
+
+    LiDAR and camera are on one vertical, so each beam stays in one column of the picture. There the picture is a
+    profile of the room; a beam ends where it first meets it. Where the beam goes behind something that the camera
+    sees (the profile is torn there) or out through unknown pixels, nobody knows what it meets: no point.
+
+    Args:
+        depth_m: (H, W) radial depth of a level panorama, metres; 0 or not finite is unknown.
+        lidar_height_m, camera_height_m: above the same floor.
+        rings: beams between -15 and 15 degrees (VLP-16: 16).
+        noise_m, outliers, seed: see ``Errors``.
+
+    Returns:
+        (N, 3) points in the camera's frame, metres.
+
+    Raises:
+        ValueError: not a depth picture, or a value out of bounds.
+    """
+    if depth_m.ndim != 2 or min(depth_m.shape) < 4:
+        raise ValueError(f"depth_m must be (H, W) (got {depth_m.shape})")
+    if rings < 1:
+        raise ValueError(f"rings must be 1 or more (got {rings})")
+    errors = Errors(noise_m, outliers, seed)
+    below_m = lidar_height_m - camera_height_m
+    if not math.isfinite(below_m):
+        raise ValueError(f"heights must be numbers (got {lidar_height_m}, {camera_height_m})")
+    height = len(depth_m)
+    known = np.isfinite(depth_m) & (depth_m > 1e-3)
+    inverse = np.where(known, 1.0 / np.where(known, depth_m, 1.0), 0.0)
+    azimuth = math.pi - (np.arange(AZIMUTHS) + 0.5) * (2 * math.pi / AZIMUTHS)
+    profile = _profiles(inverse, azimuth)
+    elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
+    torn = _torn(profile, math.pi / height)[:-1] | ((profile[1:] > 0) ^ (profile[:-1] > 0))
+    profile, torn = _bridge_unknown(profile, torn)
+    radius = np.where(profile > 0, 1.0 / np.where(profile > 0, profile, 1.0), np.nan)
+    across, up = radius * np.cos(elevation)[:, None], radius * np.sin(elevation)[:, None] - below_m
+
+    points = []
+    for omega in np.radians(np.linspace(-15, 15, rings) if rings > 1 else np.zeros(1)):
+        range_m = _first_crossing(across, up, torn, omega)
+        hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
+        points.append(_on_rays(omega, azimuth[hit], range_m[hit]))
+    true = np.concatenate(points)
+    return _measured(true, errors, np.array([0.0, 0.0, below_m]))
+
+
+def measure_world(
+    renderer: EquirectRenderer,
+    map_from_camera: Floats,
+    lidar_height_m: float,
+    camera_height_m: float,
+    errors: Errors | None = None,
+) -> NDArray[np.float32]:
+    """The same by casting rays in a world, also behind what the camera sees; (N, 3) in the camera's frame, metres."""
+    omega, azimuth = np.meshgrid(np.radians(np.linspace(-15, 15, 16)), np.arange(AZIMUTHS) * (2 * math.pi / AZIMUTHS))
+    rays = _on_rays(omega.ravel(), azimuth.ravel(), np.ones(omega.size))
+    mount = np.array([0.0, 0.0, lidar_height_m - camera_height_m])
+    origin = map_from_camera[:3, :3] @ mount + map_from_camera[:3, 3]
+    directions = np.ascontiguousarray(rays @ map_from_camera[:3, :3].T, np.float32)
+    origins = np.ascontiguousarray(np.broadcast_to(origin, directions.shape), np.float32)
+    range_m, _ = renderer.cast(origins, directions)
+    hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
+    return _measured(rays[hit] * range_m[hit, None].astype(np.float64), errors or Errors(), mount)
+
+
+def _on_rays(omega: float | Floats, azimuth: Floats, range_m: Floats) -> NDArray[np.float64]:
+    """(N, 3) points at ranges (N,) on rays of elevation ``omega`` and azimuths (N,), from the LiDAR."""
+    flat = np.cos(omega) * range_m
+    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(omega) * range_m], axis=-1)
+
+
+def _measured(points: Floats, errors: Errors, mount: Floats) -> NDArray[np.float32]:
+    """Errors along the rays of points (N, 3) from the LiDAR at ``mount`` (3,)."""
+    range_m = np.linalg.norm(points, axis=1)
+    return (points * (errors.apply(range_m) / range_m)[:, None] + mount).astype(np.float32)
+
+
+def _torn(inverse: Floats, step_rad: float) -> NDArray[np.bool_]:
+    """Whether the surface is torn between each row of (H, W) inverse depth and the next; the last row to the first.
+
+    Seen under less than 8 degrees, and the inverse depth, which is smooth over any plane, jumps; or under 1 degree.
+    """
+    following = np.roll(inverse, -1, axis=0)
+    jump = np.abs(following - inverse)
+    # Of a right-angled triangle: step_rad * range across the ray, the difference of ranges along it.
+    slope = jump / np.maximum(step_rad * np.maximum(np.minimum(inverse, following), 1e-9), 1e-12)
+    alike = np.maximum(np.roll(jump, 1, axis=0), np.roll(jump, -1, axis=0))
+    return (slope > 1 / math.tan(math.radians(1))) | ((slope > 1 / math.tan(math.radians(8))) & (jump > 2 * alike))
+
+
+def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
+    """Columns (H, N) of inverse depth (H, W) at azimuths (N,): between two of a surface, else the nearer one."""
+    width = inverse.shape[1]
+    u = (math.pi - azimuth) * (width / (2 * math.pi)) - 0.5
+    left = np.floor(u).astype(np.intp)
+    share = u - left
+    torn = _torn(np.ascontiguousarray(inverse.T), 2 * math.pi / width).T
+    a, b = inverse[:, left % width], inverse[:, (left + 1) % width]
+    apart = torn[:, left % width] | (a == 0) | (b == 0)
+    return np.where(apart, np.where(share < 0.5, a, b), (1 - share) * a + share * b)
+
+
+def _bridge_unknown(
+    profile: NDArray[np.float64], torn: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Unknown pixels get the known one above (first: below), torn from it: a beam that passes there has no end."""
+    known = profile > 0
+    row = np.where(known, np.arange(len(profile))[:, None], -1)
+    above = np.maximum.accumulate(row, axis=0)
+    first = np.where(known.any(axis=0), known.argmax(axis=0), -1)
+    above = np.where(above < 0, first, above)
+    filled = np.where(above < 0, 0.0, np.take_along_axis(profile, np.maximum(above, 0), axis=0))
+    return filled, torn | ~known[:-1] | ~known[1:]
+
+
+def _first_crossing(across: Floats, up: Floats, torn: NDArray[np.bool_], omega: float) -> NDArray[np.float64]:
+    """Ranges (N,) at which beams of elevation ``omega`` first meet profiles (H, N); inf at nothing and at a tear."""
+    side = across * math.sin(omega) - up * math.cos(omega)
+    along = across * math.cos(omega) + up * math.sin(omega)
+    s0, s1 = side[:-1], side[1:]
+    crosses = (s0 > 0) != (s1 > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        range_m = (along[:-1] * s1 - along[1:] * s0) / (s1 - s0)
+    range_m = np.where(crosses & (range_m > 0), range_m, np.inf)
+    nearest = np.argmin(range_m, axis=0)[None]
+    end = np.take_along_axis(range_m, nearest, axis=0)[0]
+    return np.where(np.take_along_axis(torn, nearest, axis=0)[0], np.inf, end)

@@ -1,0 +1,115 @@
+"""Panoramas with true depth that no training may see: the held-out sets of the depth evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.poses import pose_matrix
+
+if TYPE_CHECKING:
+    from instant_ic.sim.render import EquirectRenderer
+    from instant_ic.sim.world import World
+
+KINDS = ("random", "corridor", "mesh")
+FIRST_SEED = 900_000
+"""Worlds from this seed on are for evaluation; training stays below."""
+CAMERA_HEIGHT_M = 1.2
+LIDAR_HEIGHT_M = 0.6
+_MESH_POSITIONS = {
+    "small_house": ((3.2, -2.2), (-4.6, -0.2), (-5.5, -3.4), (6.3, -2.4), (1.5, 2.2)),
+}
+"""Free places (x, y) of mesh files by their stem; metres."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One panorama of a held-out world.
+
+    Attributes:
+        name: kind, world and place.
+        renderer: of the world, to measure it by rays too.
+        map_from_camera: (4, 4), level.
+        rgb: (H, W, 3) uint8.
+        depth_m: (H, W) float32 radial truth; 0 where nothing is hit.
+        camera_height_m: above the floor.
+    """
+
+    name: str
+    renderer: EquirectRenderer
+    map_from_camera: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    camera_height_m: float
+
+
+def held_out(
+    kind: str, count: int = 20, mesh: str | Path | None = None, height: int = 256
+) -> Iterator[tuple[str, NDArray[np.uint8], NDArray[np.float32], float]]:
+    """Name, picture (H, W, 3), true radial depth (H, W) and camera height of each panorama; see ``scenes``."""
+    for scene in scenes(kind, count, mesh, height):
+        yield scene.name, scene.rgb, scene.depth_m, scene.camera_height_m
+
+
+def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: int = 256) -> Iterator[Scene]:
+    """The held-out panoramas of a kind, always the same ones.
+
+    Args:
+        kind: ``random`` (a world each, seeds from ``FIRST_SEED``), ``corridor`` (places in the corridor of the
+            experiments and its rooms) or ``mesh`` (its known places first, then random free ones).
+        count: panoramas.
+        mesh: the file, for ``mesh``.
+        height: rows of a panorama; twice as many columns.
+
+    Raises:
+        ValueError: an unknown kind, no count, a mesh without a free place, or ``mesh`` and kind do not go together.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)} (got {kind!r})")
+    if count < 1:
+        raise ValueError(f"count must be 1 or more (got {count})")
+    if (kind == "mesh") != (mesh is not None):
+        raise ValueError("kind mesh needs a mesh file, the other kinds take none")
+    return _scenes(kind, count, Path(mesh) if mesh is not None else None, height)
+
+
+def _scenes(kind: str, count: int, mesh: Path | None, height: int) -> Iterator[Scene]:
+    from instant_ic.sim.render import EquirectRenderer
+    from instant_ic.sim.worlds import corridor_world, load_world, random_world
+
+    if kind == "random":
+        seed, made = FIRST_SEED, 0
+        while made < count and seed < FIRST_SEED + 10 * count:
+            world = random_world(seed)
+            try:
+                places = world.sample_free_poses(np.random.default_rng([5, seed]), 1)
+            except ValueError:  # some plans are too full to stand in
+                places = np.empty((0, 3))
+            for x, y, yaw in places:
+                yield _scene(f"random:{seed}", EquirectRenderer(world), x, y, yaw, height)
+                made += 1
+            seed += 1
+        return
+    world = load_world(mesh) if mesh is not None else corridor_world()
+    renderer = EquirectRenderer(world)
+    for x, y, yaw in _places(world, count, mesh.stem if mesh is not None else ""):
+        name = mesh.name if mesh is not None else "corridor"
+        yield _scene(f"{name} ({x:.2f}, {y:.2f})", renderer, x, y, yaw, height)
+
+
+def _places(world: World, count: int, stem: str) -> NDArray[np.float64]:
+    """(count, 3) x, y, yaw: known places first, looking along x; the first ones are the same whatever the count."""
+    known = [np.array([x, y, 0.0]) for x, y in _MESH_POSITIONS.get(stem, ())][:count]
+    rngs = (np.random.default_rng([5, FIRST_SEED, k]) for k in range(count - len(known)))
+    return np.array(known + [world.sample_free_poses(rng, 1)[0] for rng in rngs])
+
+
+def _scene(name: str, renderer: EquirectRenderer, x: float, y: float, yaw: float, height: int) -> Scene:
+    pose = pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw)
+    frame = renderer.render(pose, 2 * height, height)
+    return Scene(name, renderer, pose, frame.rgb, frame.depth_m, CAMERA_HEIGHT_M)

@@ -1,0 +1,196 @@
+"""The paper's teleoperation experiment (V.D), scripted: into the obstacle, through the virtual space, and back."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.bus import LATCHED
+from instant_ic.console.client import ConsoleClient
+from instant_ic.experiments.stack import Stack, StackError
+from instant_ic.geometry.poses import compose2, pose2_from_matrix
+from instant_ic.msg import message_type, pose_matrix, stamp_ns
+
+FOOTPRINT_M = (0.60, 0.50)
+
+
+@dataclass
+class DriveRecord:
+    """What went over the bus while somebody drove."""
+
+    modes: list[int] = field(default_factory=list)
+    """Every change of mode, the first one included (ControlState.REAL, ...)."""
+    reasons: list[str] = field(default_factory=list)
+    truth: list[NDArray[np.float64]] = field(default_factory=list)
+    """Ground-truth poses of the r-bot, (x, y, yaw) in the world."""
+    vbot: list[NDArray[np.float64]] = field(default_factory=list)
+    """Poses of the v-bot in the map while it was driven."""
+    contact: bool = False
+    ready_seconds: list[float] = field(default_factory=list)
+    """For each keyframe: seconds from its arrival to a space that is fit to show."""
+    view_stamps_ns: list[int] = field(default_factory=list)
+    view_bytes: list[int] = field(default_factory=list)
+    view_size: tuple[int, int] = (0, 0)
+    render_ms: list[float] = field(default_factory=list)
+
+
+class DriveRecorder:
+    """Fills a :class:`DriveRecord` from the bus."""
+
+    def __init__(self, stack: Stack) -> None:
+        self.record = DriveRecord()
+        self.mode: int | None = None
+        self.vspace: Any = None
+        self.vbot_pose: NDArray[np.float64] | None = None
+        self._virtual = message_type("ControlState").VIRTUAL
+        self._ready_keyframe = -1
+        observer = stack.observer
+        observer.subscribe("/ic/state", message_type("ControlState"), self._on_state, LATCHED)
+        observer.subscribe("/ground_truth/odom", message_type("Odometry"), self._on_truth)
+        observer.subscribe("/ground_truth/contact", message_type("Bool"), self._on_contact, LATCHED)
+        observer.subscribe("/vbot/odom", message_type("Odometry"), self._on_vbot)
+        observer.subscribe("/vspace/status", message_type("VspaceStatus"), self._on_vspace, LATCHED)
+        observer.subscribe("/vspace/view", message_type("RenderedView"), self._on_view)
+
+    def _on_state(self, message: Any) -> None:
+        if message.mode != self.mode:
+            self.mode = message.mode
+            self.record.modes.append(message.mode)
+            self.record.reasons.append(message.reason)
+
+    def _on_truth(self, message: Any) -> None:
+        self.record.truth.append(pose2_from_matrix(pose_matrix(message)))
+
+    def _on_contact(self, message: Any) -> None:
+        self.record.contact |= bool(message.data)
+
+    def _on_vbot(self, message: Any) -> None:
+        self.vbot_pose = pose2_from_matrix(pose_matrix(message))
+        if self.mode == self._virtual:
+            self.record.vbot.append(self.vbot_pose)
+
+    def _on_vspace(self, message: Any) -> None:
+        self.vspace = message
+        if message.state == message.READY and message.keyframe_id != self._ready_keyframe:
+            self._ready_keyframe = message.keyframe_id
+            self.record.ready_seconds.append(float(message.ready_seconds))
+
+    def _on_view(self, message: Any) -> None:
+        self.record.view_stamps_ns.append(stamp_ns(message))
+        self.record.view_bytes.append(len(message.image.data))
+        self.record.view_size = (int(message.width), int(message.height))
+        self.record.render_ms.append(float(message.render_ms))
+
+    @property
+    def ready(self) -> bool:
+        """Whether the virtual space is fit to show."""
+        return self.vspace is not None and self.vspace.state == self.vspace.READY
+
+
+def footprint_clearance(pose: NDArray[np.float64], box: tuple[float, float, float, float]) -> float:
+    """Distance in metres between the crawler's footprint and an upright box; 0 when they overlap.
+
+    Args:
+        pose: (x, y, yaw) of the crawler.
+        box: x_min, y_min, x_max, y_max.
+    """
+    length, width = FOOTPRINT_M
+    xs = np.linspace(-length / 2, length / 2, 25)
+    ys = np.linspace(-width / 2, width / 2, 21)
+    points = np.array([compose2(pose, (x, y, 0.0))[:2] for x in xs for y in ys])
+    gap_x = np.maximum(np.maximum(box[0] - points[:, 0], points[:, 0] - box[2]), 0)
+    gap_y = np.maximum(np.maximum(box[1] - points[:, 1], points[:, 1] - box[3]), 0)
+    return float(np.hypot(gap_x, gap_y).min())
+
+
+@contextlib.asynccontextmanager
+async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float, str], Any]]:
+    """Runs the observer's callbacks beside asyncio code; gives ``await until(condition, timeout_s, what)``.
+
+    Time-outs are seconds of the stack's time.
+    """
+    failure: list[BaseException] = []
+
+    async def run() -> None:
+        try:
+            while True:
+                stack.observer.spin_once()
+                stack.check_alive("the drive")
+                await asyncio.sleep(0.01)
+        except Exception as error:
+            failure.append(error)
+            raise
+
+    task = asyncio.create_task(run())
+
+    async def until(condition: Callable[[], Any], timeout_s: float, what: str) -> Any:
+        deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
+        while not (value := condition()):
+            if failure:
+                raise failure[0]
+            if asyncio.get_running_loop().time() > deadline:
+                raise StackError(f"no {what} within {timeout_s:g} s:\n{stack.log_tail()}")
+            await asyncio.sleep(0.02)
+        return value
+
+    try:
+        yield until
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError, StackError):
+            await task
+
+
+async def drive_through_obstacle(
+    stack: Stack, recorder: DriveRecorder, console_url: str, beyond_x_m: float, speed_mps: float = 0.35
+) -> None:
+    """Drives straight ahead from the start until the v-bot is past the obstacle, stops there, waits for the r-bot.
+
+    When a late sensor stops the robot on the way, the operator lets go and drives on, as a person would.
+
+    Args:
+        stack: a running ``launch/sim.yaml`` whose world has an obstacle straight ahead.
+        recorder: of the same stack.
+        console_url: the page's address; the drive goes through its WebSocket.
+        beyond_x_m: how far along the map's x the v-bot is driven.
+        speed_mps: forward speed.
+
+    Raises:
+        StackError: something did not come about in time.
+    """
+    control = message_type("ControlState")
+    async with pump(stack) as until:
+        await until(lambda: recorder.mode == control.REAL and recorder.ready, 240, "virtual space that is fit to show")
+        async with ConsoleClient(console_url) as console:
+
+            async def drive_until(condition: Callable[[], Any], timeout_s: float, what: str) -> None:
+                deadline = asyncio.get_running_loop().time() + timeout_s / stack.pace
+                while True:
+                    console.drive(speed_mps, 0.0)
+                    left = (deadline - asyncio.get_running_loop().time()) * stack.pace
+                    await until(lambda: condition() or recorder.mode == control.STOPPED, max(left, 0.0), what)
+                    if condition():
+                        return
+                    await console.stop()
+                    await until(lambda: recorder.mode != control.STOPPED, 60, "end of the stop")
+
+            await console.wait_for(lambda c: any(c.frame_counts.values()), 30)
+            await console.acquire()
+            await drive_until(lambda: recorder.mode == control.VIRTUAL, 120, "passage into the virtual space")
+            await drive_until(
+                lambda: recorder.vbot_pose is not None and recorder.vbot_pose[0] > beyond_x_m,
+                120,
+                "v-bot past the obstacle",
+            )
+            await console.stop()
+            await until(lambda: recorder.mode == control.REAL, 120, "passage back to the real robot")
+            console.drive(speed_mps, 0.0)
+            await asyncio.sleep(1.5 / stack.pace)
+            await console.stop()
+            await asyncio.sleep(1.0 / stack.pace)

@@ -1,0 +1,466 @@
+"""``ic evaluate follow``: the r-bot behind a v-bot in random rooms, in a closed loop with the library that drives it.
+
+Each episode makes a room (``follow_worlds``). A scripted operator drives the v-bot to a goal, round the walls and
+straight through everything else. Costmap, subgoal, navigator and collision monitor are those of the nodes, at the
+nodes' rates; the robot is the simulator's, with slip; its commands come late, its pose wanders by centimetres, its
+LiDAR has 1.5 cm of noise. One revolution is taken as seen at once: motion within it is not part of this.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.follower import FollowerConfig, PathFollower
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.heights import sort_points
+from instant_ic.control.kinematics import MotionLimits, accelerate
+from instant_ic.control.navigator import Navigator
+from instant_ic.control.planner import HybridPlanner, Plan, PlannerConfig
+from instant_ic.control.prediction import PredictionConfig, Predictor
+from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
+from instant_ic.control.subgoal import SubgoalConfig, choose_subgoal
+from instant_ic.control.vbot import VbotConfig, VirtualRobot
+from instant_ic.control.walls import WallMap
+from instant_ic.control.warmup import warm_up
+from instant_ic.experiments import follow_worlds as worlds
+from instant_ic.experiments.processes import process_pool
+from instant_ic.geometry.poses import matrix_from_pose2, relative2, wrap_angle
+from instant_ic.sim.robot import RobotConfig, TrackedRobot
+
+FloatArray = NDArray[np.float64]
+
+DT_S = 0.05
+REACHED_M, REACHED_RAD = 0.20, math.radians(12.0)
+"""How near the v-bot the r-bot must come in truth: the arbiter's 0.15 m and 10° (switch.*), and the pose's error."""
+SPARE_M = 0.05
+"""A goal is reachable when the footprint with this much to spare on every side gets there."""
+TURNING_RAD_S = 0.1
+"""Slower than this the robot does not count as turning when changes of direction are counted."""
+LET_GO_M = 0.1
+"""A contact with a person is over when they are this far apart again."""
+OPERATOR_M_S = 0.4
+
+
+@dataclass
+class Episode:
+    """What came of one drive."""
+
+    index: int
+    people: int
+    reachable: bool
+    reached: bool = False
+    seconds: float = 0.0
+    optimum_m: float = math.inf
+    driven_m: float = 0.0
+    contacts: int = 0
+    """Times that the robot touched a wall or a thing."""
+    people_contacts: int = 0
+    """Times that the robot drove into a person."""
+    people_into_robot: int = 0
+    """Times that a person walked into the robot, which stood or drove off."""
+    yaw_rate_changes: int = 0
+    """Sign changes of the yaw rate, above TURNING_RAD_S either way."""
+    clearance_m: float = math.inf
+    """Nearest that the true footprint came to anything that stands still."""
+    reason: str = ""
+    """The follower's last words where the goal was not reached."""
+    planner_ms: list[float] = field(default_factory=list)
+    controller_ms: list[float] = field(default_factory=list)
+    costmap_ms: list[float] = field(default_factory=list)
+    tracks: dict[str, list[list[float]]] = field(default_factory=dict)
+    """Of ``robot``, ``vbot`` and each person, for the plot."""
+
+    @property
+    def ratio(self) -> float:
+        """Metres driven for each metre of the shortest way."""
+        return self.driven_m / self.optimum_m
+
+
+class _TimedPlanner(HybridPlanner):
+    """Keeps the CPU time of each plan."""
+
+    def __init__(self) -> None:
+        super().__init__(PlannerConfig(), Footprint())
+        self.spent_ms: list[float] = []
+
+    def plan(self, costmap: Costmap, start: FloatArray, goal: FloatArray, before: Plan | None = None) -> Plan:
+        began = time.thread_time()
+        plan = super().plan(costmap, start, goal, before)
+        self.spent_ms.append(1e3 * (time.thread_time() - began))
+        return plan
+
+
+class _Drive:
+    """One episode in the making."""
+
+    def __init__(self, seed: int, index: int) -> None:
+        self.rng = np.random.default_rng([seed, index])
+        self.room = worlds.make_room(self.rng, hanging=index % 3 == 0)
+        self.mask = worlds.filled(self.room.shapes, self.room.size, 0.01, worlds.IN_THE_WAY_M)
+        coarse = worlds.filled(self.room.shapes, self.room.size, 0.025, worlds.IN_THE_WAY_M)
+        goal = np.array([*self.room.goal, 0.0])
+        self.optimum = worlds.shortest_way(coarse, self.room.start, goal, 0.05, SPARE_M)
+        self.people = worlds.add_people(self.room, self.rng, int(self.rng.integers(1, 4))) if index % 5 == 0 else []
+        self.episode = Episode(index, len(self.people), self.optimum is not None)
+        if self.optimum is not None:
+            self.episode.optimum_m = float(np.linalg.norm(np.diff(self.optimum[:, :2], axis=0), axis=1).sum())
+        start: tuple[float, float, float] = tuple(float(v) for v in self.room.start)  # type: ignore[assignment]
+        self.robot = TrackedRobot(RobotConfig(slip=0.05, turn_slip=0.08), self.mask, start, seed=1000 * seed + index)
+        self.distance = self.mask.distance_m()
+        self.late: deque[tuple[float, float]] = deque([(0.0, 0.0)] * int(self.rng.integers(1, 4)))
+        self.velocity = (0.0, 0.0)
+        self.pose_error = np.zeros(3)
+        self.touching: set[int] = set()
+
+        limits, footprint = MotionLimits(), Footprint()
+        self.config = CostmapConfig()
+        self.static = self._map()
+        self.walls = WallMap(self.static)
+        self.costmaps = RollingCostmap(self.config, footprint)
+        self.costmap: Costmap | None = None
+        self.published: Costmap | None = None
+        self.planner = _TimedPlanner()
+        self.navigator = Navigator(self.planner, PathFollower(FollowerConfig(), limits, footprint))
+        self.monitor = CollisionMonitor(CollisionMonitorConfig(), footprint)
+        self.predictor = Predictor(PredictionConfig(), limits, footprint)
+        self.vbot = VirtualRobot(VbotConfig(), limits, footprint)
+        self.vbot.place(self.room.start, (0.0, 0.0))
+        self.nav = (0.0, 0.0)
+        self.plan_reason = ""
+
+    def _map(self) -> StaticMap:
+        """What SLAM would have drawn: walls, free within, unknown without; nothing of the things in the room."""
+        walls = worlds.filled(self.room.shapes[self.room.kinds == 0], self.room.size, 0.05, worlds.IN_THE_WAY_M)
+        occupancy = np.full(walls.cells.shape, -1, dtype=np.int8)
+        centres = [walls.origin[i] + (np.arange(walls.cells.shape[1 - i]) + 0.5) * 0.05 for i in (0, 1)]
+        inside = [(c > 0) & (c < s) for c, s in zip(centres, self.room.size, strict=True)]
+        occupancy[np.ix_(inside[1], inside[0])] = 0
+        occupancy[walls.cells] = 100
+        return StaticMap(occupancy, 0.05, np.asarray(walls.origin, dtype=np.float64))
+
+    def run(self) -> Episode:
+        episode = self.episode
+        limit_s = 60.0 + 3.0 * episode.optimum_m / OPERATOR_M_S if episode.reachable else 40.0
+        tracks: dict[str, list[FloatArray]] = {"robot": [], "vbot": []}
+        turning, before = 0.0, self.robot.pose.copy()
+        for k in range(round(limit_s / DT_S)):
+            episode.seconds = k * DT_S
+            self._step(k)
+            pose = self.robot.pose
+            episode.driven_m += float(np.linalg.norm(pose[:2] - before[:2]))
+            before = pose.copy()
+            rate = float(self.robot.twist[2])
+            if abs(rate) > TURNING_RAD_S:
+                episode.yaw_rate_changes += int(turning * rate < 0)
+                turning = rate
+            if k % 4 == 0:
+                tracks["robot"].append(pose.copy())
+                tracks["vbot"].append(self.vbot.pose.copy())
+                episode.clearance_m = min(episode.clearance_m, self._clearance(pose))
+            if self._arrived():
+                episode.reached = True
+                break
+        episode.contacts = self.robot.contacts
+        episode.reason = "" if episode.reached else self.plan_reason
+        episode.planner_ms = self.planner.spent_ms
+        tracks |= {f"person {i}": person.track for i, person in enumerate(self.people)}
+        episode.tracks = {name: np.round(np.array(track), 3).tolist() for name, track in tracks.items()}
+        return episode
+
+    def _arrived(self) -> bool:
+        standing = self.vbot.velocity == (0.0, 0.0)
+        if not standing or float(np.linalg.norm(self.vbot.pose[:2] - self.room.goal)) > 0.3:
+            return False
+        gap = self.vbot.pose - self.robot.pose
+        return float(np.hypot(gap[0], gap[1])) <= REACHED_M and abs(wrap_angle(float(gap[2]))) <= REACHED_RAD
+
+    def _step(self, k: int) -> None:
+        """A twentieth of a second: people, sensors, the nodes in their order, and the robot."""
+        for person in self.people:
+            worlds.walk(self.room, person, self.robot.pose, DT_S, self.rng)
+            if k % 4 == 0:
+                person.track.append(person.place.copy())
+        self.pose_error = 0.95 * self.pose_error + self.rng.normal(0.0, [0.005, 0.005, 0.002])
+        estimate = self.robot.pose + self.pose_error
+        if k % 2 == 0:
+            self._see(estimate, publish=k % 4 == 0)
+        assert self.costmap is not None and self.published is not None
+        command = self._operator()
+        self.vbot.step(command, estimate, DT_S)  # its route leads round the walls
+        prediction = self.predictor.predict(self.vbot.pose, self.vbot.velocity, command, self.costmap)
+        subgoal = choose_subgoal(self.costmap, self.vbot.pose, prediction, command[0] >= 0, self.walls, SubgoalConfig())
+        wanted = (0.0, 0.0)
+        if subgoal is not None:
+            velocity = self.vbot.velocity if subgoal.rule == "vbot" else (0.0, 0.0)
+            spent, plans = time.thread_time(), len(self.planner.spent_ms)
+            step = self.navigator.step(
+                estimate, self.nav[0], subgoal.pose, self.published, round(k * DT_S * 1e9), velocity
+            )
+            spent_ms = 1e3 * (time.thread_time() - spent) - sum(self.planner.spent_ms[plans:])
+            self.episode.controller_ms.append(spent_ms)
+            wanted = step.command
+            self.plan_reason = step.plan.reason or step.state
+        else:
+            self.plan_reason = "no free place near the v-bot"
+        self.nav = wanted
+        sent = self.monitor.limit(wanted, self._close_points(estimate)).command
+        self._move(sent)
+
+    def _operator(self) -> tuple[float, float]:
+        """Steers the v-bot along its route: turns towards a point 0.4 m ahead and drives; hands off at the end."""
+        pose, route = self.vbot.pose, self.room.route
+        if float(np.linalg.norm(route[-1] - pose[:2])) < 0.1:
+            return 0.0, 0.0
+        away = np.linalg.norm(route - pose[:2], axis=1)
+        near = int(np.argmin(away))
+        far = np.flatnonzero(away[near:] > 0.4)
+        target = route[near + int(far[0]) if far.size else -1]
+        x, y, _ = relative2(pose, np.array([*target, 0.0]))
+        bearing = math.atan2(float(y), float(x))
+        return (0.0 if abs(bearing) > 0.6 else OPERATOR_M_S), min(max(1.5 * bearing, -0.8), 0.8)
+
+    def _see(self, estimate: FloatArray, publish: bool) -> None:
+        points = worlds.look(self.room, self.people, self.robot.pose, self.rng)
+        ranges = worlds.flat_ranges(points)
+        beam = 2 * math.pi / worlds.BEAMS
+        scan = (ranges, -math.pi + beam / 2, beam, worlds.RANGE_MIN_M, worlds.RANGE_MAX_M)
+        map_from_lidar = matrix_from_pose2(estimate)
+        map_from_lidar[2, 3] = worlds.LIDAR_HEIGHT_M
+        cloud = points.astype(np.float32)
+        began = time.thread_time()
+        sweep = sort_points(cloud, np.zeros(len(cloud), np.float32), map_from_lidar[None], 0.0, self.config.points)
+        rays = scan_rays(*scan, map_from_lidar, self.config)
+        self.costmap = self.costmaps.update(estimate, self.static, rays, sweep)
+        self.episode.costmap_ms.append(1e3 * (time.thread_time() - began))
+        if publish:
+            self.published = Costmap.from_occupancy(
+                self.costmap.occupancy(), self.costmap.resolution, self.costmap.origin
+            )
+        hits = scan_points(*scan) @ map_from_lidar[:2, :2].T + map_from_lidar[:2, 3]
+        self.seen = np.concatenate([hits, sweep.nearest])
+
+    def _close_points(self, estimate: FloatArray) -> FloatArray:
+        """What the collision monitor is given (``Arbiter`` does the same)."""
+        assert self.costmap is not None
+        c, s = math.cos(estimate[2]), math.sin(estimate[2])
+        seen = (self.seen - estimate[:2]) @ np.array([[c, -s], [s, c]])
+        config = self.monitor.config
+        memory = self.costmap.memory_near(estimate, config.blind_radius_m, config.memory_range_m)
+        return np.concatenate([seen, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
+
+    def _move(self, command: tuple[float, float]) -> None:
+        self.late.append(command)
+        asked = self.late.popleft()
+        steering, before = self.robot.kinematics, self.robot.pose.copy()
+        for _ in range(3):
+            self.velocity = accelerate(self.velocity, asked, MotionLimits(), DT_S / 3)
+            self.robot.step(steering.motors_from_tracks(steering.tracks_from_twist(*self.velocity)), DT_S / 3)
+        for i, person in enumerate(self.people):
+            gap, _ = worlds.gap_to_robot(person.place, self.robot.pose)
+            if gap > LET_GO_M:
+                self.touching.discard(i)
+            elif gap <= 0.0 and i not in self.touching:
+                self.touching.add(i)
+                # Whose doing it is: had the robot stood still, would they be as near?
+                closer = worlds.gap_to_robot(person.place, before)[0] - gap
+                if closer > 0.05 * DT_S:
+                    self.episode.people_contacts += 1
+                else:
+                    self.episode.people_into_robot += 1
+
+    def _clearance(self, pose: FloatArray) -> float:
+        """Metres from the footprint's outline to the nearest thing that stands still."""
+        outline = Footprint(worlds.LENGTH_M, worlds.WIDTH_M).points(0.05)
+        c, s = math.cos(pose[2]), math.sin(pose[2])
+        index = self.mask.index(outline @ np.array([[c, s], [-s, c]]) + pose[:2])
+        index = index.clip(0, np.array(self.mask.cells.shape) - 1)
+        return float(self.distance[index[:, 0], index[:, 1]].min())
+
+
+def run_episode(seed: int, index: int) -> Episode:
+    """One drive; the same for the same seed and index, times apart."""
+    return _Drive(seed, index).run()
+
+
+def prepare() -> None:
+    """Compiles the kernels, so that no episode counts that time."""
+    warm_up()
+    drive = _Drive(0, 0)
+    for k in range(8):
+        drive._step(k)
+
+
+def evaluate(
+    episodes: int, seed: int, jobs: int, on_episode: Callable[[Episode], None] | None = None, timeout_s: float = 3600.0
+) -> list[Episode]:
+    """Drives all episodes, ``jobs`` at a time, each in a process of its own where more than one.
+
+    Raises:
+        ValueError: nothing to do.
+        TimeoutError: they took longer than ``timeout_s``.
+        RuntimeError: a process died.
+    """
+    from concurrent.futures import as_completed
+    from concurrent.futures.process import BrokenProcessPool
+
+    if episodes < 1 or jobs < 1:
+        raise ValueError(f"episodes and jobs must be at least 1 (got {episodes}, {jobs})")
+    done: list[Episode] = []
+    tell = on_episode or (lambda episode: None)
+    if jobs == 1:
+        prepare()
+        for index in range(episodes):
+            done.append(run_episode(seed, index))
+            tell(done[-1])
+        return done
+    with process_pool(jobs, prepare) as pool:
+        try:
+            futures = [pool.submit(run_episode, seed, index) for index in range(episodes)]
+            for future in as_completed(futures, timeout=timeout_s):
+                done.append(future.result())
+                tell(done[-1])
+        except BrokenProcessPool as error:
+            raise RuntimeError("a process that drove an episode died (out of memory?); try --jobs 1") from error
+        except TimeoutError as error:
+            raise TimeoutError(f"the episodes took longer than {timeout_s:.0f} s; {len(done)} are done") from error
+    return sorted(done, key=lambda episode: episode.index)
+
+
+def summary(episodes: list[Episode]) -> dict[str, Any]:
+    """Figures over all episodes, and whether the targets are met."""
+    reachable = [e for e in episodes if e.reachable]
+    reached = [e for e in reachable if e.reached]
+    ratios = np.array([e.ratio for e in reached])
+    still = np.array([e.ratio for e in reached if not e.people])
+    metres = sum(e.driven_m for e in episodes)
+    seconds = sum(e.seconds for e in episodes)
+    changes = sum(e.yaw_rate_changes for e in episodes)
+    contacts = sum(e.contacts + e.people_contacts for e in episodes)
+    share = len(reached) / len(reachable) if reachable else math.nan
+    figures: dict[str, Any] = {
+        "episodes": len(episodes),
+        "episodes_with_people": sum(e.people > 0 for e in episodes),
+        "reachable": len(reachable),
+        "reached": len(reached),
+        "reached_share": share,
+        "contacts": contacts,
+        "contacts_with_things": sum(e.contacts for e in episodes),
+        "contacts_with_people": sum(e.people_contacts for e in episodes),
+        "people_walked_into_robot": sum(e.people_into_robot for e in episodes),
+        "clearance_min_m": min(e.clearance_m for e in episodes),
+        "path_ratio_mean": _of(np.mean, ratios),
+        "path_ratio_median": _of(np.median, ratios),
+        "path_ratio_p95": _of(lambda r: np.percentile(r, 95), ratios),
+        "path_ratio_max": _of(np.max, ratios),
+        "path_ratio_mean_without_people": _of(np.mean, still),
+        "yaw_rate_changes_per_m": changes / max(metres, 1e-9),
+        "yaw_rate_changes_per_s": changes / max(seconds, 1e-9),
+        "metres": metres,
+        "simulated_s": seconds,
+    }
+    for name in ("planner", "controller", "costmap"):
+        spent = np.concatenate([np.array(getattr(e, f"{name}_ms")) for e in episodes])
+        figures[f"{name}_ms_p50"] = _of(np.median, spent)
+        figures[f"{name}_ms_p99"] = _of(lambda r: np.percentile(r, 99), spent)
+        figures[f"{name}_ms_max"] = _of(np.max, spent)
+    figures["targets"] = {
+        "contacts == 0": contacts == 0,
+        "reached_share >= 0.95": bool(share >= 0.95),
+        "path_ratio_mean <= 1.2": bool(figures["path_ratio_mean"] <= 1.2),
+        "planner_ms_p99 <= 50": bool(figures["planner_ms_p99"] <= 50),
+        "controller_ms_p99 <= 10": bool(figures["controller_ms_p99"] <= 10),
+        "costmap_ms_p99 <= 5": bool(figures["costmap_ms_p99"] <= 5),
+    }
+    return figures
+
+
+def _of(measure: Callable[[FloatArray], Any], values: FloatArray) -> float:
+    return float(measure(values)) if len(values) else math.nan
+
+
+def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
+    """The summary, and each episode without its tracks and times, as JSON takes it."""
+    left_out = {"tracks", "planner_ms", "controller_ms", "costmap_ms"}
+    rows = []
+    for episode in episodes:
+        row = {key: value for key, value in asdict(episode).items() if key not in left_out}
+        row["path_ratio"] = episode.ratio if episode.reached and episode.reachable else None
+        row["planner_ms_max"] = max(episode.planner_ms, default=None)
+        rows.append({k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()})
+    figures = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in summary(episodes).items()}
+    return {"seed": seed, **figures, "each": rows}
+
+
+def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None:
+    """A sheet of episodes as PNG, the worst first: contacts, goals not reached, long ways."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Circle, Rectangle
+
+    def badness(e: Episode) -> tuple[float, ...]:
+        missed = e.reachable and not e.reached
+        return (e.contacts + e.people_contacts, float(missed), e.ratio if e.reachable else 0.0)
+
+    shown = sorted(episodes, key=badness, reverse=True)[:most]
+    columns = min(4, len(shown))
+    rows = math.ceil(len(shown) / columns)
+    figure = Figure(figsize=(4.4 * columns, 4.0 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    colours = {0: "0.25", 1: "0.55", 2: "tab:olive", 3: "tab:purple"}
+    for n, episode in enumerate(shown):
+        axes = figure.add_subplot(rows, columns, n + 1)
+        drive = _Drive(seed, episode.index)
+        for shape, kind in zip(drive.room.shapes, drive.room.kinds, strict=True):
+            cx, cy, half_x, half_y, yaw = shape[:5]
+            corner = (cx - half_x, cy - half_y)
+            axes.add_patch(
+                Rectangle(
+                    corner,
+                    2 * half_x,
+                    2 * half_y,
+                    angle=math.degrees(yaw),
+                    rotation_point="center",
+                    color=colours[int(kind)],
+                    lw=0,
+                )
+            )
+        if drive.optimum is not None:
+            axes.plot(drive.optimum[:, 0], drive.optimum[:, 1], "k--", lw=0.8)
+        for name, track in episode.tracks.items():
+            line = np.array(track)
+            if len(line) == 0:
+                continue
+            style = {"robot": ("tab:red", 1.6), "vbot": ("tab:blue", 1.0)}.get(name, ("tab:green", 0.6))
+            axes.plot(line[:, 0], line[:, 1], color=style[0], lw=style[1])
+            if name.startswith("person"):
+                axes.add_patch(Circle(tuple(line[-1, :2]), worlds.PERSON_M, color="tab:green", alpha=0.5))
+        end = np.array(episode.tracks["robot"][-1])
+        for pose, colour in ((drive.room.start, "tab:orange"), (end, "tab:red")):
+            corners = Footprint().corners() @ np.array(
+                [[math.cos(pose[2]), math.sin(pose[2])], [-math.sin(pose[2]), math.cos(pose[2])]]
+            )
+            closed = np.concatenate([corners, corners[:1]]) + pose[:2]
+            axes.plot(closed[:, 0], closed[:, 1], color=colour, lw=1.0)
+        axes.plot(*drive.room.goal, "k*", ms=8)
+        verdict = "reached" if episode.reached else ("not reached" if episode.reachable else "unreachable")
+        ratio = f", {episode.ratio:.2f} × optimum" if episode.reachable and episode.reached else ""
+        touched = f", {episode.contacts + episode.people_contacts} contacts"
+        axes.set_title(f"{episode.index}: {verdict}{ratio}{touched}, {episode.seconds:.0f} s", fontsize=8)
+        axes.set_aspect("equal")
+        axes.set_xlim(-0.3, float(drive.room.size[0]) + 0.3)
+        axes.set_ylim(-0.3, float(drive.room.size[1]) + 0.3)
+        axes.tick_params(labelsize=6)
+    figure.suptitle(
+        "red: robot, blue: v-bot, dashed: shortest way; olive: low things, purple: hanging, green: people", fontsize=9
+    )
+    figure.savefig(path, dpi=80)

@@ -1,0 +1,421 @@
+"""Rooms for ``ic evaluate follow``: walls with doors, boxes, low and hanging things, people; a LiDAR in them.
+
+Everything here is worked out from the shapes themselves and shares no code with what is measured: the LiDAR, the
+contact with people, and the shortest way for the true footprint.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from instant_ic.sim.contact import OccupancyMask
+
+FloatArray = NDArray[np.float64]
+
+LIDAR_HEIGHT_M = 0.60
+RINGS_DEG = np.arange(-15, 16, 2)
+AZIMUTHS = 1800
+BEAMS = 720
+RANGE_MIN_M, RANGE_MAX_M = 0.40, 30.0
+SCAN_BAND_M = (0.10, 1.30)
+"""Heights of the flat scan (config/lidar.yaml)."""
+IN_THE_WAY_M = (0.05, 1.25)
+"""Heights in which a thing is run into: the crawler with its mast."""
+LENGTH_M, WIDTH_M = 0.60, 0.50
+WALL_M = 0.10
+PERSON_M = 0.22
+"""Radius of a person."""
+KINDS = ("wall", "box", "low", "hanging")
+BLIND_M = LIDAR_HEIGHT_M / math.tan(math.radians(15.0))
+"""Nearer than this the lowest beam of a standing VLP-16 does not reach the floor."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """A floor plan with heights.
+
+    Attributes:
+        size: (2,) metres; the room reaches from (0, 0) to here.
+        shapes: (N, 7) centre x, y, half length, half width, yaw, lowest and highest z.
+        kinds: (N,) index into KINDS.
+        start: (3,) pose of the r-bot.
+        goal: (2,) where the v-bot is driven.
+        route: (M, 2) the v-bot's way there: round walls, through everything else.
+    """
+
+    size: FloatArray
+    shapes: FloatArray
+    kinds: NDArray[np.int64]
+    start: FloatArray
+    goal: FloatArray
+    route: FloatArray
+
+
+@dataclass
+class Person:
+    """Somebody who walks from place to place.
+
+    Attributes:
+        place: (2,) metres.
+        target: (2,) where to.
+        speed: m/s.
+        looks: stops before a robot in the way; else walks on, into it.
+    """
+
+    place: FloatArray
+    target: FloatArray
+    speed: float
+    looks: bool
+    waited_s: float = 0.0
+    track: list[FloatArray] = field(default_factory=list)
+
+
+def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[float, float]) -> OccupancyMask:
+    """Cells whose centre lies in a shape that reaches into a band of heights."""
+    margin = 0.5
+    columns, rows = np.ceil((size + 2 * margin) / cell_m).astype(int)
+    x = -margin + (np.arange(columns) + 0.5) * cell_m
+    y = -margin + (np.arange(rows) + 0.5) * cell_m
+    cells = np.zeros((rows, columns), dtype=bool)
+    for cx, cy, half_x, half_y, yaw, low, high in shapes:
+        if high < band[0] or low > band[1]:
+            continue
+        reach = math.hypot(half_x, half_y)
+        r = np.flatnonzero(np.abs(y - cy) <= reach + cell_m)
+        c = np.flatnonzero(np.abs(x - cx) <= reach + cell_m)
+        if r.size == 0 or c.size == 0:
+            continue
+        dx, dy = np.meshgrid(x[c] - cx, y[r] - cy)
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        inside = (np.abs(cos * dx + sin * dy) <= half_x) & (np.abs(cos * dy - sin * dx) <= half_y)
+        cells[r[0] : r[-1] + 1, c[0] : c[-1] + 1] |= inside
+    return OccupancyMask(cells, np.array([-margin, -margin]), cell_m)
+
+
+def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> Room:
+    """A random room in which the goal is at least 5 m from the start, by a way round the walls.
+
+    Raises:
+        ValueError: no such room came up within ``attempts``.
+    """
+    for _ in range(attempts):
+        size = np.array([rng.uniform(8.0, 12.0), rng.uniform(7.0, 10.0)])
+        shapes, kinds = _walls(rng, size)
+        walls = np.array(shapes)
+        plan = filled(walls, size, 0.05, IN_THE_WAY_M)
+        for _ in range(int(rng.integers(6, 14))):
+            kind = int(rng.choice([1, 1, 1, 2, 3])) if hanging else 1
+            shapes.append(_thing(rng, size, kind))
+            kinds.append(kind)
+        every = np.array(shapes)
+        # What stands in the start or in the goal is taken away.
+        start = np.array([*rng.uniform([0.8, 0.8], size - 0.8), rng.uniform(-math.pi, math.pi)])
+        goal = rng.uniform([0.8, 0.8], size - 0.8)
+        # A robot that has driven to its start has seen what is low round it. One that is put there has not: no beam
+        # reaches that, and nobody could drive by it.
+        clear = np.array(
+            [
+                k == 0 or (_away(s, start[:2]) > (BLIND_M if KINDS[k] == "low" else 0.6) and _away(s, goal) > 0.6)
+                for s, k in zip(every, kinds, strict=True)
+            ]
+        )
+        every, kept = every[clear], np.array(kinds)[clear]
+        if min(_away(s, p) for s in walls for p in (start[:2], goal)) < 0.6:
+            continue
+        route = shortest_way(plan, start, np.array([*goal, 0.0]), 0.05, 0.12)
+        if route is None or _length(route) < 5.0:
+            continue
+        return Room(size, every, kept, start, goal, route[:, :2])
+    raise ValueError(f"no room with a way of 5 m within {attempts} attempts")
+
+
+def _walls(rng: np.random.Generator, size: FloatArray) -> tuple[list[Sequence[float]], list[int]]:
+    w, h, half = float(size[0]), float(size[1]), WALL_M / 2
+    shapes: list[Sequence[float]] = [
+        (w / 2, 0.0, w / 2 + half, half, 0.0, 0.0, 2.5),
+        (w / 2, h, w / 2 + half, half, 0.0, 0.0, 2.5),
+        (0.0, h / 2, half, h / 2 + half, 0.0, 0.0, 2.5),
+        (w, h / 2, half, h / 2 + half, 0.0, 0.0, 2.5),
+    ]
+    for _ in range(int(rng.integers(0, 3))):  # walls across, each with a door
+        across = rng.random() < 0.5
+        length, other = (h, w) if across else (w, h)
+        at = rng.uniform(2.5, other - 2.5)
+        door, middle = rng.uniform(0.80, 1.20), rng.uniform(1.2, length - 1.2)
+        for a, b in ((0.0, middle - door / 2), (middle + door / 2, length)):
+            centre, reach = (a + b) / 2, (b - a) / 2
+            shapes.append(
+                (at, centre, half, reach, 0.0, 0.0, 2.5) if across else (centre, at, reach, half, 0.0, 0.0, 2.5)
+            )
+    return shapes, [0] * len(shapes)
+
+
+def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[float]:
+    x, y = rng.uniform([0.4, 0.4], size - 0.4)
+    half_x, half_y = rng.uniform(0.1, 0.45), rng.uniform(0.1, 0.45)
+    if rng.random() < 0.2:
+        half_x = half_y = rng.uniform(0.03, 0.06)  # a post, a table's leg
+    low, high = {1: (0.0, rng.uniform(0.4, 1.8)), 2: (0.0, rng.uniform(0.08, 0.25)), 3: (rng.uniform(0.75, 1.1), 2.0)}[
+        kind
+    ]
+    if kind == 2:
+        half_x, half_y = max(half_x, 0.1), max(half_y, 0.1)
+    return (x, y, half_x, half_y, rng.uniform(-math.pi, math.pi), low, high)
+
+
+def _away(shape: Sequence[float] | FloatArray, point: FloatArray) -> float:
+    """Distance from a point to a shape's outline; 0 inside."""
+    cx, cy, half_x, half_y, yaw = (float(v) for v in shape[:5])
+    dx, dy = float(point[0]) - cx, float(point[1]) - cy
+    c, s = math.cos(yaw), math.sin(yaw)
+    return math.hypot(max(abs(c * dx + s * dy) - half_x, 0.0), max(abs(c * dy - s * dx) - half_y, 0.0))
+
+
+def _length(path: FloatArray) -> float:
+    return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1).sum())
+
+
+# -- the LiDAR
+
+
+def look(room: Room, people: Sequence[Person], pose: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Points (N, 3) of one revolution in the LiDAR's frame: z up, x along the robot's heading; 1.5 cm of noise."""
+    circles = np.array([[*p.place, PERSON_M] for p in people]).reshape(-1, 3)
+    angles = -math.pi + 2 * math.pi * (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS
+    slopes = np.tan(np.radians(RINGS_DEG))
+    flat = _cast(room.shapes, circles, float(pose[0]), float(pose[1]), float(pose[2]), angles, slopes)
+    slant = np.hypot(1.0, slopes)[None]
+    ranges = flat * slant
+    seen = (ranges > RANGE_MIN_M) & (ranges < RANGE_MAX_M)
+    noisy = flat + np.where(seen, rng.normal(0.0, 0.015, flat.shape), 0.0) / slant
+    points = np.stack([noisy * np.cos(angles)[:, None], noisy * np.sin(angles)[:, None], noisy * slopes[None]], axis=-1)
+    return points[seen]
+
+
+def flat_ranges(points: FloatArray) -> FloatArray:
+    """What the driver's ``/scan`` says: (BEAMS,) nearest point within ``SCAN_BAND_M``; +inf where there is none."""
+    z = points[:, 2] + LIDAR_HEIGHT_M
+    band = points[(z >= SCAN_BAND_M[0]) & (z <= SCAN_BAND_M[1])]
+    beams = np.floor((np.arctan2(band[:, 1], band[:, 0]) + math.pi) * BEAMS / (2 * math.pi)).astype(int) % BEAMS
+    ranges = np.full(BEAMS, np.inf)
+    np.minimum.at(ranges, beams, np.hypot(band[:, 0], band[:, 1]))
+    ranges[ranges < RANGE_MIN_M] = -np.inf
+    return ranges
+
+
+@njit(cache=True)
+def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untyped-def]
+    """Horizontal distance (A, R) to the first thing along each azimuth and ring; inf for none."""
+    out = np.full((angles.shape[0], slopes.shape[0]), np.inf)
+    for a in range(angles.shape[0]):
+        dx, dy = math.cos(yaw + angles[a]), math.sin(yaw + angles[a])
+        for k in range(slopes.shape[0]):
+            if slopes[k] < 0.0:
+                out[a, k] = -LIDAR_HEIGHT_M / slopes[k]
+        for i in range(shapes.shape[0] + circles.shape[0]):
+            if i < shapes.shape[0]:
+                cos, sin = math.cos(shapes[i, 4]), math.sin(shapes[i, 4])
+                px, py = x - shapes[i, 0], y - shapes[i, 1]
+                ox, oy = cos * px + sin * py, cos * py - sin * px
+                ex, ey = cos * dx + sin * dy, cos * dy - sin * dx
+                near, far = -np.inf, np.inf
+                for o, e, half in ((ox, ex, shapes[i, 2]), (oy, ey, shapes[i, 3])):
+                    if abs(e) < 1e-12:
+                        if abs(o) > half:
+                            near = np.inf
+                    else:
+                        t0, t1 = (-half - o) / e, (half - o) / e
+                        near, far = max(near, min(t0, t1)), min(far, max(t0, t1))
+                low, high = shapes[i, 5], shapes[i, 6]
+            else:
+                j = i - shapes.shape[0]
+                px, py = x - circles[j, 0], y - circles[j, 1]
+                b, c = px * dx + py * dy, px * px + py * py - circles[j, 2] ** 2
+                root = b * b - c
+                near, far = np.inf, -np.inf
+                if root > 0.0:
+                    near, far = -b - math.sqrt(root), -b + math.sqrt(root)
+                low, high = 0.0, 1.7
+            if near > far or far < 0.0:
+                continue
+            near = max(near, 0.0)
+            for k in range(slopes.shape[0]):
+                z = LIDAR_HEIGHT_M + near * slopes[k]
+                hit = np.inf
+                if low <= z <= high:
+                    hit = near
+                elif z > high and slopes[k] < 0.0:
+                    hit = (high - LIDAR_HEIGHT_M) / slopes[k]
+                elif z < low and slopes[k] > 0.0:
+                    hit = (low - LIDAR_HEIGHT_M) / slopes[k]
+                if hit <= far and hit < out[a, k]:
+                    out[a, k] = hit
+    return out
+
+
+# -- people
+
+
+def add_people(room: Room, rng: np.random.Generator, count: int) -> list[Person]:
+    """People at least 2 m from the robot; one in three does not look where he goes."""
+    people = []
+    for _ in range(count):
+        place = free_place(room, rng)
+        while float(np.linalg.norm(place - room.start[:2])) < 2.0:
+            place = free_place(room, rng)
+        people.append(Person(place, free_place(room, rng), rng.uniform(0.4, 1.0), bool(rng.random() > 1 / 3)))
+    return people
+
+
+def free_place(room: Room, rng: np.random.Generator) -> FloatArray:
+    """A place (2,) at least 0.4 m from every shape that stands on the ground or hangs low."""
+    while True:
+        place = rng.uniform([0.5, 0.5], room.size - 0.5)
+        if min(_away(s, place) for s in room.shapes) > 0.4:
+            return place
+
+
+def walk(room: Room, person: Person, robot: FloatArray, dt_s: float, rng: np.random.Generator) -> None:
+    """Moves a person by ``dt_s``; one who looks stops half a metre before the robot, and turns round after 3 s."""
+    way = person.target - person.place
+    distance = float(np.linalg.norm(way))
+    if distance < 0.2 or person.waited_s > 3.0:
+        person.target, person.waited_s = free_place(room, rng), 0.0
+        return
+    heading = way / distance
+    step = heading * person.speed * dt_s
+    ahead = person.place + heading * (PERSON_M + 0.1)
+    if min(_away(s, ahead) for s in room.shapes) < PERSON_M:
+        person.target = free_place(room, rng)  # a wall: somewhere else
+        return
+    gap, direction = gap_to_robot(person.place, robot)
+    in_the_way = float(direction @ heading) > 0.0
+    if in_the_way and (gap < 0.5 if person.looks else gap <= 0.0):
+        person.waited_s += dt_s  # who does not look stops when he has walked into it
+        return
+    person.place = person.place + step
+    person.waited_s = 0.0
+
+
+def gap_to_robot(place: FloatArray, robot: FloatArray) -> tuple[float, FloatArray]:
+    """Metres between a person and the robot's outline (negative: overlap); unit vector (2,) towards the robot."""
+    c, s = math.cos(robot[2]), math.sin(robot[2])
+    dx, dy = place[0] - robot[0], place[1] - robot[1]
+    local = np.array([c * dx + s * dy, c * dy - s * dx])
+    nearest = np.clip(local, [-LENGTH_M / 2, -WIDTH_M / 2], [LENGTH_M / 2, WIDTH_M / 2])
+    away = nearest - local
+    distance = float(np.hypot(*away))
+    if distance < 1e-9:
+        return -PERSON_M, np.array([c, s])
+    towards = np.array([c * away[0] - s * away[1], s * away[0] + c * away[1]]) / distance
+    return distance - PERSON_M, towards
+
+
+# -- the shortest way
+
+_STEPS = np.array(
+    [(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)]
+    + [(-1, 0), (-2, -1), (-1, -1), (-1, -2), (0, -1), (1, -2), (1, -1), (2, -1)]
+)
+"""Cells (dx, dy) of one step along each of 16 headings."""
+
+
+def shortest_way(
+    mask: OccupancyMask, start: FloatArray, goal: FloatArray, cell_m: float, margin_m: float
+) -> FloatArray | None:
+    """Shortest way (N, 3) of the true footprint with ``margin_m`` to spare on every side; None where there is none.
+
+    Over 5 cm cells and 16 headings, with steps along the heading, both ways, and turns on the spot, which cost next to
+    nothing. Steps in 16 directions make a straight way at most 1.4 % longer than it is.
+    """
+    import cv2
+
+    fine = mask.cell_m
+    every = max(1, round(cell_m / fine))
+    middle = (slice(every // 2, None, every), slice(every // 2, None, every))
+    free = np.empty((16, *mask.cells[middle].shape), dtype=bool)
+    for h in range(8):
+        yaw = math.atan2(_STEPS[h, 1], _STEPS[h, 0])
+        reach = math.ceil(math.hypot(LENGTH_M / 2 + margin_m, WIDTH_M / 2 + margin_m) / fine)
+        dx, dy = np.meshgrid(np.arange(-reach, reach + 1) * fine, np.arange(-reach, reach + 1) * fine)
+        c, s = math.cos(yaw), math.sin(yaw)
+        body = (np.abs(c * dx + s * dy) <= LENGTH_M / 2 + margin_m) & (
+            np.abs(c * dy - s * dx) <= WIDTH_M / 2 + margin_m
+        )
+        touched = cv2.dilate(mask.cells.astype(np.uint8), body.astype(np.uint8)) > 0
+        free[h] = free[h + 8] = ~touched[middle]
+    step = fine * every
+    (start_row, start_column), (goal_row, goal_column) = np.floor(
+        (np.stack([start[:2], goal[:2]]) - mask.origin) / step
+    ).astype(int)[:, ::-1]
+    turn = round(float(start[2]) / (math.pi / 8)) % 16
+    if not free[turn, start_row, start_column]:  # it stands there: the heading may be half a bin off
+        fits = np.flatnonzero(free[:, start_row, start_column])
+        if fits.size == 0:
+            return None
+        turn = int(fits[np.argmin(np.abs((fits - turn + 8) % 16 - 8))])
+    cells = _dijkstra(free, _STEPS, turn, start_row, start_column, goal_row, goal_column)
+    if len(cells) == 0:
+        return None
+    yaw = np.arctan2(_STEPS[cells[:, 0], 1], _STEPS[cells[:, 0], 0])
+    way = np.column_stack([mask.origin + (cells[:, 2:0:-1] + 0.5) * step, yaw])
+    way[0, :2], way[-1, :2] = start[:2], goal[:2]
+    return way
+
+
+@njit(cache=True)
+def _dijkstra(free, steps, turn, row, column, goal_row, goal_column):  # type: ignore[no-untyped-def]
+    """Cells (N, 3) heading, row, column from the start to the goal at any heading; (0, 3) when there is no way."""
+    headings, height, width = free.shape
+    best = np.full(free.size, np.inf)
+    parent = np.full(free.size, -1, dtype=np.int64)
+    done = np.zeros(free.size, dtype=np.bool_)
+    first = (turn * height + row) * width + column
+    best[first] = 0.0
+    queue = [(math.hypot(goal_row - row, goal_column - column), first)]
+    end = -1
+    while len(queue) > 0:
+        _, state = heapq.heappop(queue)
+        if done[state]:
+            continue
+        done[state] = True
+        c, r, h = state % width, state // width % height, state // (width * height)
+        if r == goal_row and c == goal_column:
+            end = state
+            break
+        for k in range(4):
+            if k < 2:
+                sign = 1 if k == 0 else -1
+                dx, dy = sign * steps[h, 0], sign * steps[h, 1]
+                other, y, x = h, r + dy, c + dx
+                price = math.hypot(dx, dy)
+            else:
+                other, y, x = (h + (1 if k == 2 else -1)) % headings, r, c
+                price = 0.02
+            if y < 0 or x < 0 or y >= height or x >= width or not free[other, y, x]:
+                continue
+            knight = k < 2 and abs(dx) + abs(dy) == 3  # it passes between two cells
+            if knight and not (free[h, r + dy // 2, c + dx // 2] and free[h, r + (dy + 1) // 2, c + (dx + 1) // 2]):
+                continue
+            new = best[state] + price
+            key = (other * height + y) * width + x
+            if new < best[key] - 1e-9:
+                best[key] = new
+                parent[key] = state
+                heapq.heappush(queue, (new + math.hypot(goal_row - y, goal_column - x), key))
+    count, walk_ = 0, end
+    while walk_ >= 0:
+        count += 1
+        walk_ = parent[walk_]
+    cells = np.empty((count, 3), dtype=np.int64)
+    for i in range(count - 1, -1, -1):
+        cells[i, 0], cells[i, 1], cells[i, 2] = end // (width * height), end // width % height, end % width
+        end = parent[end]
+    return cells

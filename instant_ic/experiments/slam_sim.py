@@ -1,0 +1,140 @@
+"""SLAM on the simulated crawler: a round trip on slipping tracks, with the scans and encoders of the simulator.
+
+The robot of `instant_ic.sim` drives to waypoints and back, led by its true pose; its tracks lose a random share of
+their way. Scans are what the VLP-16's plane at 0° sees, 10 a second; odometry comes from the encoders alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.base.kinematics import SkidSteer
+from instant_ic.experiments.slam import LogResult, run_log
+from instant_ic.experiments.slam_worlds import trajectory_errors
+from instant_ic.geometry.poses import compose2, relative2, wrap_angle
+from instant_ic.sim.robot import RobotConfig, TrackedRobot
+from instant_ic.sim.world import World
+from instant_ic.slam import Scan, SlamConfig
+from instant_ic.slam.logs import LogEntry
+from instant_ic.slam.scan import FloatArray
+
+BEAMS = 720
+RANGE_NOISE_M = 0.015
+LIDAR_HEIGHT_M = 0.6
+RANGE_MAX_M = 30.0
+STEP_S = 0.02
+SCAN_STEPS = 5
+SPEED, TURN_SPEED = 0.5, 0.8
+
+ROUTE = ((0.0, 0.0), (3.0, 0.7), (5.0, 0.7), (10.8, 0.0), (10.8, 8.5), (10.8, 0.0), (5.0, 0.7), (3.0, 0.7), (0.0, 0.0))
+"""Up the simulator's corridor, past the obstacle, round the corner and back."""
+
+
+@dataclass(frozen=True)
+class RoundTrip:
+    """A drive in the simulator: scans with odometry, true poses (n, 3) in the frame of the first, metres driven."""
+
+    entries: list[LogEntry]
+    truth: FloatArray
+    driven_m: float
+
+
+def round_trip(
+    world: World, slip: float = 0.2, seed: int = 0, rounds: int = 2, route: Sequence[tuple[float, float]] = ROUTE
+) -> RoundTrip:
+    """Drive ``route`` ``rounds`` times with tracks that lose ``slip`` (one standard deviation) of their way.
+
+    Args:
+        world: of `instant_ic.sim`.
+        slip: share of a track's way, 0..0.5.
+        seed: of slip and noise.
+        rounds: how often.
+        route: points to drive to, in the world.
+
+    Raises:
+        ValueError: the robot ran into something.
+    """
+    config = RobotConfig(slip=slip, turn_slip=slip)
+    start = (*route[0], math.atan2(route[1][1] - route[0][1], route[1][0] - route[0][0]))
+    robot = TrackedRobot(config, world.occupied(config.contact_low, config.contact_high), start, seed)
+    kinematics = SkidSteer(config.steering)
+    rng = np.random.default_rng([37, seed])
+    angles = np.asarray(-math.pi + 2 * math.pi / BEAMS * np.arange(BEAMS), dtype=np.float64)
+    entries: list[LogEntry] = []
+    truth: list[FloatArray] = []
+    odometry = np.zeros(3)
+    pulses = robot.encoder_pulses
+    driven, steps = 0.0, 0
+    targets = [point for _ in range(rounds) for point in route[1:]]
+    while targets or steps % SCAN_STEPS:
+        v, w = _towards(robot.pose, targets)
+        if steps % SCAN_STEPS == 0:
+            now = robot.encoder_pulses
+            left, right = kinematics.tracks_from_motors(now - pulses)
+            pulses = now
+            forward, _, turn = kinematics.twist_from_tracks(np.array([left, right]))
+            odometry = compose2(odometry, [forward * math.cos(turn / 2), forward * math.sin(turn / 2), turn])
+            entries.append(_entry(world, np.asarray(robot.pose, dtype=np.float64), angles, odometry, len(entries), rng))
+            truth.append(np.asarray(robot.pose, dtype=np.float64).copy())
+        robot.step(kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w)), STEP_S)
+        if robot.contact:
+            raise ValueError(f"the simulated robot ran into something at {robot.pose[:2].round(2)}")
+        driven += abs(float(robot.twist[0])) * STEP_S
+        steps += 1
+    origin = truth[0]
+    return RoundTrip(entries, np.array([relative2(origin, pose) for pose in truth]), driven)
+
+
+def _towards(pose: NDArray[np.floating], targets: list[tuple[float, float]]) -> tuple[float, float]:
+    """Speed and yaw rate to the first of ``targets``; reached ones are taken out."""
+    while targets and math.hypot(targets[0][0] - pose[0], targets[0][1] - pose[1]) < 0.15:
+        targets.pop(0)
+    if not targets:
+        return 0.0, 0.0
+    error = wrap_angle(math.atan2(targets[0][1] - pose[1], targets[0][0] - pose[0]) - float(pose[2]))
+    return SPEED * max(0.0, 1.0 - abs(error) / 0.5), float(np.clip(2.0 * error, -TURN_SPEED, TURN_SPEED))
+
+
+def _entry(
+    world: World, pose: FloatArray, angles: FloatArray, odometry: FloatArray, index: int, rng: np.random.Generator
+) -> LogEntry:
+    directions = np.column_stack([np.cos(angles + pose[2]), np.sin(angles + pose[2]), np.zeros(BEAMS)])
+    origin = np.array([pose[0], pose[1], LIDAR_HEIGHT_M], dtype=np.float32)
+    hits, _ = world.caster.cast(origin, directions.astype(np.float32))
+    ranges = hits.astype(np.float64) + RANGE_NOISE_M * rng.standard_normal(BEAMS)
+    ranges[ranges > RANGE_MAX_M] = np.inf
+    scan = Scan(ranges, float(angles[0]), 2 * math.pi / BEAMS, 0.3, RANGE_MAX_M, (index + 1) * 100_000_000)
+    return LogEntry(scan, odometry, np.zeros(3))
+
+
+def evaluate_round_trip(
+    trip: RoundTrip,
+    config: SlamConfig | None = None,
+    *,
+    use_wheel_odom: bool = True,
+    on_scan: Callable[[int], None] | None = None,
+) -> tuple[dict[str, object], LogResult]:
+    """Run the trip and compare with the truth: figures for JSON, and the run itself."""
+    result = run_log(trip.entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
+    final_m, final_deg = trajectory_errors(result.trajectory[:, 1:], trip.truth)
+    online_m, online_deg = trajectory_errors(result.online[:, 1:], trip.truth)
+    wheels = np.array([entry.odom_pose for entry in trip.entries])
+    wheels_m, wheels_deg = trajectory_errors(wheels, trip.truth)
+    return {
+        "driven_m": trip.driven_m,
+        "end_error_m": float(online_m[-1]),
+        "end_error_deg": float(online_deg[-1]),
+        "max_error_m": float(online_m.max()),
+        "max_error_deg": float(online_deg.max()),
+        "final_mean_error_m": float(final_m.mean()),
+        "final_mean_error_deg": float(final_deg.mean()),
+        "wheels_end_error_m": float(wheels_m[-1]),
+        "wheels_end_error_deg": float(wheels_deg[-1]),
+        "turn_factor": float(result.slam.motion.turn_factor),
+        **result.report(),
+    }, result

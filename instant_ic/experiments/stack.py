@@ -1,0 +1,238 @@
+"""A whole stack under a program's control: started from a launch file, watched over the bus, ended as by Ctrl-C."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from instant_ic.bus import SENSOR, Node, QoS
+from instant_ic.bus.clock import SystemClock
+from instant_ic.bus.local_transport import LocalTransport
+from instant_ic.launch.process import dies_with_us
+
+T = TypeVar("T")
+_ENOUGH_PER_S = 33e6
+"""Turns of an empty loop a second, on each of two cores, from which on a stack runs in real time with room to spare."""
+_SLOWEST_PACE = 0.1
+
+
+class StackError(RuntimeError):
+    """The stack did not start, ended early, or did not do in time what was waited for."""
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port of 127.0.0.1 that nobody uses now."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def free_ports() -> dict[str, int]:
+    """Free ports under the names of ``launch/sim.yaml``'s arguments, so that several stacks can run side by side."""
+    return {
+        "camera_port": free_port(),
+        "lidar_port": free_port(socket.SOCK_DGRAM),
+        "lidar_position_port": free_port(socket.SOCK_DGRAM),
+        "console_port": free_port(),
+    }
+
+
+@dataclass(frozen=True)
+class _NoParameters:
+    """An observer has none."""
+
+
+class Observer(Node[_NoParameters]):
+    """A node inside the watching program; its callbacks run while the program waits in :meth:`Stack.wait_for`."""
+
+    name = "observer"
+
+    def rest(self, timeout_s: float) -> None:
+        """Sleeps until something has come or is due; for a program that calls :meth:`spin_once` itself."""
+        if self._timers:
+            timeout_s = min(timeout_s, (self._timers[0][0] - self.clock.steady_ns()) / 1e9)
+        self._wake.wait(max(0.0, timeout_s))
+        self._wake.clear()
+
+
+def _observer(run_dir: Path) -> Observer:
+    clock = SystemClock()
+    return Observer(_NoParameters(), LocalTransport(run_dir, Observer.name, clock.now_ns), clock)
+
+
+@contextlib.contextmanager
+def observer(run_dir: Path) -> Iterator[Observer]:
+    """An observer of another run directory, as those of a fleet's robots."""
+    watching = _observer(run_dir)
+    try:
+        yield watching
+    finally:
+        watching.close()
+
+
+def machine_pace() -> float:
+    """A pace at which this machine can run a whole simulated stack, however slow or busy it is: 1.0 at most.
+
+    Two processes count for a second and a half: what a core does alone for a moment tells little of what two do all
+    the time.
+    """
+    count = (
+        "import time\nn, began = 0, time.perf_counter()\n"
+        "while time.perf_counter() - began < 1.5:\n for _ in range(100_000): pass\n n += 1\nprint(n)"
+    )
+    counters = [subprocess.Popen([sys.executable, "-c", count], stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    slowest_per_s = min(int(counter.communicate(timeout=60)[0]) for counter in counters) * 1e5 / 1.5
+    return min(1.0, max(_SLOWEST_PACE, slowest_per_s / _ENOUGH_PER_S))
+
+
+class Stack:
+    """Starts a launch file in a run directory of its own.
+
+    Args:
+        launch_file: name or path, as for ``ic launch``.
+        run_dir: run directory; its path must be short (sockets).
+        arguments: launch arguments.
+        log_path: where the launcher's output goes (default: ``RUN_DIR/launch.log``).
+        prefix: command that starts the launcher, as ``ip netns exec NAME``.
+        pace: of the stack's time, see :mod:`instant_ic.pace`.
+
+    Example::
+
+        with Stack("sim.yaml", run_dir, free_ports()) as stack:
+            pose = stack.observer.latest("/pose", PoseWithCovarianceStamped, max_age_s=1.0)
+            stack.wait_for(lambda: pose.message is not None, 60, "a pose")
+    """
+
+    def __init__(
+        self,
+        launch_file: str,
+        run_dir: Path,
+        arguments: dict[str, Any],
+        log_path: Path | None = None,
+        prefix: Sequence[str] = (),
+        pace: float = 1.0,
+    ) -> None:
+        self.launch_file = launch_file
+        self.run_dir = run_dir
+        self.arguments = dict(arguments)
+        self.log_path = log_path or run_dir / "launch.log"
+        self.prefix = list(prefix)
+        self.pace = pace
+        self.process: subprocess.Popen[bytes] | None = None
+        self.observer: Observer
+
+    def __enter__(self) -> Self:
+        """Starts the launcher and the observer."""
+        self.run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+        words = [f"{key}:={_word(value)}" for key, value in self.arguments.items()]
+        launch = [self.launch_file, *words, f"--pace={self.pace:g}"]
+        environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self.run_dir)}
+        with self.log_path.open("wb") as log:
+            self.process = subprocess.Popen(
+                [*dies_with_us(), *self.prefix, sys.executable, "-m", "instant_ic.cli.main", "launch", *launch],
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self.observer = _observer(self.run_dir)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends everything, also after an error."""
+        try:
+            self.stop()
+        finally:
+            self.observer.close()
+
+    def collect(self, topic: str, message_class: Any, qos: QoS = SENSOR) -> list[Any]:
+        """A list that the topic's messages are added to while the program waits."""
+        messages: list[Any] = []
+        self.observer.subscribe(topic, message_class, messages.append, qos)
+        return messages
+
+    def wait_for(self, condition: Callable[[], T], timeout_s: float, what: str) -> T:
+        """Runs the observer's callbacks until the condition is true, and returns its value.
+
+        Args:
+            condition: what is waited for.
+            timeout_s: seconds of the stack's time, as a slow machine needs longer.
+            what: what it is, for the error.
+
+        Raises:
+            StackError: time is up, or the launcher ended.
+        """
+        deadline = time.monotonic() + timeout_s / self.pace
+        while True:
+            self.observer.spin_once()
+            if value := condition():
+                return value
+            self.check_alive(what)
+            if time.monotonic() > deadline:
+                raise StackError(f"no {what} within {timeout_s:g} s; the stack's output ends with:\n{self.log_tail()}")
+            time.sleep(0.005)
+
+    def check_alive(self, while_waiting_for: str) -> None:
+        """Raises StackError when the launcher has ended."""
+        assert self.process is not None
+        status = self.process.poll()
+        if status is not None:
+            raise StackError(
+                f"the stack ended with status {status} while waiting for {while_waiting_for}:\n{self.log_tail()}"
+            )
+
+    def stop(self, timeout_s: float = 15.0) -> int:
+        """Ends the stack as Ctrl-C does and returns the launcher's exit status.
+
+        Raises:
+            StackError: it did not end in time; it has been killed then.
+        """
+        assert self.process is not None
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+        try:
+            return self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            # The nodes go with their launcher (PR_SET_PDEATHSIG).
+            os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait(10)
+            raise StackError(
+                f"the stack did not end within {timeout_s:g} s of SIGINT and was killed:\n{self.log_tail()}"
+            ) from None
+
+    def log_tail(self, lines: int = 40) -> str:
+        """The end of the launcher's output."""
+        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-lines:])
+
+
+def processes_of(run_dir: Path) -> Sequence[Any]:
+    """Psutil processes that were started with this run directory in their environment."""
+    import psutil
+
+    wanted = str(run_dir)
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get("INSTANT_IC_RUN_DIR") == wanted and process.pid != os.getpid():
+                found.append(process)
+        except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
+            continue
+    return found
+
+
+def _word(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)

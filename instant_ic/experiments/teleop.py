@@ -1,0 +1,297 @@
+"""``ic evaluate teleop``: an operator drives through corridors with obstacles that he does not look at.
+
+The whole stack runs in simulated time (``teleop_stack``), by illusory control, by a robot that stops at obstacles, and
+by shared control that goes round by itself. Figures are those of ``teleop_figures``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.arbiter import Mode
+from instant_ic.control.warmup import warm_up
+from instant_ic.experiments import teleop_figures as figures
+from instant_ic.experiments.processes import process_pool
+from instant_ic.experiments.teleop_figures import Drive, Switch
+from instant_ic.experiments.teleop_operator import Operator, Sight, make_operator, read_commands
+from instant_ic.experiments.teleop_results import in_order
+from instant_ic.experiments.teleop_stack import (
+    CAMERA_HEIGHT_M,
+    DEPTHS,
+    METHODS,
+    NODES,
+    VSPACE_NODES,
+    Shown,
+    SimulatedStack,
+    StackConfig,
+)
+from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
+from instant_ic.geometry.poses import pose_matrix
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+AT_GOAL_M = 0.35
+READY_S = 10.0
+"""Most that the machine may take to be ready for the first command."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of one evaluation.
+
+    Attributes:
+        episodes, seed: which drives; the same seed gives the same drives.
+        world: ``corridors`` (random ones), or a world of the simulator.
+        methods: of ``METHODS``.
+        depth: of ``DEPTHS``.
+        log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
+        pictures: whether the pictures on either side of a switch are drawn and compared.
+        overrides: ``node.key:=value`` words on top of the shipped parameters.
+    """
+
+    episodes: int = 50
+    seed: int = 0
+    world: str = RANDOM_CORRIDORS
+    methods: tuple[str, ...] = METHODS
+    depth: str = "fused"
+    log: Path | None = None
+    pictures: bool = True
+    overrides: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
+        for key, given, allowed in (("methods", self.methods, METHODS), ("depth", (self.depth,), DEPTHS)):
+            unknown = [name for name in given if name not in allowed]
+            if unknown or not given:
+                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
+        StackConfig(overrides=self.overrides)  # raises ValueError on a word that is none
+
+    def course(self, index: int) -> Course:
+        """Course ``index``.
+
+        Raises:
+            ValueError: no such world, or nowhere to drive to in it.
+        """
+        return _course(self.world, self.seed, index, self.log is not None)
+
+
+_course = functools.lru_cache(maxsize=2)(make_course)
+"""Of one course all methods are driven."""
+
+
+class _Episode:
+    """One drive in the making."""
+
+    def __init__(self, settings: Settings, course: Course, index: int, method: str, filmed: bool = False) -> None:
+        seed, words = 1000 * settings.seed + index, settings.overrides
+        config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=words)
+        self.settings, self.course = settings, course
+        self.drive = Drive(index, method, way_m=course.way_m)
+        log = read_commands(settings.log) if settings.log is not None else None
+        self.recorded = log is not None
+        self.operator: Operator = make_operator(course.goals, lambda: floor_plan(course.world), log)
+        per_obstacle = 20.0 * len(course.obstacles)
+        self.limit_s = READY_S + (log[-1, 0] + 20.0 if log is not None else 20.0 + 4.0 * course.way_m + per_obstacle)
+        self.stack = SimulatedStack(course.world, config)
+        self.began_s: float | None = None
+        self.ended_s: float | None = None
+        self.contacts = 0
+
+    def run(self, on_step: Callable[[SimulatedStack], None] | None = None) -> Drive:
+        """Drives until the goal, the operator's giving up, or the time limit.
+
+        Raises:
+            RuntimeError: the machine never got ready.
+        """
+        drive, stack, began = self.drive, self.stack, time.process_time()
+        with stack:
+            while stack.time_s < self.limit_s and not self._over():
+                stack.step(self._operate)
+                if on_step is not None:
+                    on_step(stack)
+                if self.began_s is None and stack.time_s > READY_S:
+                    reason = stack.state.reason if stack.state is not None else "the arbiter says nothing"
+                    raise RuntimeError(f"the simulated robot was not ready within {READY_S:g} s: {reason}")
+            drive.cpu_s = time.process_time() - began
+            end_s = self.ended_s or stack.time_s
+            drive.seconds = end_s - (self.began_s or 0.0)
+            drive.contacts = stack.simulation.robot.contacts
+            drive.completed = self.ended_s is not None
+            drive.gave_up = self.operator.gave_up
+            drive.detours = getattr(self.operator, "detours", 0)
+            drive.reason = "" if drive.completed else str(stack.state.reason)
+            centres = np.array([(one.x, one.y) for one in self.course.obstacles]).reshape(-1, 2)
+            figures.judge(drive, stack.log, centres)
+            drive.switches = [self._with_pictures(switch) for switch in drive.switches]
+        return drive
+
+    def _operate(self) -> tuple[float, float]:
+        stack = self.stack
+        state = stack.state
+        if state is None or (self.began_s is None and int(state.mode) != Mode.REAL):
+            return 0.0, 0.0
+        if self.began_s is None:
+            self.began_s = stack.time_s
+        twist = stack.simulation.robot.twist
+        sight = Sight(
+            stack.time_s,
+            stack.shown_pose,
+            stack.page.virtual,
+            int(state.mode) == Mode.STOPPED,
+            (float(twist[0]), float(twist[2])),
+            stack.robot,
+        )
+        command = self.operator.command(sight)
+        if self.ended_s is None and self._there():
+            self.ended_s = stack.time_s
+        return command
+
+    def _there(self) -> bool:
+        """The operator is done, the r-bot is where he wanted it, and it is shown again."""
+        if not self.operator.done or self.stack.page.virtual:
+            return False
+        if self.recorded:
+            return True
+        return float(np.linalg.norm(self.stack.robot[:2] - self.course.goals[-1])) < AT_GOAL_M
+
+    def _over(self) -> bool:
+        return self.operator.gave_up or (self.ended_s is not None and self.stack.time_s > self.ended_s + 0.5)
+
+    # -- the pictures at a switch
+
+    def _with_pictures(self, switch: Switch) -> Switch:
+        found = figures.pictures_at(self.stack.log.pictures, switch.time_s, switch.to_virtual)
+        if found is None or not self.settings.pictures:
+            return switch
+        return replace(switch, psnr_db=self._psnr_db(*found))
+
+    def _psnr_db(self, before: Shown, after: Shown) -> float:
+        from instant_ic.experiments.pictures import psnr_db
+
+        view, photo = (before, after) if before.virtual else (after, before)
+        rgb = decode(view.jpeg)
+        return psnr_db(rgb, photograph(self.stack, photo, rgb.shape[1], rgb.shape[0], view.fov_rad))
+
+
+def photograph(stack: SimulatedStack, shown: Shown, width: int, height: int, fov_rad: float) -> NDArray[np.uint8]:
+    """The camera's picture as the page shows it: from where it was taken, turned to the heading."""
+    pose = pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading)
+    return stack.simulation.renderer.render_perspective(pose, width, height, fov_rad).rgb
+
+
+def decode(jpeg: bytes) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB of a JPEG.
+
+    Raises:
+        ValueError: it is none.
+    """
+    import cv2
+
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    if picture is None:
+        raise ValueError(f"a rendered view of {len(jpeg)} bytes cannot be decoded")
+    return np.asarray(picture[..., ::-1])
+
+
+def run_episode(
+    settings: Settings,
+    index: int,
+    on_step: Callable[[SimulatedStack], None] | None = None,
+    methods: tuple[str, ...] = (),
+) -> list[Drive]:
+    """One course driven by each method in turn; the same for the same settings and index, times apart."""
+    course = settings.course(index)
+    with _quiet():
+        filmed = on_step is not None
+        return [_Episode(settings, course, index, name, filmed).run(on_step) for name in methods or settings.methods]
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """The nodes' loggers tell errors only: what they warn of while a robot starts is no news."""
+    loggers = [logging.getLogger(name) for name in (*NODES, *VSPACE_NODES)]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def prepare() -> None:
+    """Compiles the kernels that the nodes compile at their start elsewhere, so that no episode counts that time."""
+    warm_up()
+
+
+def evaluate(
+    settings: Settings,
+    jobs: int = 1,
+    on_drive: Callable[[Drive], None] | None = None,
+    timeout_s: float = 7200.0,
+    done: Sequence[Drive] = (),
+) -> list[Drive]:
+    """Drives all courses by all methods, ``jobs`` drives at a time, each process one where more than one.
+
+    Args:
+        settings: what is driven.
+        jobs: drives at a time.
+        on_drive: called with each drive as it ends.
+        timeout_s: for all.
+        done: drives that need not be driven again.
+
+    Raises:
+        ValueError: nothing to do, no such world, no such log.
+        TimeoutError: they took longer than ``timeout_s``.
+        RuntimeError: a process died, or a robot never got ready.
+    """
+    from concurrent.futures import as_completed
+    from concurrent.futures.process import BrokenProcessPool
+
+    if jobs < 1:
+        raise ValueError(f"jobs must be at least 1 (got {jobs})")
+    if settings.log is not None:
+        read_commands(settings.log)  # before anything is started
+    drives = list(done)
+    known = {(drive.index, drive.method) for drive in drives}
+    tasks = [(i, name) for i in range(settings.episodes) for name in settings.methods if (i, name) not in known]
+    began = time.monotonic()
+
+    def take(drive: Drive) -> None:
+        drives.append(drive)
+        if on_drive is not None:
+            on_drive(drive)
+
+    late = f"the drives took longer than {timeout_s:.0f} s"
+    if jobs == 1 or len(tasks) <= 1:
+        prepare()
+        for index, name in tasks:
+            if time.monotonic() - began > timeout_s:
+                raise TimeoutError(late)
+            take(run_episode(settings, index, methods=(name,))[0])
+        return in_order(drives)
+    with process_pool(min(jobs, len(tasks)), prepare) as pool:
+        try:
+            futures = [pool.submit(run_episode, settings, index, None, (name,)) for index, name in tasks]
+            for future in as_completed(futures, timeout=timeout_s):
+                take(future.result()[0])
+        except BrokenProcessPool as error:
+            raise RuntimeError("a process that drove a course died (out of memory?); try --jobs 1") from error
+        except TimeoutError as error:
+            raise TimeoutError(late) from error
+    return in_order(drives)
+
+
+__all__ = ["Drive", "Settings", "evaluate", "run_episode"]

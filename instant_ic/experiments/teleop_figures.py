@@ -1,0 +1,358 @@
+"""What came of a teleoperated drive: obedience, switches, jumps, freezes; from its log alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.arbiter import Mode
+from instant_ic.control.kinematics import MotionLimits, accelerate
+from instant_ic.experiments.teleop_stack import Log, Shown
+from instant_ic.geometry.poses import relative2, wrap_angle
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+STEP_S = 0.05
+"""Between two rows of a log."""
+TRACK_S = 0.2
+"""Between two places of a track."""
+LATENCY_S = 0.35
+"""A robot obeys where it does what was commanded at any time of the last so long (and its ramps since)."""
+TOLERANCE_M_S, TOLERANCE_RAD_S = 0.05, 0.15
+"""How far its speed may be off that: tracks that slip, a speed taken over 0.1 s."""
+FLICKER_S = 2.0
+"""A switch that is taken back sooner than this is flicker."""
+MET_M = 1.2
+"""An obstacle counts as met from this far between its centre and that of the shown robot."""
+
+
+@dataclass(frozen=True)
+class Switch:
+    """The picture changes between the camera's and the rendered view.
+
+    Attributes:
+        time_s: when.
+        to_virtual: into the virtual space, else back.
+        position_error_m: between the places of the last picture before and the first after, as the stack knows them,
+            less what the shown robot drove from when the one came to when the other did.
+        yaw_error_deg: between the headings of v-bot and r-bot just before it, as the stack knows them, to which the
+            page turns the pictures.
+        true_position_error_m: the same, of the camera's picture where it was truly taken.
+        jump_m: the same, less what the shown robot drove from when the one came up to when the other did: with how
+            long a camera's picture had been there already. What the eye sees, before the page eases it.
+        gap_m: between r-bot and v-bot in that step: the camera's picture is older than the r-bot's pose.
+        psnr_db: between those two pictures; None where they were not drawn.
+        true_yaw_error_deg: with the r-bot's true heading in place of the known one.
+    """
+
+    time_s: float
+    to_virtual: bool
+    position_error_m: float
+    yaw_error_deg: float
+    true_position_error_m: float
+    jump_m: float
+    gap_m: float
+    psnr_db: float | None = None
+    true_yaw_error_deg: float = math.nan
+
+
+@dataclass
+class Drive:
+    """One episode by one method."""
+
+    index: int
+    method: str
+    completed: bool = False
+    gave_up: bool = False
+    seconds: float = 0.0
+    """From the first command to the r-bot at the goal, or the end."""
+    way_m: float = 0.0
+    driven_m: float = 0.0
+    contacts: int = 0
+    obstacles: int = 0
+    """That the operator met."""
+    detours: int = 0
+    """Times that he was held up, looked and drove round by himself."""
+    obedience: float = math.nan
+    flicker: int = 0
+    transitions: int = 0
+    mode_seconds: dict[str, float] = field(default_factory=dict)
+    disobeyed_seconds: dict[str, float] = field(default_factory=dict)
+    """By mode."""
+    virtual_m: float = 0.0
+    """Driven by the v-bot while it was shown."""
+    gap_mean_m: float = math.nan
+    gap_max_m: float = math.nan
+    longest_freeze_s: float = 0.0
+    longest_stall_s: float = 0.0
+    keyframes: int = 0
+    cpu_s: float = 0.0
+    reason: str = ""
+    """The machine's last words where the drive was not completed."""
+    switches: list[Switch] = field(default_factory=list)
+    tracks: dict[str, list[list[float]]] = field(default_factory=dict)
+    """``robot``, ``vbot`` (where it was shown): x, y, yaw each fifth of a second; ``modes``: time and mode from then
+    on, the last one the end. For the plot."""
+
+
+def shown_poses(log: Log) -> FloatArray:
+    """(N, 3) of the robot that is shown."""
+    virtual = np.array(log.virtual)[:, None]
+    return np.where(virtual, np.array(log.vbot), np.array(log.robot))
+
+
+def shown_speeds(log: Log) -> FloatArray:
+    """(N, 2) forward m/s and rad/s of the shown robot, over 0.1 s; NaN across a switch and at the ends."""
+    poses, virtual = shown_poses(log), np.array(log.virtual)
+    speeds = np.full((len(poses), 2), math.nan)
+    for k in range(1, len(poses) - 1):
+        if virtual[k - 1] == virtual[k] == virtual[k + 1]:
+            moved = relative2(poses[k - 1], poses[k + 1])
+            speeds[k] = float(moved[0]) / (2 * STEP_S), wrap_angle(float(moved[2])) / (2 * STEP_S)
+    return speeds
+
+
+def ramped(commands: FloatArray, limits: MotionLimits) -> FloatArray:
+    """(N, 2) speeds of a robot that does at once what it is commanded, within its accelerations."""
+    speed, out = (0.0, 0.0), np.zeros((len(commands), 2))
+    for k, (linear, angular) in enumerate(commands):
+        speed = accelerate(speed, (float(linear), float(angular)), limits, STEP_S)
+        out[k] = speed
+    return out
+
+
+def obeys(log: Log, limits: MotionLimits | None = None) -> FloatArray:
+    """(N,) 1 where the shown robot did what was commanded, 0 where it did not, NaN where nothing was to be done.
+
+    It did where its speed, ahead and about, lies between the least and the greatest that the ramped command had within
+    the last ``LATENCY_S``, give or take ``TOLERANCE_*``. A robot that stands, is slowed, or turns otherwise does not.
+    """
+    commands = np.array(log.command, dtype=np.float64).reshape(-1, 2)
+    wanted, speeds = ramped(commands, limits or MotionLimits()), shown_speeds(log)
+    window = round(LATENCY_S / STEP_S)
+    tolerance = np.array([TOLERANCE_M_S, TOLERANCE_RAD_S])
+    out = np.full(len(commands), math.nan)
+    for k in range(len(commands)):
+        if commands[k].any() and not np.isnan(speeds[k]).any():
+            recent = wanted[max(0, k - window) : k + 1]
+            low, high = recent.min(axis=0) - tolerance, recent.max(axis=0) + tolerance
+            out[k] = float(((speeds[k] >= low) & (speeds[k] <= high)).all())
+    return out
+
+
+def obedience(log: Log, limits: MotionLimits | None = None) -> float:
+    """Share of the time under command in which the shown robot obeyed; NaN without commands."""
+    done = obeys(log, limits)
+    return math.nan if np.isnan(done).all() else float(np.nanmean(done))
+
+
+def longest_stall_s(log: Log) -> float:
+    """Longest time that the shown robot stood under a command."""
+    commands, speeds = np.array(log.command).reshape(-1, 2), shown_speeds(log)
+    standing = (np.abs(speeds[:, 0]) < 0.01) & (np.abs(speeds[:, 1]) < 0.02) & commands.any(axis=1)
+    longest = run = 0
+    for stands in standing:
+        run = run + 1 if stands else 0
+        longest = max(longest, run)
+    return longest * STEP_S
+
+
+def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
+    """Longest time that one picture stayed on the screen, up to ``until_s``."""
+    times = [shown.time_s for shown in pictures if shown.time_s <= until_s]
+    if not times:
+        return 0.0
+    return float(np.diff([*times, until_s]).max())
+
+
+def find_switches(log: Log) -> list[Switch]:
+    """Each change of what is shown; NaN for the places where one of the pictures is missing."""
+    found = []
+    for k in range(1, len(log.virtual)):
+        if log.virtual[k] == log.virtual[k - 1]:
+            continue
+        gap = relative2(log.estimate[k], log.vbot[k])
+        pictures = pictures_at(log.pictures, log.time_s[k], log.virtual[k])
+        error, true, jump = (math.nan,) * 3 if pictures is None else picture_errors_m(*pictures, log)
+        found.append(
+            Switch(
+                log.time_s[k],
+                bool(log.virtual[k]),
+                error,
+                abs(math.degrees(log.known_yaw_gap_rad[k - 1])),
+                true,
+                jump,
+                math.hypot(float(gap[0]), float(gap[1])),
+                true_yaw_error_deg=abs(math.degrees(log.yaw_gap_rad[k - 1])),
+            )
+        )
+    return found
+
+
+def count_flicker(switches: list[Switch]) -> int:
+    """Switches taken back within ``FLICKER_S``."""
+    return sum(after.time_s - before.time_s < FLICKER_S for before, after in pairwise(switches))
+
+
+def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple[Shown, Shown] | None:
+    """Last picture before a switch, first after; None where one of them is missing."""
+    for before, after in pairwise(pictures):
+        near = abs(after.time_s - time_s) < 1.0
+        if near and before.virtual != after.virtual == to_virtual:
+            return before, after
+    return None
+
+
+def picture_errors_m(before: Shown, after: Shown, log: Log) -> tuple[float, float, float]:
+    """How far the places of two pictures are apart that should be one: as known, in truth, and as the eye sees it.
+
+    The shown robot drives from one picture to the next; its mean speed round the switch says how far.
+    """
+    speeds = shown_speeds(log)[:, 0]
+    times = np.array(log.time_s)
+    near = (times > before.time_s - 0.3) & (times < after.time_s + 0.3) & ~np.isnan(speeds)
+    speed = float(speeds[near].mean()) if near.any() else 0.0
+    heading = np.array([math.cos(before.heading), math.sin(before.heading)])
+    between = speed * (after.came_s - before.came_s) * heading
+    shown_between = speed * (after.time_s - before.time_s) * heading
+    known, true = after.place - before.place, after.pose[:2] - before.pose[:2]
+    error, truly, seen = (float(np.hypot(*apart)) for apart in (known - between, true - between, known - shown_between))
+    return error, truly, seen
+
+
+def obstacles_met(log: Log, centres: FloatArray) -> int:
+    """How many obstacles (N, 2) the shown robot came near."""
+    if len(centres) == 0 or not log.time_s:
+        return 0
+    away = np.linalg.norm(shown_poses(log)[:, None, :2] - np.asarray(centres)[None], axis=2)
+    return int((away.min(axis=0) < MET_M).sum())
+
+
+def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
+    """Fills in what the log tells; pictures' figures of the switches are another's."""
+    drive.obedience = obedience(log)
+    drive.switches = find_switches(log)
+    drive.flicker = count_flicker(drive.switches)
+    modes = np.array(log.mode)
+    drive.transitions = int((np.diff(modes) != 0).sum())
+    drive.mode_seconds = {mode.name.lower(): round(float((modes == mode).sum()) * STEP_S, 2) for mode in Mode}
+    robot, vbot = np.array(log.robot), np.array(log.vbot)
+    disobeyed = obeys(log) == 0.0
+    drive.disobeyed_seconds = {
+        mode.name.lower(): round(float(disobeyed[modes == mode].sum()) * STEP_S, 2) for mode in Mode
+    }
+    drive.driven_m = float(np.linalg.norm(np.diff(robot[:, :2], axis=0), axis=1).sum())
+    virtual = np.array(log.virtual)
+    if virtual.any():
+        gaps = np.linalg.norm(robot[virtual, :2] - vbot[virtual, :2], axis=1)
+        drive.gap_mean_m, drive.gap_max_m = float(gaps.mean()), float(gaps.max())
+        steps_m = np.linalg.norm(np.diff(vbot[:, :2], axis=0), axis=1)
+        drive.virtual_m = float(steps_m[virtual[1:] & virtual[:-1]].sum())
+    drive.longest_freeze_s = longest_freeze_s(log.pictures, log.time_s[-1])
+    drive.longest_stall_s = longest_stall_s(log)
+    drive.obstacles = obstacles_met(log, centres)
+    drive.keyframes = log.keyframes
+    shown = np.where(virtual[:, None], vbot, math.nan)
+    every = round(TRACK_S / STEP_S)
+    begins = [0, *(np.flatnonzero(np.diff(modes)) + 1).tolist()]
+    drive.tracks = {
+        "robot": np.round(robot[::every], 3).tolist(),
+        "vbot": [row for row in np.round(shown[::every], 3).tolist() if not math.isnan(row[0])],
+        "modes": [[round(log.time_s[k], 2), int(modes[k])] for k in (*begins, len(modes) - 1)],
+    }
+
+
+def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, Any]:
+    """Figures of one method over its episodes; ``stop`` are those of the robot that simply stops."""
+    switches = [switch for drive in drives for switch in drive.switches]
+    into, back = ([s for s in switches if s.to_virtual == to_virtual] for to_virtual in (True, False))
+    obstacles = sum(drive.obstacles for drive in drives)
+    psnr = [s.psnr_db for s in switches if s.psnr_db is not None]
+    figures: dict[str, Any] = {
+        "episodes": len(drives),
+        "contacts": sum(drive.contacts for drive in drives),
+        "completed_fraction": float(np.mean([drive.completed for drive in drives])),
+        "obedience": _mean([drive.obedience for drive in drives], [drive.seconds for drive in drives]),
+        "switches_per_obstacle": len(switches) / 2 / obstacles if obstacles else None,
+        "switches_to_virtual_per_obstacle": len(into) / obstacles if obstacles else None,
+        "switches_to_real_per_obstacle": len(back) / obstacles if obstacles else None,
+        "switch_position_error_m": _most([s.position_error_m for s in switches]),
+        "switch_yaw_error_deg": _most([s.yaw_error_deg for s in switches]),
+        "switch_psnr_db": _mean(psnr),
+        "longest_freeze_s": _most([drive.longest_freeze_s for drive in drives]),
+        "longest_stall_s": _most([drive.longest_stall_s for drive in drives]),
+        "switch_position_error_mean_m": _mean([s.position_error_m for s in switches]),
+        "switch_yaw_error_mean_deg": _mean([s.yaw_error_deg for s in switches]),
+        "switch_true_yaw_error_deg": _most([s.true_yaw_error_deg for s in switches]),
+        "switch_true_yaw_error_mean_deg": _mean([s.true_yaw_error_deg for s in switches]),
+        "switch_true_position_error_m": _most([s.true_position_error_m for s in switches]),
+        "switch_true_position_error_mean_m": _mean([s.true_position_error_m for s in switches]),
+        "switch_jump_m": _most([s.jump_m for s in switches]),
+        "switch_jump_mean_m": _mean([s.jump_m for s in switches]),
+        "switch_gap_mean_m": _mean([s.gap_m for s in switches]),
+        "switch_psnr_min_db": min(psnr, default=None),
+        "switch_to_virtual_psnr_db": _mean([s.psnr_db for s in into if s.psnr_db is not None]),
+        "switch_to_real_psnr_db": _mean([s.psnr_db for s in back if s.psnr_db is not None]),
+        "obstacles": obstacles,
+        "detours": sum(drive.detours for drive in drives),
+        "gave_up": sum(drive.gave_up for drive in drives),
+        "flicker": sum(drive.flicker for drive in drives),
+        "transitions": sum(drive.transitions for drive in drives),
+        "mode_seconds": {
+            name: round(sum(d.mode_seconds.get(name, 0.0) for d in drives), 2) for name in drives[0].mode_seconds
+        },
+        "disobeyed_seconds": {
+            name: round(sum(d.disobeyed_seconds.get(name, 0.0) for d in drives), 2)
+            for name in drives[0].disobeyed_seconds
+        },
+        "virtual_m_per_obstacle": sum(drive.virtual_m for drive in drives) / obstacles if obstacles else None,
+        "virtual_share": sum(drive.mode_seconds.get(name, 0.0) for drive in drives for name in ("virtual", "returning"))
+        / max(sum(drive.seconds for drive in drives), 1e-9),
+        "gap_mean_m": _mean([drive.gap_mean_m for drive in drives]),
+        "gap_max_m": _most([drive.gap_max_m for drive in drives]),
+        "seconds_mean": _mean([drive.seconds for drive in drives if drive.completed]),
+        "path_ratio_mean": _mean([d.driven_m / d.way_m for d in drives if d.completed and d.way_m > 0]),
+        "cpu_s_per_simulated_s": sum(d.cpu_s for d in drives) / max(sum(d.seconds for d in drives), 1e-9),
+    }
+    if stop:
+        others = {drive.index: drive for drive in stop if drive.completed}
+        lost = [d.seconds - others[d.index].seconds for d in drives if d.completed and d.index in others]
+        figures["time_lost_against_stop_s"] = _mean(lost)
+    return figures
+
+
+def targets(figures: dict[str, Any]) -> dict[str, bool | None]:
+    """Which of the targets of illusory control are met; None where nothing happened that could tell."""
+
+    def holds(key: str, least: float = -math.inf, most: float = math.inf) -> bool | None:
+        value = figures[key]
+        return None if value is None else least <= value <= most
+
+    each_way = [holds(f"switches_to_{name}_per_obstacle", 0.95, 1.05) for name in ("virtual", "real")]
+    return {
+        "contacts == 0": holds("contacts", most=0),
+        "completed_fraction >= 0.95": holds("completed_fraction", least=0.95),
+        "obedience >= 0.98": holds("obedience", least=0.98),
+        "one switch each way an obstacle": None if None in each_way else all(each_way),
+        "switch_position_error_m <= 0.02": holds("switch_position_error_m", most=0.02),
+        "switch_yaw_error_deg <= 0.5": holds("switch_yaw_error_deg", most=0.5),
+        "longest_freeze_s <= 0.3": holds("longest_freeze_s", most=0.3),
+    }
+
+
+def _mean(values: list[float], weights: list[float] | None = None) -> float | None:
+    known = [k for k, value in enumerate(values) if not math.isnan(value)]
+    if not known:
+        return None
+    chosen = [weights[k] for k in known] if weights is not None else None
+    return float(np.average([values[k] for k in known], weights=chosen))
+
+
+def _most(values: list[float]) -> float | None:
+    known = [value for value in values if not math.isnan(value)]
+    return max(known) if known else None

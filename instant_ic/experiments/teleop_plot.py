@@ -1,0 +1,296 @@
+"""Plot and video of ``evaluation.teleop``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.arbiter import Mode
+from instant_ic.control.footprint import Footprint
+from instant_ic.experiments.pictures import save_figure
+from instant_ic.experiments.teleop import Settings, decode, photograph
+from instant_ic.experiments.teleop_figures import TRACK_S, Drive
+from instant_ic.experiments.teleop_stack import METHODS, SimulatedStack
+from instant_ic.experiments.teleop_worlds import Course, floor_plan
+from instant_ic.sim.contact import OccupancyMask
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+# Of Okabe and Ito, which also the colour-blind can tell apart.
+_COLOURS = {"ic": "#0072B2", "stop": "#E69F00", "shared": "#009E73"}
+_MODE_COLOURS = {
+    Mode.REAL: "#BBBBBB", Mode.ENTERING: "#F0E442", Mode.VIRTUAL: "#56B4E9", Mode.RETURNING: "#CC79A7",
+    Mode.STOPPED: "#D55E00",
+}  # fmt: skip
+_BARS = (
+    ("completed_fraction", "completed"),
+    ("obedience", "obedience"),
+    ("contacts", "contacts"),
+    ("detours", "detours by hand"),
+    ("seconds_mean", "seconds a drive"),
+    ("longest_stall_s", "longest stall, s"),
+)
+_COURSES = (("seconds", "seconds"), ("obedience", "obedience"))
+_MARGIN_M = 1.4
+_PICTURE, _MAP = (640, 360), 360
+FPS = 10
+
+
+def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: Settings, most: int = 4) -> None:
+    """Figures by method, every course's time and obedience, and maps of the courses that went worst.
+
+    Under each map the arbiter's modes over time, a bar a method.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    indices = sorted({d.index for d in drives})
+    shown = sorted(indices, key=lambda index: _how_well([d for d in drives if d.index == index]))[:most]
+    courses = [(settings.course(index), [d for d in drives if d.index == index]) for index in shown]
+    columns = min(2, len(shown))
+    rows = [courses[k : k + columns] for k in range(0, len(courses), columns)]
+    heights = [1.7, 1.9, *(h for row in rows for h in (max(_map_height(course, of) for course, of in row), 0.75))]
+    figure = Figure(figsize=(13.0, 1.1 * sum(heights) + 0.6 * len(rows) + 1.0), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights)
+    names = [name for name in METHODS if name in report["methods"]]
+    bars = grid[0].subgridspec(1, len(_BARS))
+    for k, (key, label) in enumerate(_BARS):
+        _draw_bars(figure.add_subplot(bars[k]), label, {name: report["methods"][name][key] for name in names})
+    strips = grid[1].subgridspec(1, len(_COURSES))
+    for k, (key, label) in enumerate(_COURSES):
+        _draw_courses(figure.add_subplot(strips[k]), key, label, drives, names)
+    for number, row in enumerate(rows):
+        maps, modes = (grid[2 + 2 * number + k].subgridspec(1, columns) for k in range(2))
+        for k, (course, of) in enumerate(row):
+            _draw_course(figure.add_subplot(maps[k]), course, of)
+            _draw_modes(figure.add_subplot(modes[k]), of)
+    figure.legend(handles=_legend(names), loc="outside lower center", ncols=6, fontsize=8, frameon=False)
+    figure.suptitle(
+        f"{settings.world}, seed {settings.seed}: {len(indices)} courses; the maps are of those that went worst"
+    )
+    save_figure(figure, path)
+
+
+def _how_well(drives: Sequence[Drive]) -> tuple[float, ...]:
+    """Sorts courses: not completed first, then contacts, flicker, disobedience of the first method."""
+    contacts, flicker = (sum(getattr(d, name) for d in drives) for name in ("contacts", "flicker"))
+    obedience = drives[0].obedience
+    missing = sum(not d.completed for d in drives)
+    return -missing, -contacts, -flicker, 0.0 if math.isnan(obedience) else obedience
+
+
+def _draw_bars(axis: Any, label: str, values: dict[str, float | None]) -> None:
+    heights = [value or 0.0 for value in values.values()]
+    axis.bar(list(values), heights, color=[_COLOURS[name] for name in values])
+    axis.set_ylim(0, 1.2 * max(heights) or 1.0)
+    for k, value in enumerate(values.values()):
+        words = "none" if value is None else f"{value:.3g}"
+        axis.annotate(words, (k, value or 0.0), ha="center", va="bottom", fontsize=8)
+    axis.set_title(label, fontsize=9)
+    axis.tick_params(labelsize=7)
+
+
+def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[Drive], names: Sequence[str]) -> None:
+    """A dot for every drive, by course; a ring where it was not completed, a cross where something was touched."""
+    for name in names:
+        of = [d for d in drives if d.method == name]
+        at, values = np.array([d.index for d in of]), np.array([getattr(d, key) for d in of])
+        done, touched = (np.array([getattr(d, what) for d in of]) > 0 for what in ("completed", "contacts"))
+        colour = _COLOURS[name]
+        axis.scatter(at[done], values[done], s=12, color=colour)
+        axis.scatter(at[~done], values[~done], s=22, facecolors="none", edgecolors=colour)
+        axis.scatter(at[touched], values[touched], s=40, marker="x", color="black", lw=1)
+    axis.set_title(f"{label} of each course", fontsize=9)
+    axis.set_xlabel("course", fontsize=7)
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis.tick_params(labelsize=7)
+    axis.grid(alpha=0.3)
+
+
+def _tracks(drives: Sequence[Drive]) -> FloatArray:
+    """(N, 2) all places that robots of these drives have been to."""
+    return np.concatenate(
+        [np.array(t).reshape(-1, 3)[:, :2] for d in drives for n, t in d.tracks.items() if n != "modes"]
+    )
+
+
+def _extent(course: Course, drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest corner (2,) of what a map of these drives shows."""
+    things = [(one.x, one.y) for one in course.obstacles]
+    places = np.concatenate([_tracks(drives), course.goals, np.array(things).reshape(-1, 2), [course.world.spawn[:2]]])
+    return places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
+
+
+def _map_height(course: Course, drives: Sequence[Drive]) -> float:
+    low, high = _extent(course, drives)
+    return float(np.clip(5.8 * (high[1] - low[1]) / (high[0] - low[0]), 1.2, 4.0))
+
+
+def _draw_course(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
+    plan = floor_plan(course.world)
+    rows, columns = plan.cells.shape
+    x, y = plan.origin
+    extent = (x, x + columns * plan.cell_m, y, y + rows * plan.cell_m)
+    axis.imshow(np.where(plan.cells, 0.55, 1.0), origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1)
+    for drive in drives:
+        colour = _COLOURS[drive.method]
+        for name, style in (("robot", "-"), ("vbot", "--")):
+            track = np.array(drive.tracks.get(name, [])).reshape(-1, 3)
+            steps = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1)
+            parts = np.split(track, np.flatnonzero(steps > 0.5) + 1)  # another visit to the virtual space
+            for part in parts:
+                axis.plot(part[:, 0], part[:, 1], style, color=colour, lw=1.2)
+        for switch in drive.switches:
+            at = _where(drive, switch.time_s)
+            mark = ">" if switch.to_virtual else "<"
+            axis.plot(*at, mark, color=colour, ms=7, mec="black", mew=0.6)
+    axis.plot(*course.world.spawn[:2], "ko", ms=4)
+    axis.plot(course.goals[:, 0], course.goals[:, 1], "k*", ms=9)
+    (x0, y0), (x1, y1) = _extent(course, drives)
+    axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    words = [f"{d.method} {d.seconds:.0f} s{'' if d.completed else ' NOT COMPLETED'}" for d in drives]
+    axis.set_title(f"course {drives[0].index}: " + ", ".join(words), fontsize=8)
+    axis.tick_params(labelsize=6)
+
+
+def _where(drive: Drive, time_s: float) -> FloatArray:
+    """Place (2,) of the r-bot."""
+    track, modes = drive.tracks["robot"], drive.tracks["modes"]
+    return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
+
+
+def _draw_modes(axis: Any, drives: Sequence[Drive]) -> None:
+    """What the arbiter's mode was, a bar for each method."""
+    for k, drive in enumerate(drives):
+        modes = drive.tracks["modes"]
+        for (begins, mode), (ends, _) in pairwise(modes):
+            axis.barh(k, ends - begins, left=begins - modes[0][0], height=0.8, color=_MODE_COLOURS[Mode(int(mode))])
+    axis.set_yticks(range(len(drives)), [d.method for d in drives], fontsize=7)
+    axis.invert_yaxis()
+    axis.set_xlabel("s", fontsize=7, labelpad=0)
+    axis.tick_params(labelsize=6)
+
+
+def _legend(names: Sequence[str]) -> list[Any]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    def dot(marker: str, label: str, **look: Any) -> Line2D:
+        return Line2D([], [], color="black", marker=marker, ls="none", ms=6, label=label, **look)
+
+    return [
+        *(Patch(color=_COLOURS[name], label=name) for name in names),
+        Line2D([], [], color="black", label="r-bot"),
+        Line2D([], [], color="black", ls="--", label="v-bot"),
+        dot(">", "into the virtual space", mfc="none"),
+        dot("<", "back", mfc="none"),
+        dot("o", "not completed", mfc="none"),
+        dot("x", "contact"),
+        *(Patch(color=colour, label=mode.name) for mode, colour in _MODE_COLOURS.items()),
+    ]
+
+
+class Video:
+    """Split view of one drive, picture by picture of simulated time: what the operator sees, and the map.
+
+    Raises:
+        ValueError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import cv2
+
+        self.path = path
+        size = (_PICTURE[0] + _MAP, _PICTURE[1])
+        self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FPS, size)
+        if not self._writer.isOpened():
+            raise ValueError(f"{path}: the video cannot be written")
+        self._map: _Map | None = None
+        self._next_s = 0.0
+        self.pictures = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends the file."""
+        self._writer.release()
+
+    def on_step(self, stack: SimulatedStack) -> None:
+        """Adds a picture where one is due; give it to ``teleop.run_episode``."""
+        if stack.time_s < self._next_s or not stack.log.pictures or not stack.log.time_s:
+            return
+        self._next_s = stack.time_s + 1.0 / FPS - 1e-6
+        if self._map is None:
+            self._map = _Map(floor_plan(stack.simulation.world, 0.05))
+        self._writer.write(np.hstack([self._picture(stack), self._map.draw(stack)]))
+        self.pictures += 1
+
+    def _picture(self, stack: SimulatedStack) -> NDArray[np.uint8]:
+        import cv2
+
+        shown = stack.log.pictures[-1]
+        if shown.virtual:
+            rgb = decode(shown.jpeg)
+        else:
+            rgb = photograph(stack, shown, *_PICTURE, math.pi / 2)
+        frame = np.ascontiguousarray(cv2.resize(rgb, _PICTURE)[..., ::-1])
+        mode = Mode(stack.log.mode[-1]).name
+        for words, top in (
+            (f"{'virtual space' if shown.virtual else 'camera'}  ({mode})", 0),
+            (stack.log.reason[-1], 334),
+        ):
+            frame[top : top + 26] //= 2
+            at = (10, top + 18)
+            cv2.putText(frame, words[:80], at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+        return frame
+
+
+class _Map:
+    """The floor plan scaled into a square, and the robots on it (BGR)."""
+
+    def __init__(self, plan: OccupancyMask) -> None:
+        rows, columns = np.nonzero(plan.cells)
+        points = plan.centre(np.column_stack([rows, columns]))
+        low, high = points.min(axis=0) - 0.3, points.max(axis=0) + 0.3
+        self.scale = _MAP / float((high - low).max())
+        self.middle = 0.5 * (low + high)
+        self.base = np.full((_MAP, _MAP, 3), 255, np.uint8)
+        at = self.pixels(points)
+        self.base[at[:, 1].clip(0, _MAP - 1), at[:, 0].clip(0, _MAP - 1)] = 140
+
+    def pixels(self, points: FloatArray) -> NDArray[np.int32]:
+        """(N, 2) column, row of places (N, 2)."""
+        offset = (np.asarray(points) - self.middle) * self.scale * [1, -1] + _MAP / 2
+        return np.asarray(np.rint(offset), np.int32)
+
+    def draw(self, stack: SimulatedStack) -> NDArray[np.uint8]:
+        import cv2
+
+        frame = self.base.copy()
+        log = stack.log
+        cv2.polylines(frame, [self.pixels(np.array(log.robot)[:, :2])], False, (60, 60, 200), 1, cv2.LINE_AA)
+        robots = [(log.robot[-1], (60, 60, 200))]
+        if log.virtual[-1]:
+            robots.append((log.vbot[-1], (200, 120, 0)))
+        for pose, colour in robots:
+            c, s = math.cos(pose[2]), math.sin(pose[2])
+            corners = Footprint().corners() @ np.array([[c, s], [-s, c]]) + pose[:2]
+            cv2.polylines(frame, [self.pixels(corners)], True, colour, 2, cv2.LINE_AA)
+            nose = np.stack([pose[:2], pose[:2] + 0.4 * np.array([c, s])])
+            cv2.polylines(frame, [self.pixels(nose)], False, colour, 1, cv2.LINE_AA)
+        cv2.putText(frame, f"{stack.time_s:.1f} s", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+        return frame
+
+
+__all__ = ["FPS", "Video", "save_plot"]

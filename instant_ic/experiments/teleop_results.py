@@ -1,0 +1,104 @@
+"""What ``ic evaluate teleop`` writes down, and takes up again after it was interrupted."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from instant_ic.experiments import teleop_figures as figures
+from instant_ic.experiments.teleop_figures import Drive, Switch
+from instant_ic.experiments.teleop_stack import METHODS
+
+if TYPE_CHECKING:
+    from instant_ic.experiments.teleop import Settings
+
+
+def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
+    """Figures by method, the targets, and each drive without its tracks, as JSON takes it."""
+    by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
+    stop = by_method.get("stop")
+    methods = {name: figures.summary(of, stop if name != "stop" else None) for name, of in by_method.items() if of}
+    rows = [{key: value for key, value in asdict(drive).items() if key != "tracks"} for drive in drives]
+    return {
+        **_conditions(settings),
+        "drives": len(drives),
+        "drives_planned": settings.episodes * len(settings.methods),
+        "methods": _finite(methods),
+        "targets": figures.targets(methods["ic"]) if "ic" in methods else {},
+        "each": _finite(rows),
+    }
+
+
+def save(path: Path, drives: Sequence[Drive], settings: Settings) -> None:
+    """Writes the report with the tracks, whole or not at all: whatever ends the program, the file can be read."""
+    text = json.dumps(report(drives, settings), indent=2)
+    # Tracks are long: a line each.
+    rows = (f"    {json.dumps([d.index, d.method, d.tracks], separators=(',', ':'))}" for d in drives)
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(text.removesuffix("\n}") + ',\n  "tracks": [\n' + ",\n".join(rows) + "\n  ]\n}\n")
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def load(path: Path, settings: Settings) -> list[Drive]:
+    """The drives of an earlier run with the same settings that these settings ask for, too.
+
+    Raises:
+        ValueError: the file cannot be read, is no such report, or is one of other settings; names what differs.
+    """
+    try:
+        told = json.loads(path.read_text())
+        rows, tracks = told["each"], {(index, method): one for index, method, one in told["tracks"]}
+        found = {key: told[key] for key in _conditions(settings)}
+        drives = [
+            Drive(
+                **_with_nan({key: value for key, value in row.items() if key != "switches"}),
+                switches=[Switch(**_with_nan(one)) for one in row["switches"]],
+                tracks=tracks[row["index"], row["method"]],
+            )
+            for row in rows
+        ]
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        words = f"{type(error).__name__}: {error}"
+        raise ValueError(f"{path}: no report of ic evaluate teleop that a run can go on with ({words})") from error
+    for key, wanted in _conditions(settings).items():
+        if found[key] != wanted:
+            raise ValueError(f"{path}: was driven with {key} {found[key]}, not {wanted}; give another --json")
+    return [d for d in drives if d.index < settings.episodes and d.method in settings.methods]
+
+
+def in_order(drives: Sequence[Drive]) -> list[Drive]:
+    """By course, then method."""
+    return sorted(drives, key=lambda drive: (drive.index, METHODS.index(drive.method)))
+
+
+def _conditions(settings: Settings) -> dict[str, Any]:
+    """What must be the same for drives to be told of together."""
+    return {
+        "seed": settings.seed,
+        "world": settings.world,
+        "operator": "scripted" if settings.log is None else "recorded",
+        "log": None if settings.log is None else str(settings.log),
+        "depth": settings.depth,
+        "parameters": list(settings.overrides),
+    }
+
+
+def _with_nan(row: dict[str, Any]) -> dict[str, Any]:
+    """JSON has null for what is not known."""
+    return {key: math.nan if value is None and key != "psnr_db" else value for key, value in row.items()}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,104 @@
+"""Shared control that overrides the operator, to compare illusory control with: the robot goes round by itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode
+from instant_ic.control.costmap import UNKNOWN, Costmap
+from instant_ic.control.follower import FollowerConfig, PathFollower
+from instant_ic.control.navigator import Navigator
+from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.prediction import Prediction
+from instant_ic.control.subgoal import extend_ahead
+from instant_ic.geometry.poses import wrap_angle
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+BEHIND_M = 0.3
+"""The goal lies so far behind the first free place: the body has passed the obstacle there."""
+ARRIVED_M, ALIGNED_RAD = 0.15, math.radians(15.0)
+
+
+class SharedControl(Arbiter):
+    """The arbiter without a virtual space: where its prediction meets an obstacle, planner and follower take over.
+
+    The goal is the first free place straight on behind the obstacle, in the direction that was commanded; the way
+    there is that of the r-bot in illusory control: the same costmap, planner, follower and collision monitor. The
+    operator's command is not heeded meanwhile, but for letting go, which stops the robot, and driving back, which
+    gives the controls back. They are given back too when the goal is reached, or the commanded way is free again.
+    """
+
+    def __init__(self, config: ArbiterConfig | None = None) -> None:
+        super().__init__(config)
+        follower = PathFollower(FollowerConfig(), self.config.limits, self.config.footprint)
+        self.navigator = Navigator(HybridPlanner(PlannerConfig(), self.config.footprint), follower)
+        self.goal: FloatArray | None = None
+        self._speed_m_s = 0.0
+
+    def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
+        """One step, as ``Arbiter.step``; ``command`` is the robot's own while it goes round."""
+        decision = super().step(inputs, now_ns)
+        command, costmap, pose = decision.operator_command, inputs.costmap, inputs.robot_pose
+        if decision.mode != Mode.REAL or costmap is None or pose is None or command[0] < 0.0:
+            return self._given_back(decision)
+        if command == (0.0, 0.0):
+            self._speed_m_s = 0.0
+            return decision
+        if self.goal is None:
+            if not decision.blocked or command[0] < self.config.switch.min_switch_speed_m_s:
+                return decision
+            ahead = self.predictor.predict(pose, inputs.robot_velocity, command, costmap)
+            self.goal = _behind(costmap, ahead, self.config.passage.max_pass_m, self.config.passage.max_cost)
+            self.navigator.reset()
+            if self.goal is None:
+                return decision
+        if self._done(inputs, pose, costmap, command):
+            return self._given_back(decision)
+        step = self.navigator.step(pose, self._speed_m_s, self.goal, costmap, now_ns)
+        self._speed_m_s = step.command[0]
+        monitor = self.config.collision_monitor
+        memory = costmap.memory_near(pose, monitor.blind_radius_m, monitor.memory_range_m)
+        points = np.concatenate([inputs.scan_points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
+        sent = self.monitor.limit(step.command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
+        hard = sent.action == "stop"
+        return replace(
+            decision, command=sent.command, hard=hard, blocked=False, reason="the robot goes round by itself"
+        )
+
+    def _given_back(self, decision: Decision) -> Decision:
+        self.goal, self._speed_m_s = None, 0.0
+        return decision
+
+    def _done(self, inputs: ArbiterInputs, pose: FloatArray, costmap: Costmap, command: tuple[float, float]) -> bool:
+        assert self.goal is not None
+        if abs(wrap_angle(float(pose[2] - self.goal[2]))) > ALIGNED_RAD:
+            return False
+        if float(np.linalg.norm(pose[:2] - self.goal[:2])) < ARRIVED_M:
+            return True
+        switch = self.config.switch
+        ahead = self.predictor.predict(
+            pose, inputs.robot_velocity, command, costmap, switch.return_margin_m, switch.return_side_m
+        )
+        return ahead.hit_index is None
+
+
+def _behind(costmap: Costmap, ahead: Prediction, reach_m: float, max_cost: int) -> FloatArray | None:
+    """Pose (3,) straight on behind what the prediction meets; None where nothing is free within ``reach_m``."""
+    if ahead.hit_index is None:
+        return None
+    line = extend_ahead(ahead.poses[ahead.hit_index], reach_m, costmap.resolution)
+    costs = costmap.cost_at(line[:, :2])
+    free = (costs <= max_cost) | (costs == UNKNOWN)
+    taken = np.flatnonzero(~free)
+    free[: taken[0] if taken.size else 0] = False
+    found = np.flatnonzero(free)
+    if found.size == 0:
+        return None
+    further = min(int(found[0]) + round(BEHIND_M / costmap.resolution), len(line) - 1)
+    return np.asarray(line[further if free[further] else int(found[0])])

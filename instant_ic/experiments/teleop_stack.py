@@ -1,0 +1,500 @@
+"""The whole stack in one process and in simulated time, for ``ic evaluate teleop``.
+
+Real are the nodes, their parameters and their messages, on a lockstep bus: base driver and motor controller's protocol,
+LiDAR driver (packets in), SLAM, arbiter, v-bot, navigator, console, and for illusory control depth and virtual space.
+Simulated are the robot, its LiDAR and its camera (``sim``). A model are: how late a command reaches the base and a
+picture the page; how old depth is (its network takes no simulated time); and the page itself, which shows what the
+console sends it. The camera's pictures are drawn only where depth takes them: the console and the arbiter get a small
+stand-in at the camera's rate, as all they need of it is its stamp. Rendered views are drawn small, and at full size on
+either side of a switch, where they are compared.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.bag.replay import make_node
+from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.geometry.poses import (
+    compose2,
+    matrix_from_quaternion,
+    pose2_from_matrix,
+    pose_matrix,
+    relative2,
+    wrap_angle,
+)
+from instant_ic.msg import (
+    VelodynePacket,
+    VelodyneScan,
+    compressed_image_message,
+    deserialize,
+    header,
+    stamp_ns,
+    to_time,
+)
+from instant_ic.msg import pose_matrix as message_pose
+
+if TYPE_CHECKING:
+    from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
+    from instant_ic.sim.simulation import Simulation
+    from instant_ic.sim.world import World
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+METHODS = ("ic", "stop", "shared")
+DEPTHS = ("fused", "lidar")
+NODES = ("crawler_base", "vlp16_driver", "grid_slam", "virtual_robot", "navigator", "arbiter", "console")
+VSPACE_NODES = ("depth_estimator", "depth_scaler", "nerf")
+STEP_S = 1 / 60
+START_NS = 1_700_000_000_000_000_000
+CAMERA_HEIGHT_M = 1.2
+_EVERY = 3
+"""Steps between two of the operator's commands (20 Hz)."""
+_FIRST_CUT_S = 0.05
+"""The driver ends revolutions at 180°."""
+_OVERDUE_S = 0.5
+"""Of a picture that depth has had for so long nothing comes any more."""
+_SMALLER = 4
+"""A view that nobody compares is drawn so much smaller each way."""
+
+
+@dataclass(frozen=True)
+class StackConfig:
+    """What is run, and the delays that the lockstep bus does not have.
+
+    Attributes:
+        method: of ``METHODS``.
+        depth: what depth is made of, of ``DEPTHS``.
+        seed: of the robot's slip, the LiDAR's noise and the delays.
+        camera_hz: pictures a second.
+        camera_latency_s: from the exposure to the page, as the simulated camera's.
+        depth_latency_s: from the exposure to the keyframe.
+        command_latency_s: from the arbiter to the base, the least and the most; drawn once.
+        panorama: width of the pictures that depth and virtual space get, pixels.
+        whole_views: draw all rendered views at full size, for a film; else those on either side of a switch.
+        overrides: further ``node.key:=value`` words.
+    """
+
+    method: str = "ic"
+    depth: str = "fused"
+    seed: int = 0
+    camera_hz: float = 5.0
+    camera_latency_s: float = 0.2
+    depth_latency_s: float = 1.0
+    command_latency_s: tuple[float, float] = (0.02, 0.08)
+    panorama: int = 1024
+    whole_views: bool = False
+    overrides: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise ValueError(f"method must be one of {', '.join(METHODS)} (got {self.method!r})")
+        if self.depth not in DEPTHS:
+            raise ValueError(f"depth must be one of {', '.join(DEPTHS)} (got {self.depth!r})")
+        for word in self.overrides:
+            if word.partition(".")[0] not in (*NODES, *VSPACE_NODES) or ":=" not in word:
+                names = ", ".join((*NODES, *VSPACE_NODES))
+                raise ValueError(f"parameter {word!r}: expected NODE.KEY:=VALUE with one of the nodes {names}")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture on the operator's screen.
+
+    Attributes:
+        time_s: when it came up.
+        came_s: when it came to the page: at a switch the newest picture is shown that is already there.
+        virtual: a rendered view, else the camera's picture.
+        pose: (3,) of the robot that it was taken from, in the world's frame; of a camera's picture the true one.
+        place: (2,) the same, as the stack knows it.
+        heading: yaw that it is shown at: the page turns the camera's picture to the newest heading.
+        jpeg, fov_rad: of a rendered view.
+        draw: makes the JPEG of this view at full size.
+    """
+
+    time_s: float
+    came_s: float
+    virtual: bool
+    pose: FloatArray
+    place: FloatArray
+    heading: float
+    jpeg: bytes = b""
+    fov_rad: float = math.pi / 2
+    draw: Callable[[], bytes] | None = None
+
+
+class _Port:
+    """The motor controller's serial line, in memory."""
+
+    def __init__(self, controller: RoboclawEmulator) -> None:
+        self.controller, self.received = controller, bytearray()
+
+    def write(self, data: bytes, /) -> int:
+        self.received += self.controller.feed(bytes(data))
+        return len(data)
+
+    def read(self, size: int = 1, /) -> bytes:
+        taken = bytes(self.received[:size])
+        del self.received[:size]
+        return taken
+
+    def reset_input_buffer(self) -> None:
+        self.received.clear()
+
+    def close(self) -> None:
+        pass
+
+
+class SilentPage:
+    """Stands in for the console's server; nobody looks at it."""
+
+    plain_http = False
+
+    def now_ms(self) -> float:
+        return 0.0
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        pass
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        pass
+
+    def show(self, *kinds: Any) -> None:
+        pass
+
+    def watching(self) -> dict[int, Any]:
+        return {}
+
+    def stop(self) -> None:
+        pass
+
+
+class _Page(SilentPage):
+    """Keeps what the console's server is given to show."""
+
+    def __init__(self, stack: SimulatedStack) -> None:
+        self._stack = stack
+        self.virtual = False
+
+    def now_ms(self) -> float:
+        return self._stack.bus.clock.now_ns() / 1e6
+
+    def publish(self, kind: str, message: dict[str, Any]) -> None:
+        if kind != "state":
+            return
+        virtual = message["shown"] == "virtual"
+        if virtual != self.virtual:
+            self.virtual = virtual
+            self._stack.on_show()
+
+    def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
+        if kind.name in ("VIEW", "PANORAMA"):  # and not the map
+            self._stack.on_frame(kind.name == "VIEW", header, payload)
+
+
+@dataclass
+class Log:
+    """What happened, a row each twentieth of a second; poses (x, y, yaw) in the world's frame."""
+
+    time_s: list[float] = field(default_factory=list)
+    mode: list[int] = field(default_factory=list)
+    virtual: list[bool] = field(default_factory=list)
+    """The rendered view is shown."""
+    robot: list[FloatArray] = field(default_factory=list)
+    estimate: list[FloatArray] = field(default_factory=list)
+    """The r-bot's pose as the stack knows it."""
+    vbot: list[FloatArray] = field(default_factory=list)
+    yaw_gap_rad: list[float] = field(default_factory=list)
+    """v-bot's heading less the r-bot's true one when the v-bot told it."""
+    known_yaw_gap_rad: list[float] = field(default_factory=list)
+    """The same as the arbiter knows it: to these headings the page turns the pictures."""
+    command: list[tuple[float, float]] = field(default_factory=list)
+    blocked: list[bool] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
+    pictures: list[Shown] = field(default_factory=list)
+    keyframes: int = 0
+
+
+class SimulatedStack:
+    """A robot in a world with the nodes that drive it; ``step`` moves everything on by ``STEP_S``."""
+
+    def __init__(self, world: World, config: StackConfig) -> None:
+        from instant_ic.sim.simulation import Simulation, SimulationConfig
+
+        self.config = config
+        self.simulation: Simulation = Simulation(SimulationConfig(seed=config.seed), START_NS, world)
+        # From the driver's first cut on: of the half revolution before it a map is begun that the next fits nowhere in.
+        self.simulation.scanner.skip_to(_FIRST_CUT_S)
+        self.rng = np.random.default_rng([53, config.seed])
+        self.start = np.array(world.spawn)
+        self.log = Log()
+        self.state: Any = None
+        self.vbot: FloatArray = self.start.copy()
+        self.yaw_gap_rad = 0.0
+        self.page = _Page(self)
+        self.command_delay_ns = round(1e9 * self.rng.uniform(*config.command_latency_s))
+        self._commands: deque[tuple[int, Record]] = deque()
+        self._steps = 0
+        self._next_exposure_s = self._next_depth_s = 0.0
+        self._exposed: deque[tuple[float, FloatArray]] = deque()  # on their way to the page
+        self._for_depth: deque[tuple[float, float, bytes]] = deque()  # due, exposure, JPEG
+        self._keyframe_at: FloatArray | None = None
+        self._drawn: dict[int, FloatArray] = {}  # pictures on their way to a keyframe: stamp, r-bot's true pose
+        self._whole: tuple[int, Callable[[], bytes]] | None = None  # newest view: its request, what draws it whole
+        self._newest: dict[bool, Shown] = {}
+        self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
+        self._add_nodes()
+
+    def close(self) -> None:
+        """Ends the nodes."""
+        self.bus.close()
+
+    def __enter__(self) -> SimulatedStack:
+        """Closes the nodes at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """See :meth:`__enter__`."""
+        self.close()
+
+    # -- nodes
+
+    def _add_nodes(self) -> None:
+        config = self.config
+        words = [
+            "vlp16_driver.source:=topic",
+            "nerf.space.source:=warp",
+            f"depth_scaler.source:={config.depth}",
+            "theta_camera.source:=files",
+            "console.map_rate_hz:=0.1",
+            *config.overrides,
+        ]
+        names = list(NODES)
+        if config.method == "ic":
+            names += [name for name in VSPACE_NODES if name != "depth_estimator" or config.depth == "fused"]
+        pictures = {"/camera/image/compressed": "/camera/for_depth"}
+        remaps = {
+            "crawler_base": {"/cmd_vel": "/base/cmd_vel"},
+            "depth_estimator": pictures,
+            "depth_scaler": pictures,
+        }
+        port = _Port(self.simulation.controller)
+        self.nodes: dict[str, Any] = {}
+        for name in names:
+            node = make_node(name, None, words)
+            node_class: Any = node.node_class
+            if name == "crawler_base":
+                node_class = type(node_class.__name__, (node_class,), {"open_port": staticmethod(lambda _: port)})
+            if name == "nerf" and not config.whole_views:
+                node_class = type(node_class.__name__, (node_class,), {"do": self._draw_small(node_class.do)})
+            self.nodes[name] = self.bus.add(node_class, node.config, name, remaps=remaps.get(name))
+        if config.method == "ic":
+            looks = self.nodes["depth_estimator" if config.depth == "fused" else "depth_scaler"]
+            self._depth_hz = float(looks.config.max_rate_hz)
+        camera = make_node("theta_camera", None, words).config
+        mount = pose_matrix(*camera.mount_xyz, *np.radians(camera.mount_rpy_deg))
+        self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
+        self.nodes["console"].server.stop()
+        self.nodes["console"].server = self.page
+        if config.method == "shared":
+            from instant_ic.experiments.teleop_shared import SharedControl
+
+            self.nodes["arbiter"].arbiter = SharedControl(self.nodes["arbiter"].config)
+
+    def _on_record(self, record: Record) -> None:
+        topic = record.topic
+        if topic == "/cmd_vel":
+            self._commands.append((record.stamp_ns + self.command_delay_ns, record))
+        elif topic == "/ic/state":
+            self.state = deserialize(record.payload, record.type_name)
+        elif topic == "/vbot/odom":
+            message = deserialize(record.payload, record.type_name)
+            self.vbot = self._in_world(pose2_from_matrix(message_pose(message)))
+            truth = self.simulation.poses_at([(stamp_ns(message) - START_NS) / 1e9])[0]
+            self.yaw_gap_rad = wrap_angle(float(self.vbot[2] - truth[2]))
+        elif topic == "/keyframe":
+            self.log.keyframes += 1
+            of = stamp_ns(deserialize(record.payload, record.type_name))
+            self._keyframe_at = self._drawn.pop(of, self._keyframe_at)
+
+    def _draw_small(self, do: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """A virtual space's work, but views are drawn small, and it is kept what it takes to draw the newest whole."""
+
+        def small(node: Any, job: Any) -> Any:
+            if job.kind != "draw":
+                return do(node, job)
+            as_now = copy.copy(node)
+            as_now.space = copy.copy(node.space)  # drawing changes what it has; keyframes stay as they are
+            self._whole = int(job.message.id), lambda: bytes(do(as_now, job).jpeg)
+            width, height = (max(16, int(side) // _SMALLER) for side in (job.message.width, job.message.height))
+            return do(node, replace(job, message=replace(job.message, width=width, height=height)))
+
+        return small
+
+    def _in_world(self, in_map: FloatArray) -> FloatArray:
+        return np.asarray(compose2(self.start, in_map))
+
+    # -- pictures
+
+    def on_frame(self, virtual: bool, header: dict[str, Any], payload: bytes) -> None:
+        """A picture has come to the page."""
+        if virtual:
+            map_from_camera = matrix_from_quaternion(np.array(header["q"]))
+            map_from_camera[:3, 3] = header["p"]
+            pose = self._in_world(pose2_from_matrix(map_from_camera))
+            draw = self._whole[1] if self._whole is not None and self._whole[0] == header["request_id"] else None
+            now, fov = self.time_s, float(header["fov"])
+            shown = Shown(now, now, True, pose, pose[:2], float(pose[2]), payload, fov, draw)
+        else:
+            exposure_s, taken_from = self._exposed.popleft()
+            stamp = START_NS + round(exposure_s * 1e9)
+            known = self.nodes["console"].lookup("map", "camera", stamp)
+            place = taken_from if known is None else self._in_world(pose2_from_matrix(known))
+            shown = Shown(self.time_s, self.time_s, False, taken_from, place[:2], float(self.robot[2]))
+        self._newest[virtual] = shown
+        if virtual == self.page.virtual:
+            self._show(shown)
+
+    def on_show(self) -> None:
+        """The page changes to the other picture: the newest of it that there is, if it is fresh."""
+        newest = self._newest.get(self.page.virtual)
+        if newest is not None and self.time_s - newest.time_s < 0.5:
+            heading = newest.heading if newest.virtual else float(self.robot[2])
+            self._show(replace(newest, time_s=self.time_s, heading=heading))
+
+    def _show(self, shown: Shown) -> None:
+        """The picture comes up: at a switch it and the one before are drawn whole; what draws others is let go."""
+        pictures = self.log.pictures
+        if pictures:
+            switched = pictures[-1].virtual != shown.virtual
+            pictures[-1] = _settled(pictures[-1], switched)
+            shown = _settled(shown, True) if switched else shown
+        pictures.append(shown)
+
+    def _photograph(self) -> None:
+        now = self.time_s
+        if now >= self._next_exposure_s - 1e-9:
+            self._next_exposure_s += 1.0 / self.config.camera_hz
+            self._exposed.append((now, self.robot))
+            if self.config.method == "ic" and self._worth_drawing():
+                self._drawn[START_NS + round(now * 1e9)] = self.robot
+                jpeg = self._draw()
+                self._for_depth.append((now + self.config.depth_latency_s, now, jpeg))
+        # What is on its way: the console takes the first off the queue itself.
+        while self._exposed and now - self._exposed[0][0] >= self.config.camera_latency_s - 1e-9:
+            waiting, exposure = len(self._exposed), self._exposed[0][0]
+            self._publish_picture("/camera/image/compressed", b"", exposure)
+            if len(self._exposed) == waiting:  # the console is not there
+                self._exposed.popleft()
+        while self._for_depth and now >= self._for_depth[0][0] - 1e-9:
+            _, exposure, jpeg = self._for_depth.popleft()
+            self._publish_picture("/camera/for_depth", jpeg, exposure)
+
+    def _publish_picture(self, topic: str, jpeg: bytes, exposure_s: float) -> None:
+        message = compressed_image_message(jpeg, "camera", START_NS + round(exposure_s * 1e9))
+        self.bus.publish(topic, message)
+
+    def _worth_drawing(self) -> bool:
+        """Whether depth looks at a picture taken now, and makes a keyframe of it: none is of a place near here."""
+        if self.time_s < self._next_depth_s - 1e-9:
+            return False
+        self._next_depth_s = self.time_s + 1.0 / self._depth_hz
+        now_ns = START_NS + round(self.time_s * 1e9)
+        wait_ns = (self.config.depth_latency_s + _OVERDUE_S) * 1e9
+        while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not taken
+            del self._drawn[next(iter(self._drawn))]
+        rule = self.nodes["depth_scaler"].config.keyframes
+        places = [*self._drawn.values(), *([] if self._keyframe_at is None else [self._keyframe_at])]
+        return all(
+            _moved(self.robot, place, rule.distance_m + 0.01, math.radians(rule.angle_deg + 0.5)) for place in places
+        )
+
+    def _draw(self) -> bytes:
+        import cv2
+
+        rgb = self.simulation.panorama(self.config.panorama, self.config.panorama // 2).rgb
+        _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 92])
+        return bytes(jpeg.tobytes())
+
+    # -- time
+
+    @property
+    def time_s(self) -> float:
+        return self.simulation.time_s
+
+    @property
+    def robot(self) -> FloatArray:
+        """True pose (3,) of the r-bot in the world's frame."""
+        return self.simulation.robot.pose.copy()
+
+    @property
+    def shown_pose(self) -> FloatArray:
+        """Pose (3,) of the robot that is shown: the r-bot's as in the newest picture, at its present heading."""
+        if self.page.virtual:
+            return self.vbot
+        seen = self._newest.get(False)
+        place = self.robot[:2] if seen is None else seen.pose[:2]
+        return np.array([*place, self.robot[2]])
+
+    def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
+        """One sixtieth of a second; ``operate`` is asked for the command at 20 Hz."""
+        simulation = self.simulation
+        simulation.step(STEP_S)
+        now_ns = START_NS + round(simulation.time_s * 1e9)
+        self.bus.advance_to(now_ns)
+        # Just after the driver's cut, so that no scan is late for it.
+        packets = simulation.scan_packets() if self._steps % 6 == 3 else []
+        if packets:
+            scan = VelodyneScan(
+                header=header("velodyne", now_ns),
+                packets=[VelodynePacket(stamp=to_time(now_ns), data=np.frombuffer(p, np.uint8)) for p in packets],
+            )
+            self.bus.publish("/lidar/packets", scan)
+        while self._commands and self._commands[0][0] <= now_ns:
+            _, record = self._commands.popleft()
+            self.bus.publish_bytes("/base/cmd_vel", record.type_name, record.payload, publisher=record.node)
+        self._photograph()
+        if operate is not None and self._steps % _EVERY == 0:
+            command = operate()
+            self.nodes["console"].on_drive(*command)
+            self.bus.advance_to(now_ns)
+            self._note(command)
+        self._steps += 1
+
+    def _note(self, command: tuple[float, float]) -> None:
+        log, state = self.log, self.state
+        if state is None:
+            return
+        log.time_s.append(self.time_s)
+        log.mode.append(int(state.mode))
+        log.virtual.append(self.page.virtual)
+        log.robot.append(self.robot)
+        log.estimate.append(self._in_world(pose2_from_matrix(message_pose(state.robot_pose))))
+        log.vbot.append(self.vbot.copy())
+        log.yaw_gap_rad.append(self.yaw_gap_rad)
+        log.known_yaw_gap_rad.append(float(state.yaw_gap_rad))
+        log.command.append(command)
+        log.blocked.append(bool(state.blocked))
+        log.reason.append(str(state.reason))
+
+
+def _settled(shown: Shown, whole: bool) -> Shown:
+    if shown.draw is None:
+        return shown
+    return replace(shown, jpeg=shown.draw() if whole else shown.jpeg, draw=None)
+
+
+def _moved(a: FloatArray, b: FloatArray, distance_m: float, angle_rad: float) -> bool:
+    x, y, yaw = relative2(a, b)
+    return math.hypot(float(x), float(y)) >= distance_m or abs(wrap_angle(float(yaw))) >= angle_rad
+
+
+__all__ = ["DEPTHS", "METHODS", "Log", "Shown", "SimulatedStack", "StackConfig"]

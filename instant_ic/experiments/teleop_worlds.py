@@ -1,0 +1,281 @@
+"""Worlds for ``ic evaluate teleop``: random corridors with obstacles that the operator does not look at."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.experiments.follow_worlds import shortest_way
+
+if TYPE_CHECKING:
+    from instant_ic.sim.contact import OccupancyMask
+    from instant_ic.sim.world import World
+
+FloatArray = NDArray[np.float64]
+
+RANDOM_CORRIDORS = "corridors"
+BODY_M = (0.03, 0.9)
+"""Heights in which a thing is run into, as ``sim.robot.RobotConfig``."""
+SPARE_M = 0.10
+"""Each obstacle can be passed by the true footprint with this much to spare on every side."""
+FIRST_M, APART_M, LAST_M = 3.2, 3.8, 2.4
+"""Metres from the start to the first obstacle, between two, and from the last to the goal, at least."""
+_TALLER_THAN_THINGS_M = (1.9, 2.2)
+_TALL_M = (1.5, 1.9)
+"""In furnished worlds, what stands in these heights is no hidden thing; a door's lintel is above."""
+_DRIVE_M = (3.5, 10.0)
+"""Of a drive across a furnished world: the shortest, the longest."""
+_ROOM_M = 0.45
+"""Distance from everything at its start and its goal."""
+_LONGEST_THING_M = 1.5
+"""Along the operator's line; v-bots pass no more than 3 m (config/control.yaml: max_pass_m)."""
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """A box on the floor: centre (m), length and width (m), yaw (rad), height (m)."""
+
+    x: float
+    y: float
+    length: float
+    width: float
+    yaw: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Course:
+    """A world, and what the operator wants in it.
+
+    Attributes:
+        world: what the devices see; the robot starts at its ``spawn``.
+        goals: (N, 2) places driven to one after another, in the world's frame.
+        obstacles: what stands in the operator's way.
+        way_m: metres from the start over the goals.
+    """
+
+    world: World
+    goals: FloatArray
+    obstacles: tuple[Obstacle, ...]
+
+    @property
+    def way_m(self) -> float:
+        points = np.concatenate([[self.world.spawn[:2]], self.goals])
+        return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> Course:
+    """Another random corridor for each index, a drive along the simulator's corridor, or one across any other world.
+
+    Args:
+        name: ``corridors``, or any name of ``sim.worlds.make_world``.
+        seed, index: which course; the same give the same.
+        from_spawn: start where the simulator starts robots, without goals; for recorded commands.
+
+    Raises:
+        ValueError: no such world, or nowhere to drive to in it.
+    """
+    if name == RANDOM_CORRIDORS:
+        course = random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
+    elif name.partition(":")[0] in ("corridor", "corridor-free"):
+        course = straight_ahead(_world(name))
+    elif not from_spawn:
+        return across(_world(name), np.random.default_rng([59, seed, index]))
+    else:
+        course = Course(_world(name), np.empty((0, 2)), ())
+    return replace(course, goals=np.empty((0, 2))) if from_spawn else course
+
+
+@functools.lru_cache(maxsize=1)
+def _world(name: str) -> World:
+    """Kept for the next course: a mesh with its textures takes seconds to load."""
+    from instant_ic.sim.worlds import make_world
+
+    return make_world(name)
+
+
+def random_corridor(rng: np.random.Generator, name: str, attempts: int = 50) -> Course:
+    """A straight or bent corridor, 2.0 to 2.6 m wide, with one to three boxes, posts or low things in the middle.
+
+    Raises:
+        ValueError: no passable corridor came up within ``attempts``.
+    """
+    for _ in range(attempts):
+        course = _corridor(rng, name)
+        if course is not None:
+            return course
+    raise ValueError(f"no passable corridor within {attempts} attempts")
+
+
+def _corridor(rng: np.random.Generator, name: str) -> Course | None:
+    from instant_ic.sim.building import Building, Zone
+    from instant_ic.sim.world import Material
+    from instant_ic.sim.worlds import decorate, random_finish, tint
+
+    building = Building()
+    finish, height = random_finish(rng), float(rng.uniform(2.4, 3.2))
+    width = float(rng.uniform(2.0, 2.6))
+    bent = rng.random() < 0.4
+    length = float(rng.uniform(7.0, 8.5) if bent else rng.uniform(8.0, 11.5))
+    arm = building.add(Zone(-1.5, -width / 2, length, width / 2, height, finish))
+    legs = [(np.zeros(2), np.array([length - 1.0, 0.0]))]
+    if bent:
+        across, beyond = float(rng.uniform(2.0, 2.6)), float(rng.uniform(4.5, 6.5))
+        low, high = (arm.y1, arm.y1 + beyond) if rng.random() < 0.5 else (arm.y0 - beyond, arm.y0)
+        building.add(Zone(length - across, low, length, high, height, finish))
+        turn = np.array([length - across / 2, 0.0])
+        legs = [(np.zeros(2), turn), (turn, np.array([turn[0], high - 1.0 if low > 0 else low + 1.0]))]
+    obstacles: list[Obstacle] = []
+    for number, (start, end) in enumerate(legs):
+        at = FIRST_M if number == 0 else APART_M - width / 2
+        way = float(np.linalg.norm(end - start))
+        at += float(rng.uniform(0.0, 1.0))
+        while at < way - LAST_M:
+            obstacles.append(_obstacle(rng, start, (end - start) / way, at))
+            at += APART_M + float(rng.uniform(0.0, 2.0))
+    if not obstacles:
+        return None
+    for zone in building.zones:
+        building.lamps(zone, float(rng.uniform(1.8, 3.0)), float(rng.uniform(2.5, 5.0)), bool(rng.random() < 0.5))
+        decorate(rng, building, zone)
+    for one in obstacles:
+        look = Material(str(rng.choice(["white", "metal", "wood", "fabric"])), 0.8, tint(rng, 0.4))
+        building.builder.box((one.x, one.y), (one.length, one.width, one.height), yaw=one.yaw, side=look)
+    goals = np.stack([end for _, end in legs])
+    world = building.world(name, (0.0, 0.0, 0.0), light_cell_m=0.3, rays=12)
+    start = np.zeros(3)
+    if route(floor_plan(world), start, goals, SPARE_M) is None:
+        return None
+    return Course(world, goals, tuple(obstacles))
+
+
+def _obstacle(rng: np.random.Generator, start: FloatArray, heading: FloatArray, at: float) -> Obstacle:
+    """A box, a post or a low thing across the operator's line, ``at`` metres along it."""
+    kind = str(rng.choice(["box", "box", "post", "low"]))
+    aside = float(rng.uniform(-0.2, 0.2))
+    x, y = start + at * heading + aside * np.array([-heading[1], heading[0]])
+    if kind == "post":
+        size = float(rng.uniform(0.08, 0.14))
+        return Obstacle(float(x), float(y), size, size, float(rng.uniform(0, math.pi)), float(rng.uniform(0.7, 1.6)))
+    length, width = (float(v) for v in rng.uniform(0.25, 0.5, 2))
+    height = float(rng.uniform(0.15, 0.28) if kind == "low" else rng.uniform(0.4, 1.2))
+    yaw = math.atan2(heading[1], heading[0]) + float(rng.uniform(-0.4, 0.4))
+    return Obstacle(float(x), float(y), length, width, yaw, height)
+
+
+def floor_plan(world: World, cell_m: float = 0.025) -> OccupancyMask:
+    """Where the robot's body would meet something."""
+    return world.occupied(*BODY_M, cell_m)
+
+
+def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: float) -> FloatArray | None:
+    """Shortest way (N, 3) of the true footprint over all goals (M, 2); None where there is none."""
+    way, pose = [np.asarray(start, np.float64)[None]], np.asarray(start, np.float64)
+    for goal in goals:
+        leg = shortest_way(mask, pose, np.array([*goal, 0.0]), 0.05, spare_m)
+        if leg is None:
+            return None
+        way.append(leg[1:])
+        pose = leg[-1]
+    return np.concatenate(way)
+
+
+def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.2) -> Course:
+    """Any world: the operator drives straight on from its start, as far as the walls let him.
+
+    What is taller than 1.9 m counts as wall, the rest in the way as obstacle.
+
+    Raises:
+        ValueError: a wall is too near.
+    """
+    x, y, yaw = world.spawn
+    heading = np.array([math.cos(yaw), math.sin(yaw)])
+    steps = np.arange(0.0, most_m + before_wall_m, 0.05)
+    line = np.array([x, y]) + steps[:, None] * heading
+    wall = np.flatnonzero(world.occupied(*_TALLER_THAN_THINGS_M, 0.05).at(line))
+    reach = float(steps[wall[0]] if wall.size else steps[-1]) - before_wall_m
+    if reach < 2.0:
+        raise ValueError(
+            f"world {world.name!r}: a wall stands {reach + before_wall_m:.1f} m ahead of the start; "
+            "the operator drives straight on and needs 3.2 m"
+        )
+    goal = np.array([x, y]) + reach * heading
+    return Course(world, goal[None], things_between(floor_plan(world), np.array([x, y]), goal))
+
+
+def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> tuple[Obstacle, ...]:
+    """What stands on the straight way (2,) to (2,) of a robot 0.5 m wide, as boxes across it."""
+    length = float(np.linalg.norm(goal - start))
+    heading = (goal - start) / length
+    yaw = math.atan2(heading[1], heading[0])
+    steps = np.arange(0.0, length, 0.05)
+    line = start + steps[:, None] * heading
+    across = np.linspace(-0.25, 0.25, 11)[:, None] * np.array([-heading[1], heading[0]])
+    places = (line[:, None] + across).reshape(-1, 2)
+    strip: NDArray[np.bool_] = np.asarray(plan.at(places).reshape(len(steps), -1).any(axis=1))
+    begins = np.flatnonzero(strip & ~np.concatenate([[False], strip[:-1]]))
+    ends = np.flatnonzero(strip & ~np.concatenate([strip[1:], [False]]))
+    found: list[list[float]] = []  # first and last metre of each
+    for first, last in zip(steps[begins], steps[ends], strict=True):
+        if found and first - 0.5 * sum(found[-1]) < 1.0:  # the other side of a hollow one
+            found[-1][1] = float(last)
+        else:
+            found.append([float(first), float(last)])
+    places = [start + 0.5 * (first + last) * heading for first, last in found]
+    sizes = [last - first + 0.05 for first, last in found]
+    return tuple(
+        Obstacle(float(at[0]), float(at[1]), size, 0.5, yaw, BODY_M[1]) for at, size in zip(places, sizes, strict=True)
+    )
+
+
+def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Course:
+    """A straight drive between two free places of a furnished world, over things in the way where there are any.
+
+    No wall and nothing taller than ``_TALL_M`` stands between, the goal can be reached round everything with
+    ``SPARE_M`` to spare, and things on the line leave the robot as much room before and behind them as in a corridor.
+
+    Raises:
+        ValueError: no such drive came up within ``attempts``.
+    """
+    plan, tall = floor_plan(world), world.occupied(*_TALL_M, 0.05)
+    away = plan.distance_m()
+    cells = plan.reachable(world.spawn[:2], 0.35)
+    cells = cells[away[cells[:, 0], cells[:, 1]] >= _ROOM_M] if len(cells) else cells
+    places = plan.centre(cells)
+    longest: Course | None = None
+    for start, goal in places[rng.integers(0, len(places), (attempts, 2))] if len(places) else ():
+        length = float(np.linalg.norm(goal - start))
+        if not _DRIVE_M[0] <= length <= _DRIVE_M[1] or things_between(tall, start, goal):
+            continue
+        things = things_between(plan, start, goal)
+        if any(not _passable(thing, start, goal) for thing in things):
+            continue
+        there = copy.copy(world)
+        there.spawn = (float(start[0]), float(start[1]), math.atan2(goal[1] - start[1], goal[0] - start[0]))
+        course = Course(there, goal[None], things)
+        if not things and longest is not None and longest.way_m >= course.way_m:
+            continue
+        if route(plan, np.array(there.spawn), course.goals, SPARE_M) is None:
+            continue
+        if things:
+            return course
+        longest = course
+    if longest is None:
+        raise ValueError(
+            f"world {world.name!r}: no straight drive of {_DRIVE_M[0]} m between two free places came up in {attempts} "
+            f"tries ({len(places) * plan.cell_m**2:.1f} m² are {_ROOM_M} m away from everything and can be reached)"
+        )
+    return longest
+
+
+def _passable(thing: Obstacle, start: FloatArray, goal: FloatArray) -> bool:
+    """Whether there is room before and behind it, and it is no longer than a v-bot passes."""
+    at, half = np.array([thing.x, thing.y]), 0.5 * thing.length
+    before, behind = (float(np.linalg.norm(end - at)) - half for end in (start, goal))
+    return thing.length <= _LONGEST_THING_M and before >= FIRST_M - 1.0 and behind >= LAST_M - 1.0

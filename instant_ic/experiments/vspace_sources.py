@@ -1,0 +1,204 @@
+"""Sources of ``evaluation.vspace``: what draws a place from a pose, made of keyframes in a simulated world."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from instant_ic.depth.sources import DepthResult
+    from instant_ic.experiments.vspace import Settings
+    from instant_ic.sim.render import EquirectRenderer
+    from instant_ic.sim.worlds import World
+    from instant_ic.vspace import VirtualSpaceConfig
+
+Picture = NDArray[np.uint8]
+CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
+Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, float]]
+"""Draws the place from a pose (4, 4) at width, height, field of view: picture, and share that a panorama has seen."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A keyframe: panorama, its true depth, the model's depth, and the depth that ``ours`` uses."""
+
+    pose: NDArray[np.float64]
+    rgb: Picture
+    true_depth_m: NDArray[np.float32]
+    raw: NDArray[np.float32]
+    result: DepthResult
+
+
+def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: Settings, model: Any) -> Shot:
+    """Panorama from a pose, and its depth: the model's, and as scaled by a simulated VLP-16."""
+    from instant_ic.depth.scaler import ScalerConfig
+    from instant_ic.depth.sources import DepthSource, SourceConfig
+    from instant_ic.experiments.depth_lidar import Errors, measure_world
+
+    width = settings.panorama_width
+    rgb = renderer.render(pose, width, width // 2, supersample=2).rgb
+    true = renderer.render(pose, min(width, 1024), min(width, 1024) // 2).depth_m
+    raw = model.estimate(rgb)
+    points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed))
+    scaler = ScalerConfig(output_kind=model.manifest.output_kind)
+    source = DepthSource(SourceConfig(source=settings.depth_source, scaler=scaler))
+    result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M, rgb)
+    if not result.ok:
+        raise ValueError(f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) is not fit: {result.message}")
+    return Shot(pose, rgb, true, raw, result)
+
+
+def scanned(world: World, seed: int) -> World:
+    """The world as scanned at another time: another exposure and white balance, and each texture's own drift."""
+    rng = np.random.default_rng([71, seed])
+    drift = np.exp(rng.normal(0, 0.12, (int(world.texture.max()) + 1, 3)))[world.texture]
+    tint = world.tint * drift * (0.85 * np.array([1.08, 1.0, 0.88]))
+    return replace(world, tint=tint.astype(np.float32), emission=world.emission * np.float32(0.85))
+
+
+def train(space: Any, cpu_seconds: float) -> None:
+    """Trains until so much CPU time of this process is spent, or the schedule has ended."""
+    start = time.process_time()
+    while not space.status.converged and time.process_time() - start < cpu_seconds:
+        space.train(iterations=5)
+
+
+def point_warp(
+    rgb: Picture, depth_m: NDArray[np.floating], pose: NDArray[np.float64], view: NDArray[np.float64],
+    width: int, height: int, fov: float,
+) -> tuple[Picture, float]:  # fmt: skip
+    """The panorama's pixels as points with a z-buffer, holes filled from around; and the share that is no hole."""
+    import cv2
+
+    from instant_ic.geometry.projections import equirect_directions
+    from instant_ic.vspace.prior import fill_holes
+
+    size = (rgb.shape[1], rgb.shape[0])
+    depth = cv2.resize(np.asarray(depth_m, np.float32), size, interpolation=cv2.INTER_NEAREST)
+    points = (equirect_directions(*size) * depth[..., None])[depth > 0]
+    view_from_camera = np.linalg.inv(view) @ pose
+    x, y, z = (points @ view_from_camera[:3, :3].T + view_from_camera[:3, 3]).T
+    focal = 0.5 * width / math.tan(fov / 2)
+    ahead = x > 0.02
+    u, v = (np.rint(0.5 * (n - 1) - focal * a[ahead] / x[ahead]).astype(int) for n, a in ((width, y), (height, z)))
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    at, far = (v * width + u)[inside], x[ahead][inside]
+    order = np.argsort(-far, kind="stable")  # the nearest is written last
+    image, seen = np.zeros((height * width, 3), np.float32), np.zeros(height * width, bool)
+    image[at[order]] = rgb[depth > 0][ahead][inside][order]
+    seen[at] = True
+    filled = fill_holes(image.reshape(height, width, 3), seen.reshape(height, width))
+    return np.clip(np.rint(filled), 0, 255).astype(np.uint8), float(seen.mean())
+
+
+def make_space(shots: list[Shot], depth: str, settings: Settings, config: VirtualSpaceConfig) -> Any:
+    """A virtual space with the keyframes, oldest first, by ``scaled``, ``raw`` or ``true`` depth.
+
+    The last is not trained yet; those before it are, until they are fit, as on the way (at most ``settings.seconds``).
+    """
+    from instant_ic.vspace import VirtualSpace
+
+    space = VirtualSpace(config)
+    for number, shot in enumerate(shots):
+        if depth == "scaled":
+            space.set_keyframe(shot.rgb, shot.result.depth_m, shot.pose, shot.result.sigma)
+        elif depth == "raw":
+            space.set_keyframe(shot.rgb, shot.raw, shot.pose, shot.result.relative_sigma)
+        else:
+            space.set_keyframe(shot.rgb, shot.true_depth_m, shot.pose, 0.02)
+        if number < len(shots) - 1:
+            start = time.process_time()
+            while not space.status.ready_iterations and time.process_time() - start < settings.seconds:
+                space.train(iterations=5)
+    return space
+
+
+def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
+    """The same, with pictures of the field however young it is."""
+    return replace(config, picture=replace(config.picture, field_from_db=config.picture.panorama_until_db))
+
+
+def make_source(
+    name: str, shots: list[Shot], settings: Settings, config: VirtualSpaceConfig, before: Callable[[], World]
+) -> tuple[Drawer, float]:
+    """A source made ready: what draws it, and the CPU seconds that it took.
+
+    ``before`` gives the world as it was when it was scanned.
+    """
+    from instant_ic.vspace.warp import PanoramaWarp
+
+    last = shots[-1]
+    start = time.process_time()
+
+    def of_view(drawer: Any) -> Drawer:
+        def draw(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
+            view = drawer.render(pose, width, height, fov)
+            return view.rgb, float(view.confidence.mean())
+
+        return draw
+
+    if name in ("ours", "field", "no-scale", "true-depth"):
+        depth = {"no-scale": "raw", "true-depth": "true"}.get(name, "scaled")
+        space = make_space(shots, depth, settings, field_alone(config) if name == "field" else config)
+        train(space, settings.seconds)
+        return of_view(space), time.process_time() - start
+    if name == "no-depth":
+        from instant_ic.experiments.colour_only import ColourOnlyField
+
+        colours = ColourOnlyField(last.rgb, last.pose, config)
+        colours.train(settings.seconds)
+        return of_view(colours), time.process_time() - start
+    if name == "mesh":
+        from instant_ic.sim.render import EquirectRenderer
+
+        renderer = EquirectRenderer(scanned(before(), settings.seed))
+
+        def draw_mesh(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
+            return renderer.render_perspective(pose, width, height, fov, supersample=2).rgb, 1.0
+
+        return draw_mesh, 0.0
+    if name == "point-warp":
+
+        def draw_points(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
+            return point_warp(last.rgb, last.result.depth_m, last.pose, pose, width, height, fov)
+
+        return draw_points, 0.0
+    true = name == "true-warp"
+    warp = PanoramaWarp(last.rgb, last.true_depth_m if true else last.result.depth_m, last.pose)
+    if name != "panorama":
+        return of_view(warp), time.process_time() - start
+
+    def draw_turned(pose: Any, width: int, height: int, fov: float) -> tuple[Picture, float]:
+        turned = pose.copy()
+        turned[:3, 3] = last.pose[:3, 3]
+        return warp.render(turned, width, height, fov).rgb, 1.0
+
+    return draw_turned, 0.0
+
+
+def depth_figures(shots: list[Shot]) -> dict[str, Any]:
+    """How the last panorama's depth was found, and how far it is off the truth (median and mean, by solid angle)."""
+    import cv2
+
+    last = shots[-1]
+    height, width = last.result.depth_m.shape
+    true = cv2.resize(last.true_depth_m, (width, height), interpolation=cv2.INTER_NEAREST)
+    known = (true > 0) & (last.result.depth_m > 0)
+    raw_known = (true > 0) & (last.raw > 0)
+    error = np.abs(last.result.depth_m[known] / true[known] - 1)
+    return {
+        "panoramas": len(shots),
+        "source": last.result.source,
+        "message": last.result.message,
+        "scale": round(last.result.scale, 4),
+        "relative_sigma": round(last.result.relative_sigma, 4),
+        "median_relative_error": round(float(np.median(error)), 4),
+        "mean_relative_error": round(float(np.mean(error)), 4),
+        "unscaled_median_ratio": round(float(np.median(last.raw[raw_known] / true[raw_known])), 4),
+    }

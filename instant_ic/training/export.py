@@ -1,0 +1,172 @@
+"""SliceNet to ONNX with manifest and training record (torch and onnx)."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import shutil
+import tempfile
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from instant_ic.depth.manifest import ModelManifest, manifest_path, save_manifest
+from instant_ic.training.folding import fold_upsampling
+from instant_ic.training.slicenet import SliceNet
+
+OPSET = 17
+HALF_PRECISION_MIN_ELEMENTS = 256
+MAX_RELATIVE_DIFFERENCE = 1e-5
+MAX_HALF_DIFFERENCE = 2e-2
+
+
+class ExportError(RuntimeError):
+    """The exported file does not compute what the network does."""
+
+
+def export_onnx(
+    model: SliceNet, path: str | Path, half_weights: bool = False, report: Callable[[str], None] = lambda line: None
+) -> dict[str, float]:
+    """Writes the network as ONNX of fixed shape and holds it against torch on a random picture.
+
+    The decoder is folded (:mod:`.folding`), batch norms go into the convolutions before them.
+
+    Args:
+        model: the network; put into evaluation mode.
+        path: file to write; replaced only when all is well.
+        half_weights: store the weights as float16 (half the size); they are computed with in float32.
+        report: is given a line before each step that takes time.
+
+    Returns:
+        ``difference``: largest |onnx - torch| over the largest |torch|, with float32 weights; ``rounding``: the same
+        of torch in float32 and in float64, where the first is not under 1e-5; ``half_difference``: the same of the
+        file with float16 weights, where those are written.
+
+    Raises:
+        ExportError: a difference is above what rounding explains, or the network gives no numbers.
+        OSError: the file cannot be written.
+    """
+    path = Path(path)
+    model.eval()
+    shape = (1, 3, model.config.height, model.config.width)
+    picture = torch.rand(shape, generator=torch.Generator().manual_seed(1))
+    report("torch computes a picture")
+    with torch.inference_mode():
+        expected = model(picture).numpy()
+    if not np.isfinite(expected).all() or not np.ptp(expected):
+        raise ExportError("the network gives no depth: the same number, or none, for every pixel")
+    with tempfile.TemporaryDirectory() as folder:
+        plain = Path(folder) / "model.onnx"
+        report("torch writes ONNX")
+        with warnings.catch_warnings():
+            # The tracing exporter is the fast one here; its successor keeps the LSTM no better.
+            warnings.simplefilter("ignore")
+            torch.onnx.export(
+                fold_upsampling(model), (picture,), str(plain), dynamo=False, opset_version=OPSET,
+                input_names=["image"], output_names=["depth"],
+            )  # fmt: skip
+        report("onnxruntime computes the same picture")
+        got = _run(plain, picture.numpy())
+        result = {"difference": _difference(got, expected)}
+        told = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
+        if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
+            # Weights may amplify rounding beyond any fixed bound; then the exact numbers tell who is wrong.
+            report(f"{told}; torch computes it in float64")
+            with torch.inference_mode():
+                exact = copy.deepcopy(model).double()(picture.double()).numpy()
+            result["rounding"] = _difference(expected, exact)
+            if not _difference(got, exact) < max(2 * result["rounding"], MAX_RELATIVE_DIFFERENCE):
+                raise ExportError(f"{told}, {_difference(got, exact):.1e} to float64")
+            told += f", while float32 alone costs torch {result['rounding']:.1e} with these weights"
+        report(told)
+        if half_weights:
+            report("weights to float16, and the picture again")
+            plain.write_bytes(_halve_weights(plain.read_bytes()))
+            result["half_difference"] = _difference(_run(plain, picture.numpy()), expected)
+            if not result["half_difference"] < MAX_HALF_DIFFERENCE:
+                raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
+            report(f"float16 weights change it by {result['half_difference']:.1e}")
+        beside = path.with_name(f".{path.name}.new")
+        try:
+            shutil.copyfile(plain, beside)
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+    return result
+
+
+def _run(path: Path, picture: NDArray[np.float32]) -> NDArray[np.float32]:
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return np.asarray(session.run(None, {"image": picture})[0])
+
+
+def _difference(got: NDArray[np.floating], expected: NDArray[np.floating]) -> float:
+    return float(np.abs(got - expected).max() / np.abs(expected).max())
+
+
+def _halve_weights(content: bytes) -> bytes:
+    """Stores large float32 initialisers as float16 behind a Cast, which the runtime folds when it loads."""
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    model = onnx.load_from_string(content)
+    casts, kept = [], []
+    for tensor in model.graph.initializer:
+        if tensor.data_type == TensorProto.FLOAT and np.prod(tensor.dims) >= HALF_PRECISION_MIN_ELEMENTS:
+            values = numpy_helper.to_array(tensor).astype(np.float16)
+            stored = f"{tensor.name}.half"
+            kept.append(numpy_helper.from_array(values, stored))
+            casts.append(helper.make_node("Cast", [stored], [tensor.name], to=TensorProto.FLOAT))
+        else:
+            kept.append(tensor)
+    nodes = casts + list(model.graph.node)
+    del model.graph.initializer[:], model.graph.node[:]
+    model.graph.initializer.extend(kept)
+    model.graph.node.extend(nodes)
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
+
+
+def export_model(
+    model: SliceNet,
+    path: str | Path,
+    name: str,
+    licence: str,
+    max_range_m: float,
+    record: dict[str, Any] | None = None,
+    half_weights: bool = False,
+    brightness: float = 0.0,
+    report: Callable[[str], None] = lambda line: None,
+) -> ModelManifest:
+    """Writes ``NAME.onnx``, its manifest ``NAME.yaml`` and, where given, the training record ``NAME.json``.
+
+    Raises:
+        ExportError, OSError: as :func:`export_onnx`.
+        ValueError: a value is wrong in a manifest.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    differences = export_onnx(model, path, half_weights, report)
+    manifest = ModelManifest(
+        model=path.name,
+        name=name,
+        licence=licence,
+        input_height=model.config.height,
+        input_width=model.config.width,
+        brightness=brightness,
+        max_range_m=max_range_m,
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
+    save_manifest(manifest, manifest_path(path))
+    if record is not None:
+        text = json.dumps({**record, "export": {"opset": OPSET, **differences}}, indent=1)
+        path.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    return manifest

@@ -1,0 +1,338 @@
+"""Where the batches of a training come from: files, or worlds that are rendered while it goes on (numpy).
+
+A batch is a function of its number alone, so that a training that is taken up again sees what it would have seen.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import queue
+import tempfile
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.context import SpawnProcess
+from types import TracebackType
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.training.dataset import Sample
+from instant_ic.training.rooms import RoomsConfig, render_rooms
+
+Batch = tuple[NDArray[np.uint8], NDArray[np.float32]]
+"""rgb (B, H, W, 3) uint8 and radial depth (B, H, W) metres, 0 = unknown."""
+WORLD_TIMEOUT_S = 600.0
+
+
+class FeedError(RuntimeError):
+    """No more batches come: a renderer ended or takes too long, or there is nothing to draw from."""
+
+
+class Samples(Protocol):
+    """Panoramas by number."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: int) -> Sample: ...
+
+
+class Feed(Protocol):
+    """Batches by number; asked for in rising order."""
+
+    batch_size: int
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Recipe, for the training record (plain values)."""
+        ...
+
+    @property
+    def steps_an_epoch(self) -> int:
+        """Batches until everything has been seen once."""
+        ...
+
+    def batch(self, step: int) -> Batch: ...
+
+    def close(self) -> None: ...
+
+
+def stack(samples: Sequence[Sample]) -> Batch:
+    """Panoramas of one size as a batch."""
+    return np.stack([s.rgb for s in samples]), np.stack([np.asarray(s.depth_m, np.float32) for s in samples])
+
+
+class FileFeed:
+    """Passes over stored panoramas, each in an order of its own.
+
+    Args:
+        samples: where the panoramas are.
+        indices: which of them.
+        batch_size: of this process.
+        seed: of the order.
+        rank, ranks: this process among those that train together; each gets its own part of a pass.
+        info: recipe.
+        threads: that read at the same time (decoding pictures takes longer than a small network's step).
+    """
+
+    def __init__(
+        self,
+        samples: Samples,
+        indices: NDArray[np.intp],
+        batch_size: int,
+        seed: int = 0,
+        rank: int = 0,
+        ranks: int = 1,
+        info: dict[str, Any] | None = None,
+        threads: int = 4,
+    ) -> None:
+        if len(indices) == 0:
+            raise FeedError("no panorama to train on")
+        self.samples, self.indices, self.batch_size = samples, indices, batch_size
+        self.seed, self.rank, self.ranks = seed, rank, ranks
+        self._info = info or {}
+        self._readers = ThreadPoolExecutor(threads)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        return {**self._info, "panoramas": len(self.indices)}
+
+    @property
+    def steps_an_epoch(self) -> int:
+        return max(1, len(self.indices) // (self.batch_size * self.ranks))
+
+    def batch(self, step: int) -> Batch:
+        epoch, place = divmod(step, self.steps_an_epoch)
+        order = np.random.default_rng((self.seed, epoch)).permutation(self.indices)
+        first = (place * self.ranks + self.rank) * self.batch_size
+        picked = np.sort(np.take(order, np.arange(first, first + self.batch_size), mode="wrap"))
+        return stack(list(self._readers.map(lambda index: self.samples[int(index)], picked)))
+
+    def close(self) -> None:
+        self._readers.shutdown(cancel_futures=True)
+
+
+class RenderedFeed:
+    """Draws from a window of worlds that moves on as the training does; processes in the background render ahead.
+
+    Args:
+        recipe: of the worlds. After the last of them the first comes again.
+        batch_size: of this process.
+        seed: of the choice within the window.
+        workers: rendering processes; 0 renders in this one.
+        pool: panoramas in the window.
+        reuse: how often each is used on average (turned, mirrored, coloured differently each time).
+        rank, ranks: this process among those that train together; each renders worlds of its own.
+    """
+
+    def __init__(
+        self,
+        recipe: RoomsConfig,
+        batch_size: int,
+        seed: int = 0,
+        workers: int = 1,
+        pool: int = 96,
+        reuse: float = 3.0,
+        rank: int = 0,
+        ranks: int = 1,
+    ) -> None:
+        if reuse < 1 or pool < batch_size:
+            raise FeedError(f"reuse must be 1 or more, pool no less than a batch (got {reuse}, {pool}, {batch_size})")
+        self.recipe, self.batch_size, self.seed = recipe, batch_size, seed
+        self.workers, self.pool, self.reuse, self.rank, self.ranks = workers, pool, reuse, rank, ranks
+        self._worlds = max(1, -(-pool // recipe.poses))
+        self._window: deque[list[Sample]] = deque(maxlen=self._worlds)
+        self._next = 0
+        self._renderers: Renderers | None = None
+
+    @property
+    def info(self) -> dict[str, Any]:
+        return {**self.recipe.as_dict(), "rendered": "on the fly", "pool": self.pool, "reuse": self.reuse}
+
+    @property
+    def steps_an_epoch(self) -> int:
+        return max(1, round(self.recipe.count * self.reuse / (self.batch_size * self.ranks)))
+
+    def batch(self, step: int) -> Batch:
+        last = self._worlds + int(step * self.batch_size / (self.reuse * self.recipe.poses))
+        if self._renderers is None or last - self._worlds > self._next:
+            self.close()
+            self._next = last - self._worlds
+            self._renderers = Renderers(self.recipe, self.workers, self._seed, self._next)
+        while self._next < last:
+            self._window.append(self._renderers.world())
+            self._next += 1
+        choice = [sample for world in self._window for sample in world]
+        if not choice:
+            raise FeedError(
+                f"no free place to stand in {self._worlds} worlds from seed {self._seed(self._next - 1)} on"
+            )
+        rng = np.random.default_rng((self.seed, self.rank, step))
+        return stack(
+            [choice[i] for i in rng.choice(len(choice), self.batch_size, replace=len(choice) < self.batch_size)]
+        )
+
+    def _seed(self, place: int) -> int:
+        return self.recipe.first_world + (place * self.ranks + self.rank) % self.recipe.worlds
+
+    def close(self) -> None:
+        if self._renderers is not None:
+            self._renderers.close()
+        self._renderers = None
+        self._window.clear()
+
+
+class MixedFeed:
+    """Each batch is made of one of every feed, of the size that each has."""
+
+    def __init__(self, feeds: Sequence[Feed]) -> None:
+        self.feeds = list(feeds)
+        self.batch_size = sum(feed.batch_size for feed in feeds)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        return {"mixed": [{"batch_size": feed.batch_size, **feed.info} for feed in self.feeds]}
+
+    @property
+    def steps_an_epoch(self) -> int:
+        return max(feed.steps_an_epoch for feed in self.feeds)
+
+    def batch(self, step: int) -> Batch:
+        parts = [feed.batch(step) for feed in self.feeds]
+        return np.concatenate([rgb for rgb, _ in parts]), np.concatenate([depth for _, depth in parts])
+
+    def close(self) -> None:
+        for feed in self.feeds:
+            feed.close()
+
+
+class Ahead:
+    """Makes the next batch in a thread while the present one is trained on."""
+
+    def __init__(self, feed: Feed) -> None:
+        self.feed = feed
+        self._thread = ThreadPoolExecutor(1)
+        self._made: dict[int, Any] = {}
+
+    def batch(self, step: int) -> Batch:
+        """The feed's batch ``step``; its error, if it has one."""
+        ready = self._made.pop(step, None) or self._thread.submit(self.feed.batch, step)
+        batch: Batch = ready.result()
+        self._made = {step + 1: self._thread.submit(self.feed.batch, step + 1)}
+        return batch
+
+    def close(self) -> None:
+        """Ends the feed first: a batch that is being waited for would hold this up."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        self.feed.close()
+        self._thread.shutdown()
+
+
+class Renderers:
+    """Processes that render worlds in the order of their places; :meth:`world` gives one after the other.
+
+    Args:
+        recipe: of the worlds.
+        workers: processes; 0 renders in this one.
+        seed_of: world seed of a place 0, 1, 2...
+        first: place to begin with.
+    """
+
+    def __init__(self, recipe: RoomsConfig, workers: int, seed_of: Callable[[int], int], first: int = 0) -> None:
+        self.recipe, self.seed_of, self._place = recipe, seed_of, first
+        self._processes: list[SpawnProcess] = []
+        self._asked: list[Any] = []
+        self._given: list[Any] = []
+        self._cache: tempfile.TemporaryDirectory[str] | None = None
+        if workers == 0:
+            return
+        context = multiprocessing.get_context("spawn")
+        # The light of worlds that never come again would push everything else out of the user's cache.
+        self._cache = tempfile.TemporaryDirectory(prefix="instant_ic-render-")
+        for _ in range(workers):
+            asked, given = context.SimpleQueue(), context.Queue()
+            process = context.Process(
+                target=_render, args=(recipe, self._cache.name, os.getpid(), asked, given), daemon=True
+            )
+            process.start()
+            self._processes.append(process)
+            self._asked.append(asked)
+            self._given.append(given)
+        self._ordered = first
+        for _ in range(2 * workers):
+            self._order()
+
+    def _order(self) -> None:
+        self._asked[self._ordered % len(self._asked)].put(self.seed_of(self._ordered))
+        self._ordered += 1
+
+    def world(self) -> list[Sample]:
+        """Panoramas of the next world; none where it has no free place.
+
+        Raises:
+            FeedError: a renderer failed, ended or took longer than ``WORLD_TIMEOUT_S``.
+        """
+        place = self._place
+        self._place += 1
+        if not self._processes:
+            return list(render_rooms(self.recipe, [self.seed_of(place)]))
+        which = place % len(self._processes)
+        end = time.monotonic() + WORLD_TIMEOUT_S
+        while True:
+            try:
+                samples, error = self._given[which].get(timeout=1.0)
+                break
+            except queue.Empty:
+                if not self._processes[which].is_alive():
+                    code = self._processes[which].exitcode
+                    raise FeedError(f"a rendering process ended with {code} at world {self.seed_of(place)}") from None
+                if time.monotonic() > end:
+                    raise FeedError(
+                        f"world {self.seed_of(place)} took over {WORLD_TIMEOUT_S:.0f} s to render"
+                    ) from None
+        if error:
+            raise FeedError(f"world {self.seed_of(place)} could not be rendered:\n{error}")
+        self._order()
+        return list(samples)
+
+    def close(self) -> None:
+        """Ends the processes."""
+        for process in self._processes:
+            process.kill()  # SIGTERM would wait where one is stopped
+        for process in self._processes:
+            process.join(10)
+        self._processes = []
+        if self._cache is not None:
+            self._cache.cleanup()
+
+    def __enter__(self) -> Renderers:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def _render(recipe: RoomsConfig, cache: str, parent: int, asked: Any, given: Any) -> None:
+    """Main of a rendering process; ends with its parent."""
+    import signal
+    import threading
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training, which then ends this
+    threading.Thread(target=watch, daemon=True).start()
+    os.environ["XDG_CACHE_HOME"] = cache
+    while True:
+        seed = asked.get()
+        try:
+            given.put((list(render_rooms(recipe, [seed])), None))
+        except Exception:
+            given.put(([], traceback.format_exc()))  # for the training, which stops with it
+            raise

@@ -1,0 +1,92 @@
+"""Decoder stages that compute at half the size what they show at full size: the same depth in less time.
+
+A stage doubles each pixel and then convolves 3x3. Of nine neighbours in the doubled map only four differ, so the same
+numbers come out of convolving the small map once for each of the two or four pixels that one becomes (Shi et al.,
+"Real-time single image and video super-resolution using an efficient sub-pixel convolutional neural network", CVPR
+2016), and of interleaving the results. The network's last, largest maps are then never padded, copied or reordered.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from instant_ic.training.slicenet import ConvStage, SliceNet, wrapped_conv
+
+
+class FoldedStage(nn.Module):
+    """What a widening :class:`ConvStage` computes, from a kernel for each phase; for inference only."""
+
+    def __init__(self, stage: ConvStage) -> None:
+        super().__init__()
+        conv, norm, prelu = stage.layers.get_submodule("0.1"), stage.layers[1], stage.layers[2]
+        assert isinstance(conv, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d) and isinstance(prelu, nn.PReLU)
+        self.upscale = stage.upscale
+        kernels = fold_kernel(conv.weight.detach(), stage.upscale)
+        count = kernels.shape[0] // conv.out_channels
+        self.layers = nn.Sequential(
+            wrapped_conv(conv.in_channels, kernels.shape[0], 3),
+            nn.BatchNorm2d(kernels.shape[0]),
+            nn.PReLU(kernels.shape[0]),
+        )
+        state = {f"1.{key}": value for key, value in norm.state_dict().items() if value.ndim}
+        state |= {"0.1.bias": conv.bias, "2.weight": prelu.weight}
+        repeated = {key: value.detach().repeat_interleave(count) for key, value in state.items()}
+        self.layers.load_state_dict(
+            {**repeated, "0.1.weight": kernels, "1.num_batches_tracked": norm.num_batches_tracked}, strict=True
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.layers(x)
+        if self.upscale == (2, 2):
+            return functional.pixel_shuffle(y, 2)
+        batch, channels, height, width = y.shape
+        y = y.view(batch, channels // 2, 2, height, width)
+        return y.transpose(2, 3).reshape(batch, channels // 2, 2 * height, width)
+
+
+def fold_kernel(kernel: Tensor, upscale: tuple[int, int]) -> Tensor:
+    """(O, I, 3, 3) for the doubled map -> (n O, I, 3, 3) for the small one; n = 2 or 4 phases, rows first.
+
+    Along an axis that is doubled the even pixel sees the small map's neighbours (w0, w1 + w2, 0), the odd one
+    (0, w0 + w1, w2).
+    """
+    phases = [kernel]
+    for axis in (2, 3):
+        if upscale[axis - 2] == 2:
+            phases = [half for part in phases for half in _halves(part, axis)]
+    return torch.stack(phases, dim=1).flatten(0, 1)
+
+
+def unfold_kernel(kernels: Tensor, upscale: tuple[int, int]) -> Tensor:
+    """The inverse of :func:`fold_kernel`, up to rounding."""
+    count = upscale[0] * upscale[1]
+    phases = list(kernels.unflatten(0, (-1, count)).unbind(1))
+    for axis in (3, 2):
+        if upscale[axis - 2] == 2:
+            phases = [_whole(even, odd, axis) for even, odd in zip(phases[::2], phases[1::2], strict=True)]
+    (kernel,) = phases
+    return kernel
+
+
+def _halves(kernel: Tensor, axis: int) -> tuple[Tensor, Tensor]:
+    first, middle, last = kernel.unbind(axis)
+    nothing = torch.zeros_like(first)
+    return torch.stack((first, middle + last, nothing), axis), torch.stack((nothing, first + middle, last), axis)
+
+
+def _whole(even: Tensor, odd: Tensor, axis: int) -> Tensor:
+    first, last = even.select(axis, 0), odd.select(axis, 2)
+    return torch.stack((first, even.select(axis, 1) - last, last), axis)
+
+
+def fold_upsampling(model: SliceNet) -> SliceNet:
+    """A copy in evaluation mode whose widening decoder stages are folded; the depth differs by rounding alone."""
+    folded = copy.deepcopy(model).eval()
+    for index, stage in enumerate(folded.decoder):
+        assert isinstance(stage, ConvStage)
+        folded.decoder[index] = FoldedStage(stage)
+    return folded.eval()

@@ -1,0 +1,88 @@
+"""Training panoramas: generated interiors, seen from where a robot's camera could be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.training.dataset import Sample
+
+FIRST_HELD_OUT = 900_000
+"""Worlds from this seed on belong to the evaluations (``instant_ic.experiments.depth_worlds``)."""
+INTERIORS = ("wide", "random")
+
+
+@dataclass(frozen=True)
+class RoomsConfig:
+    """Recipe of generated panoramas.
+
+    Attributes:
+        worlds: number of worlds.
+        poses: panoramas in each.
+        first_world: seed of the first world; the others follow. Held-out worlds are the last ones.
+        height: rows of a panorama.
+        interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
+        camera_height_m: lowest and highest camera above the floor.
+        tilt_deg: standard deviation of roll and pitch.
+        clearance_m: distance from things, lowest and highest.
+    """
+
+    worlds: int = 400
+    poses: int = 6
+    first_world: int = 1000
+    height: int = 256
+    interiors: str = "wide"
+    camera_height_m: tuple[float, float] = (0.5, 1.7)
+    tilt_deg: float = 1.5
+    clearance_m: tuple[float, float] = (0.3, 0.7)
+
+    def __post_init__(self) -> None:
+        if self.worlds < 2 or self.poses < 1:
+            raise ValueError(f"at least 2 worlds and 1 pose are needed (got {self.worlds}, {self.poses})")
+        if self.interiors not in INTERIORS:
+            raise ValueError(f"interiors must be one of {', '.join(INTERIORS)} (got {self.interiors!r})")
+        if self.first_world < 0 or self.first_world + self.worlds > FIRST_HELD_OUT:
+            raise ValueError(f"world seeds must lie in 0..{FIRST_HELD_OUT - 1}: the others are for evaluation "
+                             f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """Panoramas in all."""
+        return self.worlds * self.poses
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for the folder's ``dataset.json``."""
+        module = "depth.interiors.interior_world" if self.interiors == "wide" else "sim.worlds.random_world"
+        return {"kind": f"instant_ic.{module}", **asdict(self)}
+
+
+def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> Iterator[Sample]:
+    """Renders the recipe (or only some world seeds of it); the same recipe gives the same panoramas.
+
+    Worlds without a free place are left out, so that fewer samples than ``config.count`` may come.
+    """
+    from instant_ic.sim.render import EquirectRenderer
+    from instant_ic.sim.worlds import World, random_world
+    from instant_ic.training.interiors import interior_world
+
+    make: Callable[[int], World] = interior_world if config.interiors == "wide" else random_world
+    seeds = range(config.first_world, config.first_world + config.worlds) if worlds is None else worlds
+    for seed in seeds:
+        rng = np.random.default_rng((7, seed))
+        world = make(seed)
+        renderer = EquirectRenderer(world)
+        try:
+            poses = world.sample_free_poses(rng, config.poses, clearance_m=rng.uniform(*config.clearance_m))
+        except ValueError:
+            continue
+        for x, y, yaw in poses:
+            roll, pitch = np.radians(config.tilt_deg) * rng.standard_normal(2)
+            height = rng.uniform(*config.camera_height_m)
+            pose = pose_matrix(x, y, height, roll, pitch, math.remainder(yaw, math.tau))
+            frame = renderer.render(pose, 2 * config.height, config.height)
+            yield Sample(frame.rgb, frame.depth_m, seed)

@@ -1,0 +1,455 @@
+"""Trains SliceNet; can be stopped at any time and taken up again, and runs on several GPUs under ``torchrun``.
+
+The schedule runs over wall time or epochs, whichever ends first: on a machine that is shared, time is what is known
+beforehand. The weights that are evaluated and saved are an exponential average of the trained ones.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
+
+from instant_ic.depth.metrics import DepthMetrics, depth_metrics, mean_metrics, solid_angle_weights
+from instant_ic.training.augment import photograph, to_brightness, turn_and_mirror
+from instant_ic.training.feeds import Ahead, Feed, Samples
+from instant_ic.training.log import TrainingLog
+from instant_ic.training.losses import depth_loss, edge_loss
+from instant_ic.training.slicenet import CheckpointError, SliceNet, SliceNetConfig
+from instant_ic.training.weights import Start, fold_norms, unfold_norms
+
+POLE_WEIGHT = 0.1
+"""Least weight of a row in the loss, the mean row being 1. By solid angle alone the rows at the poles are hardly
+trained, and stand as spikes over and under the camera in the point cloud."""
+TEAM_TIMEOUT = timedelta(minutes=20)
+"""A process that waits longer for the others ends with an error."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How to train.
+
+    Attributes:
+        minutes: wall time after which the learning rate has come down and training ends.
+        epochs: passes over the data after which it ends, if that comes first.
+        batch_size: panoramas a step and process.
+        learning_rate: the largest, of AdamW.
+        weight_decay: of AdamW.
+        warmup: share of the schedule in which the learning rate rises.
+        average: decay of the weight average a step.
+        mix: share of the trained weights in the result, the rest are the start's. A short training on other pictures
+            forgets what it does not see; between both ends of the line lies what does well on old and new (Wortsman et
+            al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+        edge_share: weight of the edge loss.
+        photograph: pictures are augmented with what a real camera adds.
+        brightness: mean byte that each picture is brought to before the network, as inference does; 0: as it is.
+        evaluation_panoramas: how many of the held-out ones are evaluated during training.
+        checkpoint_s: seconds between checkpoints with evaluation.
+        max_range_m: truth beyond it is unknown, output beyond it is cut.
+        mixed_precision: convolutions in bfloat16, or in float16 on a GPU that has no bfloat16.
+        threads: CPU threads. Two on two cores that others use as well are several times slower than one: each
+            of the LSTM's many short steps waits for the slower thread.
+        seed: of weights, order and augmentation.
+    """
+
+    minutes: float = 60.0
+    epochs: int = 40
+    batch_size: int = 8
+    learning_rate: float = 2e-3
+    weight_decay: float = 0.02
+    warmup: float = 0.04
+    average: float = 0.998
+    mix: float = 1.0
+    edge_share: float = 0.5
+    photograph: bool = True
+    brightness: float = 178.5
+    evaluation_panoramas: int = 48
+    checkpoint_s: float = 300.0
+    max_range_m: float = 16.0
+    mixed_precision: bool = True
+    threads: int = 1
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for key in ("minutes", "epochs", "batch_size", "learning_rate", "checkpoint_s", "max_range_m", "threads",
+                    "evaluation_panoramas"):  # fmt: skip
+            if getattr(self, key) <= 0:
+                raise ValueError(f"{key} must be above 0 (got {getattr(self, key)})")
+        if not 0 < self.warmup < 1 or not 0 <= self.average < 1:
+            raise ValueError(f"warmup and average must lie in 0..1 (got {self.warmup}, {self.average})")
+        if not 0 < self.mix <= 1:
+            raise ValueError(f"mix must lie in 0..1, above 0 (got {self.mix})")
+        if not 0 <= self.brightness <= 255:
+            raise ValueError(f"brightness must lie in 0..255 (got {self.brightness})")
+
+
+@dataclass(frozen=True)
+class Team:
+    """The processes that train together, and this one's device.
+
+    Attributes:
+        device: this process's.
+        rank: its number, ``ranks`` of them in all; number 0 evaluates, reports and saves.
+    """
+
+    device: torch.device
+    rank: int = 0
+    ranks: int = 1
+
+    @classmethod
+    def join(cls, device: str = "auto") -> Team:
+        """Joins the processes that ``torchrun`` started, if it did, and picks the device.
+
+        Args:
+            device: ``auto`` (a GPU of this process's own where there is one, else the CPU) or a torch device.
+
+        Raises:
+            ValueError: there is no such device.
+        """
+        ranks, local = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("LOCAL_RANK", "0"))
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        try:
+            chosen = torch.device(device)
+        except RuntimeError as error:
+            raise ValueError(f"device {device!r}: {str(error).splitlines()[0]}") from error
+        if chosen.type == "cuda":
+            if not torch.cuda.is_available():
+                raise ValueError(f"device {device!r}: torch {torch.__version__} sees no CUDA GPU here")
+            chosen = torch.device("cuda", local if chosen.index is None else chosen.index)
+            if chosen.index >= torch.cuda.device_count():
+                raise ValueError(f"device {chosen}: there are {torch.cuda.device_count()} GPUs for process {local}")
+            torch.cuda.set_device(chosen)
+        if ranks > 1:
+            distributed.init_process_group("nccl" if chosen.type == "cuda" else "gloo", timeout=TEAM_TIMEOUT)
+            return cls(chosen, distributed.get_rank(), ranks)
+        return cls(chosen)
+
+    def leave(self) -> None:
+        if self.ranks > 1:
+            distributed.destroy_process_group()
+
+    @property
+    def name(self) -> str:
+        """What a record says of the machine."""
+        if self.device.type == "cuda":
+            return f"{self.ranks} x {torch.cuda.get_device_name(self.device)}"
+        return f"{self.ranks} x CPU ({platform.machine()}, {os.cpu_count()} cores)"
+
+
+def schedule(progress: float, warmup: float) -> float:
+    """Factor of the learning rate at ``progress`` 0..1: linear rise, then half a cosine down to 0."""
+    if progress < warmup:
+        return max(progress / warmup, 0.02)
+    return 0.5 * (1 + math.cos(math.pi * min(1.0, (progress - warmup) / (1 - warmup))))
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
+    """``average = decay * average + (1 - decay) * model`` for every floating tensor of the state."""
+    for kept, new in zip(average.state_dict().values(), model.state_dict().values(), strict=True):
+        if kept.is_floating_point():
+            kept.lerp_(new.to(kept.dtype), 1 - decay)
+        else:
+            kept.copy_(new)
+
+
+def mixed(trained: SliceNet, initial: SliceNet, share: float) -> SliceNet:
+    """``share`` of the weights of ``trained``, the rest of ``initial``; with batch norms folded, as their numbers mean
+    different things in each.
+    """
+    result, start = copy.deepcopy(trained).cpu().eval(), copy.deepcopy(initial).cpu().eval()
+    fold_norms(result)
+    fold_norms(start)
+    update_average(result, start, share)
+    return result.to(next(trained.parameters()).device)
+
+
+def to_tensors(rgb: np.ndarray, depth: np.ndarray, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """A batch (B, 3, H, W) in 0..1 and its truth (B, H, W), 0 where it is unknown or too far."""
+    pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
+    truth = torch.tensor(depth).to(device)
+    return pictures, torch.where(torch.isfinite(truth) & (truth <= max_range_m), truth, 0.0)
+
+
+@torch.inference_mode()
+def evaluate(model: SliceNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
+    """Mean metrics over panoramas, by solid angle, without augmentation, in float32, on the model's device."""
+    model.eval()
+    device = next(model.parameters()).device
+    weights = solid_angle_weights(model.config.height)[:, None]
+    each = []
+    for index in range(len(samples)):
+        sample = samples[index]
+        rgb, truth = to_tensors(sample.rgb[None], np.asarray(sample.depth_m, np.float32)[None], max_range_m, device)
+        predicted = model(to_brightness(rgb, brightness))[0].clamp(0.1, max_range_m)
+        each.append(depth_metrics(predicted.cpu().numpy(), truth[0].cpu().numpy(), weights=weights))
+    return mean_metrics(each)
+
+
+@dataclass
+class Trainer:
+    """One run of the training; :meth:`run` goes on until the schedule ends or ``stop`` is set.
+
+    Attributes:
+        feed: training batches, of ``config.batch_size``.
+        held_out: panoramas for evaluation, of worlds or scenes that the feed does not have.
+        network: what to train.
+        config: how.
+        output: checkpoint file.
+        team: the processes of this training; by default this one on the CPU.
+        start: weights to begin with; by default random ones.
+        result: the weights that are evaluated and saved: the average, in the end mixed with the start's.
+        command: for the record, what the user typed.
+        report: takes lines for people.
+        bar: is told the progress 0..1 after each step.
+        stop: set it to end early.
+    """
+
+    feed: Feed
+    held_out: Samples
+    network: SliceNetConfig
+    config: TrainingConfig
+    output: Path
+    team: Team = field(default_factory=lambda: Team(torch.device("cpu")))
+    start: Start | None = None
+    command: str = ""
+    report: Callable[[str], None] = print
+    bar: Callable[[float], None] = lambda progress: None
+    stop: bool = False
+    step: int = 0
+    elapsed_s: float = 0.0
+    history: list[dict[str, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        torch.set_num_threads(self.config.threads)
+        torch.manual_seed(self.config.seed)
+        self._ahead = Ahead(self.feed)
+        rows = np.maximum(solid_angle_weights(self.network.height), POLE_WEIGHT)
+        self.row_weights = torch.from_numpy(rows).to(self.team.device)
+        rgb, depth = self.feed.batch(0)
+        if rgb.shape[1:3] != (self.network.height, self.network.width):
+            raise ValueError(f"the panoramas are {rgb.shape[1]} x {rgb.shape[2]}, the network takes "
+                             f"{self.network.height} x {self.network.width}")  # fmt: skip
+        self.model = self.start.model if self.start else SliceNet(self.network)
+        self._initial: SliceNet | None = None
+        if self.config.mix < 1:
+            if self.start is None:
+                raise ValueError("mix needs weights to start from")
+            self._initial = copy.deepcopy(self.model)
+        if self.start is None:
+            self._start_at_typical_depth(depth)
+        elif self.start.folded:
+            pictures, truth = to_tensors(rgb, depth, self.config.max_range_m, torch.device("cpu"))
+            unfold_norms(self.model, self._augmented(pictures, truth)[0])
+        self.model = self.model.to(self.team.device)
+        self.average = copy.deepcopy(self.model).eval()
+        self.result = self.average
+        if self.team.ranks > 1 and self.team.device.type == "cuda":
+            self.model = nn.SyncBatchNorm.convert_sync_batchnorm(self.model)
+        self._parallel: nn.Module = self.model
+        if self.team.ranks > 1:
+            ids = [self.team.device.index] if self.team.device.type == "cuda" else None
+            self._parallel = DistributedDataParallel(self.model, device_ids=ids)
+        decayed = [p for p in self.model.parameters() if p.ndim > 1]
+        plain = [p for p in self.model.parameters() if p.ndim <= 1]
+        self.optimizer = torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": self.config.weight_decay}, {"params": plain, "weight_decay": 0.0}],
+            lr=self.config.learning_rate,
+        )
+        cuda = self.team.device.type == "cuda"
+        self._half = torch.float16 if cuda and not torch.cuda.is_bf16_supported() else torch.bfloat16
+        scales = self.config.mixed_precision and self._half == torch.float16
+        self.scaler = torch.amp.GradScaler(self.team.device.type, enabled=scales)
+
+    @torch.no_grad()
+    def _start_at_typical_depth(self, depth: np.ndarray) -> None:
+        """Sets mean and spread of the last norm to those of the data, which Adam's small steps take long to reach."""
+        known = depth[(depth > 0) & (depth <= self.config.max_range_m)]
+        if not len(known):
+            raise ValueError("the first batch has no depth within max_range_m")
+        norm = self.model.decoder[-1].get_submodule("layers.1")
+        assert isinstance(norm, nn.BatchNorm2d)
+        norm.bias.fill_(float(np.median(known)))
+        norm.weight.fill_(max(0.1, float(known.std())))
+
+    @property
+    def progress(self) -> float:
+        """0..1 through the schedule, by time or epochs."""
+        by_time = self.elapsed_s / (60 * self.config.minutes)
+        return min(1.0, max(by_time, self.step / (self.config.epochs * self.feed.steps_an_epoch)))
+
+    def _augmented(self, rgb: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+        """By a generator of this step and process, so that a run that is taken up again does the same."""
+        generator = torch.Generator().manual_seed((self.config.seed << 40) + (self.step << 8) + self.team.rank)
+        rgb, depth = turn_and_mirror(rgb, depth, generator)
+        if self.config.photograph:
+            rgb = photograph(rgb, depth, generator)
+        return to_brightness(rgb, self.config.brightness), depth
+
+    def train_step(self, progress: float | None = None) -> float:
+        """One step of the optimiser; gives the loss.
+
+        Raises:
+            RuntimeError: the loss is not finite.
+        """
+        factor = schedule(self.progress if progress is None else progress, self.config.warmup)
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * factor
+        batch = self._ahead.batch(self.step)
+        rgb, truth = self._augmented(*to_tensors(*batch, self.config.max_range_m, self.team.device))
+        self.model.train()
+        with torch.autocast(self.team.device.type, self._half, enabled=self.config.mixed_precision):
+            predicted = self._parallel(rgb)
+        predicted = predicted.float()
+        loss = depth_loss(predicted, truth, self.row_weights)
+        loss = loss + self.config.edge_share * edge_loss(predicted, truth, self.row_weights)
+        if not torch.isfinite(loss):
+            raise RuntimeError(f"step {self.step}: loss is {loss.item()}; lower learning_rate")
+        self.optimizer.zero_grad(set_to_none=True)
+        self.scaler.scale(loss).backward()
+        self.scaler.unscale_(self.optimizer)
+        nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        self.step += 1
+        # A young average would remember the start for long.
+        update_average(self.average, self.model, min(self.config.average, (1 + self.step) / (10 + self.step)))
+        return float(loss.item())
+
+    def _agreed(self) -> tuple[float, bool]:
+        """Progress and whether to stop, as process 0 sees them: all must end at the same step."""
+        values = torch.tensor([self.progress, float(self.stop)], dtype=torch.float64, device=self.team.device)
+        if self.team.ranks > 1:
+            distributed.broadcast(values, 0)
+        return float(values[0]), bool(values[1])
+
+    def run(self) -> DepthMetrics | None:
+        """Trains to the end of the schedule; gives the metrics over all held-out panoramas (process 0 alone)."""
+        log = TrainingLog(self.output, self.step, self.report) if self.team.rank == 0 else None
+        begin = time.monotonic() - self.elapsed_s
+        last_checkpoint, last_row, losses = time.monotonic(), (time.monotonic(), self.step), []
+        try:
+            while True:
+                progress, stop = self._agreed()
+                if progress >= 1.0 or stop:
+                    break
+                losses.append(self.train_step(progress))
+                self.elapsed_s = time.monotonic() - begin
+                if log is None:
+                    continue
+                self.bar(self.progress)
+                now = time.monotonic()
+                if self.step % 50 == 0 or now - last_row[0] > 60:
+                    last_row = self._row(log, losses, *last_row)
+                if now - last_checkpoint > self.config.checkpoint_s:
+                    step = max(1, len(self.held_out) // self.config.evaluation_panoramas)
+                    picked = [self.held_out[i] for i in range(0, len(self.held_out), step)]
+                    self._checkpoint(log, self._evaluate(picked), losses)
+                    self.elapsed_s = time.monotonic() - begin
+                    last_checkpoint, last_row = time.monotonic(), (time.monotonic(), self.step)
+            if log is None:
+                return None
+            self._row(log, losses, *last_row)
+            if self._initial is not None:
+                self.result = mixed(self.average, self._initial, self.config.mix)
+            final = self._evaluate(self.held_out)
+            self._checkpoint(log, final, losses)
+            return final
+        finally:
+            if log is not None:
+                log.close()
+
+    def close(self) -> None:
+        """Ends the feed with its processes."""
+        self._ahead.close()
+
+    def _row(self, log: TrainingLog, losses: list[float], since: float, since_step: int) -> tuple[float, int]:
+        """Writes loss and speed since a time and step; gives the present ones."""
+        now, count = time.monotonic(), self.step - since_step
+        if count:
+            rate = count * self.config.batch_size * self.team.ranks / (now - since)
+            row = {
+                "step": self.step, "minutes": round(self.elapsed_s / 60, 2),
+                "loss": round(float(np.mean(losses[-count:])), 5),
+                "learning_rate": self.optimizer.param_groups[0]["lr"], "panoramas_per_s": round(rate, 2),
+            }  # fmt: skip
+            log.row(row, f"step {self.step} epoch {self.step / self.feed.steps_an_epoch:.2f} "
+                         f"loss {row['loss']:.4f} {rate:.1f} panoramas/s {100 * self.progress:.0f} %")  # fmt: skip
+        return now, self.step
+
+    def _evaluate(self, samples: Samples) -> DepthMetrics:
+        return evaluate(self.result, samples, self.config.max_range_m, self.config.brightness)
+
+    def _checkpoint(self, log: TrainingLog, metrics: DepthMetrics, losses: list[float]) -> None:
+        entry: dict[str, Any] = {"step": self.step, "minutes": round(self.elapsed_s / 60, 1), **metrics.as_dict()}
+        entry["loss"] = round(float(np.mean(losses[-100:])), 5) if losses else None
+        self.history.append(entry)
+        state = {
+            "config": self.network.as_dict(),
+            "state_dict": self.result.state_dict(),
+            "record": self.record(),
+            "resume": {
+                "model": self.model.state_dict(),
+                "average": self.average.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "scaler": self.scaler.state_dict(),
+                "step": self.step,
+                "elapsed_s": self.elapsed_s,
+            },
+        }
+        temporary = self.output.with_name(self.output.name + ".part")
+        torch.save(state, temporary)
+        temporary.replace(self.output)
+        log.row({**entry, "loss": None}, f"held-out panoramas: {entry}")
+
+    def record(self) -> dict[str, Any]:
+        """What made these weights: command, start, data, network, training, device, results (plain values)."""
+        return {
+            "command": self.command,
+            "start": self.start.origin if self.start else None,
+            "network": self.network.as_dict(),
+            "parameters": sum(p.numel() for p in self.model.parameters()),
+            "training": asdict(self.config),
+            "data": self.feed.info,
+            "held_out": len(self.held_out),
+            "device": self.team.name,
+            "steps": self.step,
+            "epochs": round(self.step / self.feed.steps_an_epoch, 2),
+            "wall_minutes": round(self.elapsed_s / 60, 1),
+            "torch": str(torch.__version__),
+            "history": self.history,
+        }
+
+    def resume(self, path: Path) -> None:
+        """Takes up a run from its checkpoint.
+
+        Raises:
+            CheckpointError: the file is no checkpoint of a run with this network.
+        """
+        try:
+            state = torch.load(path, map_location=self.team.device, weights_only=True)
+        except FileNotFoundError:
+            raise CheckpointError(f"{path}: no such checkpoint to go on from") from None
+        except Exception as error:  # torch.load raises anything from KeyError to UnpicklingError
+            raise CheckpointError(f"{path}: not a checkpoint of tensors and plain values ({error})") from error
+        if not isinstance(state, dict) or "resume" not in state or state.get("config") != self.network.as_dict():
+            raise CheckpointError(f"{path}: not a checkpoint of a run with {self.network}")
+        self.average.load_state_dict(state["resume"].get("average", state["state_dict"]))
+        self.model.load_state_dict(state["resume"]["model"])
+        self.optimizer.load_state_dict(state["resume"]["optimizer"])
+        self.scaler.load_state_dict(state["resume"]["scaler"])
+        self.step, self.elapsed_s = state["resume"]["step"], state["resume"]["elapsed_s"]
+        self.history = state["record"]["history"]

@@ -1,0 +1,132 @@
+"""CPU kernels of the background behind a keyframe's surfaces (numba)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from instant_ic.vspace.nerf.kernels import _OPTIONS
+from instant_ic.vspace.nerf.march import along, panorama_pixels
+from instant_ic.vspace.warp_kernels import NEAR_M, beyond, draw_triangle
+
+SAME_THING = np.float32(2)
+"""What is nearer than an edge of a thing by more than this factor is not the thing, but what it stands on."""
+
+
+@njit(**_OPTIONS)
+def in_front(inverse, torn, level, reach, steps):  # type: ignore[no-untyped-def]
+    """How far pixels of nearer surfaces lie from a depth edge.
+
+    From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
+    two sides of that edge.
+
+    Args:
+        inverse, torn: of the ``PanoramaPrior``, (h, w).
+        level: (h, w) over 0 on the floor and the ceiling, which hide nothing.
+        reach: pixels at most.
+        steps: out, (h, w) int32: pixels from the edge, from 1; 0 where no edge is near, or on the far side.
+    """
+    height, width = inverse.shape
+    queue = np.empty(height * width, np.int64)
+    limit = np.zeros((height, width), np.float32)
+    near = np.zeros((height, width), np.float32)
+    size = 0
+    for v in range(height - 1):
+        for u in range(width):
+            if not torn[v, u]:
+                continue
+            right = (u + 1) % width
+            a, b, c, d = inverse[v, u], inverse[v, right], inverse[v + 1, u], inverse[v + 1, right]
+            middle = math.sqrt(min(min(a, b), min(c, d)) * max(max(a, b), max(c, d)))
+            for corner in range(4):
+                y, x = v + corner // 2, right if corner % 2 else u
+                if inverse[y, x] > middle and steps[y, x] == 0 and level[y, x] == 0:
+                    steps[y, x], limit[y, x], near[y, x] = 1, middle, inverse[y, x]
+                    queue[size] = y * width + x
+                    size += 1
+    first = 0
+    while first < size:
+        y, x = queue[first] // width, queue[first] % width
+        first += 1
+        if steps[y, x] >= reach:
+            continue
+        for way in range(4):
+            ny = y + (1 if way == 0 else -1 if way == 1 else 0)
+            nx = (x + (1 if way == 2 else -1 if way == 3 else 0)) % width
+            if not 0 <= ny < height or steps[ny, nx] > 0 or level[ny, nx] > 0:
+                continue
+            if limit[y, x] < inverse[ny, nx] < SAME_THING * near[y, x]:
+                steps[ny, nx], limit[ny, nx], near[ny, nx] = steps[y, x] + 1, limit[y, x], near[y, x]
+                queue[size] = ny * width + nx
+                size += 1
+
+
+@njit(**_OPTIONS)
+def draw_quads(  # type: ignore[no-untyped-def]
+    quads, mark, inverse, directions, view_from_camera, half, nearness, marks
+):
+    """Some quads of a panorama's mesh into a z-buffer.
+
+    Args:
+        quads: upper left pixels (row, column), (N, 2); mark: what ``marks`` gets.
+        inverse: (h, w); directions: of the pixels, (h, w, 3).
+        view_from_camera, half, nearness, marks: as in ``warp_kernels.draw_mesh``.
+    """
+    width = inverse.shape[1]
+    aspect = np.float32(nearness.shape[0]) / np.float32(nearness.shape[1])
+    origin = np.zeros(3, np.float32)
+    patch = np.zeros((4, 3), np.float32)
+    for n in range(quads.shape[0]):
+        tangled, common = False, 31
+        for corner in range(4):
+            v, u = quads[n, 0] + corner // 2, (quads[n, 1] + corner % 2) % width
+            x, y, z = along(view_from_camera, origin, directions[v, u], np.float32(1) / inverse[v, u])
+            patch[corner, 0], patch[corner, 1], patch[corner, 2] = x, y, z
+            tangled = tangled or x < NEAR_M
+            common &= beyond(x, y, z, half, half * aspect)
+        if common == 0:
+            draw_triangle(patch[0], patch[1], patch[2], tangled, mark, half, nearness, marks)
+            draw_triangle(patch[1], patch[3], patch[2], tangled, mark, half, nearness, marks)
+
+
+@njit(**_OPTIONS)
+def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour):  # type: ignore[no-untyped-def]
+    """Colours (P, 3) of a panorama (h, w, 3), bilinear, at places ``depth`` (P,) along rays where ``wanted`` (P,)."""
+    height, width = rgb.shape[:2]
+    one = np.float32(1)
+    for n in range(depth.shape[0]):
+        if not wanted[n]:
+            continue
+        x, y, z = along(camera_from_map, origin, directions[n], depth[n])
+        v0, v1, fv, left, right, fu = panorama_pixels(x, y, z, height, width)
+        for c in range(3):
+            top = np.float32(rgb[v0, left, c]) * (one - fu) + np.float32(rgb[v0, right, c]) * fu
+            bottom = np.float32(rgb[v1, left, c]) * (one - fu) + np.float32(rgb[v1, right, c]) * fu
+            colour[n, c] = (top * (one - fv) + bottom * fv) * np.float32(1 / 255) * gain[c]
+
+
+@njit(**_OPTIONS)
+def mix_guess(guess, guessed, reach, share, image):  # type: ignore[no-untyped-def]
+    """Mixes guessed colours (H, W, 3) into a picture where ``guessed`` (H, W): the more, the farther off what is seen.
+
+    ``share`` is reached ``reach`` pixels (city blocks) inside.
+    """
+    height, width = guessed.shape
+    inside = np.zeros((height, width), np.int32)
+    for y in range(height):
+        for x in range(width):
+            if guessed[y, x]:
+                up = inside[y - 1, x] if y > 0 else reach
+                left = inside[y, x - 1] if x > 0 else reach
+                inside[y, x] = min(up, left) + 1
+    for y in range(height - 1, -1, -1):
+        for x in range(width - 1, -1, -1):
+            if guessed[y, x]:
+                down = inside[y + 1, x] if y + 1 < height else reach
+                right = inside[y, x + 1] if x + 1 < width else reach
+                inside[y, x] = min(inside[y, x], min(down, right) + 1)
+                weight = np.float32(share * min(1.0, inside[y, x] / reach))
+                for c in range(3):
+                    image[y, x, c] += weight * (guess[y, x, c] - image[y, x, c])

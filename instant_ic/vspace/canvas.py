@@ -1,0 +1,114 @@
+"""What a picture is drawn on: the keyframes' warped panoramas, the field and the background, put together.
+
+One interface, chosen by device: here with numpy and numba on the CPU, in ``torch_canvas`` on a GPU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.background import mixed_in
+from instant_ic.vspace.compose import Layer, compose
+from instant_ic.vspace.nerf.field import Floats, Rays
+from instant_ic.vspace.store import KeyframeSet
+from instant_ic.vspace.view import continue_unseen
+from instant_ic.vspace.warp import dissolve
+
+Drawing = tuple[Any, Any, Any]
+"""Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,), in arrays of the canvas' kind."""
+Painted = tuple[NDArray[np.uint8], Floats, Floats]
+"""A finished picture: (H, W, 3) uint8, depth (P,) and confidence (P,)."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A view (P, …) as it was drawn, in arrays of its canvas; ``guessed``: what nobody has seen, of the background."""
+
+    colour: Any
+    depth: Any
+    confidence: Any
+    guessed: Any
+
+
+class Canvas(Protocol):
+    """One device's way to put a picture together."""
+
+    def draw(
+        self,
+        rays: Rays,
+        shown: KeyframeSet | None,
+        panorama_share: float,
+        field: Drawing | None,
+        layers: dict[int, Drawing],
+    ) -> Picture:
+        """A view by keyframes: their panoramas warped, dissolved into the field; what lies behind, where nobody looked.
+
+        Args:
+            rays: of a perspective view; of any where ``shown`` is None.
+            shown: the keyframes; None: the field alone, nothing is warped.
+            panorama_share: of the warped panoramas, 0..1.
+            field: the view as the field has it, as ``field.Device.drawn`` gives it; None: the panoramas alone.
+            layers: in and out, the warps of keyframes that have been drawn for this view.
+        """
+
+    def continued(self, picture: Picture, shape: tuple[int, int], wraps: bool) -> Any:
+        """The picture (H, W, 3) with what nobody knows continued from around it, and the guesses mixed in."""
+
+    def painted(self, picture: Picture, image: Any) -> Painted:
+        """``continued``'s picture, or a mixture of several, in 8 bit; depth and confidence of ``picture``."""
+
+
+class CpuCanvas:
+    """See ``Canvas``; its arrays are numpy's. Warping needs numba."""
+
+    def draw(
+        self,
+        rays: Rays,
+        shown: KeyframeSet | None,
+        panorama_share: float,
+        field: Drawing | None,
+        layers: dict[int, Drawing],
+    ) -> Picture:
+        if field is None:
+            assert shown is not None, "neither keyframes nor a field to draw"
+            picture = self._warped(rays, shown, layers)
+        elif shown is not None and panorama_share > 0:
+            picture = dissolve(self._warped(rays, shown, layers), field, panorama_share)
+        else:
+            picture = field
+        colour, depth, confidence = picture
+        guessed = np.zeros(len(depth), bool)
+        for keyframe, gain in () if shown is None else zip(shown.keyframes, shown.gains, strict=True):
+            wanted = (confidence == 0) & ~guessed
+            if keyframe.background is None or not wanted.any():
+                break
+            guessed |= keyframe.background.draw(rays, gain, wanted, picture)
+        return Picture(colour, depth, confidence, guessed)
+
+    @staticmethod
+    def _warped(rays: Rays, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
+        """The keyframes' panoramas warped by their depth, put together."""
+        drawn = []
+        for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
+            assert keyframe.warp is not None
+            if id(keyframe.warp) not in layers:
+                layers[id(keyframe.warp)] = keyframe.warp.draw(rays)
+            drawn.append(Layer(keyframe.prior, gain, *layers[id(keyframe.warp)]))
+        if len(drawn) > 1:
+            return compose(drawn, rays)
+        colour, depth, confidence = layers[id(shown.keyframes[0].warp)]
+        return colour.copy(), depth.copy(), confidence.copy()
+
+    def continued(self, picture: Picture, shape: tuple[int, int], wraps: bool) -> Floats:
+        drawn = picture.colour.reshape(*shape, 3)
+        depth, confidence = picture.depth.reshape(shape), picture.confidence.reshape(shape)
+        image = continue_unseen(drawn, depth, confidence, wraps)
+        return mixed_in(image, drawn, picture.guessed.reshape(shape)) if picture.guessed.any() else image
+
+    def painted(self, picture: Picture, image: Floats) -> Painted:
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        return rgb, picture.depth, picture.confidence

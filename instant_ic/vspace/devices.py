@@ -1,0 +1,159 @@
+"""Which device trains and draws: numba on the CPU, the Triton kernels on an NVIDIA GPU, or plain torch on either."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from instant_ic.vspace.canvas import Canvas
+from instant_ic.vspace.config import FieldConfig, GeometryConfig, TrainConfig, VirtualSpaceConfig
+from instant_ic.vspace.nerf.field import Device, Lattice, Rays, Scene
+from instant_ic.vspace.nerf.occupancy import build_occupancy
+from instant_ic.vspace.prior import prepare
+from instant_ic.vspace.store import KeyframeSet, ready
+from instant_ic.vspace.view import perspective_rays
+from instant_ic.vspace.warp import Pyramid
+
+MakeDevice = Callable[[FieldConfig, TrainConfig], Device]
+AGREEMENT = 0.1
+"""Triton's errors of a training step may differ from plain torch's by this share: half tables, other roundings."""
+
+
+class DeviceError(RuntimeError):
+    """The device that was asked for is not there, or does not work."""
+
+
+def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
+    """The device that ``config.device`` asks for, and what is not as it should be ("" when all is well).
+
+    Raises:
+        DeviceError: a device was asked for that is not there, or does not work.
+    """
+    warning = ""
+    wants_gpu = config.device in ("cuda", "triton", "torch-cuda")
+    if wants_gpu or (config.device == "auto" and _may_have_cuda()):
+        import torch
+
+        if torch.cuda.is_available():
+            try:
+                return _make_gpu_device(config)
+            except torch.OutOfMemoryError as error:
+                if wants_gpu:
+                    raise
+                warning = f"the GPU is out of memory; on the CPU ({error})"
+        elif wants_gpu:
+            raise DeviceError(f"device is {config.device}, but torch finds no CUDA device; use auto or cpu")
+    if config.device != "torch-cpu":
+        try:
+            from instant_ic.vspace.nerf.numba_device import NumbaDevice
+        except ImportError:
+            if config.device == "cpu":
+                raise
+        else:
+            return NumbaDevice(config.field, config.train), warning
+    from instant_ic.vspace.nerf.torch_device import TorchDevice
+
+    return TorchDevice(config.field, config.train, "cpu"), warning
+
+
+def _may_have_cuda() -> bool:
+    """Whether the machine has an NVIDIA device at all: importing torch only to learn that it has not costs seconds."""
+    return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
+
+
+def _make_gpu_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
+    """``make_device`` where there is CUDA.
+
+    The Triton kernels are compiled here (seconds at the first start of an installation, then kept on disk), and their
+    results compared with plain torch's. Where that fails plain torch runs, with a warning.
+    """
+    from instant_ic.vspace.nerf.torch_device import TorchDevice
+
+    def plain(field: FieldConfig, train: TrainConfig) -> Device:
+        return TorchDevice(field, train, "cuda")
+
+    if config.device == "torch-cuda" or (config.device != "triton" and config.field.geometry != "distance"):
+        return plain(config.field, config.train), ""
+    try:
+        from instant_ic.vspace.nerf.triton_device import TritonDevice
+
+        check_device(TritonDevice, plain, config.field)
+        return TritonDevice(config.field, config.train), ""
+    except ImportError as error:
+        words = f"Triton is not installed ({error}); pip install 'instant-ic[triton]'"
+    except Exception as error:  # a compiler, a driver: whatever they raise, plain torch still works
+        if type(error).__name__ == "OutOfMemoryError":
+            raise
+        words = f"the Triton kernels do not work here ({type(error).__name__}: {error})"
+    if config.device == "triton":
+        raise DeviceError(f"device is triton, but {words}")
+    return plain(config.field, config.train), f"{words}: on the GPU by plain torch, which is slower"
+
+
+def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfig) -> None:
+    """Two training steps and a picture of a scratch scene, against another device's: all kernels run and are right.
+
+    Raises:
+        DeviceError: the results are not alike.
+    """
+    small = dataclasses.replace(field, log2_table=10)
+    train = TrainConfig(ray_columns=16, ray_rows=8)
+    ours, theirs = make(small, train), make_reference(small, train)
+    scene, rays = _scratch(small)
+    uniform = np.random.default_rng(0).random((2, train.ray_columns * train.ray_rows, 3), np.float32)
+    for device in (ours, theirs):
+        device.set_scene(scene)
+    for number in range(2):  # the second is the graph's
+        found, expected = (device.step(uniform[number], 0.01, 0.01) for device in (ours, theirs))
+        if not np.allclose(found, expected, rtol=AGREEMENT, atol=1e-4):
+            raise DeviceError(f"step {number + 1} has the errors {found}, plain torch {expected}")
+    colours, depths, _ = zip(*(device.draw(rays, 0.5, 0.9) for device in (ours, theirs)), strict=True)
+    alike = np.isclose(depths[0], depths[1], rtol=0.02) & np.all(np.abs(colours[0] - colours[1]) < 0.05, axis=1)
+    if alike.mean() < 0.9:
+        raise DeviceError(f"only {alike.mean():.0%} of a picture's pixels are as plain torch draws them")
+    if importlib.util.find_spec("numba") is not None:  # without it nothing is warped
+        check_canvas(ours.canvas, theirs.canvas)
+
+
+def check_canvas(ours: Canvas, theirs: Canvas, size: tuple[int, int] = (160, 90)) -> None:
+    """Pictures of a scratch keyframe's warp from two places, against another canvas'.
+
+    Raises:
+        DeviceError: the pictures are not alike.
+    """
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[:, ::8] = (250, 120, 30)
+    depth = np.full((32, 64), 2.0, np.float32)
+    depth[10:20, 28:40] = 1.0  # something with edges, and with a background that nobody has seen
+    prior = prepare(rgb, depth, np.eye(4), 0.05, GeometryConfig(), 64)
+    shown = KeyframeSet((ready(0, prior, Pyramid.of(prior.rgb)),), np.ones((1, 3), np.float32))
+    for x, y in ((0.3, 0.4), (1.9, 0.0)):  # from near a wall few quads cover the whole picture
+        pose = np.eye(4)
+        pose[:2, 3] = x, y
+        rays = perspective_rays(pose, *size, 1.5)
+        painted = []
+        for canvas in (ours, theirs):
+            picture = canvas.draw(rays, shown, 1.0, None, {})
+            painted.append(canvas.painted(picture, canvas.continued(picture, rays.shape, False)))
+        colours, depths, confidences = zip(*painted, strict=True)
+        alike = np.abs(colours[0].astype(int) - colours[1]).max(axis=2).reshape(-1) < 12
+        alike &= np.isclose(depths[0], depths[1], rtol=0.02) & (confidences[0] == confidences[1])
+        if alike.mean() < 0.97:
+            raise DeviceError(f"only {alike.mean():.0%} of a warped picture's pixels are as plain torch draws them")
+
+
+def _scratch(field: FieldConfig) -> tuple[Scene, Rays]:
+    """A striped sphere of 2 m seen from its middle, and a view from aside."""
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[:, ::8] = (250, 120, 30)
+    geometry = GeometryConfig(cell_m=0.2)
+    prior = prepare(rgb, np.full((32, 64), 2.0, np.float32), np.eye(4), 0.05, geometry, 64)
+    pose = np.eye(4)
+    pose[0, 3] = 0.3
+    return Scene((prior,), Lattice.for_prior(prior, field), build_occupancy([prior], geometry)), perspective_rays(
+        pose, 16, 9, 1.0
+    )

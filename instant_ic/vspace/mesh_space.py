@@ -1,0 +1,268 @@
+"""Conventional illusory control: a place that was scanned beforehand, drawn as it is (paper, section II).
+
+The same calls as ``VirtualSpace``, but nothing is learnt: READY at once, and a keyframe only tells how alike the mesh
+and the camera's picture are, and what the colours have to be multiplied by.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.geometry.raycast import RayCaster
+from instant_ic.vspace.config import VirtualSpaceConfig
+from instant_ic.vspace.mesh_file import MeshError, load_mesh
+from instant_ic.vspace.nerf.field import Floats, Rays
+from instant_ic.vspace.prior import KeyframeError, area_average
+from instant_ic.vspace.readiness import UNSEEN_GAIN, Texture
+from instant_ic.vspace.space import State, Status, TrainStats, VirtualSpace
+from instant_ic.vspace.view import Drawn, View, checked_pose, continue_unseen, equirect_rays, perspective_rays
+
+if TYPE_CHECKING:
+    from instant_ic.vspace.prior import PanoramaPrior
+
+EDGE_RATIO = 0.03
+"""Neighbouring depths that differ by more than this share are an edge: such pixels are drawn by four rays."""
+_SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
+_PROBE_WIDTH = 256
+"""Pixels of the panoramas by which mesh and camera are compared."""
+_MIN_SAMPLES = 200
+_MAX_GAIN = 3.0
+_NEAR, _LEAST_NEAR = 0.25, 0.7
+"""Depths that differ by less than this share agree; a mesh of which less than this agrees does not lie where it should.
+In small_house.glb, with depth 10 % off, 1 m aside or 20° turned gave 0.43 to 0.80, in its place 0.98 and more."""
+_ASIDE = math.sin(math.radians(22.5))
+"""Floor and ceiling agree wherever the mesh lies: directions flatter than this count."""
+
+
+class Space(Protocol):
+    """What a source of views has to be able to do; see ``VirtualSpace`` for each."""
+
+    config: VirtualSpaceConfig
+
+    @property
+    def keyframe(self) -> PanoramaPrior | None: ...
+    @property
+    def status(self) -> Status: ...
+    def set_keyframe(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float | NDArray[np.floating],
+    ) -> None: ...
+    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats: ...
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View: ...
+    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View: ...
+    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View: ...
+    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float: ...
+
+
+def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> Space:
+    """The space that ``config.source`` asks for; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
+
+    Raises:
+        MeshError: ``source`` is ``mesh``, and its file cannot be used.
+        DeviceError: the device that was asked for is not there.
+    """
+    config = config or VirtualSpaceConfig()
+    return MeshSpace(config) if config.source == "mesh" else VirtualSpace(config, robot)
+
+
+class MeshSpace(Drawn):
+    """A mesh in the map, drawn by ray casting. One thread at a time.
+
+    Raises:
+        MeshError: the file cannot be used; the message says why.
+
+    Example:
+        >>> space = MeshSpace(VirtualSpaceConfig(source="mesh", mesh="house.glb"))  # doctest: +SKIP
+        >>> space.render(map_from_camera, 320, 180, fov_rad=1.57).rgb
+    """
+
+    keyframe = None
+    """None of the pictures comes from one."""
+
+    def __init__(self, config: VirtualSpaceConfig) -> None:
+        self.config = config
+        self._mesh = load_mesh(config.mesh, config.mesh_max_triangles)
+        x, y, z, yaw_deg = config.mesh_pose
+        self._map_from_mesh = pose_matrix(x, y, z, yaw=math.radians(yaw_deg))
+        triangles = self._mesh.triangles
+        try:
+            corners = np.arange(3 * len(triangles), dtype=np.int32).reshape(-1, 3)
+            self._caster = RayCaster(triangles.reshape(-1, 3), corners)
+        except ImportError as error:
+            raise MeshError("a mesh as the virtual space needs the package embreex: pip install it") from error
+        self._gain = np.ones(3, np.float32)
+        self._mse = math.nan
+        self._variance = 0.0
+        self._warning = ""
+        self.render(np.eye(4), 32, 16, 1.0)  # kernels are compiled now, not at the operator's first picture
+
+    def set_keyframe(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float | NDArray[np.floating],
+    ) -> None:
+        """Compares the mesh with a panorama: how alike they are, and, with ``mesh_fit_colours``, a factor a colour.
+
+        Args: as ``prior.prepare``; ``relative_sigma`` counts for nothing here.
+
+        Raises:
+            KeyframeError: no panorama, or a pose that is none; all stays as it was.
+        """
+        rgb, depth_m = np.asarray(rgb), np.asarray(depth_m, np.float32)
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.shape[1] != 2 * rgb.shape[0]:
+            raise KeyframeError(f"the panorama must be (H, 2 H, 3) uint8 (got {rgb.shape} {rgb.dtype})")
+        if depth_m.ndim != 2 or min(depth_m.shape) < 2:
+            raise KeyframeError(f"depth must be (h, 2 h) (got {depth_m.shape})")
+        try:
+            pose = checked_pose(map_from_camera)
+        except ValueError as error:
+            raise KeyframeError(str(error)) from error
+        width = min(_PROBE_WIDTH, rgb.shape[1])
+        theirs: Floats = area_average(rgb, width // 2, width).astype(np.float32).reshape(-1, 3) / np.float32(255)
+        rays = equirect_rays(pose, width)
+        colour, range_m, _ = self._draw(rays)
+        ours = colour / self._gain
+        met = range_m > 0
+        if self.config.mesh_fit_colours:
+            self._fit_colours(theirs[met], ours[met])
+        weight = np.sqrt(np.clip(1 - rays.directions[:, 2] ** 2, 0, 1))  # a panorama's rows by solid angle
+        if met.any():
+            squared = np.mean((np.clip(ours[met] * self._gain, 0, 1) - theirs[met]) ** 2, axis=1)
+            self._mse = float(np.average(squared, weights=weight[met]))
+        else:
+            self._mse = math.nan
+        self._variance = Texture.of(rgb).variance
+        aside = np.abs(rays.directions @ pose[:3, 2].astype(np.float32)) < _ASIDE
+        self._check_place(depth_m, range_m, aside, width)
+
+    def _fit_colours(self, theirs: Floats, ours: Floats) -> None:
+        """Factors of the mesh's colours from medians, as between keyframes; later keyframes go half the way."""
+        usable = np.all((theirs > 0.05) & (theirs < 0.95) & (ours > 0.05) & (ours < 0.95), axis=1)
+        if np.count_nonzero(usable) < _MIN_SAMPLES:
+            return
+        fit = np.clip(np.median(theirs[usable] / ours[usable], axis=0), 1 / _MAX_GAIN, _MAX_GAIN).astype(np.float32)
+        self._gain = fit if math.isnan(self._mse) else np.sqrt(self._gain * fit)
+
+    def _check_place(self, depth_m: Floats, range_m: Floats, aside: NDArray[np.bool_], width: int) -> None:
+        """Warns where the keyframe's depth says that the mesh lies elsewhere."""
+        height = width // 2
+        rows = (np.arange(height) + 0.5) * (depth_m.shape[0] / height)
+        columns = (np.arange(width) + 0.5) * (depth_m.shape[1] / width)
+        depth = depth_m[rows.astype(int)][:, columns.astype(int)].reshape(-1)
+        known = aside & np.isfinite(depth) & (depth > 0)
+        self._warning = ""
+        if known.any():
+            ratio = range_m[known] / depth[known]  # 0 where nothing is met
+            agrees = float(np.mean((ratio > 1 - _NEAR) & (ratio < 1 / (1 - _NEAR))))
+            if agrees < _LEAST_NEAR:
+                self._warning = (
+                    f"only {agrees:.0%} of the mesh round the newest keyframe lies where the measured depth says;"
+                    " is space.mesh_pose right?"
+                )
+
+    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
+        """There is nothing to train."""
+        return TrainStats(0, self._psnr_db, math.nan, 0.0, True)
+
+    @property
+    def _psnr_db(self) -> float:
+        return -10 * math.log10(max(self._mse, 1e-10)) if self._mse == self._mse else math.nan
+
+    @property
+    def status(self) -> Status:
+        """READY at once. ``psnr_db``: of the mesh at the newest keyframe against the camera; NaN before the first."""
+        low, high = self._mesh.bounds
+        return Status(
+            state=State.READY,
+            refreshing=False,
+            psnr_db=self._psnr_db,
+            iterations=0,
+            train_seconds=0.0,
+            ready_iterations=0,
+            ms_per_iteration=0.0,
+            ready_radius_m=float(np.linalg.norm(high - low)),  # from any place in it to any other
+            converged=True,
+            device="cpu (embree)",
+            warning=self._warning,
+        )
+
+    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
+        """PSNR that a view will have: the mesh's at the newest keyframe, and what of the view it does not hold.
+
+        NaN before the first keyframe: nothing is known of how alike mesh and place are.
+        """
+        return self._view(perspective_rays(checked_pose(map_from_camera), 64, 36, fov_rad), "").expected_psnr_db
+
+    def _view(self, rays: Rays, projection: str) -> View:
+        height, width = rays.shape
+        colour, range_m, confidence = self._draw(rays)
+        depth, confidence = range_m.reshape(height, width), confidence.reshape(height, width)
+        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence, wraps=projection == "equirect")
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        unseen = float(np.mean(confidence == 0))
+        mse = (1 - unseen) * self._mse + UNSEEN_GAIN * unseen * self._variance
+        return View(rgb, depth, confidence, projection, -10 * math.log10(max(mse, 1e-10)) if mse == mse else math.nan)
+
+    def _draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+        """Colours (P, 3) in 0..1, range (P,) with 0 where nothing is met, and confidence (P,)."""
+        height, width = rays.shape
+        turn = self._map_from_mesh[:3, :3].astype(np.float32)
+        origin = ((rays.origin - self._map_from_mesh[:3, 3]) @ self._map_from_mesh[:3, :3]).astype(np.float32)
+        directions = np.einsum("pj,ji->pi", rays.directions, turn)
+        grid = directions.reshape(height, width, 3)
+        across, down = (np.gradient(grid, axis=axis) for axis in (1, 0))
+        if width > 2 * height - 1:  # a panorama's first column has its left neighbour at the other edge
+            across[:, 0] = across[:, 1]
+            across[:, -1] = across[:, -2]
+        pixel_rad = float(np.linalg.norm(down[height // 2, width // 2]))
+        colour, range_m, face = self._cast(origin, directions, pixel_rad)
+        edges = np.flatnonzero(self._fine(range_m.reshape(height, width), face, pixel_rad))
+        if edges.size:
+            total = np.zeros((edges.size, 3), np.float32)
+            hits = np.zeros(edges.size, np.float32)
+            for row, column in _SUBPIXELS:
+                beside = directions[edges] + column * across.reshape(-1, 3)[edges] + row * down.reshape(-1, 3)[edges]
+                beside /= np.linalg.norm(beside, axis=1, keepdims=True)
+                some, _, met = self._cast(origin, beside, 0.6 * pixel_rad)
+                total += some
+                hits += met >= 0
+            seen = edges[(hits > 0) & (face[edges] >= 0)]
+            colour[seen] = (total / np.maximum(hits, 1)[:, None])[(hits > 0) & (face[edges] >= 0)]
+        colour *= self._gain
+        np.clip(colour, 0, 1, out=colour)
+        return colour, range_m, (face >= 0).astype(np.float32)
+
+    def _cast(self, origin: Floats, directions: Floats, pixel_rad: float) -> tuple[Floats, Floats, NDArray[np.int32]]:
+        from instant_ic.vspace.mesh_kernels import shade
+
+        mesh = self._mesh
+        range_m, face = self._caster.cast(origin, directions)
+        colour = np.empty((len(face), 3), np.float32)
+        shade(
+            mesh.triangles, mesh.corner_uv, mesh.corner_rgb, mesh.texture, mesh.texel_per_m, mesh.texels, mesh.start,
+            mesh.sizes, mesh.levels, origin, directions, range_m, face, pixel_rad, colour,
+        )  # fmt: skip
+        return colour, np.where(face >= 0, range_m, 0).astype(np.float32), face
+
+    def _fine(self, range_m: Floats, face: NDArray[np.int32], pixel_rad: float) -> NDArray[np.bool_]:
+        """Pixels that one ray does not do: at depth edges, and where triangles are finer than a pixel, (P,)."""
+        edge = np.zeros(range_m.shape, bool)
+        for axis in (0, 1):
+            a, b = (range_m[1:], range_m[:-1]) if axis == 0 else (range_m[:, 1:], range_m[:, :-1])
+            jump = np.abs(a - b) > EDGE_RATIO * np.minimum(a, b)
+            for half in (np.s_[1:], np.s_[:-1]):
+                edge[(half, np.s_[:]) if axis == 0 else (np.s_[:], half)] |= jump
+        fine = edge.reshape(-1)
+        density = self._mesh.texel_per_m[face]
+        fine |= (self._mesh.texture[face] < 0) & (density * range_m.reshape(-1) * pixel_rad > 1)
+        return fine & (face >= 0)

@@ -1,0 +1,300 @@
+"""The field's parameters and lattice, and what every device has to be able to do with them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.config import FieldConfig, TrainConfig
+from instant_ic.vspace.nerf.occupancy import Occupancy
+from instant_ic.vspace.prior import PanoramaPrior
+
+Floats = NDArray[np.float32]
+BETA1, BETA2, EPSILON = 0.9, 0.99, 3e-7
+"""Adam's constants, as in instant-ngp."""
+VOLUME_SAMPLES = 8
+"""Of a ray where geometry is a density, evenly through the band."""
+RAW_LIMITS = -10.0, 6.0
+"""Of the logarithm of the density: outside it has no gradient."""
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Where the hash grid's cells lie. It has no border: every place of the map has its cells.
+
+    Attributes:
+        origin: map frame, metres, (3,) float32.
+        cells_per_m: of each level, coarse to fine, (levels,) float32.
+    """
+
+    origin: Floats
+    cells_per_m: Floats
+
+    @classmethod
+    def for_prior(cls, prior: PanoramaPrior, config: FieldConfig) -> Lattice:
+        """Coarsest cell: the scene over ``base_resolution``; finest: a panorama pixel at the median depth."""
+        extent = 2 * float(1.0 / np.quantile(prior.inverse_depth, 0.05))
+        coarse = config.base_resolution / extent
+        pixel = 2 * math.pi / prior.rgb.shape[1] * prior.median_depth_m
+        fine = max(1 / pixel, 2 * coarse)
+        # Half a fine cell aside: a wall in the plane of a lattice face would use one side's entries only by chance.
+        origin = prior.map_from_camera[:3, 3] + 0.37 / fine
+        return cls(origin.astype(np.float32), np.geomspace(coarse, fine, config.levels).astype(np.float32))
+
+    def suits(self, other: Lattice) -> bool:
+        """Whether a scene that asks for ``other`` can go on with this one: scales within a factor of 2."""
+        ratio = self.cells_per_m[[0, -1]] / other.cells_per_m[[0, -1]]
+        return bool(np.all((ratio > 0.5) & (ratio < 2.0)))
+
+
+@dataclass
+class FieldParameters:
+    """Table (levels, size, features) and network (``w1``, ``b1``, ``w2``, ``b2``), float32."""
+
+    table: Floats
+    w1: Floats
+    b1: Floats
+    w2: Floats
+    b2: Floats
+
+    @classmethod
+    def random(cls, config: FieldConfig, seed: int) -> FieldParameters:
+        rng = np.random.default_rng(seed)
+        inputs = config.levels * config.features
+        shape = (config.levels, 1 << config.log2_table, config.features)
+
+        def uniform(limit: float, *size: int) -> Floats:
+            return (rng.random(size, np.float32) * 2 - 1) * np.float32(limit)
+
+        return cls(
+            table=uniform(1e-3, *shape),
+            w1=uniform(math.sqrt(6 / inputs), config.hidden, inputs),
+            b1=np.zeros(config.hidden, np.float32),
+            w2=uniform(math.sqrt(3 / config.hidden), 4, config.hidden),
+            b2=np.zeros(4, np.float32),
+        )
+
+    def network(self) -> tuple[Floats, Floats, Floats, Floats]:
+        return self.w1, self.b1, self.w2, self.b2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a device trains on and renders from: keyframes, lattice and occupancy.
+
+    Attributes:
+        priors: the keyframes, newest first; all of one size.
+        lattice: of the field.
+        occupancy: round the surfaces of all keyframes.
+        gains: factors that bring each keyframe's colours to the newest's exposure, (K, 3) float32; 1 where None.
+    """
+
+    priors: tuple[PanoramaPrior, ...]
+    lattice: Lattice
+    occupancy: Occupancy
+    gains: Floats | None = None
+
+    def __post_init__(self) -> None:
+        """Raises ValueError where there is no keyframe, or their sizes or the gains' do not fit."""
+        if not self.priors:
+            raise ValueError("a scene needs a keyframe")
+        sizes = {(prior.rgb.shape, prior.inverse_depth.shape) for prior in self.priors}
+        if len(sizes) > 1:
+            raise ValueError(f"keyframes of one scene must have one size, panorama and depth (got {sorted(sizes)})")
+        if self.gains is not None and self.gains.shape != (len(self.priors), 3):
+            raise ValueError(f"gains must be ({len(self.priors)}, 3), a row a keyframe (got {self.gains.shape})")
+
+    @property
+    def prior(self) -> PanoramaPrior:
+        """The newest keyframe."""
+        return self.priors[0]
+
+    @property
+    def exposure(self) -> Floats:
+        """``gains``, (K, 3) float32."""
+        return np.ones((len(self.priors), 3), np.float32) if self.gains is None else self.gains.astype(np.float32)
+
+    @property
+    def focus(self) -> Floats:
+        """Places of the keyframes' cameras and radians of a panorama's pixel, (K, 4): how fine the field may be."""
+        pixel = 2 * math.pi / self.prior.rgb.shape[1]
+        return np.array([[*prior.map_from_camera[:3, 3], pixel] for prior in self.priors], np.float32)
+
+
+def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
+    """Which keyframe each tile of a batch looks from, (tiles,): half of them from the newest, the rest from the others.
+
+    Over the steps each keyframe looks everywhere: by a lattice of two irrational steps, so that no tile is left out
+    for long.
+
+    Args:
+        keyframes: of the scene.
+        tiles: of 8 × 8 rays in a batch.
+        step: of this run, from 1.
+    """
+    if keyframes == 1:
+        return np.zeros(tiles, np.int32)
+    place = (np.arange(tiles) * 0.7548776662 + step * 0.5698402910) % 1.0  # the plastic number's lattice
+    older = 1 + np.floor((2 * place - 1) * (keyframes - 1))
+    return np.where(place < 0.5, 0, older).astype(np.int32)
+
+
+LEAST_TRUST = 0.1
+"""Weight of depth that is guessed, against depth of the picture's median uncertainty."""
+
+
+@dataclass(frozen=True)
+class StackedPriors:
+    """A scene's keyframes as the kernels take them, newest first: ``PanoramaPrior``'s arrays with a leading axis (K,).
+
+    ``trust``: weight of each pixel's depth in the loss by its uncertainty, (K, h, w), 1 at the picture's median.
+    """
+
+    rgb: NDArray[np.uint8]
+    inverse_depth: Floats
+    known: NDArray[np.uint8]
+    torn: NDArray[np.uint8]
+    usable: NDArray[np.uint8]
+    trust: Floats
+    map_from_camera: Floats
+    camera_from_map: Floats
+    band: Floats
+    gains: Floats
+
+    @classmethod
+    def of(cls, scene: Scene) -> StackedPriors:
+        def stacked(key: str) -> Any:
+            if len(scene.priors) == 1:
+                return getattr(scene.prior, key)[None]  # no copy
+            return np.stack([getattr(prior, key) for prior in scene.priors])
+
+        poses = [prior.map_from_camera for prior in scene.priors]
+        return cls(
+            rgb=stacked("rgb"),
+            inverse_depth=stacked("inverse_depth"),
+            known=stacked("known"),
+            torn=stacked("torn"),
+            usable=stacked("usable"),
+            trust=np.stack([depth_trust(prior) for prior in scene.priors]),
+            map_from_camera=np.array(poses, np.float32),
+            camera_from_map=np.linalg.inv(poses).astype(np.float32),
+            band=np.array([prior.band for prior in scene.priors], np.float32),
+            gains=scene.exposure,
+        )
+
+
+def depth_trust(prior: PanoramaPrior) -> Floats:
+    """Weight of each pixel's depth, (h, w) float32: by the square of its uncertainty against the picture's median."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(prior.sigma > prior.relative_sigma, prior.relative_sigma / prior.sigma, 1.0)
+    return np.clip(ratio * ratio, LEAST_TRUST, 1.0).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """A view's rays: ``origin`` (3,) float32 map frame; ``directions`` (P, 3) float32 unit vectors, map frame;
+    ``axial`` (P,): the depth times it has an inverse that is linear over a plane in the picture (depth along the view's
+    axis per metre along the ray); ``shape`` (height, width); ``stride``: between so many pixels it may be interpolated.
+    """
+
+    origin: Floats
+    directions: Floats
+    axial: Floats
+    shape: tuple[int, int]
+    stride: int = 4
+
+    def some(self, chosen: NDArray[np.integer]) -> Rays:
+        """The rays of some pixels, as one column."""
+        return Rays(self.origin, self.directions[chosen], self.axial[chosen], (len(chosen), 1))
+
+
+class Device(Protocol):
+    """One device's way to train and render; ``numba_device`` and ``torch_device`` have it.
+
+    Attributes:
+        canvas: what puts its pictures together, a ``canvas.Canvas``.
+    """
+
+    name: str
+    canvas: Any
+
+    def load(self, parameters: FieldParameters) -> None:
+        """Takes parameters over and forgets the optimiser's moments."""
+
+    def set_scene(self, scene: Scene) -> None:
+        """Trains and renders this scene from now on, with the present parameters; forgets the moments."""
+
+    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
+        """One iteration on the rays drawn by ``uniform`` (N, 3) from the keyframes by turns (``ray_sources``).
+
+        Returns:
+            Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
+        """
+
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        """Colours (P, 3) in 0..1, depth along the ray (P,) with 0 where nothing is met, confidence (P,).
+
+        Args:
+            rays: of the view.
+            panorama_share: of the keyframe's panorama in the colour of surfaces that it has seen; the rest is the
+                field's. With 1 the colour of surfaces without confidence is not worked out.
+            depth_share: of the keyframe's depth in the signed distance; the rest is the field's.
+        """
+
+    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Any, Any, Any]:
+        """As ``draw``, in arrays as ``canvas`` takes them."""
+
+    def parameters(self) -> FieldParameters:
+        """A copy of the present parameters."""
+
+
+@dataclass
+class Schedule:
+    """Learning rates that fall exponentially over a run."""
+
+    config: TrainConfig
+    refresh: bool = False
+    iteration: int = field(default=0)
+
+    @property
+    def finished(self) -> bool:
+        return self.iteration >= self.config.iterations
+
+    def rates(self) -> tuple[float, float]:
+        """Table's and network's rates of the present iteration."""
+        share = self.config.final_lr_share ** min(1.0, self.iteration / self.config.iterations)
+        if self.refresh:
+            share *= self.config.refresh_lr_share
+        return self.config.table_lr * share, self.config.network_lr * share
+
+
+def sample_weights(config: TrainConfig) -> tuple[Floats, Floats]:
+    """Weights of a batch's samples in the loss, colour's and distance's, each (2 · rays,).
+
+    Samples in the band carry their ray's colour too, at less weight: a view from aside may meet the surface a little
+    off its place.
+    """
+    rays = config.ray_columns * config.ray_rows
+    on_surface = np.repeat(np.tile([True, False], rays // 64), 64)
+    colour = np.where(on_surface, 1.0, config.band_colour_weight) / (3 * rays)
+    distance = np.full(2 * rays, config.distance_weight / (2 * rays))
+    return colour.astype(np.float32), distance.astype(np.float32)
+
+
+def volume_rays(config: TrainConfig) -> tuple[int, int]:
+    """Columns and rows of a batch's rays where geometry is a density: as many field queries as with a distance."""
+    return config.ray_columns // 2, config.ray_rows // 2
+
+
+def level_rates(config: TrainConfig, levels: int) -> Floats:
+    """Learning rate of each level against the coarsest's, (levels,)."""
+    return np.geomspace(1.0, config.fine_lr_share, levels).astype(np.float32)
+
+
+def adam_step_size(lr: float, step: int) -> float:
+    """Adam's step with both bias corrections in it; ``step`` counts from 1."""
+    return lr * math.sqrt(1 - BETA2**step) / (1 - BETA1**step)

@@ -1,0 +1,192 @@
+"""Training and rendering on one CPU thread by the numba kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from instant_ic.vspace.canvas import CpuCanvas
+from instant_ic.vspace.config import FieldConfig, TrainConfig
+from instant_ic.vspace.nerf import kernels, march, volume
+from instant_ic.vspace.nerf.field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FieldParameters,
+    Floats,
+    Rays,
+    Scene,
+    StackedPriors,
+    adam_step_size,
+    level_rates,
+    ray_sources,
+    sample_weights,
+    volume_rays,
+)
+
+FIRST_STRIDE = 4
+"""Every so many pixels the rays are traced, or ``Rays.stride`` where that is less, the rest only where those between
+differ; a power of two, 1 traces all."""
+DEPTH_TOLERANCE = 0.08
+"""Neighbours further apart than this share are traced, not interpolated."""
+
+
+@dataclass(frozen=True)
+class DrawnField:
+    """What drawing needs: parameters and scene, with what follows from the scene."""
+
+    parameters: FieldParameters
+    scene: Scene
+    focus: Floats
+    priors: StackedPriors
+
+
+class NumbaDevice:
+    """See ``field.Device``. Not thread-safe: one thread at a time."""
+
+    name = "cpu (numba)"
+
+    def __init__(self, field: FieldConfig, train: TrainConfig) -> None:
+        self.first_stride = FIRST_STRIDE
+        self.canvas = CpuCanvas()
+        self._train = train
+        self._density = field.geometry == "density"
+        self._losses = np.array([train.depth_weight, train.opacity_weight, train.distortion_weight], np.float32)
+        self._rays = train.ray_columns * train.ray_rows
+        self._points = np.zeros((2 * self._rays, 3), np.float32)
+        self._target = np.zeros((2 * self._rays, 4), np.float32)
+        self._weight = np.zeros((2 * self._rays, 2), np.float32)
+        self._colour_weight, self._distance_weight = sample_weights(train)
+        self._level_rates = level_rates(train, field.levels)
+        self.load(FieldParameters.random(field, train.seed))
+
+    def load(self, parameters: FieldParameters) -> None:
+        self._p = parameters
+        table = parameters.table
+        self._table_grad = np.zeros_like(table)
+        self._touched = kernels.no_marks(table)
+        self._table_moments = (np.zeros_like(table), np.zeros_like(table))
+        self._network_grads = tuple(np.zeros_like(a) for a in parameters.network())
+        self._network_moments = tuple((np.zeros_like(a), np.zeros_like(a)) for a in parameters.network())
+        self._steps = 0
+
+    def set_scene(self, scene: Scene) -> None:
+        self._drawn = DrawnField(self._p, scene, scene.focus, StackedPriors.of(scene))
+        for moments in (self._table_moments, *self._network_moments):
+            for moment in moments:
+                moment[...] = 0
+        self._steps = 0
+
+    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
+        drawn, lattice, p = self._drawn, self._drawn.scene.lattice, self._p
+        priors = drawn.priors
+        columns, rows = volume_rays(self._train) if self._density else (self._train.ray_columns, self._train.ray_rows)
+        weight = self._weight[: 2 * columns * rows]
+        self._steps += 1
+        sources = ray_sources(len(priors.band), columns * rows // 64, self._steps)
+        march.sample_rays(
+            uniform, columns, rows, sources,
+            priors.rgb, priors.inverse_depth, priors.torn, priors.usable, priors.trust,
+            priors.map_from_camera, priors.gains, priors.band, self._points, self._target, weight,
+        )  # fmt: skip
+        place = lattice.cells_per_m, lattice.origin, drawn.focus
+        grads = self._table_grad, self._touched, *self._network_grads
+        share = np.maximum(weight.mean(axis=0), np.float32(1e-3)).tolist()
+        if self._density:
+            colour, distance = volume.volume_gradient(
+                p.table, *p.network(), *place, self._points, self._target, weight,
+                uniform[: columns * rows, 2].copy(), sources, drawn.focus[:, :3].copy(), priors.band,
+                self._losses, *grads,
+            )  # fmt: skip
+        else:
+            colour, distance = kernels.gradient(
+                p.table, *p.network(), *place, self._points, self._target,
+                self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1], *grads,
+            )  # fmt: skip
+            colour /= 1 + self._train.band_colour_weight
+            distance /= self._train.distance_weight
+        betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
+        step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, self._steps))
+        kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_sizes, *betas)
+        step_size = np.float32(adam_step_size(network_lr, self._steps))
+        for value, grad, (m, v) in zip(p.network(), self._network_grads, self._network_moments, strict=True):
+            m += (1 - betas[0]) * (grad - m)
+            v += (1 - betas[1]) * (grad * grad - v)
+            value -= step_size * m / (np.sqrt(v) + betas[2])
+            grad[...] = 0
+        return colour / share[0], distance / share[1]
+
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        height, width = rays.shape
+        drawn = self._drawn
+        # A density is composited round the keyframes' own depth.
+        axial_depth, confidence = self._trace(drawn, rays, 1.0 if self._density else depth_share)
+        depth = axial_depth / rays.axial
+        guide, colour = depth, np.zeros((height * width, 3), np.float32)
+        if panorama_share < 1 and self._density:
+            p, lattice, depth = drawn.parameters, drawn.scene.lattice, guide.copy()
+            volume.composite(
+                p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, drawn.priors.band[0],
+                np.float32(depth_share), rays.origin, rays.directions, depth, colour,
+            )  # fmt: skip
+        elif panorama_share < 1:
+            self._query(drawn, rays, depth, colour)
+        if panorama_share > 0:
+            priors = drawn.priors
+            march.mix_panorama(
+                priors.rgb, priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.gains,
+                priors.band, rays.origin, rays.directions, guide, confidence, np.float32(panorama_share), colour,
+            )  # fmt: skip
+        return colour, depth, confidence
+
+    drawn = draw
+
+    @staticmethod
+    def _query(drawn: DrawnField, rays: Rays, depth: Floats, colour: Floats) -> None:
+        """The field's colours where the rays meet something."""
+        met = np.flatnonzero(depth)
+        points = rays.origin + depth[met, None] * rays.directions[met]
+        out = np.empty((met.size, 4), np.float32)
+        p, lattice = drawn.parameters, drawn.scene.lattice
+        kernels.query(p.table, *p.network(), lattice.cells_per_m, lattice.origin, drawn.focus, points, out)
+        colour[met] = np.clip(out[:, :3] + np.float32(0.5), 0, 1)
+
+    def _trace(self, drawn: DrawnField, rays: Rays, depth_share: float) -> tuple[Floats, Floats]:
+        """Depth along the view's axis and confidence: every 4th pixel first, then what cannot be interpolated."""
+        height, width = rays.shape
+        depth = np.zeros(height * width, np.float32)
+        confidence = np.zeros(height * width, np.float32)
+        index = np.arange(height * width, dtype=np.int32).reshape(height, width)
+        stride = min(self.first_stride, rays.stride)
+        self._march(drawn, rays, depth_share, index[::stride, ::stride].reshape(-1).copy(), depth, confidence)
+        listed = np.empty(height * width, np.int32)
+        stride //= 2
+        while stride >= 1:
+            count = march.interpolate_depth(
+                depth.reshape(height, width),
+                confidence.reshape(height, width),
+                stride,
+                np.float32(DEPTH_TOLERANCE),
+                listed,
+            )
+            self._march(drawn, rays, depth_share, listed[:count], depth, confidence)
+            stride //= 2
+        return depth, confidence
+
+    def _march(
+        self, drawn: DrawnField, rays: Rays, depth_share: float, pixels: np.ndarray, depth: Floats, confidence: Floats
+    ) -> None:
+        scene, p = drawn.scene, drawn.parameters
+        priors, grid = drawn.priors, scene.occupancy
+        march.trace(
+            p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, drawn.focus,
+            grid.distance, grid.origin, np.float32(grid.cell_m),
+            priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.band,
+            np.float32(depth_share), rays.origin, rays.directions, pixels, depth, confidence,
+        )  # fmt: skip
+        depth[pixels] *= rays.axial[pixels]
+
+    def parameters(self) -> FieldParameters:
+        p = self._p
+        return FieldParameters(p.table.copy(), *(a.copy() for a in p.network()))

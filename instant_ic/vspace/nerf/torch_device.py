@@ -1,0 +1,200 @@
+"""Training and rendering by plain torch: on CUDA, and on CPUs where numba is missing (slow)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from instant_ic.vspace.canvas import Canvas, CpuCanvas
+from instant_ic.vspace.config import FieldConfig, TrainConfig
+from instant_ic.vspace.nerf import reference, volume_reference
+from instant_ic.vspace.nerf.field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FieldParameters,
+    Floats,
+    Rays,
+    Scene,
+    adam_step_size,
+    depth_trust,
+    level_rates,
+    ray_sources,
+    sample_weights,
+    volume_rays,
+)
+from instant_ic.vspace.nerf.reference import TorchField, TorchGrid, TorchPrior
+from instant_ic.vspace.torch_canvas import TorchCanvas
+from instant_ic.vspace.view import LensRays
+
+RAYS_AT_ONCE = 1 << 18
+
+
+def torch_priors(scene: Scene, device: str) -> list[TorchPrior]:
+    """A scene's keyframes as tensors, newest first."""
+
+    def tensor(array: Any, kind: torch.dtype = torch.float32) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(device=device, dtype=kind)
+
+    return [
+        TorchPrior(
+            rgb=tensor(prior.rgb),
+            inverse_depth=tensor(prior.inverse_depth),
+            known=tensor(prior.known, torch.bool),
+            torn=tensor(prior.torn, torch.bool),
+            usable=tensor(prior.usable, torch.bool),
+            trust=tensor(depth_trust(prior)),
+            map_from_camera=tensor(prior.map_from_camera),
+            camera_from_map=tensor(np.linalg.inv(prior.map_from_camera)),
+            band=prior.band,
+            gain=tensor(gain),
+        )
+        for prior, gain in zip(scene.priors, scene.exposure, strict=True)
+    ]
+
+
+class TorchDevice:
+    """See ``field.Device``."""
+
+    def __init__(self, field: FieldConfig, train: TrainConfig, device: str) -> None:
+        self._train = train
+        self._density = field.geometry == "density"
+        self._device = device
+        self.name = torch.cuda.get_device_name() if device == "cuda" else f"{device} (torch)"
+        weights = (torch.from_numpy(w).to(device) for w in sample_weights(train))
+        self._colour_weight, self._distance_weight = weights
+        self._level_rates = torch.from_numpy(level_rates(train, field.levels)).to(device)[:, None, None]
+        self._newest_lens: tuple[Floats, Tensor] | None = None
+        # On the CPU numba's is faster by far.
+        self.canvas: Canvas = TorchCanvas(device) if device == "cuda" else CpuCanvas()
+        self.load(FieldParameters.random(field, train.seed))
+
+    def load(self, parameters: FieldParameters) -> None:
+        arrays = (parameters.table, *parameters.network())
+        tensors = [torch.from_numpy(a.copy()).to(self._device).requires_grad_() for a in arrays]
+        levels = parameters.table.shape[0]
+        lattice = [torch.zeros(n, device=self._device) for n in ((levels,), (3,), (1, 4))]  # until a scene comes
+        self._field = TorchField(*tensors, *lattice)
+        self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in tensors]
+        self._steps = 0
+
+    def set_scene(self, scene: Scene) -> None:
+        grid, lattice = scene.occupancy, scene.lattice
+        arrays = (grid.distance, grid.origin, lattice.cells_per_m, lattice.origin, scene.focus)
+        # All that needs memory comes first: where there is none, the old scene stays whole.
+        priors = torch_priors(scene, self._device)
+        distance, corner, cells_per_m, origin, focus = (torch.from_numpy(a).to(self._device) for a in arrays)
+        moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
+        self._priors, self._grid, self._moments = priors, TorchGrid(distance, corner, grid.cell_m), moments
+        self._field.cells_per_m, self._field.origin, self._field.focus = cells_per_m, origin, focus
+        self._steps = 0
+
+    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
+        drawn = torch.from_numpy(uniform).to(self._device)
+        self._steps += 1
+        error, colour, distance = self._density_loss(drawn) if self._density else self._distance_loss(drawn)
+        grads = torch.autograd.grad(error, self._field.parameters())
+        with torch.no_grad():
+            for index, (value, grad) in enumerate(zip(self._field.parameters(), grads, strict=True)):
+                lr = table_lr if index == 0 else network_lr
+                step_size: float | Tensor = adam_step_size(lr, self._steps)
+                if index == 0:
+                    step_size = step_size * self._level_rates
+                # A network's row is an entry like the table's: without a gradient it is left alone.
+                reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
+        return float(colour.detach()), float(distance.detach())
+
+    def _rays(self, uniform: Tensor, columns: int, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Points, targets and weights of a batch, and the keyframe of each tile."""
+        sources = torch.from_numpy(ray_sources(len(self._priors), columns * rows // 64, self._steps)).to(self._device)
+        return *reference.sample_rays(uniform, columns, rows, self._priors, sources), sources
+
+    def _distance_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What training minimises, and ``step``'s two errors."""
+        points, target, weight, _ = self._rays(uniform, self._train.ray_columns, self._train.ray_rows)
+        output = reference.query(self._field, points)
+        weights = self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1]
+        colour, distance = reference.loss(output, target, *weights)
+        share = weight.mean(dim=0).clamp(min=1e-3)
+        errors = colour / share[0] / (1 + self._train.band_colour_weight), distance / share[1]
+        return colour + distance, errors[0], errors[1] / self._train.distance_weight
+
+    def _density_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As ``_distance_loss``."""
+        columns, rows = volume_rays(self._train)
+        points, target, weight, sources = self._rays(uniform[: columns * rows], columns, rows)
+        surface, colours, weight = (a.view(-1, 2, 64, a.shape[1])[:, 0].flatten(0, 1) for a in (points, target, weight))
+        number = sources.long().repeat_interleave(64)
+        cameras = torch.stack([prior.map_from_camera[:3, 3] for prior in self._priors])[number]
+        band = torch.tensor([prior.band for prior in self._priors], device=self._device)[number]
+        jitter = uniform[: columns * rows, 2]
+        samples, offset, span = volume_reference.band_samples(cameras, surface, jitter, band, self._priors[0])
+        output = reference.query(self._field, samples.reshape(-1, 3)).reshape(*offset.shape, 4)
+        losses = volume_reference.volume_loss(output, offset, span, colours[:, :3], weight)
+        weights = 1.0, self._train.depth_weight, self._train.opacity_weight, self._train.distortion_weight
+        share = weight.mean(dim=0).clamp(min=1e-3)
+        error = sum((w * loss for w, loss in zip(weights, losses, strict=True)), torch.zeros((), device=self._device))
+        return error, losses[0] / share[0], losses[1] / share[1]
+
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        colour, depth, confidence = self._drawn(rays, panorama_share, depth_share)
+        return colour.cpu().numpy(), depth.cpu().numpy(), confidence.cpu().numpy()
+
+    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Any, Any, Any]:
+        draw = self._drawn if isinstance(self.canvas, TorchCanvas) else self.draw
+        return draw(rays, panorama_share, depth_share)
+
+    @torch.no_grad()
+    def _drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
+        drawn = self._field, self._priors, self._grid
+        origin, directions = torch.from_numpy(rays.origin).to(self._device), self._directions(rays)
+        shares = panorama_share, depth_share
+        draw = self._draw_density if self._density else self._draw
+        parts = [draw(*drawn, origin, part, shares) for part in directions.split(RAYS_AT_ONCE)]
+        colour, depth, confidence = (torch.cat(tensors) for tensors in zip(*parts, strict=True))
+        return colour, depth, confidence
+
+    def _directions(self, rays: Rays) -> Tensor:
+        """Of a view, in the map, (P, 3); a lens is uploaded once, and turned on the device."""
+        if not isinstance(rays, LensRays):
+            return torch.from_numpy(rays.directions).to(self._device)
+        if self._newest_lens is None or self._newest_lens[0] is not rays.lens:
+            self._newest_lens = rays.lens, torch.from_numpy(rays.lens).to(self._device)
+        return self._newest_lens[1] @ torch.from_numpy(rays.turn).to(self._device).T
+
+    @staticmethod
+    def _draw(
+        field: TorchField,
+        priors: list[TorchPrior],
+        grid: TorchGrid,
+        origin: Tensor,
+        directions: Tensor,
+        shares: tuple[float, float],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        depth, confidence = reference.trace(field, grid, priors, shares[1], origin, directions)
+        met = torch.nonzero(depth)[:, 0]
+        colour = torch.zeros_like(directions)
+        points = origin + depth[met, None] * directions[met]
+        colour[met] = (reference.query(field, points)[:, :3] + 0.5).clamp(0, 1)
+        reference.mix_panorama(priors, origin, directions, depth, confidence, shares[0], colour)
+        return colour, depth, confidence
+
+    @staticmethod
+    def _draw_density(
+        field: TorchField,
+        priors: list[TorchPrior],
+        grid: TorchGrid,
+        origin: Tensor,
+        directions: Tensor,
+        shares: tuple[float, float],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        guide, confidence = reference.trace(field, grid, priors, 1.0, origin, directions)
+        colour, depth = volume_reference.composite(field, priors[0], shares[1], origin, directions, guide)
+        reference.mix_panorama(priors, origin, directions, guide, confidence, shares[0], colour)
+        return colour, depth, confidence
+
+    def parameters(self) -> FieldParameters:
+        return FieldParameters(*(p.detach().cpu().numpy().copy() for p in self._field.parameters()))

@@ -1,0 +1,283 @@
+"""Training and rendering on an NVIDIA GPU by the Triton kernels; a training step is one CUDA graph."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from instant_ic import paths
+from instant_ic.vspace.config import FieldConfig, TrainConfig
+from instant_ic.vspace.nerf.field import (
+    BETA1,
+    BETA2,
+    EPSILON,
+    FieldParameters,
+    Floats,
+    Rays,
+    Scene,
+    StackedPriors,
+    adam_step_size,
+    level_rates,
+    ray_sources,
+    sample_weights,
+)
+from instant_ic.vspace.torch_canvas import TorchCanvas
+from instant_ic.vspace.view import LensRays
+
+# Compiled kernels stay with what else the project keeps; has to be set before triton is imported.
+os.environ.setdefault("TRITON_CACHE_DIR", str(paths.cache_dir() / "triton"))
+
+from instant_ic.vspace import triton_warp
+from instant_ic.vspace.nerf import triton_kernels as kernels
+
+TRAIN_BLOCK = 64
+ENTRIES = 256
+"""Table entries of one program of Adam; the smallest table has four times as many."""
+TILE = 64
+"""Rays of one program, 8 × 8: of a batch's stratum tile, and of a picture."""
+
+
+@dataclass
+class _Parameters:
+    """``master``: table as float32, ``table``: the same as float16, which the kernels read; ``network``: flat."""
+
+    master: Tensor
+    table: Tensor
+    network: Tensor
+
+
+@dataclass(frozen=True)
+class _GpuScene:
+    """A scene's arrays as tensors; shapes as in ``StackedPriors``, ``Lattice``, ``Occupancy``."""
+
+    priors: dict[str, Tensor]
+    cells_per_m: Tensor
+    origin: Tensor
+    focus: Tensor
+    grid: Tensor
+    low: Tensor
+    cell_m: float
+    camera: Tensor
+    keyframes: int
+
+
+@dataclass
+class _Step:
+    """Buffers of a training step: they stay where they are, as the graph has their addresses."""
+
+    uniform: Tensor
+    sources: Tensor
+    rates: Tensor
+    points: Tensor
+    target: Tensor
+    weight: Tensor
+    table_grad: Tensor
+    network_grad: Tensor
+    table_moments: tuple[Tensor, Tensor]
+    network_moments: tuple[Tensor, Tensor]
+    sums: Tensor
+    graph: Any = field(default=None)
+
+
+class TritonDevice:
+    """See ``field.Device``. One thread at a time.
+
+    Args:
+        device: ``cuda``; ``cpu`` for tests, with ``TRITON_INTERPRET=1``.
+
+    Raises:
+        ValueError: a geometry that the kernels do not know.
+    """
+
+    def __init__(self, field: FieldConfig, train: TrainConfig, device: str = "cuda") -> None:
+        if field.geometry != "distance":
+            raise ValueError(f"the Triton kernels know geometry distance only (got {field.geometry!r})")
+        self._train, self._device = train, device
+        self._graphs = device == "cuda"
+        self.name = f"{torch.cuda.get_device_name()} (triton)" if self._graphs else f"{device} (triton)"
+        features, inputs = field.features, field.levels * field.features
+        self._shape = {
+            "LEVELS": field.levels,
+            "LP": max(_power_of_two(field.levels), 16 // features),
+            "F": features,
+            "HIDDEN": field.hidden,
+            "HP": max(_power_of_two(field.hidden), 16),
+        }
+        self._table_shape = (field.levels, 1 << field.log2_table, features)
+        self._network_shapes = ((field.hidden, inputs), (field.hidden,), (4, field.hidden), (4,))
+        self._colour_weight, self._distance_weight = (self._tensor(w) for w in sample_weights(train))
+        self._level_rates = level_rates(train, field.levels)
+        self._scene: _GpuScene | None = None
+        self._newest_lens: tuple[Floats, Tensor] | None = None
+        self.canvas = TorchCanvas(device, triton_warp.KERNELS)
+        self._p = self._uploaded(FieldParameters.random(field, train.seed))
+        self._buffers = self._new_buffers()
+        self._steps = 0
+
+    def load(self, parameters: FieldParameters) -> None:
+        self._p = self._uploaded(parameters)
+        self._forget()
+
+    def set_scene(self, scene: Scene) -> None:
+        self._scene = self._uploaded_scene(scene)  # all that needs memory first: without it the old scene stays whole
+        self._forget()
+
+    def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
+        scene, b = self._scene, self._buffers
+        assert scene is not None, "set_scene first"
+        self._steps += 1
+        rates = np.append(self._level_rates * adam_step_size(table_lr, self._steps), 0.0).astype(np.float32)
+        rates[-1] = adam_step_size(network_lr, self._steps)
+        b.uniform.copy_(torch.from_numpy(np.ascontiguousarray(uniform)))
+        b.rates.copy_(torch.from_numpy(rates))
+        if scene.keyframes > 1 or self._steps == 1:
+            b.sources.copy_(torch.from_numpy(ray_sources(scene.keyframes, len(b.sources), self._steps)))
+        # The first step compiles, which a capture does not allow; from the second on it is the graph.
+        if self._graphs and b.graph is None and self._steps == 2:
+            b.graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(b.graph):
+                self._launch_step(scene)
+        if b.graph is not None:
+            b.graph.replay()
+        else:
+            self._launch_step(scene)
+        colour, distance, shown, sure = b.sums.tolist()
+        count = len(b.points)
+        colour /= max(shown / count, 1e-3) * (1 + self._train.band_colour_weight)
+        return colour, distance / max(sure / count, 1e-3) / self._train.distance_weight
+
+    def _launch_step(self, scene: _GpuScene) -> None:
+        b, p, q, train = self._buffers, self._p, scene.priors, self._train
+        levels, size, features = self._table_shape
+        height, width = q["rgb"].shape[1:3]
+        h, w = q["inverse_depth"].shape[1:]
+        b.sums.zero_()
+        kernels.sample_rays[(len(b.sources),)](
+            b.uniform, b.sources, q["rgb"], q["inverse_depth"], q["torn"], q["usable"], q["trust"],
+            q["map_from_camera"], q["band"], q["gains"],
+            train.ray_columns, train.ray_rows, width, height, w, h, b.points, b.target, b.weight, TILE,
+        )  # fmt: skip
+        count = len(b.points)
+        kernels.gradient[(math.ceil(count / TRAIN_BLOCK),)](
+            p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.keyframes,
+            b.points, b.target, b.weight, self._colour_weight, self._distance_weight, count,
+            b.table_grad, b.network_grad, b.sums, **self._shape, B=TRAIN_BLOCK,
+        )  # fmt: skip
+        kernels.adam_table[(levels * size // ENTRIES,)](
+            p.master, p.table, b.table_grad, *b.table_moments, b.rates, size, BETA1, BETA2, EPSILON,
+            F=features, B=ENTRIES,
+        )  # fmt: skip
+        kernels.adam_network[(1,)](
+            p.network, b.network_grad, *b.network_moments, b.rates[-1:], BETA1, BETA2, EPSILON,
+            COUNT=len(p.network), B=_power_of_two(len(p.network)),
+        )  # fmt: skip
+
+    def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
+        colour, depth, confidence = self.drawn(rays, panorama_share, depth_share)
+        return colour.cpu().numpy(), depth.cpu().numpy(), confidence.cpu().numpy()
+
+    def drawn(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Tensor, Tensor, Tensor]:
+        assert self._scene is not None, "set_scene first"
+        p, scene = self._p, self._scene
+        q = scene.priors
+        rows, columns = rays.shape
+        size = self._table_shape[1]
+        pixels = rows * columns
+        directions, turn = self._lens(rays)
+        view = self._tensor(np.concatenate([rays.origin, turn.reshape(-1)]))
+        room = -(-pixels // 4) * 4  # all three begin at 16 bytes, for which the kernel is compiled
+        out = torch.empty(5 * room, device=self._device)
+        colour, depth, confidence = out[: 3 * room], out[3 * room : 4 * room], out[4 * room :]
+        height, width = q["rgb"].shape[1:3]
+        h, w = q["inverse_depth"].shape[1:]
+        kernels.draw[(math.ceil(rows / 8) * math.ceil(columns / 8),)](
+            p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.grid, scene.low,
+            q["rgb"], q["inverse_depth"], q["torn"], q["known"], q["camera_from_map"], scene.camera, q["band"],
+            q["gains"], scene.keyframes, view, view[3:], directions, columns, rows, width, height, w, h,
+            *scene.grid.shape, scene.cell_m, float(panorama_share), float(depth_share), colour, depth, confidence,
+            **self._shape, B=TILE,
+        )  # fmt: skip
+        return colour[: 3 * pixels].view(pixels, 3), depth[:pixels], confidence[:pixels]
+
+    def _lens(self, rays: Rays) -> tuple[Tensor, Floats]:
+        """Directions of a view on the GPU, and how they are turned into the map; a lens is uploaded once."""
+        if not isinstance(rays, LensRays):
+            return self._tensor(rays.directions), np.eye(3, dtype=np.float32)
+        if self._newest_lens is None or self._newest_lens[0] is not rays.lens:
+            self._newest_lens = rays.lens, self._tensor(rays.lens)
+        return self._newest_lens[1], rays.turn
+
+    def parameters(self) -> FieldParameters:
+        p = self._p
+        network = p.network.cpu().numpy()
+        ends = np.cumsum([math.prod(shape) for shape in self._network_shapes])
+        parts = np.split(network, ends[:-1])
+        shaped = (part.reshape(shape).copy() for part, shape in zip(parts, self._network_shapes, strict=True))
+        return FieldParameters(p.master.cpu().numpy().reshape(self._table_shape).copy(), *shaped)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
+
+    def _uploaded(self, parameters: FieldParameters) -> _Parameters:
+        master = torch.from_numpy(parameters.table.reshape(-1).copy()).to(self._device)
+        network = np.concatenate([array.reshape(-1) for array in parameters.network()])
+        return _Parameters(master, master.half(), self._tensor(network))
+
+    def _uploaded_scene(self, scene: Scene) -> _GpuScene:
+        stacked = StackedPriors.of(scene)
+        keys = (
+            *("rgb", "inverse_depth", "known", "torn", "usable", "trust"),
+            *("map_from_camera", "camera_from_map", "band", "gains"),
+        )
+        grid, lattice = scene.occupancy, scene.lattice
+        return _GpuScene(
+            priors={key: self._tensor(getattr(stacked, key)) for key in keys},
+            cells_per_m=self._tensor(lattice.cells_per_m),
+            origin=self._tensor(lattice.origin),
+            focus=self._tensor(scene.focus),
+            grid=self._tensor(grid.distance),
+            low=self._tensor(grid.origin.astype(np.float32)),
+            cell_m=float(grid.cell_m),
+            camera=self._tensor(scene.prior.map_from_camera[:3, 3].astype(np.float32)),
+            keyframes=len(scene.priors),
+        )
+
+    def _new_buffers(self) -> _Step:
+        rays = self._train.ray_columns * self._train.ray_rows
+
+        def zeros(*shape: int, kind: torch.dtype = torch.float32) -> Tensor:
+            return torch.zeros(shape, dtype=kind, device=self._device)
+
+        table, network = len(self._p.master), len(self._p.network)
+        return _Step(
+            uniform=zeros(rays, 3),
+            sources=zeros(rays // TILE, kind=torch.int32),
+            rates=zeros(self._shape["LEVELS"] + 1),
+            points=zeros(2 * rays, 3),
+            target=zeros(2 * rays, 4),
+            weight=zeros(2 * rays, 2),
+            table_grad=zeros(table),
+            network_grad=zeros(network),
+            table_moments=(zeros(table), zeros(table)),
+            network_moments=(zeros(network), zeros(network)),
+            sums=zeros(4),
+        )
+
+    def _forget(self) -> None:
+        """Moments start anew, and so does the graph: it has the addresses of the scene and parameters before."""
+        b = self._buffers
+        for moment in (*b.table_moments, *b.network_moments, b.table_grad, b.network_grad):
+            moment.zero_()
+        b.graph = None
+        self._steps = 0
+
+
+def _power_of_two(number: int) -> int:
+    """The least that is no smaller."""
+    return 1 << (number - 1).bit_length()

@@ -1,0 +1,215 @@
+"""Geometry as density, the paper's way: compositing over samples round the depth, and its gradient by hand (numba).
+
+The torch functions in ``volume_reference.py`` do the same. Network's output 3 is the logarithm of the density, per band
+of the newest keyframe (``band · distance to its camera`` metres), so that walls near and far look alike to the network.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from instant_ic.vspace.nerf.field import RAW_LIMITS
+from instant_ic.vspace.nerf.field import VOLUME_SAMPLES as SAMPLES
+from instant_ic.vspace.nerf.kernels import (
+    _OPTIONS,
+    BLOCK,
+    encode_backward_block,
+    encode_block,
+    layer_block,
+    network_backward_block,
+    relu_block,
+)
+
+_RAYS = BLOCK // SAMPLES
+
+
+@njit(**_OPTIONS)
+def band_samples(camera, surface, jitter, band, newest, newest_band, points, first, offset, span):  # type: ignore[no-untyped-def]
+    """Samples of one ray through the band round its surface.
+
+    Args:
+        camera, surface: (3,); jitter: place in the strata, 0..1; band: half width, share of the depth.
+        newest: the newest keyframe's camera, (3,); newest_band: its band.
+        points: out, rows ``first``… of (…, 3).
+        offset: out, (SAMPLES,): distance behind the surface, in bands of the ray.
+        span: out, (SAMPLES,): length that a sample stands for, in bands of the newest keyframe.
+    """
+    step = np.float32(2.0 / SAMPLES)
+    depth = np.float32(0)
+    for c in range(3):
+        depth += (surface[c] - camera[c]) ** 2
+    depth = np.float32(math.sqrt(depth))
+    for s in range(SAMPLES):
+        offset[s] = (np.float32(s) + jitter) * step - np.float32(1)
+        away = np.float32(0)
+        for c in range(3):
+            points[first + s, c] = camera[c] + (surface[c] - camera[c]) * (np.float32(1) + band * offset[s])
+            away += (points[first + s, c] - newest[c]) ** 2
+        unit = newest_band * max(np.float32(math.sqrt(away)), np.float32(1e-3))
+        span[s] = step * band * depth / unit
+
+
+@njit(**_OPTIONS)
+def ray_weights(raw, first, span, weight, left):  # type: ignore[no-untyped-def]
+    """Weights of a ray's samples (SAMPLES,), and what of the light is left after each.
+
+    ``raw``: logarithms of the density, entries ``first``….
+    """
+    light = np.float32(1)
+    for s in range(SAMPLES):
+        value = min(max(raw[first + s], np.float32(RAW_LIMITS[0])), np.float32(RAW_LIMITS[1]))
+        kept = np.float32(math.exp(-math.exp(value) * span[s]))
+        weight[s] = light * (np.float32(1) - kept)
+        light *= kept
+        left[s] = light
+
+
+@njit(**_OPTIONS)
+def volume_gradient(  # type: ignore[no-untyped-def]
+    table, w1, b1, w2, b2, cells_per_m, origin, focus, points, target, weight, jitter, sources, cameras, band,
+    losses, table_grad, touched, g1, gb1, g2, gb2
+):  # fmt: skip
+    """Adds the gradient of the training loss of composited rays to the ``*_grad`` arrays.
+
+    Loss of a ray, times its weight, mean over the rays: ``|Σ w c − colour|² / 3 + losses[0] · depth + losses[1] ·
+    opacity + losses[2] · distortion`` with ``depth = (Σ w o)²``, ``opacity = (1 − Σ w)²`` and ``distortion =
+    Σᵢⱼ wᵢ wⱼ |oᵢ − oⱼ| + ⅓ Σ wᵢ² · step`` (Barron et al., 2022), o in bands behind the surface.
+
+    Args:
+        points, target, weight: of ``march.sample_rays``: of each tile's 128 rows the first 64 are used.
+        jitter: (N,) place of each ray's samples in their strata, 0..1.
+        sources: (N / 64,) each tile's keyframe; cameras: (K, 3); band: (K,).
+        losses: weights of depth, opacity and distortion, (3,).
+
+    Returns:
+        Mean squared colour error (0..1 units) and mean squared depth error (bands), not weighted by ``losses``.
+    """
+    x, dx = np.zeros((w1.shape[1], BLOCK), np.float32), np.zeros((w1.shape[1], BLOCK), np.float32)
+    h, dh = np.zeros((w1.shape[0], BLOCK), np.float32), np.zeros((w1.shape[0], BLOCK), np.float32)
+    y, dy = np.zeros((4, BLOCK), np.float32), np.zeros((4, BLOCK), np.float32)
+    levels = table.shape[0]
+    entries, corner_weights = np.empty((levels, 8, BLOCK), np.uint32), np.empty((levels, 8, BLOCK), np.float32)
+    samples = np.empty((BLOCK, 3), np.float32)
+    offset, span = np.empty((_RAYS, SAMPLES), np.float32), np.empty((_RAYS, SAMPLES), np.float32)
+    w, left, pull = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+    rays = jitter.shape[0]
+    each, step = np.float32(1.0 / rays), np.float32(2.0 / SAMPLES)
+    colour_error, depth_error = 0.0, 0.0
+    for start in range(0, rays, _RAYS):
+        tile = start // 64
+        k = sources[tile]
+        for r in range(_RAYS):
+            n = tile * 128 + (start + r) % 64
+            band_samples(
+                cameras[k], points[n], jitter[start + r], band[k], cameras[0], band[0],
+                samples, r * SAMPLES, offset[r], span[r],
+            )  # fmt: skip
+        encode_block(table, cells_per_m, origin, focus, samples, 0, BLOCK, entries, corner_weights, x)
+        layer_block(w1, b1, x, h)
+        relu_block(h)
+        layer_block(w2, b2, h, y)
+        for r in range(_RAYS):
+            n, first = tile * 128 + (start + r) % 64, r * SAMPLES
+            ray_weights(y[3], first, span[r], w, left)
+            by_colour, by_depth = each * weight[n, 0], each * weight[n, 1] * losses[0]
+            red, green, blue = -target[n, 0], -target[n, 1], -target[n, 2]
+            mean, opacity = np.float32(0), np.float32(0)
+            for s in range(SAMPLES):
+                red += w[s] * y[0, first + s]
+                green += w[s] * y[1, first + s]
+                blue += w[s] * y[2, first + s]
+                mean += w[s] * offset[r, s]
+                opacity += w[s]
+            colour_error += by_colour * (red * red + green * green + blue * blue) / 3
+            depth_error += each * weight[n, 1] * mean * mean
+            scale = np.float32(2.0 / 3.0) * by_colour
+            for s in range(SAMPLES):
+                i = first + s
+                spread = np.float32(2.0 / 3.0) * step * w[s]
+                for other in range(SAMPLES):
+                    spread += np.float32(2) * w[other] * abs(offset[r, s] - offset[r, other])
+                pull[s] = (
+                    scale * (red * y[0, i] + green * y[1, i] + blue * y[2, i])
+                    + 2 * by_depth * mean * offset[r, s]
+                    + each * weight[n, 0] * (losses[2] * spread - 2 * losses[1] * (np.float32(1) - opacity))
+                )
+                dy[0, i], dy[1, i], dy[2, i] = scale * w[s] * red, scale * w[s] * green, scale * w[s] * blue
+            behind = np.float32(0)
+            for s in range(SAMPLES - 1, -1, -1):
+                raw = y[3, first + s]
+                inside = RAW_LIMITS[0] < raw < RAW_LIMITS[1]
+                thickness = np.float32(math.exp(raw)) * span[r, s] if inside else np.float32(0)
+                dy[3, first + s] = thickness * (left[s] * pull[s] - behind)
+                behind += w[s] * pull[s]
+        network_backward_block(w1, w2, x, h, dy, g1, gb1, g2, gb2, dh, dx)
+        encode_backward_block(table_grad, touched, entries, corner_weights, BLOCK, dx)
+    return colour_error, depth_error
+
+
+@njit(**_OPTIONS)
+def composite(  # type: ignore[no-untyped-def]
+    table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, band, depth_share, origin, directions, depth, colour
+):
+    """Draws rays by compositing round the depth that they were guided to: hash grid, network and sums in one pass.
+
+    Args:
+        band: of the newest keyframe, whose camera is ``focus[0, :3]``.
+        depth_share: of the guiding depth in the depth that comes out; the rest is the mean over the samples.
+        origin: (3,); directions: (P, 3).
+        depth: in and out, (P,): metres along the ray, 0 where it meets nothing.
+        colour: out, (P, 3) in 0..1, before a mid-grey ground as in training; not written where nothing is met.
+    """
+    x = np.zeros((w1.shape[1], BLOCK), np.float32)
+    h = np.zeros((w1.shape[0], BLOCK), np.float32)
+    y = np.zeros((4, BLOCK), np.float32)
+    entries, corner_weights = np.empty((1, 8, BLOCK), np.uint32), np.empty((1, 8, BLOCK), np.float32)
+    samples = np.zeros((BLOCK, 3), np.float32)
+    offset, span = np.empty((_RAYS, SAMPLES), np.float32), np.empty((_RAYS, SAMPLES), np.float32)
+    share = np.empty(_RAYS, np.float32)
+    w, left = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
+    surface = np.empty(3, np.float32)
+    pixels = np.empty(_RAYS, np.int64)
+    half, newest = np.float32(0.5), focus[0, :3]
+    place, count = 0, depth.shape[0]
+    while place < count:
+        filled = 0
+        while place < count and filled < _RAYS:
+            if depth[place] > 0:
+                pixels[filled] = place
+                filled += 1
+            place += 1
+        for r in range(filled):
+            pixel = pixels[r]
+            away = np.float32(0)
+            for c in range(3):
+                surface[c] = origin[c] + depth[pixel] * directions[pixel, c]
+                away += (surface[c] - newest[c]) ** 2
+            share[r] = min(band * np.float32(math.sqrt(away)) / depth[pixel], half)
+            band_samples(
+                origin, surface, half, share[r], newest, band, samples, r * SAMPLES, offset[r], span[r]
+            )  # fmt: skip
+        encode_block(
+            table, cells_per_m, lattice_origin, focus, samples, 0, filled * SAMPLES, entries, corner_weights, x
+        )
+        layer_block(w1, b1, x, h)
+        relu_block(h)
+        layer_block(w2, b2, h, y)
+        for r in range(filled):
+            ray_weights(y[3], r * SAMPLES, span[r], w, left)
+            opacity, mean = np.float32(1e-6), np.float32(0)
+            red, green, blue = np.float32(0), np.float32(0), np.float32(0)
+            for s in range(SAMPLES):
+                i = r * SAMPLES + s
+                red += w[s] * y[0, i]
+                green += w[s] * y[1, i]
+                blue += w[s] * y[2, i]
+                mean += w[s] * offset[r, s]
+                opacity += w[s]
+            pixel = pixels[r]
+            colour[pixel, 0] = min(max(red + half, np.float32(0)), np.float32(1))
+            colour[pixel, 1] = min(max(green + half, np.float32(0)), np.float32(1))
+            colour[pixel, 2] = min(max(blue + half, np.float32(0)), np.float32(1))
+            depth[pixel] *= np.float32(1) + (np.float32(1) - depth_share) * share[r] * mean / opacity

@@ -1,0 +1,367 @@
+"""A keyframe made ready for training: panorama, depth prior with its tears, pose, uncertainty (paper, IV.A-B)."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.config import GeometryConfig
+
+MOST_SIGMA = 0.5
+"""Depth that is more uncertain than this, relative to it, is as good as filled in: views of it are less confident."""
+
+
+EDGE_RAD = 0.05
+"""So far to each side of an edge its depth may be of the one or the other."""
+
+ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
+"""What a pixel shows: a part of the place; the robot itself; the sky, endlessly far; what has moved away."""
+_SKY_RISE = 0.17  # sine of the elevation that unknown regions must lie above, on the mean, to be the sky
+
+
+class KeyframeError(ValueError):
+    """The keyframe cannot be trained from; the message says what is wrong with it."""
+
+
+@dataclass(frozen=True)
+class PanoramaPrior:
+    """What training and rendering need of a keyframe.
+
+    Attributes:
+        rgb: panorama, (H, W, 3) uint8.
+        inverse_depth: 1/m along the ray, (h, w) float32, h = w/2, holes filled.
+        known: 1 where the depth was measured or estimated and is less uncertain than ``MOST_SIGMA``, (h, w) uint8.
+        torn: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
+        map_from_camera: pose, (4, 4).
+        relative_sigma: standard deviation of the depth, relative to it: median over the picture.
+        band: half width, relative to the depth, of the band in which the signed distance is learnt.
+        sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
+        usable: 1 where training may draw rays, (h, w) uint8: where ``content`` is ``ROOM``.
+        content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
+    """
+
+    rgb: NDArray[np.uint8]
+    inverse_depth: NDArray[np.float32]
+    known: NDArray[np.uint8]
+    torn: NDArray[np.uint8]
+    map_from_camera: NDArray[np.float64]
+    relative_sigma: float
+    band: float
+    sigma: NDArray[np.float32]
+    usable: NDArray[np.uint8]
+    content: NDArray[np.uint8]
+
+    def without(self, moved: NDArray[np.bool_]) -> PanoramaPrior:
+        """The keyframe with what has ``moved`` (h, w) left out, and nothing else that was left out for that before."""
+        content = np.where(self.content == MOVED, ROOM, self.content)
+        content[moved & (content == ROOM)] = MOVED
+        return self if np.array_equal(content, self.content) else self._with(content.astype(np.uint8))
+
+    def _with(self, content: NDArray[np.uint8]) -> PanoramaPrior:
+        return replace(self, content=content, usable=(content == ROOM).astype(np.uint8))
+
+    @functools.cached_property
+    def beside_edge(self) -> NDArray[np.uint8]:
+        """1 within ``EDGE_RAD`` of a torn quad, (h, w) uint8."""
+        pixels = max(1, round(EDGE_RAD / np.pi * self.torn.shape[0]))
+        near = np.pad(self.torn, ((pixels, pixels), (0, 0)))
+        for axis in (0, 1):  # columns wrap
+            near = np.maximum.reduce([np.roll(near, k, axis) for k in range(-pixels, pixels + 1)])
+        return np.ascontiguousarray(near[pixels:-pixels])
+
+    @property
+    def median_depth_m(self) -> float:
+        """Median over the viewing sphere's middle band (within 60° of the horizon)."""
+        rows = self.inverse_depth.shape[0]
+        return float(1.0 / np.median(self.inverse_depth[rows // 6 : rows - rows // 6]))
+
+
+def prepare(
+    rgb: NDArray[np.uint8],
+    depth_m: NDArray[np.floating],
+    map_from_camera: NDArray[np.floating],
+    relative_sigma: float | NDArray[np.floating],
+    config: GeometryConfig,
+    panorama_width: int,
+    robot: NDArray[np.bool_] | None = None,
+) -> PanoramaPrior:
+    """Checks a keyframe and makes its prior.
+
+    Args:
+        rgb: equirect panorama (H, W, 3) uint8, W = 2 H.
+        depth_m: radial depth (h, w) in metres, w = 2 h, 0 = unknown; need not have the panorama's size.
+        map_from_camera: camera pose in the map, (4, 4).
+        relative_sigma: one standard deviation of the depth, relative to it: one number, or (h, w) for each pixel of
+            the depth, not finite where it is unknown.
+        config: geometry parameters.
+        panorama_width: a wider panorama is area-averaged to this width.
+        robot: picture (H, 2 H) of any size: true where the panorama shows the robot itself or its stand, besides what
+            lies below ``config.body_below_deg``.
+
+    Raises:
+        KeyframeError: wrong shape or type, values that are not finite, too little depth, a pose that is none.
+    """
+    _check_panorama(rgb)
+    _check_pose(map_from_camera)
+    depth, content = _checked_depth(depth_m, config, robot)
+    sigma, each = _checked_sigma(relative_sigma, depth_m, depth)
+    if rgb.shape[1] > panorama_width:
+        rgb = _shrunk(rgb, panorama_width // 2, panorama_width)
+    sky = content == SKY
+    known: NDArray[np.bool_] = depth > 0
+    with np.errstate(divide="ignore"):
+        inverse = np.where(known, 1.0 / np.clip(depth, config.min_depth_m, config.max_depth_m), 0.0)
+    inverse = fill_holes(inverse.astype(np.float32), known & ~sky)
+    inverse[sky] = 1 / config.max_depth_m
+    known |= sky
+    band = float(np.clip(config.band_sigmas * sigma, config.band_min, config.band_max))
+    return PanoramaPrior(
+        rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile anew
+        inverse_depth=np.ascontiguousarray(inverse),
+        known=(known & ((each <= MOST_SIGMA) | sky) & (content != ROBOT)).astype(np.uint8),
+        torn=torn_quads(inverse, config.torn_ratio),
+        map_from_camera=np.array(map_from_camera, np.float64),
+        relative_sigma=sigma,
+        band=band,
+        sigma=np.where(known, np.minimum(each, np.float32(MOST_SIGMA)), np.float32(MOST_SIGMA)),
+        usable=(content == ROOM).astype(np.uint8),
+        content=content,
+    )
+
+
+def _check_panorama(rgb: NDArray[np.uint8]) -> None:
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype != np.uint8:
+        raise KeyframeError(f"panorama must be (H, W, 3) uint8 (got {rgb.shape} {rgb.dtype})")
+    height, width = rgb.shape[:2]
+    if width != 2 * height or width < 32:
+        raise KeyframeError(f"panorama must be twice as wide as high, 32 pixels or more (got {width} x {height})")
+    if int(rgb.max()) - int(rgb.min()) < 2:
+        raise KeyframeError("panorama has one colour only: covered lens or black picture")
+
+
+def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
+    pose = np.asarray(map_from_camera, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise KeyframeError(f"pose must be a finite 4x4 matrix (got shape {pose.shape})")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        raise KeyframeError("pose has no rotation matrix in it")
+
+
+def _checked_depth(
+    depth_m: NDArray[np.floating], config: GeometryConfig, robot: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Depth (h, w) and content (h, w)."""
+    if depth_m.ndim != 2 or depth_m.shape[1] != 2 * depth_m.shape[0] or depth_m.shape[1] < 32:
+        raise KeyframeError(f"depth must be (H, 2 H), 32 columns or more (got {depth_m.shape})")
+    bad = int(np.count_nonzero(~np.isfinite(depth_m)))
+    if bad:
+        raise KeyframeError(f"depth holds {bad} values that are not finite; unknown is written 0")
+    if float(depth_m.min()) < 0:
+        raise KeyframeError(f"depth is negative (smallest {float(depth_m.min()):.3f} m)")
+    # Geometry does not gain from more than 0.35° a pixel, and tears and occupancy cost by the pixel.
+    step = max(1, depth_m.shape[1] // 1024)
+    depth = np.ascontiguousarray(depth_m[::step, ::step], np.float32)
+    if depth.shape[1] != 2 * depth.shape[0]:
+        depth = depth[: depth.shape[1] // 2, : 2 * depth.shape[0]]
+    content = np.full(depth.shape, ROOM, np.uint8)
+    content[sky_region(depth == 0, config.sky_share)] = SKY
+    content[robot_region(depth.shape[0], config.body_below_deg, robot)] = ROBOT
+    share = float(np.count_nonzero(depth)) / max(1, int(np.count_nonzero(content != SKY)))
+    if share < config.min_known_share:
+        raise KeyframeError(f"depth is known in {share:.0%} of the picture, {config.min_known_share:.0%} are needed")
+    return depth, content
+
+
+def robot_region(height: int, below_deg: float, robot: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Where a panorama of ``height`` rows shows the robot itself, (h, 2 h).
+
+    Raises:
+        KeyframeError: the mask ``robot`` is no panorama.
+    """
+    elevation = 90 - (np.arange(height) + 0.5) * (180 / height)
+    region = np.repeat((elevation < below_deg)[:, None], 2 * height, axis=1)
+    if robot is None:
+        return region
+    if robot.ndim != 2 or robot.shape[1] != 2 * robot.shape[0] or robot.shape[0] < 1:
+        raise KeyframeError(f"the robot's mask must be twice as wide as high (got {robot.shape})")
+    rows = ((np.arange(height) + 0.5) * (robot.shape[0] / height)).astype(int)
+    columns = ((np.arange(2 * height) + 0.5) * (robot.shape[1] / (2 * height))).astype(int)
+    return np.asarray(region | (robot[rows][:, columns] > 0))
+
+
+def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.bool_]:
+    """Regions of unknown depth that are the sky, (h, w): as large as ``least_share`` of the sphere, and high up.
+
+    Unknown places in a room are small; where they are not, ``least_share`` 1 has them filled from around instead.
+    """
+    height, width = unknown.shape
+    area = np.cos(np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height)) * (np.pi / (2 * height * width))
+    sky = np.zeros(unknown.shape, bool)
+    if least_share >= 1 or float(unknown.sum(axis=1) @ area) < least_share:
+        return sky
+    try:
+        from scipy.ndimage import find_objects, label
+    except ImportError:  # then it is filled from around
+        return sky
+    labels, count = label(unknown)
+    for row in range(height):  # a region may go on over the seam
+        first, last = labels[row, 0], labels[row, -1]
+        if first and last and first != last:
+            labels[labels == last] = first
+    rise = np.sin(np.pi / 2 - (np.arange(height) + 0.5) * (np.pi / height))
+    for number, place in enumerate(find_objects(labels, count), 1):
+        if place is None:
+            continue
+        part = labels[place] == number
+        share = part.sum(axis=1) * area[place[0]]
+        if share.sum() >= least_share and share @ rise[place[0]] > _SKY_RISE * share.sum():
+            sky[place] |= part
+    return sky
+
+
+def _shrunk(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """``area_average``; OpenCV's where it is installed: a tenth of the time where the ratio is no whole number."""
+    try:
+        import cv2
+    except ImportError:
+        return area_average(rgb, height, width)
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _checked_sigma(
+    relative_sigma: float | NDArray[np.floating], depth_m: NDArray[np.floating], depth: NDArray[np.float32]
+) -> tuple[float, NDArray[np.float32]]:
+    """One number for the picture, and of each pixel of the depth (after ``_checked_depth``), (h, w), inf = unknown."""
+    sigma = np.asarray(relative_sigma, np.float32)
+    if sigma.ndim == 0:
+        if not np.isfinite(sigma) or sigma < 0:
+            raise KeyframeError(f"relative_sigma must be finite and not negative (got {relative_sigma})")
+        return float(relative_sigma), np.full(depth.shape, min(float(relative_sigma), MOST_SIGMA), np.float32)
+    if sigma.shape != depth_m.shape:
+        raise KeyframeError(f"relative_sigma must be one number or as the depth {depth_m.shape} (got {sigma.shape})")
+    step = max(1, depth_m.shape[1] // 1024)
+    sigma = sigma[::step, ::step][: depth.shape[0], : depth.shape[1]]
+    known = (depth > 0) & np.isfinite(sigma)
+    if not known.any() or float(sigma[known].min()) < 0:
+        raise KeyframeError("relative_sigma must be finite somewhere and nowhere negative")
+    return float(np.median(sigma[known])), np.where(known, sigma, np.float32(np.inf))
+
+
+def area_average(image: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """Each target pixel is the mean over its area of the source, (H, W, C) → (height, width, C)."""
+    result = image.astype(np.float32)
+    for axis, target in ((0, height), (1, width)):
+        source = result.shape[axis]
+        if source == target:
+            continue
+        if source % target == 0:
+            shape = (*result.shape[:axis], target, source // target, *result.shape[axis + 1 :])
+            result = result.reshape(shape).mean(axis=axis + 1, dtype=np.float32)
+            continue
+        # Integral along the axis, read at the (fractional) edges of the target's pixels.
+        lines = np.moveaxis(result, axis, 0)
+        integral = np.zeros((source + 1, *lines.shape[1:]), np.float64)
+        np.cumsum(lines, axis=0, dtype=np.float64, out=integral[1:])
+        edges = np.arange(target + 1) * (source / target)
+        low = np.minimum(edges.astype(np.intp), source - 1)
+        share = (edges - low).reshape(-1, *([1] * (lines.ndim - 1)))
+        at_edges = integral[low] * (1 - share) + integral[low + 1] * share
+        result = np.moveaxis(np.diff(at_edges, axis=0) * (target / source), 0, axis).astype(np.float32)
+    return np.clip(np.rint(result), 0, 255).astype(np.uint8)
+
+
+def fill_holes(
+    values: NDArray[np.float32], valid: NDArray[np.bool_], weight: NDArray[np.float32] | None = None
+) -> NDArray[np.float32]:
+    """Fills what is not valid from its surroundings by a pyramid of weighted means (pull, then push).
+
+    Args:
+        values: (H, W) or (H, W, C).
+        valid: (H, W); where nothing is valid at all, zeros come back.
+        weight: (H, W) positive weights of the valid values, 1 where None.
+    """
+    if valid.all():
+        return values
+    channels = values if values.ndim == 3 else values[..., None]
+    w = valid.astype(np.float32) if weight is None else np.where(valid, weight, 0).astype(np.float32)
+    try:
+        from instant_ic.vspace.fill_kernels import fill
+    except ImportError:  # no numba
+        filled = _fill(channels, w)
+    else:
+        filled = fill(channels, w)
+    return filled if values.ndim == 3 else filled[..., 0]
+
+
+def _fill(channels: NDArray[np.float32], w: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``fill_holes`` in numpy: (H, W, C), and weights (H, W) that are 0 in the holes."""
+    valid = w > 0
+    total = channels * w[..., None]
+    levels = [(total, w)]
+    while min(levels[-1][1].shape) > 1:
+        total, w = levels[-1]
+        levels.append((_halve(total), _halve(w)))
+    # Sums and weights go down together, so that where two sides meet the heavier counts more.
+    total, w = levels[-1]
+    for finer_total, finer_w in reversed(levels[:-1]):
+        known = finer_w > 0
+        total = np.float32(0.25) * _double(total, known.shape)
+        w = np.float32(0.25) * _double(w, known.shape)
+        total[known], w[known] = finer_total[known], finer_w[known]
+    coarse = (total / np.maximum(w, np.float32(1e-30))[..., None]).astype(np.float32)
+    coarse[valid] = channels[valid]
+    return coarse
+
+
+def _halve(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    height, width = values.shape[:2]
+    if height % 2 or width % 2:
+        pad = ((0, height % 2), (0, width % 2), *([(0, 0)] * (values.ndim - 2)))
+        values = np.pad(values, pad)
+    return values[::2, ::2] + values[1::2, ::2] + values[::2, 1::2] + values[1::2, 1::2]
+
+
+def _double(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Bilinear enlargement (weights 3/4 and 1/4), so that fills have no blocks."""
+    for axis in (0, 1):
+        before = np.concatenate([values.take([0], axis), values.take(range(values.shape[axis] - 1), axis)], axis)
+        after = np.concatenate([values.take(range(1, values.shape[axis]), axis), values.take([-1], axis)], axis)
+        pair = np.stack([0.75 * values + 0.25 * before, 0.75 * values + 0.25 * after], axis + 1)
+        merged = (*values.shape[:axis], 2 * values.shape[axis], *values.shape[axis + 1 :])
+        values = pair.reshape(merged)
+    return np.ascontiguousarray(values[: shape[0], : shape[1]], np.float32)
+
+
+_ABRUPT = 0.75  # of the change over five pixels: a step that makes up less of it is a slope with noise on it
+_LARGE = 0.3  # a difference larger than this share is an edge also where others are near
+
+
+def torn_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
+    """1 for each quad (v, u)-(v + 1, u + 1) that crosses a depth edge; columns wrap, the last row has no quad below.
+
+    Two neighbours are an edge when their depths differ by more than ``ratio`` and neither side's slope of the inverse
+    depth leads to the other: inverse depth is linear along a plane, however much the plane leans away. Where it leans
+    far, the noise of the depth is as large as what a pixel makes: there the step has to be most of the change around.
+    """
+    inverse = inverse_depth.astype(np.float32)
+    width = inverse.shape[1]
+    columns = np.pad(inverse, ((0, 0), (2, 3)), "wrap")
+    rows = np.pad(inverse, ((2, 3), (0, 0)), "edge")
+    across = _torn_pairs([columns[:, k : k + width] for k in range(6)], ratio)
+    down = _torn_pairs([rows[k : k + len(inverse)] for k in range(6)], ratio)
+    torn = across | np.concatenate([across[1:], across[-1:]]) | down | np.roll(down, -1, 1)
+    return torn.astype(np.uint8)
+
+
+def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.bool_]:
+    """Whether there is an edge between the third and the fourth of six pixels in a row."""
+    first, before, a, b, after, last = line
+    jump, nearest = np.abs(a - b), np.minimum(a, b)
+    limit = 0.5 * jump
+    off = (np.abs(2 * a - before - b) > limit) & (np.abs(2 * b - after - a) > limit)
+    abrupt = (jump > _ABRUPT * np.abs(last - first)) | (jump > _LARGE * nearest)
+    return (jump > ratio * nearest) & off & abrupt

@@ -1,0 +1,508 @@
+"""The virtual space: one keyframe's panorama and depth, trained and drawn by turns (paper, IV.A-B)."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import functools
+import importlib.util
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.canvas import Drawing, Painted, Picture
+from instant_ic.vspace.compose import exposure_gains, moved
+from instant_ic.vspace.config import VirtualSpaceConfig
+from instant_ic.vspace.devices import make_device
+from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
+from instant_ic.vspace.nerf.occupancy import build_occupancy
+from instant_ic.vspace.prior import KeyframeError, PanoramaPrior, prepare
+from instant_ic.vspace.readiness import Texture, error_terms, expected_psnr_db
+from instant_ic.vspace.saved import Progress, SavedSpace, read, write
+from instant_ic.vspace.store import Keyframe, KeyframeSet, KeyframeStore, ready
+from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
+
+T = TypeVar("T")
+_PROBE = (64, 36)  # pixels of the picture that readiness is judged by
+
+
+class State(enum.IntEnum):
+    """Numbers as in VspaceStatus.msg."""
+
+    EMPTY = 0
+    TRAINING = 1
+    READY = 2
+    FAILED = 3
+
+
+@dataclass(frozen=True)
+class TrainStats:
+    """What one ``train`` call did: iterations of this call and its CPU-independent wall time; PSNR is a running mean
+    over training rays since the newest keyframe, dB, NaN before the first iteration.
+    """
+
+    iterations: int
+    psnr_db: float
+    distance_error: float
+    """Root mean square of the signed distance's error, share of the band."""
+    elapsed_ms: float
+    converged: bool
+
+
+@dataclass(frozen=True)
+class Status:
+    """What the space can show now; fields as in VspaceStatus.msg.
+
+    Training figures are since the newest keyframe. ``refreshing``: the field has not learnt that one yet.
+    """
+
+    state: State
+    refreshing: bool
+    psnr_db: float
+    iterations: int
+    train_seconds: float
+    """Spent in training since the newest keyframe."""
+    ready_iterations: int
+    """Iterations from the keyframe until READY, 0 while not ready."""
+    ms_per_iteration: float
+    ready_radius_m: float
+    """How far from the keyframe a view is fit to show."""
+    converged: bool
+    device: str
+    warning: str = ""
+    """What is not as it should be with the device; empty when all is well."""
+
+
+class NotReadyError(RuntimeError):
+    """Asked for training or a picture before the first keyframe."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What the field is to learn, and the keyframes that it is of."""
+
+    scene: Scene
+    keyframes: KeyframeSet
+
+
+class VirtualSpace(Drawn):
+    """The newest keyframes: shown at once by warping, and one hash-grid field that learns from all of them.
+
+    A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
+    time, but for ``prepare`` and ``scene_of``, which another may call meanwhile. The same calls with the same seed give
+    the same bits on the CPU, as long as training is asked for by iterations and not by time.
+
+    Example:
+        >>> space = VirtualSpace(VirtualSpaceConfig())                        # doctest: +SKIP
+        >>> space.set_keyframe(rgb, depth_m, map_from_camera, relative_sigma=0.05)
+        >>> space.train(iterations=200).psnr_db
+        >>> space.render(map_from_camera, 320, 180, fov_rad=1.57).rgb
+    """
+
+    def __init__(self, config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> None:
+        """Makes an empty space.
+
+        Args:
+            config: parameters.
+            robot: picture (H, 2 H): true where panoramas show the robot itself or its stand, besides what
+                ``config.geometry.body_below_deg`` says.
+
+        Raises:
+            ValueError: parameters that do not fit; DeviceError: a device that is not there.
+        """
+        self.config = config or VirtualSpaceConfig()
+        if self.config.source == "mesh":
+            raise ValueError("source is mesh: nothing is learnt there; use make_space, which draws the mesh")
+        self._robot = robot
+        self._device, self._warning = make_device(self.config)
+        self._can_warp = importlib.util.find_spec("numba") is not None
+        # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
+        self._store = KeyframeStore(self.config.keyframes + 2)
+        self._shown: KeyframeSet | None = None
+        self._before: KeyframeSet | None = None  # what pictures showed before, until these have taken over
+        self._pictures = 0  # drawn since then
+        self._scene: Scene | None = None  # what the field learns
+        self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
+        self._texture: tuple[PanoramaPrior, Texture] | None = None
+        self._ready = False
+        self._colour_error = math.nan
+        self._rng = np.random.default_rng(self.config.train.seed)
+        self._reset_run(refresh=False)
+
+    def _reset_run(self, refresh: bool) -> None:
+        self._schedule = Schedule(self.config.train, refresh)
+        if not refresh:
+            self._colour_error = math.nan
+        self._history: deque[float] = deque(maxlen=self.config.readiness.plateau_iterations + 1)
+        self._ready_iterations = 0
+        self._train_seconds = 0.0
+
+    @property
+    def keyframe(self) -> PanoramaPrior | None:
+        """The newest keyframe that pictures show."""
+        return None if self._shown is None else self._shown.keyframes[0].prior
+
+    @property
+    def keyframes(self) -> tuple[PanoramaPrior, ...]:
+        """All keyframes that pictures show, newest first."""
+        return () if self._shown is None else self._shown.priors
+
+    @property
+    def _psnr_db(self) -> float:
+        return -10 * math.log10(max(self._colour_error, 1e-10))  # NaN stays NaN
+
+    @property
+    def _done(self) -> bool:
+        """Nothing is left to train."""
+        return self._schedule.finished or self.config.source == "warp"
+
+    def set_keyframe(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float | NDArray[np.floating],
+    ) -> None:
+        """Takes a new keyframe in: ``prepare``, ``scene_of``, ``learn`` and ``show``, one after another.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good; the old space stays as it was.
+        """
+        prepared = self.prepare(rgb, depth_m, map_from_camera, relative_sigma)
+        self.learn(self.scene_of(prepared))
+        self.show(prepared)
+
+    def prepare(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        relative_sigma: float | NDArray[np.floating],
+    ) -> KeyframeSet:
+        """Makes a new keyframe ready to be shown, with those before it that are kept; changes nothing that is shown.
+
+        Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), in the new one's exposure and
+        without what has moved; none where its pictures have another size. May run in a thread of its own beside all
+        other calls; one keyframe at a time, and each must be shown before the next.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good.
+        """
+        config = self.config
+        prior = prepare(
+            rgb, depth_m, map_from_camera, relative_sigma, config.geometry, config.panorama_width, self._robot
+        )
+        newest = self._store.put(prior, self._can_warp)
+        older = () if self._shown is None else self._shown.keyframes[: config.keyframes - 1]
+        same = (newest.prior.rgb.shape, newest.prior.inverse_depth.shape)
+        older = tuple(one for one in older if (one.prior.rgb.shape, one.prior.inverse_depth.shape) == same)
+        return self._together((newest, *older))
+
+    def _together(self, keyframes: tuple[Keyframe, ...]) -> KeyframeSet:
+        """Keyframes in one exposure, without what has moved."""
+        if len(keyframes) == 1:
+            alone = keyframes[0].prior.without(np.zeros_like(keyframes[0].prior.content, bool))
+            return KeyframeSet((_renewed(keyframes[0], alone),), np.ones((1, 3), np.float32))
+        if self._can_warp:
+            gone = moved([keyframe.prior for keyframe in keyframes])
+            keyframes = tuple(_renewed(one, one.prior.without(mask)) for one, mask in zip(keyframes, gone, strict=True))
+        return KeyframeSet(keyframes, exposure_gains([keyframe.prior for keyframe in keyframes]))
+
+    def show(self, prepared: KeyframeSet, dissolve: bool = False) -> None:
+        """Pictures show these keyframes from now on.
+
+        ``dissolve``: what was shown before passes into them over the next ``picture.refresh_pictures`` pictures.
+        """
+        self._before, self._pictures = self._shown if dissolve else None, 0
+        self._shown = prepared
+        if self.config.source == "warp":
+            self._ready, self._ready_iterations = True, 1  # a warp is ready at once
+        self._let_go()
+
+    def _let_go(self) -> None:
+        """Frees what is neither shown nor learnt any more."""
+        if self._pictures >= self.config.picture.refresh_pictures - 1:
+            self._before = None
+        shown = [one.keyframes for one in (self._shown, self._before) if one is not None]
+        self._store.keep(itertools.chain(*shown, self._held))
+
+    def scene_of(self, prepared: KeyframeSet) -> Prepared:
+        """What the field needs to learn keyframes; in any thread, as ``prepare``, and before the next keyframe's."""
+        priors, config = prepared.priors, self.config
+        lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
+        if scene is not None and scene.lattice.suits(lattice):
+            lattice = scene.lattice
+        return Prepared(Scene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains), prepared)
+
+    def learn(self, prepared: Prepared) -> None:
+        """The field learns these keyframes from now on, from what it has learnt before.
+
+        Where the scale has changed by more than a factor of 2 it starts anew. A failing device leaves the old space.
+        """
+        scene, old = prepared.scene, self._scene
+        refresh = old is not None and scene.lattice is old.lattice
+        if refresh or old is None:
+            self._on_device(lambda device: device.set_scene(scene))
+        else:
+            self._start_anew(scene, old)
+        self._scene, self._held = scene, prepared.keyframes.keyframes
+        self._ready = self._ready and (refresh or self.config.picture.panorama_share(math.nan) == 1)
+        self._reset_run(refresh)
+
+    def _start_anew(self, scene: Scene, old: Scene) -> None:
+        learnt = self._device.parameters()
+
+        def start(device: Device) -> None:
+            device.load(FieldParameters.random(self.config.field, self.config.train.seed))
+            device.set_scene(scene)
+
+        try:
+            self._on_device(start)
+        except Exception:
+            self._device.load(learnt)
+            self._device.set_scene(old)
+            raise
+
+    def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
+        """Trains until the time is spent, the iterations are done or the schedule has ended, at least one iteration.
+
+        Raises:
+            NotReadyError: no keyframe yet.
+        """
+        if self._shown is None:
+            raise NotReadyError("no keyframe yet: call set_keyframe first")
+        if self._scene is None:
+            self.learn(self.scene_of(self._shown))
+        start = time.perf_counter()
+        done, distance_error = 0, math.nan
+        limit = self.config.train.iterations if iterations is None else iterations
+        shape = (self.config.train.ray_columns * self.config.train.ray_rows, 3)
+        while not self._done and done < limit:
+            uniform = self._rng.random(shape, np.float32)
+            colour, distance = self._on_device(functools.partial(_step, uniform, self._schedule.rates()))
+            self._schedule.iteration += 1
+            done += 1
+            distance_error = math.sqrt(distance)
+            self._note(colour)
+            if (time.perf_counter() - start) * 1e3 >= budget_ms:
+                break
+        elapsed = time.perf_counter() - start
+        self._train_seconds += elapsed
+        return TrainStats(done, self._psnr_db, distance_error, elapsed * 1e3, self._done)
+
+    def _note(self, colour_error: float) -> None:
+        first = math.isnan(self._colour_error)
+        self._colour_error = colour_error if first else 0.9 * self._colour_error + 0.1 * colour_error
+        self._history.append(self._psnr_db)
+        rule = self.config.readiness
+        full = len(self._history) == rule.plateau_iterations + 1
+        plateau = full and self._history[-1] - self._history[0] < rule.plateau_db
+        good = self._psnr_db >= rule.psnr_db and self._schedule.iteration >= 5
+        if not self._ready_iterations and (good or plateau or self._schedule.finished):
+            self._ready_iterations, self._ready = self._schedule.iteration, True
+
+    @property
+    def status(self) -> Status:
+        """What the space can show now."""
+        iterations = self._schedule.iteration
+        if self._shown is None:
+            state = State.EMPTY
+        else:
+            state = State.READY if self._ready else State.TRAINING
+        return Status(
+            state=state,
+            refreshing=self._ready and not self._ready_iterations,
+            psnr_db=self._psnr_db,
+            iterations=iterations,
+            train_seconds=self._train_seconds,
+            ready_iterations=self._ready_iterations if self.config.source == "field" else 0,
+            ms_per_iteration=self._train_seconds * 1e3 / iterations if iterations else 0.0,
+            ready_radius_m=self._ready_radius_m() if state == State.READY else 0.0,
+            converged=self._shown is not None and self._done,
+            device=self._device.name,
+            warning=self._warning,
+        )
+
+    def _ready_radius_m(self) -> float:
+        """A surface at depth D, wrong by σ·D, seen from b aside is displaced by about b·σ/D radians."""
+        rule, prior = self.config.readiness, self.keyframe
+        assert prior is not None
+        sigma = max(prior.relative_sigma, 1e-3)
+        return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
+
+    def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
+        """PSNR that a view from a pose will have, judged without its truth (``readiness``); −inf without a keyframe.
+
+        From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
+        """
+        shown = self._shown
+        if shown is None:
+            return -math.inf
+        rays = perspective_rays(checked_pose(map_from_camera), *_PROBE, fov_rad)
+        self._learn_what_is_drawn(around=False)
+
+        def draw(device: Device) -> Painted:
+            picture = self._drawn(device, rays, shown, self._can_warp, {})
+            return device.canvas.painted(picture, picture.colour)
+
+        _, depth, confidence = self._on_device(draw)
+        return self._judge(rays, depth, confidence)
+
+    def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
+        """Expected PSNR of a view as it was drawn, (P,) each; a few thousand pixels tell it."""
+        step = max(1, rays.shape[1] // _PROBE[0])
+        height, width = rays.shape
+        chosen = np.arange(step // 2, height, step)[:, None] * width + np.arange(step // 2, width, step)
+        chosen = chosen.reshape(-1)
+        some = rays.some(chosen)
+        priors = self.keyframes
+        if self._texture is None or self._texture[0] is not priors[0]:
+            self._texture = priors[0], Texture.of(priors[0].rgb)
+        terms = error_terms(priors, self._texture[1], some, depth[chosen], confidence[chosen])
+        return expected_psnr_db(terms, self._psnr_db, self._panorama_share)
+
+    def _view(self, rays: Rays, projection: str) -> View:
+        if self._shown is None:
+            raise NotReadyError("no keyframe yet: call set_keyframe first")
+        self._learn_what_is_drawn(projection == "equirect")
+        rgb, depth, confidence = self._on_device(lambda device: self._painted(device, rays, projection == "equirect"))
+        if self._before is not None:
+            self._pictures += 1
+            self._let_go()
+        expected = self._judge(rays, depth, confidence)
+        return View(rgb, depth.reshape(rays.shape), confidence.reshape(rays.shape), projection, expected)
+
+    def _learn_what_is_drawn(self, around: bool) -> None:
+        """Gives the field the keyframes that are shown where it is drawn too, and has none yet."""
+        if self._scene is None and (self._panorama_share < 1 or around or not self._can_warp):
+            assert self._shown is not None
+            self.learn(self.scene_of(self._shown))
+
+    def _painted(self, device: Device, rays: Rays, around: bool) -> Painted:
+        """A view of what is shown, passing over from what was shown before; ``around``: a panorama, not warped."""
+        assert self._shown is not None
+        canvas, warps = device.canvas, self._can_warp and not around
+        layers: dict[int, Drawing] = {}  # a keyframe of both sets is drawn once
+        picture = self._drawn(device, rays, self._shown, warps, layers)
+        image = canvas.continued(picture, rays.shape, around)
+        if self._before is not None:
+            before = self._drawn(device, rays, self._before, warps, layers)
+            share = (self._pictures + 1) / self.config.picture.refresh_pictures
+            image = share * image + (1 - share) * canvas.continued(before, rays.shape, around)
+        return canvas.painted(picture, image)
+
+    def _drawn(
+        self, device: Device, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, Drawing]
+    ) -> Picture:
+        """A view by keyframes: their panoramas warped (``warps``), then the field as it becomes better."""
+        share, depth_share = self._panorama_share, self.config.picture.depth_share(self._psnr_db)
+        field = None
+        if share < 1 or not warps:
+            field = device.drawn(rays, 0.0 if warps else share, depth_share)
+        return device.canvas.draw(rays, shown if warps else None, share, field, layers)
+
+    @property
+    def _panorama_share(self) -> float:
+        return 1.0 if self.config.source == "warp" else self.config.picture.panorama_share(self._psnr_db)
+
+    def _on_device(self, call: Callable[[Device], T]) -> T:
+        """Calls; a GPU without memory is left for the CPU where ``device`` is ``auto``, with what is learnt."""
+        try:
+            return call(self._device)
+        except RuntimeError as error:
+            if type(error).__name__ != "OutOfMemoryError" or self.config.device != "auto":
+                raise
+            self._warning = f"{self._device.name} is out of memory; on the CPU from now on ({error})"
+        parameters = self._device.parameters()
+        self._device, _ = make_device(dataclasses.replace(self.config, device="cpu"))
+        self._device.load(parameters)
+        if self._scene is not None:
+            self._device.set_scene(self._scene)
+        return call(self._device)
+
+    def parameters(self) -> FieldParameters:
+        """A copy of the field's present parameters."""
+        return self._device.parameters()
+
+    @property
+    def _progress(self) -> Progress:
+        schedule = self._schedule
+        return Progress(
+            *(self._psnr_db, schedule.iteration, schedule.refresh),
+            *(self._ready_iterations, self._train_seconds, self._ready),
+        )
+
+    def save(self, path: str | Path) -> Path:
+        """Saves the space that pictures show as one ``.npz`` file; ``path`` is that or a folder. Returns the file.
+
+        The optimiser's moments are not in it: training that goes on from a file starts them anew.
+
+        Raises:
+            NotReadyError: no keyframe yet.
+            OSError: the file cannot be written; an older one stays as it was.
+        """
+        if self._shown is None:
+            raise NotReadyError("no keyframe yet: there is nothing to save")
+        if self._scene is None:
+            self.learn(self.scene_of(self._shown))
+        assert self._scene is not None
+        return write(
+            path,
+            SavedSpace(
+                self.config, self._shown.priors, self._shown.gains, self._scene.lattice, self.parameters(),
+                self._progress,
+            ),
+        )  # fmt: skip
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
+        """The space of a file (or of the folder it lies in). Its pictures have the same bits as before, on the CPU.
+
+        Args:
+            path: what ``save`` was given.
+            device: as in ``VirtualSpaceConfig``; the file's own where None.
+
+        Raises:
+            SpaceFileError: missing, damaged, foreign, or of a newer version.
+        """
+        saved = read(path)
+        space = cls(saved.config if device is None else dataclasses.replace(saved.config, device=device))
+        shown = KeyframeSet(tuple(space._store.put(prior, space._can_warp) for prior in saved.priors), saved.gains)
+        occupancy = build_occupancy(saved.priors, saved.config.geometry)
+        space._device.load(saved.parameters)
+        space.learn(Prepared(Scene(shown.priors, saved.lattice, occupancy, saved.gains), shown))
+        space.show(shown)
+        progress = saved.progress
+        space._schedule = Schedule(saved.config.train, progress.refresh, progress.iteration)
+        space._colour_error = 10 ** (-progress.psnr_db / 10)
+        space._train_seconds, space._ready_iterations = progress.train_seconds, progress.ready_iterations
+        space._ready = progress.ready
+        # Rays that were not drawn before, the same at each loading.
+        space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
+        return space
+
+
+def _renewed(keyframe: Keyframe, prior: PanoramaPrior) -> Keyframe:
+    """The keyframe with another prior of the same panorama."""
+    if prior is keyframe.prior:
+        return keyframe
+    return ready(keyframe.place, prior, None if keyframe.warp is None else keyframe.warp.pyramid)
+
+
+def _step(uniform: Floats, rates: tuple[float, float], device: Device) -> tuple[float, float]:
+    return device.step(uniform, *rates)
+
+
+__all__ = ["KeyframeError", "NotReadyError", "State", "Status", "TrainStats", "View", "VirtualSpace"]

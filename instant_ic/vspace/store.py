@@ -1,0 +1,96 @@
+"""The newest keyframes, in places that are made once and used again and again."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.background import Background
+from instant_ic.vspace.nerf.field import Floats
+from instant_ic.vspace.prior import PanoramaPrior
+from instant_ic.vspace.warp import PanoramaWarp, Pyramid
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A keyframe as pictures need it; ``warp`` and ``background`` are None without numba. ``place``: in the store."""
+
+    place: int
+    prior: PanoramaPrior
+    warp: PanoramaWarp | None
+    background: Background | None
+
+
+@dataclass(frozen=True)
+class KeyframeSet:
+    """Keyframes that pictures show together, newest first; ``gains`` (K, 3) bring their colours to the newest's."""
+
+    keyframes: tuple[Keyframe, ...]
+    gains: Floats
+
+    @property
+    def priors(self) -> tuple[PanoramaPrior, ...]:
+        """Of the keyframes, newest first."""
+        return tuple(keyframe.prior for keyframe in self.keyframes)
+
+
+class KeyframeStore:
+    """Arrays of keyframes of one size; nothing large is allocated for a keyframe after the first.
+
+    ``put`` may be called from another thread than ``keep``.
+    """
+
+    def __init__(self, places: int) -> None:
+        self._lock = threading.Lock()
+        self._places = places
+        self._arrays: list[dict[str, NDArray[Any]]] = []
+        self._held: set[int] = set()
+
+    def put(self, prior: PanoramaPrior, draws: bool) -> Keyframe:
+        """Copies a keyframe into a free place and makes it ready to be drawn (``draws``: by the warp, with numba)."""
+        names = [field.name for field in fields(prior) if isinstance(getattr(prior, field.name), np.ndarray)]
+        arrays = self._free({name: getattr(prior, name) for name in names})
+        for name in names:
+            if name != "rgb":
+                arrays[name][...] = getattr(prior, name)
+        pyramid = Pyramid.of(prior.rgb, arrays["texels"])
+        stored: dict[str, Any] = {name: arrays[name] for name in names}
+        prior = replace(prior, **stored)
+        return ready(int(arrays["place"]), prior, pyramid if draws else None)
+
+    def _free(self, like: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """The arrays of a free place; another one is made where all are held."""
+        with self._lock:
+            if self._arrays and any(self._arrays[0][name].shape != array.shape for name, array in like.items()):
+                self._arrays, self._held = [], set()  # another size; whoever holds an old keyframe keeps its arrays
+            free = next((n for n in range(len(self._arrays)) if n not in self._held), len(self._arrays))
+            while len(self._arrays) < max(self._places, free + 1):
+                self._arrays.append(_arrays_for(like, len(self._arrays)))
+            self._held.add(free)
+            return self._arrays[free]
+
+    def keep(self, keyframes: Iterable[Keyframe]) -> None:
+        """Frees all places but those of ``keyframes``."""
+        with self._lock:
+            self._held = {keyframe.place for keyframe in keyframes}
+
+
+def ready(place: int, prior: PanoramaPrior, pyramid: Pyramid | None) -> Keyframe:
+    """A keyframe made ready to be drawn by the warp, or not where it has no pyramid."""
+    if pyramid is None:
+        return Keyframe(place, prior, None, None)
+    return Keyframe(place, prior, PanoramaWarp.of_prior(prior, pyramid), Background.of(prior))
+
+
+def _arrays_for(like: dict[str, NDArray[Any]], place: int) -> dict[str, NDArray[Any]]:
+    """A place for a keyframe of this size; the panorama is the first level of its pyramid."""
+    arrays = {name: np.zeros_like(array) for name, array in like.items() if name != "rgb"}
+    arrays["texels"] = np.zeros_like(Pyramid.of(like["rgb"]).texels)
+    height, width = like["rgb"].shape[:2]
+    arrays["rgb"] = arrays["texels"][: height * width].reshape(height, width, 3)
+    return arrays | {"place": np.array(place)}

@@ -1,0 +1,208 @@
+"""Pictures of the space: what they hold, and the rays of each projection."""
+
+from __future__ import annotations
+
+import abc
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.projections import CUBE_FACES, equirect_directions, perspective_directions, sample_equirect
+from instant_ic.vspace.nerf.field import Floats, Rays
+from instant_ic.vspace.prior import fill_holes
+
+MIN_VIEW, MAX_VIEW = 16, 4096
+"""Pixels a side."""
+_STRIDE_RAD = 0.025
+"""In an equirect picture the inverse depth of a plane is linear between pixels no further apart than about this."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A picture of the space; of a cube map all arrays have a leading axis of six, in the order of ``CUBE_FACES``.
+
+    Attributes:
+        rgb: (H, W, 3) uint8; what is not known is continued from around it.
+        depth_m: (H, W) along the ray, 0 where it meets nothing.
+        confidence: (H, W): 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled from
+            around, 0 where none has: unknown.
+        projection: ``perspective``, ``equirect`` or ``cube``.
+        expected_psnr_db: that the picture has, judged without its truth (``readiness``); NaN of a cube map.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth_m: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    projection: str = "perspective"
+    expected_psnr_db: float = math.nan
+
+    @property
+    def unseen_share(self) -> float:
+        """Of the picture's pixels, 0..1: what no keyframe has seen."""
+        return float(np.count_nonzero(self.confidence == 0)) / self.confidence.size
+
+    @property
+    def opacity(self) -> NDArray[np.float32]:
+        """1 where the ray meets a surface, seen or not, else 0, (H, W): surfaces are met or missed, never half."""
+        return (self.depth_m > 0).astype(np.float32)
+
+    @property
+    def mean_confidence(self) -> float:
+        """Mean over the picture; of an equirect picture by solid angle."""
+        if self.projection != "equirect":
+            return float(self.confidence.mean())
+        height = self.confidence.shape[0]
+        weight = np.sin((np.arange(height) + 0.5) * (math.pi / height))
+        return float(self.confidence.mean(axis=1) @ weight / weight.sum())
+
+    def mask_png(self, width: int = 64) -> bytes:
+        """Confidence of a flat picture as a small grey PNG, 0 unseen to 255 seen; empty where all of it was seen."""
+        import cv2
+
+        if (self.confidence >= 1).all():
+            return b""
+        rows, columns = self.confidence.shape
+        width = min(width, columns)
+        size = (width, max(1, round(rows * width / columns)))
+        small = cv2.resize(np.asarray(self.confidence, np.float32), size, interpolation=cv2.INTER_AREA)
+        ok, png = cv2.imencode(".png", np.rint(255 * np.clip(small, 0, 1)).astype(np.uint8))
+        if not ok:
+            raise ValueError(f"PNG encoder refused a mask of shape {small.shape}")
+        return bytes(png.tobytes())
+
+
+def check_size(width: int, height: int) -> None:
+    """Raises ValueError for a picture that is too small or too large to draw."""
+    if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
+        raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
+
+
+def checked_pose(map_from_camera: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The pose as float64; ValueError where it is none."""
+    pose = np.asarray(map_from_camera, np.float64)
+    if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        raise ValueError("pose of the view must be a finite 4x4 matrix")
+    return pose
+
+
+@functools.lru_cache(maxsize=2)
+def _perspective(width: int, height: int, fov_rad: float) -> tuple[Floats, Floats]:
+    directions = perspective_directions(width, height, fov_rad).reshape(-1, 3)
+    axial = 1 / np.linalg.norm(directions, axis=1)
+    return directions * axial[:, None], axial
+
+
+@functools.lru_cache(maxsize=1)
+def _equirect(width: int, height: int) -> tuple[Floats, Floats]:
+    return equirect_directions(width, height).reshape(-1, 3), np.ones(width * height, np.float32)
+
+
+class LensRays(Rays):
+    """Rays of a lens, turned into the map only where that is asked for: a GPU turns them itself.
+
+    Attributes:
+        lens: unit vectors of the camera's frame, (P, 3); the same array for all pictures of one size and projection.
+        turn: map_from_camera rotation, (3, 3) float32.
+    """
+
+    lens: Floats
+    turn: Floats
+
+    def __init__(self, pose: NDArray[np.float64], lens: Floats, axial: Floats, shape: tuple[int, int], stride: int):
+        turn, origin = pose[:3, :3].astype(np.float32), pose[:3, 3].astype(np.float32)
+        # Not by assignment: rays are frozen.
+        vars(self).update(origin=origin, axial=axial, shape=shape, stride=stride, lens=lens, turn=turn)
+
+    @functools.cached_property
+    def directions(self) -> Floats:
+        return _turned(self.lens, self.turn)
+
+    def some(self, chosen: NDArray[np.integer]) -> Rays:
+        return Rays(self.origin, _turned(self.lens[chosen], self.turn), self.axial[chosen], (len(chosen), 1))
+
+
+def _turned(directions: Floats, turn: Floats) -> Floats:
+    # Not by matmul: BLAS would start threads for it, which wait for each other ten times as long as they compute.
+    return np.einsum("pj,ij->pi", directions, turn)
+
+
+def perspective_rays(pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
+    """Rays of a pinhole picture along the camera's x axis."""
+    return LensRays(pose, *_perspective(width, height, round(fov_rad, 6)), (height, width), 4)
+
+
+def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
+    """Rays of a panorama, ``width`` × ``width / 2``."""
+    pixels = _STRIDE_RAD / (2 * math.pi / width)
+    stride = 4 if pixels >= 4 else 2 if pixels >= 2 else 1
+    return LensRays(pose, *_equirect(width, width // 2), (width // 2, width), stride)
+
+
+def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: bool = False) -> Floats:
+    """Continues what is not known from around it, more from the far side than from the near: it opens up behind the
+    nearer surface.
+
+    Args:
+        image: (H, W, 3); depth_m, confidence: (H, W).
+        wraps: the left edge is the right edge's neighbour, as in a panorama.
+    """
+    seen = confidence > 0
+    if seen.all() or not seen.any():  # where nothing is known there is nothing to continue
+        return image
+    if not wraps:
+        return fill_holes(image, seen, weight=depth_m * depth_m)
+    width = image.shape[1]
+    side = width // 4
+    around = np.r_[width - side : width, 0:width, 0:side]
+    return continue_unseen(image[:, around], depth_m[:, around], confidence[:, around])[:, side : side + width]
+
+
+class Drawn(abc.ABC):
+    """A space that is drawn ray by ray: its pictures in each projection."""
+
+    @abc.abstractmethod
+    def _view(self, rays: Rays, projection: str) -> View:
+        """What the rays see, (H, W); what is not known is continued from around it."""
+
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
+        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+
+        Raises:
+            NotReadyError: no keyframe yet, where one is needed.
+            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+        """
+        check_size(width, height)
+        return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")
+
+    def render_equirect(self, map_from_camera: NDArray[np.floating], width: int) -> View:
+        """A panorama, ``width`` × ``width / 2``. Raises as ``render``."""
+        check_size(width, width // 2)
+        if width % 2:
+            raise ValueError(f"a panorama's width must be even (got {width})")
+        return self._view(equirect_rays(checked_pose(map_from_camera), width), "equirect")
+
+    def render_cube(self, map_from_camera: NDArray[np.floating], size: int) -> View:
+        """Six faces of 90°, (6, size, size), in the order of ``geometry.projections.CUBE_FACES``. Raises as ``render``.
+
+        What is not known is continued across the faces' edges.
+        """
+        check_size(size, size)
+        pose, faces = checked_pose(map_from_camera), []
+        round_about: View | None = None
+        for rotation in CUBE_FACES.values():
+            turned = pose.copy()
+            turned[:3, :3] = pose[:3, :3] @ rotation
+            face = self._view(perspective_rays(turned, size, size, math.pi / 2), "cube")
+            unseen = face.confidence == 0
+            if unseen.any():
+                round_about = round_about or self.render_equirect(pose, min(4 * size, MAX_VIEW))
+                directions = perspective_directions(size, size, math.pi / 2)[unseen] @ rotation.T.astype(np.float32)
+                face.rgb[unseen] = np.rint(sample_equirect(round_about.rgb, directions))
+            faces.append(face)
+        rgb, depth, confidence = (
+            np.stack([getattr(f, key) for f in faces]) for key in ("rgb", "depth_m", "confidence")
+        )
+        return View(rgb, depth, confidence, "cube")

@@ -1,0 +1,231 @@
+"""The newest panorama, warped by its depth: a view without any training, and what the field has to beat.
+
+The panorama's depth picture is a mesh, torn at depth edges, drawn into a z-buffer; colours come from the panorama at
+its full resolution, averaged over each pixel's footprint; what opens is continued from the farther side.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.vspace.config import GeometryConfig
+from instant_ic.vspace.nerf.field import Floats, Rays
+from instant_ic.vspace.prior import ROOM, PanoramaPrior, prepare, torn_quads
+from instant_ic.vspace.view import View, check_size, checked_pose, continue_unseen, perspective_rays
+
+TORN_RATIO = 0.05
+"""Neighbouring depths that differ by more than this share, off one plane, are an edge."""
+BLUR = 0.65
+"""Share of a pixel that a colour is averaged over; trilinear look-up blurs by itself (as in ``sim.render``)."""
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """A panorama at full, half, quarter... size, area-averaged.
+
+    Attributes:
+        texels: rows of all levels one after another, (N, 3) uint8.
+        start: first texel of each level, (levels,) int64.
+        sizes: height and width of each level, (levels, 2) int64.
+    """
+
+    texels: NDArray[np.uint8]
+    start: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, rgb: NDArray[np.uint8], texels: NDArray[np.uint8] | None = None) -> Pyramid:
+        """Of a panorama (H, 2 H, 3); levels as long as both sides can be halved, down to 8 rows.
+
+        ``texels``: where they go, if there is a place for them already.
+        """
+        levels = [rgb]
+        while levels[-1].shape[0] >= 16 and levels[-1].shape[0] % 2 == 0:
+            rows = levels[-1][::2].astype(np.uint16) + levels[-1][1::2]
+            levels.append(((rows[:, ::2] + rows[:, 1::2] + 2) >> 2).astype(np.uint8))
+        sizes = np.array([level.shape[:2] for level in levels], np.int64)
+        start = np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]).astype(np.int64)
+        return cls(np.concatenate([level.reshape(-1, 3) for level in levels], out=texels), start, sizes)
+
+    def look_up(
+        self, camera_from_map: Floats, rays: Rays, depth: Floats, wanted: Floats, share: float, colour: Floats
+    ) -> None:
+        """Mixes the panorama's colour into that of a view's surfaces, averaged over each pixel's footprint.
+
+        Args:
+            camera_from_map: of the panorama, (4, 4) float32.
+            rays: of the view; depth: along them, (P,), 0 where nothing is met.
+            wanted: (P,) over 0 where a colour is wanted.
+            share: of the panorama in the result, 0..1.
+            colour: in and out, (P, 3) in 0..1.
+        """
+        from instant_ic.vspace import warp_kernels
+
+        places = np.empty((len(depth), 2), np.float32)
+        warp_kernels.panorama_places(camera_from_map, rays.origin, rays.directions, depth, *self.sizes[0], places)
+        warp_kernels.look_up(
+            self.texels,
+            self.start,
+            self.sizes,
+            places,
+            *rays.shape,
+            np.float32(BLUR),
+            wanted,
+            np.float32(share),
+            colour,
+        )
+
+
+class PanoramaWarp:
+    """A panorama with depth that can be seen from elsewhere.
+
+    Attributes:
+        inverse, torn, known: of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
+
+    Example:
+        >>> warp = PanoramaWarp(rgb, depth_m, map_from_camera)               # doctest: +SKIP
+        >>> warp.render(pose, 320, 180, fov_rad=1.57).rgb
+    """
+
+    def __init__(
+        self,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[np.floating],
+        map_from_camera: NDArray[np.floating],
+        panorama_width: int = 4096,
+    ) -> None:
+        """Checks and takes a keyframe.
+
+        Args: as ``prior.prepare``.
+
+        Raises:
+            KeyframeError: the keyframe is no good.
+        """
+        self._take(prepare(rgb, depth_m, map_from_camera, 0.0, GeometryConfig(), panorama_width))
+
+    @classmethod
+    def of_prior(cls, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> PanoramaWarp:
+        """Of a keyframe that has been made ready already, and its pyramid where that is there too."""
+        warp = cls.__new__(cls)
+        warp._take(prior, pyramid)
+        return warp
+
+    def _take(self, prior: PanoramaPrior, pyramid: Pyramid | None = None) -> None:
+        self.prior = prior
+        self.pyramid = pyramid or Pyramid.of(prior.rgb)
+        self._camera_from_map = np.linalg.inv(prior.map_from_camera).astype(np.float32)
+        height, width = prior.inverse_depth.shape
+        # A row more above and below closes the mesh at the poles.
+        self.inverse, self.known = (
+            np.ascontiguousarray(np.concatenate([a[:1], a, a[-1:]])) for a in (prior.inverse_depth, prior.known)
+        )
+        none = np.zeros((1, width), np.uint8)
+        # The last row's own quads reach down to the pole, where nothing is torn.
+        torn = torn_quads(prior.inverse_depth, TORN_RATIO)
+        gone = prior.content != ROOM
+        if gone.any():  # quads at its rim are drawn by their corners, of which it has none
+            right = np.roll(gone, -1, 1)
+            torn[:-1] |= (gone | right)[:-1] | (gone | right)[1:]
+            torn[-1] = 0
+            self.known[1:-1][gone] = 2
+            self.known[[0, -1]] = self.known[[1, -2]]
+            none = (self.known[[0]] == 2).astype(np.uint8)
+        below = (self.known[[-1]] == 2).astype(np.uint8)
+        self.torn = np.concatenate([none, torn[:-1], below, below])
+        self._halves = _half_step_directions(width, height)
+        self._directions = np.ascontiguousarray(self._halves[::2, ::2])
+        self._vertices = np.empty((height + 2, width, 3), np.float32)
+        self._outside = np.empty((height + 2, width), np.uint8)
+
+    def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
+        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+
+        Confidence is 1 where the panorama has seen the place, 0.5 where its depth was filled from around, 0 elsewhere.
+
+        Raises:
+            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+        """
+        check_size(width, height)
+        rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
+        colour, depth, confidence = self.draw(rays)
+        depth, confidence = depth.reshape(height, width), confidence.reshape(height, width)
+        image = continue_unseen(colour.reshape(height, width, 3), depth, confidence)
+        rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
+        return View(rgb, depth, confidence)
+
+    def draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
+        """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,) of a perspective view's rays, as
+        ``field.Device.draw``; what has no confidence has no colour, unless nothing has any.
+        """
+        from instant_ic.vspace import warp_kernels
+
+        map_from_view, half = pinhole(rays)
+        view_from_camera = (np.linalg.inv(map_from_view) @ self.prior.map_from_camera).astype(np.float32)
+        nearness = np.zeros(rays.shape, np.float32)
+        marks = np.zeros(rays.shape, np.uint8)
+        aspect = np.float32(rays.shape[0] / rays.shape[1])
+        warp_kernels.place_vertices(
+            self.inverse, self._directions, view_from_camera, half, aspect, self._vertices, self._outside
+        )
+        warp_kernels.draw_mesh(
+            self._vertices, self._outside, self.inverse, self.torn, self.known, self._halves,
+            view_from_camera, half, nearness, marks,
+        )  # fmt: skip
+        depth = np.zeros(len(rays.axial), np.float32)
+        np.divide(1 / rays.axial, nearness.reshape(-1), out=depth, where=nearness.reshape(-1) > 0)
+        confidence = np.array([0, 0.5, 1, 0], np.float32)[marks.reshape(-1)]
+        colour = np.zeros((len(depth), 3), np.float32)
+        # From beyond every surface only backs are met: their colours, with no confidence, say more than black.
+        wanted = confidence if confidence.any() else depth
+        self.pyramid.look_up(self._camera_from_map, rays, depth, wanted, 1.0, colour)
+        return colour, depth, confidence
+
+
+def dissolve(
+    warped: tuple[Floats, Floats, Floats], field: tuple[Floats, Floats, Floats], share: float
+) -> tuple[Floats, Floats, Floats]:
+    """Two pictures of one view, each as ``draw`` gives it: ``share`` of the first; where one has nothing, the other.
+
+    Depth and confidence are those of the larger share.
+    """
+    weights = [share * (warped[2] > 0), (1 - share) * (field[2] > 0)]
+    total = np.maximum(weights[0] + weights[1], np.float32(1e-9))
+    colour = (warped[0] * (weights[0] / total)[:, None] + field[0] * (weights[1] / total)[:, None]).astype(np.float32)
+    first = weights[0] >= weights[1]
+    return colour, np.where(first, warped[1], field[1]), np.where(first, warped[2], field[2])
+
+
+def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
+    """Pose (4, 4) of a perspective view, and the tangent of half its horizontal field of view, from its rays."""
+    height, width = rays.shape
+    some = rays.some(np.array([0, width - 1, (height - 1) * width, height * width - 1]))
+    corners = (some.directions / some.axial[:, None]).reshape(2, 2, 3).astype(np.float64)
+    ahead = corners.mean(axis=(0, 1))
+    left, up = (corners[:, 0] - corners[:, 1]).mean(axis=0), (corners[0] - corners[1]).mean(axis=0)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in (ahead, left, up)], axis=1)
+    pose[:3, 3] = rays.origin
+    # The outermost pixels' centres lie half a pixel inside the picture's edge.
+    return pose, np.float32(0.5 * np.linalg.norm(left) * width / (width - 1))
+
+
+@functools.lru_cache(maxsize=2)  # a keyframe is as large as the one before
+def _half_step_directions(width: int, height: int) -> NDArray[np.float32]:
+    """Unit directions at every half pixel of a panorama with a row more above and below, (2 height + 3, 2 width, 3).
+
+    Entry (2 v + 2, 2 u) is pixel (v, u)'s own; rows beyond a pole are the pole.
+    """
+    azimuth = math.pi - (np.arange(2 * width) + 1) * (math.pi / width)
+    elevation = math.pi / 2 - (np.arange(-2, 2 * height + 1) + 1) * (math.pi / (2 * height))
+    elevation = np.clip(elevation, -math.pi / 2, math.pi / 2)
+    flat = np.cos(elevation)[:, None]
+    directions = np.empty((2 * height + 3, 2 * width, 3), np.float32)
+    directions[..., 0] = flat * np.cos(azimuth)
+    directions[..., 1] = flat * np.sin(azimuth)
+    directions[..., 2] = np.sin(elevation)[:, None]
+    return directions

@@ -1,0 +1,266 @@
+"""Plays a bag onto the bus, with /clock before each message; ends with the bag."""
+
+from __future__ import annotations
+
+import fnmatch
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from instant_ic.bag import BagError, BagMessage
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bag.player import RATES, BagPlayer, PlayOptions
+from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
+from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
+from instant_ic.bus.clock import ManualClock
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.msg import message_type, register_type, to_time
+
+_BASE = "nodes.crawler_base"
+_BASE_PERIOD_S = 0.5
+_ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
+"""What a robot's nodes act on, in the namespace of its base."""
+_HARMLESS = {"/clock", "/rosout", "/diagnostics", "/heartbeat", "/parameter_events"}
+"""What every node publishes. Of all else a second publisher would mix the bag's world with the robot's."""
+
+
+@dataclass(frozen=True)
+class BagPlayerConfig:
+    """Parameters of the player.
+
+    Attributes:
+        bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
+        rate: 2 plays twice as fast.
+        start_offset_s: seconds of the beginning to skip; latched values of it are still sent.
+        duration_s: seconds of the bag to play; 0 plays to the end.
+        loop: begin again at the end; the time then goes back.
+        start_paused: wait at the beginning until told to resume or step.
+        topics: names or patterns to play; empty plays everything.
+        exclude: names or patterns to leave out.
+        drop_transforms: transforms with these child frames are left out of ``/tf``: somebody broadcasts them anew.
+        publish_clock: whether to send ``/clock``.
+        clock_hz: how often at least, also in a pause and where the bag has gaps.
+        delay_s: how long the time stands at the beginning, so that readers find the topics, s.
+        wait_for: nodes that must run, and be connected to what they read, before it begins.
+        wait_timeout_s: how long to wait for them before it gives up, s.
+        linger_s: how long it stays after the last message, so that the others finish their work, s.
+        force: play commands and states also beside a running base, which may then move the robot.
+    """
+
+    bag: str = ""
+    rate: Annotated[float, Range(*RATES)] = 1.0
+    start_offset_s: NotNegative = 0.0
+    duration_s: NotNegative = 0.0
+    loop: bool = False
+    start_paused: bool = False
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    drop_transforms: tuple[str, ...] = ()
+    publish_clock: bool = True
+    clock_hz: Annotated[float, Range(1, 1000)] = 40.0
+    delay_s: NotNegative = 0.5
+    wait_for: tuple[str, ...] = ()
+    wait_timeout_s: Positive = 60.0
+    linger_s: NotNegative = 1.0
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        if not self.bag:
+            raise ValueError("bag must name a folder (got '')")
+        check_ranges(self)
+
+    def play_options(self) -> PlayOptions:
+        """The part of it that the player takes."""
+        return PlayOptions(
+            rate=self.rate,
+            start_offset_s=self.start_offset_s,
+            duration_s=self.duration_s,
+            loop=self.loop,
+            choice=TopicChoice(self.topics, self.exclude),
+            start_paused=self.start_paused,
+            clock_hz=self.clock_hz,
+        )
+
+
+class BagPlayerNode(Node[BagPlayerConfig]):
+    """Sends a bag's bytes from a thread of its own; with ``use_sim_time`` its own clock is the bag's."""
+
+    name = "bag_player"
+    live_parameters = ("rate", "linger_s")
+    player: BagPlayer | None = None
+    _thread: threading.Thread | None = None
+    _failed = ""
+    _next_base_s = 0.0
+
+    def setup(self) -> None:
+        """Opens the bag, makes its topics, starts the thread."""
+        try:
+            self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config.play_options())
+        except BagError as error:
+            raise NodeError(str(error)) from None
+        try:
+            self.check_base()
+        except NodeError:
+            self.player.close()
+            raise
+        self._clock_out: Publisher | None = None
+        if self.config.publish_clock:
+            self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
+        for topic in self.player.topics:  # another project's types come with the bag
+            register_type(topic.type_name, topic.schema.text)
+        self._out = {t.topic: self.publisher_raw(t.topic, t.type_name, t.qos) for t in self.player.topics}
+        for name, why in self.player.left_out.items():
+            self.log.warning("%s is not played: %s", name, why)
+        self.commands = {
+            "pause": self.player.pause,
+            "resume": self.player.resume,
+            "toggle": self.player.toggle,
+            "step": self.player.step,
+            "rate": self.player.set_rate,
+            "seek": self.player.seek,
+            "status": self.status,
+        }
+        self._thread = threading.Thread(target=self._run, name="player", daemon=True)
+        self._thread.start()
+
+    def check_base(self) -> None:
+        """Looks for a base in the run directory, real or simulated, that could obey what is played.
+
+        Raises:
+            NodeError: there is one, and ``force`` is not set.
+        """
+        assert self.player is not None
+        if self.run_dir is None or self.config.force:
+            return
+        nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
+        live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
+        for base in nodes:
+            if base.module != _BASE:
+                continue
+            spaces = {"", *(topic.removesuffix("/cmd_vel") for topic in base.subscribes if topic.endswith("/cmd_vel"))}
+            acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
+            played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
+            wrong = [
+                played[topic]
+                for topic in sorted(played)
+                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in acted_on)
+            ]
+            if wrong:
+                left_out = " ".join(f"-x {topic}" for topic in wrong)
+                raise NodeError(
+                    f"{self.config.bag}: {', '.join(wrong)} would reach the robot of {base.name}, which runs in "
+                    f"{self.run_dir}. Leave them out ({left_out}), rename them (--remap "
+                    f"{wrong[0]}:=/bag{wrong[0]}), end the stack, or play them all the same with --force"
+                )
+
+    def _run(self) -> None:
+        assert self.player is not None
+        try:
+            self._wait_for_readers()
+            length_s = (self.player.end_ns - self.player.start_ns) / 1e9
+            self.log.info("playing %.1f s of %s", length_s, self.config.bag)
+            began_s = time.monotonic()
+            if self.player.play(self._send, self._stop, on_clock=self._tell_time):
+                late = f", up to {self.player.latest_s:.2f} s late" if self.player.latest_s > 0.1 else ""
+                self.log.info("played to the end in %.1f s%s", time.monotonic() - began_s, late)
+                self._stop.wait(self.config.linger_s)
+        except (BagError, NodeError) as error:
+            self._failed = str(error)
+        except Exception as error:  # else the thread would be gone and the node would wait for ever
+            self.log.exception("player")
+            self._failed = f"{type(error).__name__}: {error}"
+        self.stop()
+
+    def _send(self, message: BagMessage) -> None:
+        if (now_s := time.monotonic()) >= self._next_base_s:
+            self._next_base_s = now_s + _BASE_PERIOD_S
+            self.check_base()
+        payload: bytes | None = message.payload
+        if self.config.drop_transforms and message.topic in TRANSFORM_TOPICS:
+            payload = without_children(message, self.config.drop_transforms)
+        self._tell_time(message.stamp_ns)
+        if payload is not None:
+            # Not by the clock: this node hears its own /clock too, a little later, which sets the time back.
+            stamp_ns = message.stamp_ns if isinstance(self.clock, ManualClock) else None
+            self._out[message.topic].publish_bytes(payload, stamp_ns)
+
+    def _tell_time(self, stamp_ns: int) -> None:
+        """The time goes before what happens at it, and goes on where nothing does."""
+        if isinstance(self.clock, ManualClock):
+            self.clock.set(stamp_ns)
+        if self._clock_out is not None:
+            self._clock_out.publish(message_type("Clock")(clock=to_time(stamp_ns)))
+
+    def reconfigure(self, config: BagPlayerConfig) -> None:
+        """A new rate holds at once."""
+        if self.player is not None and config.rate != self.config.rate:
+            self.player.set_rate(config.rate)
+        super().reconfigure(config)
+
+    def status(self) -> dict[str, Any]:
+        """What ``ic bag status`` shows."""
+        assert self.player is not None
+        player = self.player
+        return {
+            "bag": self.config.bag,
+            "state": "paused" if player.paused else "playing",
+            "position_s": round((player.position_ns - player.start_ns) / 1e9, 3),
+            "length_s": round((player.end_ns - player.start_ns) / 1e9, 3),
+            "rate": player.rate,
+            "sent": player.sent,
+            "rounds": player.rounds,
+            "late_s": round(player.latest_s, 3),
+        }
+
+    def _wait_for_readers(self) -> None:
+        """Until each node of ``wait_for`` runs, reads something of the bag, and is connected to all that it reads."""
+        if self.run_dir is None or self.player is None:
+            return
+        begin_s = time.monotonic() + self.config.delay_s
+        while time.monotonic() < begin_s and not self._stop.wait(1.0 / self.config.clock_hz):
+            self._tell_time(self.player.start_ns)
+        if not self.config.wait_for:
+            return
+        deadline_s = time.monotonic() + self.config.wait_timeout_s
+        missing = ""
+        while time.monotonic() < deadline_s:
+            self._tell_time(self.player.start_ns)
+            nodes = {info.name: info for info in registry.list_nodes(self.run_dir)}
+            played = {publisher.topic for publisher in self._out.values()}
+            # A recorder subscribes only once it has found the topics: it is ready when it reads one of them.
+            absent = [
+                name for name in self.config.wait_for if name not in nodes or played.isdisjoint(nodes[name].subscribes)
+            ]
+            readers = [topic for name in self.config.wait_for if name in nodes for topic in nodes[name].subscribes]
+            unread = [
+                topic
+                for topic, publisher in self._out.items()
+                if publisher.subscriber_count < readers.count(publisher.topic)
+            ]
+            if not absent and not unread:
+                return
+            missing = ", ".join(
+                [f"node {name} to read what is played" for name in absent]
+                + [f"a reader of {topic}" for topic in unread]
+            )
+            if self._stop.wait(0.1):
+                return
+        raise NodeError(f"waited {self.config.wait_timeout_s:.0f} s for {missing}")
+
+    def teardown(self) -> None:
+        """Ends the thread, closes the bag."""
+        if self.player is None:
+            return
+        if self._thread is not None:
+            self._thread.join(timeout=3.0)
+        self.player.close()
+        if self._failed:
+            self.log.error("%s", self._failed)
+            raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main(BagPlayerNode)

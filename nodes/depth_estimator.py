@@ -1,0 +1,158 @@
+"""Estimates the depth of the camera's panoramas (paper, section IV.B): newest picture only, at a limited rate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.camera.jpeg import JpegError, decode_rgb
+from instant_ic.config.ranges import Positive, PositiveInt, check_ranges
+from instant_ic.depth.manifest import ManifestError
+from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
+from instant_ic.depth.providers import CHOICES
+from instant_ic.msg import CompressedImage, DepthModelInfo, Image, header, image_message, stamp_ns
+from instant_ic.paths import shipped_file
+
+_WATCH_S = 0.5
+_GIVE_UP_S = 10.0  # an inference that does not end so long after it was told to hangs in a driver
+
+
+@dataclass(frozen=True)
+class DepthEstimatorConfig:
+    """Parameters.
+
+    Attributes:
+        model: ONNX file or its manifest; a bare name is looked for in ``models/``.
+        provider: what runs it: ``auto`` takes TensorRT, CUDA or the CPU, the first that works.
+        threads: CPU threads of one inference.
+        max_rate_hz: pictures a second at most; leaves the CPU to others.
+        max_age_s: an older picture at the end of its estimation is warned about.
+        timeout_s: an inference that takes longer is ended and told.
+    """
+
+    model: str = DEFAULT_MODEL
+    provider: str = "auto"
+    threads: PositiveInt = 1
+    max_rate_hz: Positive = 2.0
+    max_age_s: Positive = 1.5
+    timeout_s: Positive = 20.0
+
+    def __post_init__(self) -> None:
+        if not self.model:
+            raise ValueError("model must name a file")
+        if self.provider not in CHOICES:
+            raise ValueError(f"provider must be one of {', '.join(CHOICES)} (got {self.provider!r})")
+        check_ranges(self)
+
+
+class DepthEstimatorNode(Node[DepthEstimatorConfig]):
+    """``/camera/image/compressed`` → ``/depth/raw``, ``/depth/model``."""
+
+    name = "depth_estimator"
+    live_parameters = ("max_rate_hz", "max_age_s", "timeout_s")
+
+    def setup(self) -> None:
+        self.load(self.config.provider)
+        self.last_ns: int | None = None
+        self.began_ns = 0  # of the inference that runs, on the steady clock; 0 while none does
+        self.failures = 0
+        self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
+        self.info = self.publisher("/depth/model", DepthModelInfo, qos=LATCHED)
+        self.tell_model()
+        self.worker = self.background(self.estimate, self.on_result)
+        self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
+        self.timer(_WATCH_S, self.watch)
+
+    def load(self, provider: str) -> None:
+        """Opens the model; says on what it runs and why on nothing faster."""
+        try:
+            bare = Path(self.config.model).name == self.config.model
+            path = shipped_file("models", self.config.model) if bare else Path(self.config.model)
+            self.model = DepthModel.load(path, self.config.threads, provider)
+        except (ManifestError, FileNotFoundError) as error:
+            raise NodeError(str(error)) from error
+        manifest = self.model.manifest
+        why = f" ({'; '.join(self.model.notes)})" if self.model.notes else ""
+        self.log.info(
+            "%s (%s, %dx%d) on %s%s", manifest.name, manifest.output_kind, manifest.input_width, manifest.input_height,
+            self.model.provider, why,
+        )  # fmt: skip
+        if provider not in ("auto", self.model.provider):
+            self.log.warning("%s was asked for, %s runs the model%s", provider, self.model.provider, why)
+
+    def tell_model(self) -> None:
+        """What kind of numbers ``/depth/raw`` carries, for whoever scales them."""
+        manifest = self.model.manifest
+        self.told = self.model.provider
+        info = DepthModelInfo(
+            header=header("", self.clock.now_ns()), name=manifest.name, licence=manifest.licence,
+            output_kind=manifest.output_kind, provider=self.model.provider,
+        )  # fmt: skip
+        self.info.publish(info)
+
+    def on_image(self, message: Any) -> None:
+        # By the pictures' own stamps, so that a replay picks the same ones; 5 % for a camera's uneven pace.
+        stamp = stamp_ns(message)
+        if self.last_ns is not None and 0 <= stamp - self.last_ns < 0.95e9 / self.config.max_rate_hz:
+            return
+        self.last_ns = stamp
+        self.worker.submit(message)
+
+    def estimate(self, message: Any) -> tuple[Any, NDArray[np.float32] | None, str]:
+        """On the worker's thread: header, depth, and the reason where there is none."""
+        manifest = self.model.manifest
+        self.began_ns = self.clock.steady_ns()
+        try:
+            # Twice the network's input, so that the rest of the way down is by area averaging.
+            rgb = decode_rgb(message.data, 2 * manifest.input_width, 2 * manifest.input_height)
+            return message.header, self.model.estimate(rgb), ""
+        except JpegError as error:
+            return message.header, None, f"the picture {error}"
+        except ValueError as error:  # no panorama, or (ManifestError) outputs that only a run shows
+            return message.header, None, str(error)
+        except InferenceError as error:
+            if self.model.provider == "cpu":
+                return message.header, None, str(error)
+            self.load("cpu")
+            return message.header, None, f"{error}; going on with the CPU"
+        finally:
+            self.began_ns = 0
+
+    def watch(self) -> None:
+        """Ends an inference that takes too long; and the process, to be started anew, where it does not end."""
+        if not (began_ns := self.began_ns):
+            return
+        took_s = (self.clock.steady_ns() - began_ns) / 1e9
+        if took_s <= self.config.timeout_s:
+            return
+        self.diagnose("depth", ERROR, f"the inference has run for {took_s:.1f} s on {self.model.provider}; it is ended")
+        self.model.cancel()
+        if took_s > self.config.timeout_s + _GIVE_UP_S:
+            self.log.error("the inference on %s hangs: ending, to be started anew", self.model.provider)
+            self.stop()
+
+    def on_result(self, result: tuple[Any, NDArray[np.float32] | None, str]) -> None:
+        header, depth, reason = result
+        if self.model.provider != self.told:
+            self.tell_model()
+        if depth is None:
+            self.failures += 1
+            self.diagnose("depth", ERROR, reason, provider=self.model.provider, failures=self.failures)
+            return
+        stamp = stamp_ns(header)
+        self.depth.publish(image_message(depth, "32FC1", header.frame_id, stamp))
+        age_s = (self.clock.now_ns() - stamp) / 1e9
+        level = WARN if age_s > self.config.max_age_s else OK
+        self.diagnose(
+            "depth", level, f"depth is {age_s:.2f} s old when it is published", age_s=round(age_s, 3),
+            provider=self.model.provider, skipped=self.worker.skipped, failures=self.failures,
+        )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(DepthEstimatorNode)

@@ -1,0 +1,160 @@
+"""Serves topics, parameters and graph to Foxglove; bytes go through unchanged, and only what is watched."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from instant_ic.bag.choice import TopicChoice
+from instant_ic.bridge.commands import CommandGate, CommandLimits
+from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerSettings
+from instant_ic.bridge.topic_watch import TopicWatch
+from instant_ic.bridge.web_access import is_loopback
+from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
+from instant_ic.config.ranges import Range, check_ranges
+
+_TIME_S = 0.05
+_REFUSED_S = 1.0
+_LEAST_S = 0.02
+
+
+@dataclass(frozen=True)
+class FoxgloveBridgeConfig:
+    """Parameters.
+
+    Attributes:
+        title: shown by Foxglove.
+        host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
+        port: 0 = any free port, told in the log.
+        tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
+        tls_key: its private key, PKCS#8 in PEM.
+        allowed_origins: web pages that may connect, by their Origin, beside those of this machine; "*" lets every page
+            in. Programs that are no browsers send no Origin and are let in.
+        allowed_hosts: names by which clients may reach the server, beside localhost and any address.
+        max_clients: most clients at a time.
+        backlog: messages kept for a client that does not keep up; the oldest goes first, so it never gets a flood of
+            old ones.
+        topics: topics to offer, names or patterns; empty offers all.
+        exclude: names or patterns to leave out.
+        accept_operator: whether clients may drive (/operator/cmd_vel) and stop (/operator/estop) the robot.
+        set_parameters: whether clients may change parameters that are no safety parameters.
+        limits: what their commands have to pass.
+        discovery_period_s: how often to look for topics that come and go, s.
+    """
+
+    title: str = "Instant IC"
+    host: str = "127.0.0.1"
+    port: Annotated[int, Range(0, 65535)] = 8765
+    tls_cert: str = ""
+    tls_key: str = ""
+    allowed_origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
+    allowed_hosts: tuple[str, ...] = ()
+    max_clients: Annotated[int, Range(1, 256)] = 16
+    backlog: Annotated[int, Range(1, 1024)] = 32
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    accept_operator: bool = False
+    set_parameters: bool = False
+    limits: CommandLimits = field(default_factory=CommandLimits)
+    discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.25
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        check_ranges(self)
+        if bool(self.tls_cert) != bool(self.tls_key):
+            raise ValueError("tls_cert and tls_key go together: give both or none")
+
+
+class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
+    """Looks at the registry, hands on what is watched."""
+
+    name = "foxglove_bridge"
+    server: FoxgloveServer | None = None
+
+    def setup(self) -> None:
+        """Starts the server."""
+        config = self.config
+        if self.run_dir is None:
+            raise NodeError("the bridge needs the real bus; it has no place in lockstep")
+        settings = ServerSettings(
+            title=config.title,
+            host=config.host,
+            port=config.port,
+            tls_cert=Path(config.tls_cert).expanduser() if config.tls_cert else None,
+            tls_key=Path(config.tls_key).expanduser() if config.tls_key else None,
+            allowed_origins=config.allowed_origins,
+            allowed_hosts=config.allowed_hosts,
+            max_clients=config.max_clients,
+            backlog=config.backlog,
+            accept_operator=config.accept_operator,
+            set_parameters=config.set_parameters,
+            server_time=self.use_sim_time,
+        )
+        self.gate = CommandGate(config.limits)
+        self._watch = TopicWatch(self.run_dir)
+        choice = TopicChoice(config.topics, config.exclude)
+        try:
+            self.server = FoxgloveServer(self, self.run_dir, settings, choice.takes, self.gate)
+        except FoxgloveError as error:
+            raise NodeError(str(error)) from None
+        scheme = "wss" if config.tls_cert else "ws"
+        self.log.info("Foxglove: open %s://%s:%d", scheme, config.host, self.server.port)
+        may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
+        if not is_loopback(config.host):
+            what = " and ".join(may or ["read everything"])
+            self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {what}: no sign-in")
+        self._refused, self._next_refused_s = 0, 0.0
+        # A thread, not a timer: with simulated time the timers stand still while topics already come.
+        self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
+        self._look_thread.start()
+
+    def _look(self) -> None:
+        assert self.server is not None
+        next_s, told_ns = 0.0, 0
+        while not self.stopping:
+            now_s = time.monotonic()
+            if now_s >= next_s or self.server.wake.is_set():
+                next_s = now_s + self.config.discovery_period_s
+                self.server.wake.clear()
+                self.call_soon(self.reconcile)
+                time.sleep(_LEAST_S)  # a client that comes and goes without end costs no more than this
+            if self.use_sim_time and (now_ns := self.clock.now_ns()) != told_ns:
+                told_ns = now_ns
+                self.server.tell_time(now_ns)
+            self.server.wake.wait(_TIME_S if self.use_sim_time else max(next_s - time.monotonic(), 0.0))
+
+    def reconcile(self) -> None:
+        """Follows topics, nodes and watchers."""
+        if self.server is None or self.run_dir is None or self.stopping:
+            return
+        nodes = registry.list_nodes(self.run_dir)
+        self.server.parameters.nodes = tuple(node.name for node in nodes)
+        self.server.reconcile(self._watch.topics(), nodes)
+        refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
+        words = f"{len(self.server.watched)} of {len(self.server.topics)} topics watched"
+        self.diagnose(
+            "topics",
+            OK,
+            words,
+            messages=self.server.count,
+            megabytes=self.server.bytes / 1e6,
+            dropped=self.server.dropped,
+            **refused,
+        )
+        if self.server.refused != self._refused and time.monotonic() >= self._next_refused_s:  # strangers fill no log
+            self._refused, self._next_refused_s = self.server.refused, time.monotonic() + _REFUSED_S
+            self.diagnose("door", WARN, f"turned away: {self.server.refusal}", requests=self.server.refused)
+
+    def teardown(self) -> None:
+        """Ends the server."""
+        if self.server is not None:
+            self.server.wake.set()
+            self._look_thread.join(2.0)
+            self.server.close()
+
+
+if __name__ == "__main__":
+    main(FoxgloveBridgeNode)

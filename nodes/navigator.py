@@ -1,0 +1,134 @@
+"""Drives the r-bot to the subgoal while the operator drives the v-bot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.control.arbiter import Mode
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.follower import FollowerConfig, PathFollower
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits
+from instant_ic.control.navigator import Navigator, RecoveryConfig, meeting_pose
+from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.warmup import warm_up
+from instant_ic.geometry.poses import pose2_from_matrix
+from instant_ic.geometry.transforms import TransformError
+from instant_ic.msg import (
+    ControlState,
+    OccupancyGrid,
+    Odometry,
+    Path,
+    PoseStamped,
+    TwistStamped,
+    grid_array,
+    path_message,
+    pose_matrix,
+    twist_stamped,
+    twist_values,
+)
+
+
+@dataclass(frozen=True)
+class NavigatorConfig:
+    """Parameters of the node ``navigator``."""
+
+    controller_frequency: Positive = 20.0
+    replan_period_s: Positive = 0.2
+    subgoal_timeout_s: Positive = 0.5
+    costmap_timeout_s: Positive = 1.0
+    state_timeout_s: Positive = 0.3
+    recovery: RecoveryConfig = field(default_factory=RecoveryConfig)
+    limits: MotionLimits = field(default_factory=MotionLimits)
+    footprint: Footprint = field(default_factory=Footprint)
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    follower: FollowerConfig = field(default_factory=FollowerConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+class NavigatorNode(Node[NavigatorConfig]):
+    """Topics in and out of ``Navigator``."""
+
+    name = "navigator"
+
+    live_parameters = ("replan_period_s", "recovery", "limits", "planner", "follower")
+
+    def setup(self) -> None:
+        if not self.lockstep:
+            warm_up()
+        c = self.config
+        self.navigator = self.made(c)
+        self.speed = 0.0
+        self.cmd_vel = self.publisher("/nav/cmd_vel", TwistStamped, qos=SENSOR)
+        self.path = self.publisher("/nav/path", Path, qos=SENSOR)
+        self.subgoal = self.latest("/ic/subgoal", PoseStamped, c.subgoal_timeout_s)
+        self.costmap = self.latest("/costmap", OccupancyGrid, c.costmap_timeout_s)
+        self.vbot = self.latest("/vbot/odom", Odometry, 0.3)
+        self.state = self.latest("/ic/state", ControlState, c.state_timeout_s, qos=LATCHED)
+        _ = self.tf  # listens from now on
+        self.timer(1.0 / c.controller_frequency, self.tick)
+
+    def made(self, c: NavigatorConfig) -> Navigator:
+        follower = PathFollower(c.follower, c.limits, c.footprint)
+        return Navigator(HybridPlanner(c.planner, c.footprint), follower, c.replan_period_s, c.recovery)
+
+    def reconfigure(self, config: NavigatorConfig) -> None:
+        super().reconfigure(config)
+        self.navigator = self.made(config)  # plans anew at once
+
+    def tick(self) -> None:
+        state = self.state.message
+        if state is None or state.mode != Mode.VIRTUAL:
+            self.navigator.reset()
+            self.speed = 0.0
+            self.diagnose("follow", OK, "waiting: the operator drives the robot")
+            return
+        command = self.command(state)
+        self.speed = command[0]
+        self.cmd_vel.publish(twist_stamped(*command, self.clock.now_ns()))
+
+    def command(self, state: ControlState) -> tuple[float, float]:
+        """Twist for the r-bot; zero, with a diagnosis, when something is missing."""
+        grid, goal = self.costmap.message, self.subgoal.message
+        if grid is None or goal is None:
+            missing = "costmap" if grid is None else "subgoal"
+            return self.stand(f"no {missing} within its time-out")
+        try:
+            pose = pose2_from_matrix(self.tf.lookup("map", "base_link"))
+        except TransformError as error:
+            return self.stand(str(error))
+        occupancy, resolution, origin = grid_array(grid)
+        costmap = Costmap.from_occupancy(occupancy, resolution, np.array(origin))
+        subgoal, velocity = self.moving(pose2_from_matrix(pose_matrix(goal)), state)
+        step = self.navigator.step(pose, self.speed, subgoal, costmap, self.clock.steady_ns(), velocity)
+        if step.replanned and (self.path.subscriber_count or self.lockstep):
+            self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
+        self.diagnose("follow", OK if step.plan.reached else WARN, step.plan.reason or step.state, state=step.state)
+        return step.command
+
+    def moving(
+        self, subgoal: NDArray[np.float64], state: ControlState
+    ) -> tuple[NDArray[np.float64], tuple[float, float]]:
+        """Subgoal and its velocity: where it is the v-bot, the v-bot's own newer pose and twist."""
+        vbot = self.vbot.message
+        if vbot is not None:
+            pose = pose2_from_matrix(pose_matrix(vbot))
+            if float(np.linalg.norm(pose[:2] - subgoal[:2])) < 0.15:
+                shown, robot = (pose2_from_matrix(pose_matrix(one)) for one in (state.vbot_target, state.robot_pose))
+                return meeting_pose(pose, shown, robot), twist_values(vbot)
+        return subgoal, (0.0, 0.0)
+
+    def stand(self, reason: str) -> tuple[float, float]:
+        self.diagnose("follow", WARN, f"robot stands: {reason}")
+        return 0.0, 0.0
+
+
+if __name__ == "__main__":
+    main(NavigatorNode)

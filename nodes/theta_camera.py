@@ -1,0 +1,196 @@
+"""Publishes the 360-degree picture: Theta Z1 live preview, a video device or stream, or picture files."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
+from instant_ic.camera.config import FilesConfig, ThetaConfig, VideoConfig
+from instant_ic.camera.files import FileCamera
+from instant_ic.camera.loop import CameraLoop, ReconnectConfig
+from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.camera.theta import ThetaCamera, ThetaClient, ThetaState
+from instant_ic.camera.video import VideoCamera
+from instant_ic.config.ranges import Positive, Share, check_ranges
+from instant_ic.geometry.poses import pose_matrix
+from instant_ic.msg import CompressedImage, compressed_image_message
+
+USER_VARIABLE = "INSTANT_IC_THETA_USER"
+PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
+"""Environment of the credentials: parameters are shown by ``ic param`` and stand in files."""
+
+
+@dataclass(frozen=True)
+class ThetaCameraConfig:
+    """Parameters.
+
+    Attributes:
+        source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
+        url: of the Theta; device, address or path for the other sources.
+        frame_id: the camera's frame.
+        mount_xyz: its place on base_link, metres.
+        mount_rpy_deg: its roll, pitch, yaw on base_link, degrees.
+        silence_s: no picture for this long is a warning; four times as long is an error.
+        health_period_s: the Theta is asked for battery and temperature this often.
+        battery_low: charge under which to warn, 0-1.
+        board_hot_c: board temperature from which to warn, degrees Celsius.
+        theta: live preview.
+        video: stream by OpenCV.
+        files: pictures from files.
+        reconnect: waits between attempts to connect.
+    """
+
+    source: Literal["theta", "video", "files"] = "theta"
+    url: str = "http://192.168.1.1"
+    frame_id: str = "camera"
+    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 1.2)
+    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    silence_s: Positive = 2.0
+    health_period_s: Positive = 10.0
+    battery_low: Share = 0.2
+    board_hot_c: float = 70.0
+    theta: ThetaConfig = field(default_factory=ThetaConfig)
+    video: VideoConfig = field(default_factory=VideoConfig)
+    files: FilesConfig = field(default_factory=FilesConfig)
+    reconnect: ReconnectConfig = field(default_factory=ReconnectConfig)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_ranges(self)
+        if not self.url:
+            raise ValueError("url must not be empty")
+
+
+class ThetaCameraNode(Node[ThetaCameraConfig]):
+    """See the module."""
+
+    name = "theta_camera"
+    live_parameters = ("silence_s", "battery_low", "board_hot_c", "mount_xyz", "mount_rpy_deg")
+
+    def setup(self) -> None:
+        """Topics, mount, and the loop that reads the camera."""
+        config = self.config
+        self.loop: CameraLoop | None = None
+        self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
+        self.tell_mount()
+        self.last_ns = self.started_ns = self.clock.steady_ns()
+        self.published = self.published_told = 0
+        self.camera = self.make_camera()
+        self.diagnose("camera", WARN, f"connecting to {config.url}")
+        self.timer(1.0, self.check)
+        if self.lockstep:
+            self.play_in_lockstep()
+            return
+        self.loop = CameraLoop(
+            self.camera,
+            on_frame=self.publish,
+            on_event=lambda connected, text: self.call_soon(self.on_event, connected, text),
+            reconnect=config.reconnect,
+        )
+        if isinstance(self.camera, ThetaCamera):
+            self.health = self.background(ask_state, self.on_health)
+            client = self.camera.client
+            self.timer(config.health_period_s, lambda: self.health.submit(client))
+        self.loop.start()
+
+    def tell_mount(self) -> None:
+        """Where the camera is on the robot."""
+        mount = pose_matrix(*self.config.mount_xyz, *np.radians(self.config.mount_rpy_deg))
+        self.tf_broadcast_static("base_link", self.config.frame_id, mount)
+
+    def reconfigure(self, config: ThetaCameraConfig) -> None:
+        super().reconfigure(config)
+        self.tell_mount()
+
+    def make_camera(self) -> Camera:
+        """The camera that the parameters name."""
+        config, now_ns = self.config, self.clock.now_ns
+        if config.source == "theta":
+            user, password = os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
+            return ThetaCamera(config.url, config.theta, user, password, now_ns)
+        if config.source == "video":
+            return VideoCamera(config.url, config.video, now_ns)
+        return FileCamera(config.url, config.files, now_ns)
+
+    def play_in_lockstep(self) -> None:
+        """Files by the node's own timer; devices have a time of their own and cannot be stepped."""
+        camera = self.camera
+        if not isinstance(camera, FileCamera):
+            raise NodeError(f"source {self.config.source} cannot run in lockstep: use source:=files")
+        try:
+            self.on_event(True, camera.connect())
+        except CameraError as error:
+            raise NodeError(str(error)) from error
+        self.timer(1.0 / self.config.files.rate_hz, lambda: self.publish(camera.next_frame()))
+
+    def publish(self, frame: Frame) -> None:
+        """Send a picture as it is; runs on the camera's thread."""
+        self.out.publish(compressed_image_message(frame.jpeg, self.config.frame_id, frame.stamp_ns))
+        self.last_ns = self.clock.steady_ns()
+        self.published += 1
+
+    def on_event(self, connected: bool, text: str) -> None:
+        """The connection came or went."""
+        self.diagnose("camera", OK if connected else ERROR, text)
+
+    def check(self) -> None:
+        """Tell of silence, and of the rate; each second."""
+        silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
+        values = {
+            "pictures": self.published,
+            "rate_hz": self.published - self.published_told,
+            "bad_pictures": self.camera.bad_frames,
+        }
+        self.published_told = self.published
+        if silent_s <= self.config.silence_s:
+            if self.published:
+                self.diagnose("pictures", OK, "pictures come", **values)
+            return
+        level = ERROR if silent_s > 4.0 * self.config.silence_s else WARN
+        self.diagnose("pictures", level, f"no picture for {silent_s:.1f} s", **values)
+
+    def on_health(self, health: ThetaState | str) -> None:
+        """Battery, temperature and errors of the Theta."""
+        if isinstance(health, str):
+            self.diagnose("health", WARN, health)
+            return
+        low = health.battery is not None and health.battery < self.config.battery_low
+        hot = health.board_temperature_c is not None and health.board_temperature_c >= self.config.board_hot_c
+        text = [
+            *(["battery is low: charge it"] if low else []),
+            *(["it is getting hot"] if hot else []),
+            *health.errors,
+        ]
+        self.diagnose(
+            "health",
+            ERROR if health.errors else WARN if low or hot else OK,
+            ", ".join(text) or "well",
+            battery=health.battery,
+            battery_temperature_c=health.battery_temperature_c,
+            board_temperature_c=health.board_temperature_c,
+        )
+
+    def teardown(self) -> None:
+        """Let go of the camera."""
+        loop = getattr(self, "loop", None)
+        if loop is not None:
+            if loop.is_alive() and not loop.end():
+                self.log.warning("the camera's thread is still waiting for %s; left behind", self.config.url)
+        elif hasattr(self, "camera"):
+            self.camera.close()
+
+
+def ask_state(client: ThetaClient) -> ThetaState | str:
+    """State of the camera, or why there is none; for a worker thread."""
+    try:
+        return client.state()
+    except CameraError as error:
+        return str(error)
+
+
+if __name__ == "__main__":
+    main(ThetaCameraNode)

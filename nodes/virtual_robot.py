@@ -1,0 +1,156 @@
+"""The robot that the operator drives in the virtual space; in real mode it stands where the r-bot is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
+from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.control.costmap import StaticMap
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.kinematics import MotionLimits, move
+from instant_ic.control.states import VbotAction
+from instant_ic.control.vbot import VbotConfig, VirtualRobot
+from instant_ic.control.walls import WallFinder, WallMap
+from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
+from instant_ic.msg import (
+    ControlState,
+    OccupancyGrid,
+    Odometry,
+    TwistStamped,
+    grid_array,
+    odometry_message,
+    pose_matrix,
+    stamp_ns,
+    twist_values,
+)
+
+
+@dataclass(frozen=True)
+class VirtualRobotConfig:
+    """Parameters of the node ``virtual_robot``."""
+
+    rate_hz: Positive = 20.0
+    command_timeout_s: Positive = 0.3
+    state_timeout_s: Positive = 0.5
+    wall_min_length_m: Positive = 1.5
+    wall_period_s: Positive = 2.0
+    walls_block: bool = True
+    limits: MotionLimits = field(default_factory=MotionLimits)
+    footprint: Footprint = field(default_factory=Footprint)
+    vbot: VbotConfig = field(default_factory=VbotConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+class VirtualRobotNode(Node[VirtualRobotConfig]):
+    """Topics in and out of ``VirtualRobot``."""
+
+    name = "virtual_robot"
+    live_parameters = ("vbot", "limits", "command_timeout_s", "state_timeout_s")
+
+    def setup(self) -> None:
+        self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
+        self.walls: WallMap | None = None
+        self.map: StaticMap | None = None
+        self.map_is_new = False
+        self.action: VbotAction | None = None
+        self.stepped_ns = self.clock.steady_ns()
+        self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
+        self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
+        self.obeyed = (0.0, 0.0)  # the operator's command of the last step
+        self.early = False  # a step was made before its time since the last timer
+        self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
+        self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
+        if self.config.walls_block:
+            self.wall_worker = self.background(WallFinder(self.config.wall_min_length_m).find, self.on_walls)
+            self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
+            self.timer(self.config.wall_period_s, self.update_walls)
+        self.timer(1.0 / self.config.rate_hz, self.on_timer)
+
+    def reconfigure(self, config: VirtualRobotConfig) -> None:
+        super().reconfigure(config)
+        self.robot.config, self.robot.limits = config.vbot, config.limits
+        self.command.max_age_s, self.state.max_age_s = config.command_timeout_s, config.state_timeout_s
+
+    def on_map(self, message: OccupancyGrid) -> None:
+        grid, resolution, origin = grid_array(message)
+        if grid.size == 0:
+            return
+        self.map, self.map_is_new = StaticMap(grid, resolution, np.array(origin)), True
+        if self.walls is None:
+            self.update_walls()  # the first at once
+
+    def update_walls(self) -> None:
+        """Has walls looked for in the newest map, beside the node's thread."""
+        if self.map_is_new:
+            self.map_is_new = False
+            self.wall_worker.submit(self.map)
+
+    def on_walls(self, walls: WallMap) -> None:
+        self.walls = walls
+
+    def on_command(self, message: TwistStamped) -> None:
+        """Obeys a command that has changed at once: the next timer is half a period off."""
+        if self.action == VbotAction.DRIVEN and not self.early and twist_values(message) != self.obeyed:
+            self.early = True
+            self.tick()
+
+    def on_timer(self) -> None:
+        self.early = False
+        self.tick()
+
+    def tick(self) -> None:
+        now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
+        # A late timer must not become a leap of the picture.
+        dt_s = min((steady_ns - self.stepped_ns) / 1e9, 0.2)
+        self.stepped_ns = steady_ns
+        state = self.state.message
+        if state is None:
+            self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
+            self.robot.place(self.robot.pose, (0.0, 0.0))
+            if self.action is None:
+                return  # nowhere yet
+        else:
+            self.obey(state, dt_s)
+        self.odom.publish(
+            odometry_message(matrix_from_pose2(self.robot.pose), *self.robot.velocity, "map", "vbot_base_link", now_ns)
+        )
+
+    def obey(self, state: ControlState, dt_s: float) -> None:
+        """Does what the arbiter says."""
+        action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
+        robot_pose = pose2_from_matrix(pose_matrix(state.robot_pose))
+        robot_twist = twist_values(state.robot_twist)
+        age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
+        # The arbiter's word is up to a period old, and the r-bot goes on.
+        target = move(pose2_from_matrix(pose_matrix(state.vbot_target)), *robot_twist, min(max(age_s, 0.0), 0.1))
+        if before is None and action != VbotAction.WITH_ROBOT:
+            self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_pose)), (0.0, 0.0))  # started anew
+        if action == VbotAction.WITH_ROBOT:
+            self.robot.place(target, robot_twist)
+        elif action == VbotAction.DRIVEN:
+            self.obeyed = self.operator()
+            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls, float(state.vbot_limit_m_s))
+        elif action == VbotAction.HELD:
+            self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls)
+        elif action == VbotAction.EASED:
+            self.robot.ease(target, robot_twist, dt_s)
+        else:
+            self.robot.lead_back(robot_pose, dt_s, self.walls)
+        slowed = f", slowed by {self.robot.slowed_by}" if self.robot.slowed_by else ""
+        self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
+
+    def operator(self) -> tuple[float, float]:
+        """The operator's command; zero when it is old, by arrival or by its stamp."""
+        message = self.command.message
+        if message is None or self.command.stamp_age_s > self.config.command_timeout_s:
+            return 0.0, 0.0
+        return twist_values(message)
+
+
+if __name__ == "__main__":
+    main(VirtualRobotNode)

@@ -1,0 +1,201 @@
+"""Hands topics to Zenoh as topics of ROS 2 (rmw_zenoh's format), byte for byte, and takes topics from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Literal
+
+from instant_ic.bridge.commands import CommandGate, CommandLimits
+from instant_ic.bridge.topic_watch import TopicWatch
+from instant_ic.bridge.zenoh_incoming import Incoming
+from instant_ic.bridge.zenoh_outgoing import Outgoing
+from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
+from instant_ic.bridge.zenoh_session import (
+    CLIENT_DEFAULTS,
+    SESSION_DEFAULTS,
+    RosNode,
+    RosSession,
+    ZenohError,
+    config_path,
+    is_client,
+    load_config,
+)
+from instant_ic.bridge.zenoh_topics import COMMANDS, Namespace, parse_publish, parse_subscribe
+from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main, registry
+from instant_ic.config.ranges import Range, check_ranges
+from instant_ic.msg import MessageError
+
+_AGAIN_S = 2.0
+
+
+@dataclass(frozen=True)
+class ZenohGatewayConfig:
+    """Parameters.
+
+    Attributes:
+        namespace: the robot's name in the fleet; ``/scan`` here is ``/robot1/scan`` there. Empty: names stay.
+        domain: ROS domain (``ROS_DOMAIN_ID``).
+        mode: peer: of a router on this host, as rmw_zenoh; client: of a router elsewhere.
+        connect: routers to connect to; empty: tcp/localhost:7447, or those of the session file.
+        session_file: Zenoh configuration (JSON5), path or file of config/, instead of mode; empty: none.
+        publish: topics that go out: NAME or PATTERN, with rate_hz=N behind it for at most N messages a second.
+        subscribe: topics that come in: NAME, PATTERN, or "NAME TYPE" to have it before anybody publishes it.
+        commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop. Only over TLS with
+            certificates on both sides (session_file); without it nothing but the pressing of the emergency stop.
+        insecure_loopback_commands: take commands without TLS where every link stays within this machine, as in a
+            simulation; everybody who can run a program on it can then drive.
+        limits: what commands have to pass.
+        discovery_period_s: how often to look for topics that come and go, s.
+    """
+
+    namespace: str = ""
+    domain: Annotated[int, Range(0, 232)] = 0
+    mode: Literal["peer", "client"] = "peer"
+    connect: tuple[str, ...] = ()
+    session_file: str = ""
+    publish: tuple[str, ...] = ()
+    subscribe: tuple[str, ...] = ()
+    commands: tuple[str, ...] = ()
+    insecure_loopback_commands: bool = False
+    limits: CommandLimits = field(default_factory=CommandLimits)
+    discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.2
+
+    def __post_init__(self) -> None:
+        """Checks the values."""
+        check_ranges(self)
+        parse_publish(self.publish)
+        try:
+            Namespace(self.namespace)
+        except registry.RegistryError:
+            raise ValueError(f"namespace {self.namespace!r} must look like robot1 or fleet/robot1") from None
+        if unknown := set(self.commands) - set(COMMANDS):
+            raise ValueError(f"commands may only hold {', '.join(COMMANDS)} (got {', '.join(sorted(unknown))})")
+
+
+class ZenohGatewayNode(Node[ZenohGatewayConfig]):
+    """Looks for topics on both sides, tells counts and losses."""
+
+    name = "zenoh_gateway"
+    session: RosSession | None = None
+    _zenoh: Any
+    _no_commands: str
+
+    def setup(self) -> None:
+        """Opens the session."""
+        if self.run_dir is None:
+            raise NodeError("the gateway needs the real bus and a real Zenoh session; it has no place in lockstep")
+        if self.namespace:
+            raise NodeError(f"--namespace {self.namespace}: for the names there set the parameter namespace instead")
+        config = self.config
+        self.gate = CommandGate(config.limits)
+        self._watch = TopicWatch(self.run_dir)
+        self._lost = 0
+        try:
+            parse_subscribe(config.subscribe)
+            defaults = CLIENT_DEFAULTS if config.mode == "client" else SESSION_DEFAULTS
+            self._zenoh = load_config(config_path(config.session_file), config.connect, defaults=defaults)
+            client = is_client(self._zenoh)
+            self._no_commands = self.check_link() if config.commands else ""
+            if not client:
+                self.opened(RosSession(self._zenoh, config.domain))
+        except (ZenohError, MessageError, FileNotFoundError, registry.RegistryError) as error:
+            raise NodeError(str(error)) from None
+        if client:  # its router may come later
+            self._opener = self.background(self.open, self.opened)
+            self._opener.submit(None)
+            self.timer(_AGAIN_S, self.try_again)
+        self.timer(config.discovery_period_s, self.look)
+        self.timer(1.0, self.tell)
+
+    def check_link(self) -> str:
+        """Why no commands are taken over this configuration's links; empty where they are."""
+        why = insecurity(self._zenoh)
+        if why and self.config.insecure_loopback_commands:
+            if beyond := beyond_loopback(self._zenoh):
+                why = f"insecure_loopback_commands: {beyond}"
+            else:
+                self.diagnose("commands", WARN, "taken without TLS from every program of this machine")
+                return ""
+        if not why:
+            self.diagnose("commands", OK, "taken over TLS, from hosts with a certificate")
+            return ""
+        why = f"no commands are taken but emergency stops: {why} (docs/fleet.md, TLS and access control)"
+        self.diagnose("commands", ERROR, why)
+        return why
+
+    def open(self, _: None) -> RosSession | ZenohError:
+        """Tries to reach the router (background thread)."""
+        try:
+            return RosSession(self._zenoh, self.config.domain)
+        except ZenohError as error:
+            return error
+
+    def opened(self, session: RosSession | ZenohError) -> None:
+        """Enters the ROS graph."""
+        if isinstance(session, ZenohError):
+            self.diagnose("link", WARN, f"{session}; trying again (is the router running? ic run zenoh_router)")
+            return
+        if self.stopping:
+            session.close()
+            return
+        config, namespace = self.config, Namespace(self.config.namespace)
+        self.session = session
+        own = RosNode(session, namespace.ros, self.node_name)
+        self.outgoing = Outgoing(self, session, namespace, own, config.publish)
+        self.incoming = Incoming(self, namespace, own, config.subscribe, config.commands, self.gate, self._no_commands)
+        self.outgoing.brought_in = self.incoming.wants
+        session.watch(self.incoming.on_token)
+        self.look()
+
+    def try_again(self) -> None:
+        """Tries the router again."""
+        if self.session is None and not self._opener.busy:
+            self._opener.submit(None)
+
+    def look(self) -> None:
+        """Follows what comes and goes."""
+        if self.session is None:
+            return
+        self.outgoing.reconcile(self._watch.topics())
+        self.incoming.reconcile()
+
+    def tell(self) -> None:
+        """Tells links, counts and losses."""
+        if self.session is None:
+            return
+        routers, peers = self.session.routers(), self.session.peers()
+        if routers or peers:
+            self.diagnose("link", OK, f"{len(routers)} routers, {len(peers)} peers")
+        else:
+            where = ", ".join(self.config.connect) or self.config.session_file or "tcp/localhost:7447"
+            self.diagnose("link", WARN, f"no router answers at {where}: is it running? (ic run zenoh_router)")
+        lost_by = self.incoming.lost_by()
+        lost = sum(count for by in lost_by.values() for count in by.values())
+        words = (
+            f"{self.outgoing.count} messages out on {len(self.outgoing.topics)} topics, "
+            f"{self.incoming.count} in on {len(self.incoming.topics)}"
+        )
+        losses = {f"lost {topic} from {gid[:8]}": n for topic, by in lost_by.items() for gid, n in by.items()}
+        if lost:
+            words += f"; lost: {', '.join(f'{topic} {sum(by.values())}' for topic, by in sorted(lost_by.items()))}"
+        level = WARN if lost > self._lost else OK
+        self._lost = lost
+        refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
+        self.diagnose(
+            "topics",
+            level,
+            words,
+            thinned=self.outgoing.thinned,
+            malformed=self.incoming.malformed(),
+            **losses,
+            **refused,
+        )
+
+    def teardown(self) -> None:
+        """Leaves the ROS graph."""
+        if self.session is not None:
+            self.session.close()
+
+
+if __name__ == "__main__":
+    main(ZenohGatewayNode)
