@@ -48,7 +48,7 @@ from instant_ic.msg import (
     stamp_ns,
     twist_stamped,
 )
-from instant_ic.paths import shipped_file
+from instant_ic.paths import node_file, shipped_file
 
 COMMAND, PICTURE, STATE = "/operator/cmd_vel", "/camera/image/compressed", "/vbot/odom"
 PICTURE_BYTES = 200_000
@@ -99,13 +99,13 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
     stores["station"].allow(Peer("robot", "driver", made["robot"].public_key))
     listen, through = free_port(), free_port()
     ends = {"robot": f"listen:=tcp://127.0.0.1:{listen}", "station": f"connect:=tcp://127.0.0.1:{through}"}
-    commands = [["instant_ic.experiments.impaired_link", str(through), "127.0.0.1", str(listen), *network]]
+    commands = [["-m", "instant_ic.experiments.impaired_link", str(through), "127.0.0.1", str(listen), *network]]
     for host, end in ends.items():
         parameters = ["-p", end, "-p", f"keys:={stores[host].folder}"]
         config = str(shipped_file("config", "bridge.yaml"))
         run_dir = str(folder / host[0])
-        commands.append(["nodes.host_bridge", "--run-dir", run_dir, "--params-file", config, *parameters])
-    processes = [subprocess.Popen([sys.executable, "-m", *words], stderr=subprocess.DEVNULL) for words in commands]
+        commands.append([str(node_file("host_bridge")), "--run-dir", run_dir, "--params-file", config, *parameters])
+    processes = [subprocess.Popen([sys.executable, *words], stderr=subprocess.DEVNULL) for words in commands]
     try:
         yield [psutil.Process(process.pid) for process in processes[1:]]
     finally:

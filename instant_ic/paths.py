@@ -1,4 +1,4 @@
-"""Where launch files, configuration, models and the run directory are, in a checkout and in an installed wheel."""
+"""Paths of nodes, launch files, configuration, models and the run directory, in a checkout and in a wheel."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def share_dir(name: str) -> Path:
-    """Folder ``launch``, ``config`` or ``models``.
+    """Folder ``nodes``, ``launch``, ``config`` or ``models``.
 
     Raises:
         FileNotFoundError: the installation lacks it.
@@ -27,6 +27,16 @@ def shipped_file(folder: str, name: str) -> Path:
         have = ", ".join(sorted(entry.name for entry in share_dir(folder).iterdir())) or "nothing"
         raise FileNotFoundError(f"{path} does not exist ({folder}/ holds: {have})")
     return path
+
+
+def node_names() -> list[str]:
+    """Names of the shipped nodes."""
+    return sorted(file.stem for file in share_dir("nodes").glob("[a-z]*.py"))
+
+
+def node_file(name: str) -> Path:
+    """Where a shipped node of this name stands, if there is one."""
+    return share_dir("nodes") / f"{name}.py"
 
 
 def run_dir() -> Path:

@@ -18,7 +18,7 @@ from instant_ic.bus.clock import ManualClock
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.msg import message_type, register_type, to_time
 
-_BASE = "nodes.crawler_base"
+_BASE = "crawler_base"
 _BASE_PERIOD_S = 0.5
 _ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
 """What a robot's nodes act on, in the namespace of its base."""
@@ -138,7 +138,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
         live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
         for base in nodes:
-            if base.module != _BASE:
+            if base.executable != _BASE:
                 continue
             spaces = {"", *(topic.removesuffix("/cmd_vel") for topic in base.subscribes if topic.endswith("/cmd_vel"))}
             acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}

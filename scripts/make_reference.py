@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import argparse
 import ast
-import importlib
 import inspect
 import re
 import sys
-import types
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUT = ROOT / "docs" / "reference.md"
@@ -25,16 +22,6 @@ CALLS = {
     "subscribe_raw": "takes",
     "subscribe_received": "takes",
 }
-
-
-def node_class(module: types.ModuleType) -> Any:
-    """The node that a module of instant_ic.nodes defines."""
-    from instant_ic.bus import Node
-
-    for _, value in inspect.getmembers(module, inspect.isclass):
-        if issubclass(value, Node) and value is not Node and value.__module__ == module.__name__:
-            return value
-    raise SystemExit(f"{module.__name__} defines no node")
 
 
 def topics(source: str) -> dict[str, dict[str, str]]:
@@ -68,6 +55,7 @@ def cell(text: str) -> str:
 
 def render() -> str:
     """The page."""
+    from instant_ic.bus.node_files import node_class
     from instant_ic.config.parameter_info import parameter_infos
 
     lines = [
@@ -80,8 +68,8 @@ def render() -> str:
         "",
     ]
     missing = []
-    for path in sorted((ROOT / "instant_ic" / "nodes").glob("[a-z]*.py")):
-        cls = node_class(importlib.import_module(f"instant_ic.nodes.{path.stem}"))
+    for path in sorted((ROOT / "nodes").glob("[a-z]*.py")):
+        cls = node_class(path.stem)
         source = path.read_text()
         summary = (inspect.getdoc(sys.modules[cls.__module__]) or "").split("\n\n")[0].replace("\n", " ")
         lines += [f"## {cls.name}", "", summary, ""]

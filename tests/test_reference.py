@@ -1,8 +1,6 @@
 """docs/reference.md names every node, topic and parameter as the code has them."""
 
 import dataclasses
-import importlib
-import inspect
 import re
 import subprocess
 import sys
@@ -10,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from instant_ic.bus import Node
+from instant_ic.bus.node_files import node_class
+from instant_ic.paths import node_names
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -56,14 +55,9 @@ def constructed_defaults(config, prefix=""):
     return found
 
 
-@pytest.mark.parametrize("module", sorted(path.stem for path in (ROOT / "instant_ic/nodes").glob("[a-z]*.py")))
+@pytest.mark.parametrize("module", node_names())
 def test_documented_defaults_are_those_of_a_constructed_configuration(module):
-    imported = importlib.import_module(f"instant_ic.nodes.{module}")
-    (node,) = [
-        value
-        for _, value in inspect.getmembers(imported, inspect.isclass)
-        if issubclass(value, Node) and value.__module__ == imported.__name__
-    ]
+    node = node_class(module)
     given = NEEDED.get(module, {})
     actual = {
         key: repr(str(value) if isinstance(value, Path) else value)

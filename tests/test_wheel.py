@@ -28,7 +28,7 @@ def test_wheel_holds_every_shipped_file(wheel):
     for name in tracked.stdout.splitlines():
         if name.startswith("instant_ic/"):
             assert name in names
-        elif name.startswith(("launch/", "config/", "models/")):
+        elif name.startswith(("nodes/", "launch/", "config/", "models/")):
             assert f"instant_ic/share/{name}" in names
 
 

@@ -248,7 +248,7 @@ class Recorder:
                 self._qos[info.topic] = max(offered, key=lambda qos: (qos.latched, qos.reliable))
                 self._losses[info.topic] = self._subscribe(info.topic, self.take)
         for node in nodes:
-            self._parameters[node.name] = {"module": node.module, "params": node.params}
+            self._parameters[node.name] = {"executable": node.executable, "params": node.params}
 
     def take(
         self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""

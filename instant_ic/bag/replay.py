@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
-import inspect
 import threading
 import time
 from collections import Counter
@@ -25,6 +23,7 @@ from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.bus.node import Node
+from instant_ic.bus.node_files import node_class
 from instant_ic.bus.process import load_config
 from instant_ic.msg import deserialize
 
@@ -50,7 +49,7 @@ class ReplayNode:
     """A node to replay.
 
     Attributes:
-        name: module in ``instant_ic.nodes``.
+        name: of a shipped node.
         node_class: its class.
         config: its parameters.
     """
@@ -79,25 +78,6 @@ class ReplayResult:
     bag_s: float = 0.0
     setup_s: float = 0.0
     wall_s: float = 0.0
-
-
-def find_node_class(name: str) -> type[Node[Any]]:
-    """The node's class in ``instant_ic.nodes.NAME``.
-
-    Raises:
-        ReplayError: no such module, or no node in it.
-    """
-    module_name = f"instant_ic.nodes.{name}"
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name != module_name:
-            raise
-        raise ReplayError(f"there is no node {name!r}") from None
-    for value in vars(module).values():
-        if inspect.isclass(value) and issubclass(value, Node) and value.__module__ == module_name:
-            return value
-    raise ReplayError(f"{module_name} defines no node")
 
 
 def shipped_parameter_files(name: str) -> list[Path]:
@@ -130,19 +110,19 @@ def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequenc
     """A node with its parameters.
 
     Args:
-        name: module in ``instant_ic.nodes``.
+        name: of a shipped node.
         params_files: parameter files; None takes what ``config/`` has for the node.
         overrides: ``node.key:=value`` words; those of other nodes are skipped.
 
     Raises:
-        ReplayError: no such node.
+        NodeFileError: no such node.
         ParameterError: wrong parameters.
     """
-    node_class = find_node_class(name)
     files = shipped_parameter_files(name) if params_files is None else list(params_files)
     own = [word.removeprefix(f"{name}.") for word in overrides if word.startswith(f"{name}.")]
-    config, _ = load_config(node_class, name, files, own)
-    return ReplayNode(name, node_class, config)
+    found = node_class(name)
+    config, _ = load_config(found, name, files, own)
+    return ReplayNode(name, found, config)
 
 
 def replay(

@@ -56,14 +56,14 @@ class Parameters:
         for name, value in wanted.items():
             node, key = _split(name)
             by_node.setdefault(node, {})[key] = value
-        modules = {info.name: info.module for info in registry.list_nodes(self._run_dir)}
+        executables = {info.name: info.executable for info in registry.list_nodes(self._run_dir)}
         refused = []
         for node, values in by_node.items():
             try:
-                if node not in modules:
+                if node not in executables:
                     raise ControlError(f"node {node!r:.100} does not run")
                 for key, value in values.items():
-                    _check(modules[node], key, value)
+                    _check(executables[node], key, value)
                 self._control(node).set(values)
             except (ControlError, ParameterError) as error:
                 refused.append(f"{node:.100}: {error}")
@@ -74,7 +74,7 @@ class Parameters:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _check(module: str, key: str, value: Any) -> None:
+def _check(executable: str, key: str, value: Any) -> None:
     """Refuses a safety parameter, also as part of a group.
 
     Raises:
@@ -83,7 +83,7 @@ def _check(module: str, key: str, value: Any) -> None:
     items = value if isinstance(value, list) else [value]
     if not all(isinstance(item, (bool, int, float, str)) for item in items):
         raise ParameterError(f"{key!r:.100} must be a number, a text, true or false, or a list of them")
-    if never_set(module, key):
+    if never_set(executable, key):
         raise ParameterError(
             f"{key!r:.100} is a safety parameter and cannot be set over a bridge; use `ic param set` on the robot"
         )

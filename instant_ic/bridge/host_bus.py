@@ -19,7 +19,7 @@ from instant_ic.bus.qos import PRESETS
 from instant_ic.bus.transport import Received, TransportError
 from instant_ic.msg import MessageError, deserialize
 
-BRIDGES = ("nodes.host_bridge", "nodes.zenoh_gateway")
+BRIDGES = ("host_bridge", "zenoh_gateway")
 """Nodes that publish here what was published elsewhere: it is not sent on, or it would come back."""
 
 OLD_NEWS_NS = 1_000_000_000
@@ -56,7 +56,7 @@ class ExportedTopics:
         run_dir = self._node.run_dir
         assert run_dir is not None
         nodes = registry.list_nodes(run_dir)
-        self._bridges = {self._node.node_name, *(info.name for info in nodes if info.module in BRIDGES)}
+        self._bridges = {self._node.node_name, *(info.name for info in nodes if info.executable in BRIDGES)}
         before, self._offered = self._offered, {}
         for name in self._rules:
             for publisher in registry.topic_publishers(run_dir, self._node.resolve(name)):

@@ -15,15 +15,15 @@ NEVER_SET = (
     *("*e_stop*", "*emergency*", "*command*", "*cmd_vel*", "*watchdog*", "*max_speed*", "*max_vel*", "*max_acc*"),
     *("*deceleration*", "*use_sim_time"),
 )
-"""Patterns of ``NODE.KEY``, where NODE is the last part of the node's module: a node keeps it under any name."""
+"""Patterns of ``NODE.KEY``, where NODE is the node's executable: a node keeps it under any name."""
 
 
-def never_set(module: str, key: str) -> bool:
+def never_set(executable: str, key: str) -> bool:
     """Whether a parameter can be changed only on this machine (``ic param set``).
 
     Args:
-        module: of the node, ``nodes.arbiter``.
+        executable: of the node, ``arbiter``; its own name may be another.
         key: of the parameter, groups with dots.
     """
-    name = f"{module.rsplit('.', 1)[-1]}.{key}".lower()
+    name = f"{executable}.{key}".lower()
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in NEVER_SET)

@@ -785,7 +785,7 @@ class Node(Generic[ConfigT]):
         """What the registry tells of this node."""
         return {
             "name": self.node_name,
-            "module": f"instant_ic.nodes.{type(self).name}",
+            "executable": type(self).name,
             "pid": os.getpid(),
             "params": {"use_sim_time": self.use_sim_time, "nice": self.nice, **params.to_dict(self.config)},
             "publishes": {p.topic: p.raw.type_name for p in self.publishers},

@@ -62,7 +62,7 @@ class NodeInfo:
     """A live node."""
 
     name: str
-    module: str
+    executable: str
     pid: int
     started_ns: int
     params: dict[str, Any]

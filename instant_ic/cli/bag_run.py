@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from instant_ic.bag.replay import find_node_class
 from instant_ic.bus import Node
 from instant_ic.bus.control import ControlError, NodeBusyError, NodeControl
+from instant_ic.bus.node_files import node_class
 from instant_ic.bus.process import run as run_node
 from instant_ic.bus.registry import NodeInfo, list_nodes
 from instant_ic.cli.commands.bag import argument_of, topic_names
@@ -26,7 +26,7 @@ _STEERED = ("bag_recorder", "bag_player")
 
 def _attended(name: str, attend: Callable[[Node[Any]], Terminal]) -> type[Node[Any]]:
     """A node's class with keys and a status line."""
-    base = find_node_class(name)
+    base = node_class(name)
 
     def setup(self: Any) -> None:
         base.setup(self)
@@ -178,7 +178,7 @@ def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
 
 def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -> NodeInfo:
     """The node that is meant; of several recorders the one that can do it."""
-    running = [node for node in list_nodes(run_dir()) if node.module.rsplit(".", 1)[-1] in kinds]
+    running = [node for node in list_nodes(run_dir()) if node.executable in kinds]
     chosen = [node for node in running if not name or node.name == name]
     if len(chosen) > 1:
         able = [node for node in chosen if bool(node.params.get("snapshot")) is keeps_snapshots]

@@ -68,8 +68,9 @@ def types(args: Any) -> Iterable[str]:
 @_quiet
 def programs(args: Any) -> Iterable[str]:
     """Nodes that can be started."""
-    folder = Path(__file__).resolve().parents[1] / "nodes"
-    return sorted(path.stem for path in folder.glob("[a-z]*.py"))
+    from instant_ic import paths
+
+    return paths.node_names()
 
 
 @_quiet

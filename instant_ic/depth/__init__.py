@@ -1,5 +1,4 @@
-"""360° depth: the SliceNet network, its training, ONNX inference and the scaling by LiDAR.
+"""360° depth at run time: ONNX inference, the scaling by LiDAR, depth from LiDAR, and the fusion of both.
 
-Nothing heavy is imported here: ``slicenet``, ``training`` and ``export`` need torch, ``model`` needs onnxruntime,
-``metrics`` and ``scaler`` need only numpy.
+Nothing heavy is imported here: ``model`` needs onnxruntime, ``metrics`` and ``scaler`` need only numpy.
 """

@@ -1,1 +1,1 @@
-"""Metrics and experiments."""
+"""Evaluations and the paper's experiments: their worlds, operators, baselines and figures."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,7 +42,7 @@ class NodeSpec:
 
     Attributes:
         name: its name on the bus, unique in its run directory whatever its namespace.
-        exec: module of ``instant_ic.nodes``, or the path of a program.
+        exec: name of a shipped node, or the path of a program.
         command: the whole command line, without the run directory.
         namespace: put before its topics.
         env: environment variables to add; None takes one away.
@@ -205,10 +204,3 @@ def read_arguments(file: Path, included: bool = False) -> tuple[LaunchArgument, 
     if reader.read_top(file) is None:
         raise LaunchFileError(reader.problems)
     return tuple(reader.included if included else reader.arguments)
-
-
-def known_nodes() -> list[str]:
-    """Names of the modules in ``instant_ic.nodes``."""
-    spec = importlib.util.find_spec("instant_ic.nodes")
-    folders = [Path(location) for location in (spec.submodule_search_locations or [])] if spec else []
-    return sorted({file.stem for folder in folders for file in folder.glob("*.py") if file.stem[0] != "_"})

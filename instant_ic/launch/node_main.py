@@ -1,4 +1,4 @@
-"""Runs a node's module as a program and leaves at once when the node is done: ``node_main.py MODULE ARGUMENTS``.
+"""Runs a node's file as a program and leaves at once when the node is done: ``node_main.py FILE ARGUMENTS``.
 
 Run as a script, never imported, so that nothing of the launcher is loaded into each node.
 
@@ -28,12 +28,11 @@ if sys.path and Path(sys.path[0]) == _here:  # beside this file lie modules that
 
 
 def main() -> None:
-    """Runs the module named by the first argument; ends the process with its exit status."""
-    module = sys.argv[1]
-    del sys.argv[1]
+    """Runs the file named by the first argument; ends the process with its exit status."""
+    del sys.argv[0]
     status = 1
     try:
-        runpy.run_module(module, run_name="__main__", alter_sys=True)
+        runpy.run_path(sys.argv[0], run_name="__main__")
         status = 0
     except SystemExit as end:
         if end.code is None or isinstance(end.code, int):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
 import sys
@@ -10,7 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec, known_nodes
+from instant_ic import paths
+from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
 from instant_ic.launch.source import Value, load
 from instant_ic.launch.substitutions import Context
 from instant_ic.launch.values import (
@@ -168,9 +168,9 @@ def _program(value: Value, executable: str, context: Context) -> tuple[str, ...]
             return (sys.executable, str(file.resolve()))
         value.problem(f"program {executable} does not exist beside the launch file")
         return None
-    if executable.isidentifier() and importlib.util.find_spec(f"instant_ic.nodes.{executable}"):
-        return (sys.executable, str(_NODE_MAIN), f"instant_ic.nodes.{executable}")
-    value.problem(f"unknown exec {executable!r} (nodes: {', '.join(known_nodes()) or 'none'})")
+    if executable in paths.node_names():
+        return (sys.executable, str(_NODE_MAIN), str(paths.node_file(executable)))
+    value.problem(f"unknown exec {executable!r} (nodes: {', '.join(paths.node_names())})")
     return None
 
 

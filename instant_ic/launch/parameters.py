@@ -43,13 +43,13 @@ class _Node:
     @classmethod
     def of(cls, spec: NodeSpec) -> _Node:
         """The part of a specification that matters here."""
-        start = spec.command.index(f"instant_ic.nodes.{spec.exec}") + 1
+        start = spec.command.index(str(paths.node_file(spec.exec))) + 1
         return cls(spec.label, spec.exec, spec.command[start:], f"{spec.file}:{spec.line}", dict(spec.places))
 
 
 def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
     """Programs given by path and executables are not looked into."""
-    return [_Node.of(spec) for spec in nodes if f"instant_ic.nodes.{spec.exec}" in spec.command]
+    return [_Node.of(spec) for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
 
 
 def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
@@ -142,18 +142,18 @@ def _check_apart(nodes: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
 
 def _problems(node: _Node) -> list[str]:
     """All that is wrong with one node's command line."""
-    from instant_ic.bag.replay import ReplayError, find_node_class
+    from instant_ic.bus.node_files import NodeFileError, node_class
     from instant_ic.bus.process import argument_parser, parse_remaps
     from instant_ic.config.params import ParameterError, ProcessParameters
 
     where = f"{node.at}: node {node.label}"
     try:
-        node_class = find_node_class(node.exec)
-    except ReplayError as error:
+        found = node_class(node.exec)
+    except NodeFileError as error:
         return [f"{where}: {error}"]
     except Exception as error:  # noqa: BLE001 - whatever a module raises while it is imported, the node would too
         return [f"{where}: cannot be loaded: {type(error).__name__}: {error}"]
-    parser = argument_parser(node_class)
+    parser = argument_parser(found)
     told: list[str] = []
     parser.error = told.append  # type: ignore[method-assign,assignment]
     args, unknown = parser.parse_known_args(node.words)
@@ -166,7 +166,7 @@ def _problems(node: _Node) -> list[str]:
         problems.append(f"{where}: {error}")
     values = _values(node, args, problems, where)
     common = {key: values.pop(key) for key in ProcessParameters.__dataclass_fields__ if key in values}
-    for config_class, part in ((node_class.config_class(), values), (ProcessParameters, common)):
+    for config_class, part in ((found.config_class(), values), (ProcessParameters, common)):
         problems += _refused(config_class, part, node, where)
     return problems
 

@@ -1,9 +1,7 @@
 """Who gets into the Foxglove bridge, what nobody may do through it, and what no client can do to it."""
 
 import contextlib
-import importlib
 import json
-import pkgutil
 import socket
 import struct
 import threading
@@ -15,14 +13,15 @@ from foxglove_client import Client, FoxgloveWorld
 from live_nodes import wait_for
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-import instant_ic.nodes
 from instant_ic.bridge import foxglove_server
 from instant_ic.bridge.parameter_guard import never_set
 from instant_ic.bridge.web_access import is_loopback, refusal
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.bus.control import NodeControl
 from instant_ic.bus.node import Node
+from instant_ic.bus.node_files import node_class
 from instant_ic.msg import String, deserialize
+from instant_ic.paths import node_names
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 
@@ -210,13 +209,10 @@ HARMLESS = {
 def test_every_live_parameter_is_a_safety_parameter_or_known_to_be_harmless():
     """A new live parameter, or a node of a new name, has to be put on one side or the other."""
     found = {}
-    for module in pkgutil.iter_modules(instant_ic.nodes.__path__):
-        members = vars(importlib.import_module(f"instant_ic.nodes.{module.name}")).values()
-        for kind in members:
-            if isinstance(kind, type) and issubclass(kind, Node) and kind is not Node and kind.live_parameters:
-                settable = [k for k in kind.live_parameters if not never_set(f"instant_ic.nodes.{kind.name}", k)]
-                if settable:
-                    found[kind.name] = tuple(settable)
+    for name in node_names():
+        settable = [key for key in node_class(name).live_parameters if not never_set(name, key)]
+        if settable:
+            found[name] = tuple(settable)
     assert found == HARMLESS
 
 

@@ -1,29 +1,16 @@
 """What the nodes declare as live is there, and takes effect where it is used."""
 
-import importlib
-import inspect
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-import instant_ic
-from instant_ic.bus import Node, ParameterError
+from instant_ic.bus import ParameterError
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.bus.node_files import node_class
 from instant_ic.config.parameter_info import is_live, parameter_infos
 from instant_ic.msg import image_message, transform_matrix
+from instant_ic.paths import node_names
 
-NODES = sorted(path.stem for path in (Path(instant_ic.__file__).parent / "nodes").glob("[a-z]*.py"))
-
-
-def node_class(name):
-    module = importlib.import_module(f"instant_ic.nodes.{name}")
-    (found,) = [
-        value
-        for _, value in inspect.getmembers(module, inspect.isclass)
-        if issubclass(value, Node) and value.__module__ == module.__name__
-    ]
-    return found
+NODES = node_names()
 
 
 @pytest.mark.parametrize("name", NODES)

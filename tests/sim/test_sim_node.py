@@ -14,6 +14,7 @@ import pytest
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.config.params import build, load_file
+from instant_ic.paths import node_file
 from nodes.simulator import SimulatorConfig, SimulatorNode
 
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "sim.yaml"
@@ -35,7 +36,7 @@ def test_process_starts_serves_and_ends(tmp_path: Path) -> None:
     log = tmp_path / "log.txt"
     with log.open("w") as output:
         process = subprocess.Popen(
-            [sys.executable, "-m", "nodes.simulator",
+            [sys.executable, str(node_file("simulator")),
              "--run-dir", str(tmp_path),
              "--params-file", str(CONFIG), "-p", "world:=random:3", "-p", "camera.port:=0",
              "-p", "lidar.enabled:=false",

@@ -21,7 +21,9 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic node list -v",
     )
     listing.add_argument("-c", "--count-nodes", action="store_true", help="only how many there are")
-    listing.add_argument("-v", "--verbose", action="store_true", help="with process id, time since the start, module")
+    listing.add_argument(
+        "-v", "--verbose", action="store_true", help="with process id, time since the start, executable"
+    )
     listing.set_defaults(func=list_nodes)
     info = verbs.add_parser(
         "info",
@@ -50,7 +52,9 @@ def list_nodes(args: argparse.Namespace) -> int:
     for node in nodes:
         up_s = max(0.0, time.time() - node.started_ns / 1e9)
         print(
-            f"{node.name:<{width}}  pid {node.pid:<7}  up {up_s:6.0f} s  {node.module}" if args.verbose else node.name
+            f"{node.name:<{width}}  pid {node.pid:<7}  up {up_s:6.0f} s  {node.executable}"
+            if args.verbose
+            else node.name
         )
     if not nodes:
         print(f"ic: {nobody_runs()}", file=sys.stderr)
@@ -67,7 +71,7 @@ def show(args: argparse.Namespace) -> int:
     from instant_ic.cli.names import find_node
 
     node = find_node(args.node)
-    print(f"{node.name}: {node.module}, pid {node.pid}")
+    print(f"{node.name}: {node.executable}, pid {node.pid}")
     beat = hear(paths.run_dir(), [node.name]).get(node.name)
     if beat is None:
         print("state: silent, no heartbeat within 1.5 s")

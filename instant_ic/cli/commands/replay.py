@@ -55,12 +55,12 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replays."""
-    from instant_ic.launch.description import known_nodes
+    from instant_ic.paths import node_names
 
     names = [name for name in args.nodes.split(",") if name]
     for name in names:
-        if name not in known_nodes():
-            raise UserError(f"there is no node {name!r}; there are {', '.join(known_nodes())}", 2)
+        if name not in node_names():
+            raise UserError(f"there is no node {name!r}; there are {', '.join(node_names())}", 2)
     for word in args.param:
         node, dot, rest = word.partition(".")
         if not dot or ":=" not in rest or node not in names:

@@ -31,46 +31,19 @@ def add_parser(subparsers: Any) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Runs the node in this process."""
-    from instant_ic.bus.process import run as run_node
-
-    return run_node(
-        _own_node(Path(args.node)) if args.node.endswith(".py") else _shipped_node(args.node), args.arguments
-    )
-
-
-def _shipped_node(name: str) -> Any:
-    from instant_ic.bag.replay import find_node_class
-    from instant_ic.cli.names import near
-
-    known = completion.programs()
-    if name not in known:
-        raise UserError(
-            f"there is no node {name!r}; there are {', '.join(known)} ({near(name, known, 'or FILE.py')})", 2
-        )
-    return find_node_class(name)
-
-
-def _own_node(file: Path) -> Any:
-    """The node class that a user's file defines."""
-    import importlib.util
     import sys
 
-    from instant_ic.bus import Node
+    from instant_ic.bus.node_files import NodeFileError, load, node_class
+    from instant_ic.bus.process import run as run_node
+    from instant_ic.cli.names import near
+    from instant_ic.paths import node_names
 
-    if not file.is_file():
-        raise UserError(f"{file} does not exist", 2)
-    spec = importlib.util.spec_from_file_location(file.stem, file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[file.stem] = module  # dataclasses look their module up
-    sys.path.insert(0, str(file.resolve().parent))
-    spec.loader.exec_module(module)
-    found = [
-        value
-        for value in vars(module).values()
-        if isinstance(value, type) and issubclass(value, Node) and value.__module__ == module.__name__
-    ]
-    if len(found) != 1:
-        there = ", ".join(cls.__name__ for cls in found) or "none"
-        raise UserError(f"{file} must define one node class (it has: {there})", 2)
-    return found[0]
+    try:
+        if args.node.endswith(".py"):
+            file = Path(args.node)
+            sys.path.insert(0, str(file.resolve().parent))
+            return run_node(load(file), args.arguments)
+        return run_node(node_class(args.node), args.arguments)
+    except NodeFileError as error:
+        hint = "" if args.node.endswith(".py") else f" ({near(args.node, node_names(), 'or FILE.py')})"
+        raise UserError(f"{error}{hint}", 2) from None

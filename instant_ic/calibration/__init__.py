@@ -1,0 +1,1 @@
+"""Calibration of the mount between camera and LiDAR, from a recording."""

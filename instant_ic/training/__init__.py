@@ -1,0 +1,1 @@
+"""Training of the depth network: data, augmentation, losses, SliceNet in torch, export to ONNX (extra ``train``)."""
