@@ -5,46 +5,70 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).resolve().parents[1] / "instant_ic"
-LIBRARIES = ("camera", "lidar", "base", "slam", "depth", "nerf", "control")
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "instant_ic"
+ALGORITHMS = ("camera", "lidar", "base", "slam", "depth", "vspace", "control")
+"""Usable from a notebook: no bus, no files of the stack."""
+NOT_RUNTIME = ("training", "experiments")
+TOOLS = ("cli", "training", "experiments")
+"""May import what is not part of the running stack."""
 
 
 def imports(path: Path) -> set[str]:
     """Absolute names of the package's own modules that a file imports."""
-    module = list(path.relative_to(PACKAGE.parent).with_suffix("").parts)
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = module[: -node.level] if node.level else []
-            target = ".".join([*base, *([node.module] if node.module else [])])
-            found |= {target} | {f"{target}.{alias.name}" for alias in node.names}
-    return {name for name in found if name.startswith("instant_ic")}
+            assert node.level == 0, f"{path}:{node.lineno}: relative import"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name for name in found if name.startswith(("instant_ic.", "nodes."))}
 
 
-@pytest.mark.parametrize("folder", LIBRARIES)
+def wrong(folder: Path, *forbidden: str) -> dict[str, set[str]]:
+    """Imports of the forbidden packages by file."""
+    files = list(folder.rglob("*.py"))
+    assert files, f"{folder} is empty"
+    names = tuple(f"instant_ic.{name}." for name in forbidden) + ("nodes.",)
+    bad = {str(file.relative_to(ROOT)): {i for i in imports(file) if i.startswith(names)} for file in files}
+    return {file: found for file, found in bad.items() if found}
+
+
+@pytest.mark.parametrize("folder", ALGORITHMS)
 def test_algorithms_and_devices_know_no_bus(folder):
-    files = list((PACKAGE / folder).rglob("*.py"))
-    assert files, f"{folder}/ is empty"
-    forbidden = tuple(f"instant_ic.{name}" for name in ("bus", "msg", "nodes", "launch", "bag", "cli"))
-    wrong = {str(f): i for f in files for i in imports(f) if i.startswith(forbidden)}
-    assert not wrong
+    assert not wrong(PACKAGE / folder, "bus", "msg", "launch", "bag", "cli")
 
 
 def test_nobody_imports_a_node():
-    files = [f for f in PACKAGE.rglob("*.py") if f.parent.name != "nodes"]
-    wrong = {str(f): i for f in files for i in imports(f) if i.startswith("instant_ic.nodes")}
-    assert not wrong
+    assert not wrong(PACKAGE)
+    assert not wrong(ROOT / "nodes")
 
 
-def test_geometry_msg_and_bus_import_only_downwards():
+@pytest.mark.parametrize("folder", sorted(p.name for p in PACKAGE.iterdir() if p.is_dir() and p.name not in TOOLS))
+def test_the_runtime_imports_no_training_and_no_experiments(folder):
+    if list((PACKAGE / folder).rglob("*.py")):
+        assert not wrong(PACKAGE / folder, *NOT_RUNTIME)
+
+
+def test_nodes_import_no_training_and_no_experiments():
+    assert not wrong(ROOT / "nodes", *NOT_RUNTIME)
+
+
+@pytest.mark.parametrize("folder", sorted(p.name for p in PACKAGE.iterdir() if p.is_dir()))
+def test_only_training_and_experiments_import_the_simulator(folder):
+    if folder not in ("sim", *TOOLS) and list((PACKAGE / folder).rglob("*.py")):
+        assert not wrong(PACKAGE / folder, "sim")
+
+
+def test_geometry_msg_config_and_bus_import_only_downwards():
     allowed = {
         "geometry": {"geometry", "limits"},
         "msg": {"msg", "geometry"},
-        "bus": {"bus", "msg", "geometry", "pace", "paths", "private", "ranges"},
+        "config": {"config", "paths"},
+        "bus": {"bus", "config", "msg", "geometry", "pace", "paths", "private"},
     }
     for folder, targets in allowed.items():
         for file in (PACKAGE / folder).rglob("*.py"):
-            wrong = {i for i in imports(file) if len(i.split(".")) > 1 and i.split(".")[1] not in targets}
-            assert not wrong, file
+            upward = {i for i in imports(file) if i.split(".")[1] not in targets}
+            assert not upward, file
