@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     from instant_ic.config.params import ParameterError
 
 _NAMES = {
-    "node": "ERROR OK STALE WARN Latest Node NodeError Publisher Subscription Worker",
-    "params": "ParameterError",
-    "process": "main",
-    "qos": "LATCHED RECORD RELIABLE SENSOR QoS",
-    "registry": "RegistryError",
+    "bus.node": "ERROR OK STALE WARN Latest Node NodeError Publisher Subscription Worker",
+    "config.params": "ParameterError",
+    "bus.process": "main",
+    "bus.qos": "LATCHED RECORD RELIABLE SENSOR QoS",
+    "bus.registry": "RegistryError",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
@@ -48,6 +48,6 @@ def __getattr__(name: str) -> Any:
     """A public name, from the module that has it."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(f".{_MODULES[name]}", __name__), name)
+    value = getattr(importlib.import_module(f"instant_ic.{_MODULES[name]}"), name)
     globals()[name] = value
     return value
