@@ -15,15 +15,11 @@ from instant_ic.cli.main import main
 NODE_MAIN = Path(launch.__file__).with_name("node_main.py")
 
 
-def run_module(folder: Path, code: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    (folder / "its_module.py").write_text(textwrap.dedent(code))
-    return subprocess.run(
-        [sys.executable, str(NODE_MAIN), "its_module", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        env={**os.environ, "PYTHONPATH": str(folder)},
-    )
+def run_file(folder: Path, code: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    file = folder / "its_node.py"
+    file.write_text(textwrap.dedent(code))
+    command = [sys.executable, str(NODE_MAIN), str(file), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
 @pytest.mark.parametrize(
@@ -37,8 +33,8 @@ def run_module(folder: Path, code: str, *arguments: str) -> "subprocess.Complete
         ("raise ValueError('broken')", 1, "ValueError: broken"),
     ],
 )
-def test_exit_status_and_last_words_are_the_modules_own(tmp_path: Path, end: str, status: int, told: str) -> None:
-    done = run_module(tmp_path, f"import sys\nprint(sys.argv[1:], __name__)\n{end}\n", "--name", "x")
+def test_exit_status_and_last_message_are_the_nodes_own(tmp_path: Path, end: str, status: int, told: str) -> None:
+    done = run_file(tmp_path, f"import sys\nprint(sys.argv[1:], __name__)\n{end}\n", "--name", "x")
     assert done.returncode == status
     assert done.stdout == "['--name', 'x'] __main__\n"  # not lost, although the interpreter is not taken down
     assert told in done.stderr
@@ -46,18 +42,15 @@ def test_exit_status_and_last_words_are_the_modules_own(tmp_path: Path, end: str
 
 
 def test_interpreter_is_not_taken_down(tmp_path: Path) -> None:
-    done = run_module(tmp_path, "import atexit\natexit.register(print, 'taken down')\nprint('done')\n")
+    done = run_file(tmp_path, "import atexit\natexit.register(print, 'taken down')\nprint('done')\n")
     assert (done.returncode, done.stdout) == (0, "done\n")
 
 
 def test_a_signal_while_a_node_is_still_imported_ends_it_quietly(tmp_path: Path) -> None:
-    (tmp_path / "its_module.py").write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
+    file = tmp_path / "its_node.py"
+    file.write_text("import time\nprint('importing', flush=True)\ntime.sleep(60)\n")
     process = subprocess.Popen(
-        [sys.executable, str(NODE_MAIN), "its_module"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        [sys.executable, str(NODE_MAIN), str(file)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     try:
         assert process.stdout is not None and process.stdout.readline() == "importing\n"
