@@ -204,6 +204,7 @@ def ros_qos(qos: QoS) -> Qos:
     )
 
 
+@functools.lru_cache(maxsize=200)  # asked once per message; the YAML parser takes a millisecond
 def preset_of_text(profiles: str) -> QoS:
     """As :func:`preset_of`, of what an MCAP file notes with a topic; ``reliable`` where that is damaged."""
     try:
