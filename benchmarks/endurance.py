@@ -52,6 +52,7 @@ from instant_ic.bus.control import ControlError, NodeControl
 from instant_ic.console.client import ConsoleClient
 from instant_ic.experiments.drive import pump
 from instant_ic.experiments.stack import StackError, machine_pace, processes_of
+from instant_ic.launch.nodes import NODE_MAIN
 from instant_ic.launch.process import dies_with_us
 from instant_ic.msg import ControlState
 from instant_ic.paths import node_file
@@ -171,7 +172,8 @@ class Recording:
         self._number += 1
         self._acknowledged = []
         words = {"path": self._bag, "exclude": LARGE_TOPICS, "min_free_mb": 8}
-        command = [*dies_with_us(), sys.executable, str(node_file("bag_recorder")), "--name", "soak_recorder"]
+        node = (str(NODE_MAIN), str(node_file("bag_recorder")))  # as a launch file starts it: no signal is lost
+        command = [*dies_with_us(), sys.executable, *node, "--name", "soak_recorder"]
         command += ["--run-dir", str(self._rig.run_dir), *(w for k, v in words.items() for w in ("-p", f"{k}:={v}"))]
         environment = {**os.environ, "INSTANT_IC_RUN_DIR": str(self._rig.run_dir)}
         self._process = subprocess.Popen(

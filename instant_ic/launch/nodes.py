@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """What the bus accepts."""
 
-_NODE_MAIN = Path(__file__).with_name("node_main.py")
+NODE_MAIN = Path(__file__).with_name("node_main.py")
 _PROCESS_KEYS = (
     *("env", "args", "output", "cwd", "launch-prefix", "emulate_tty", "shell", "required"),
     *("respawn", "respawn_delay", "respawn_max_retries", "sigterm_timeout", "sigkill_timeout", *CONDITION),
@@ -169,7 +169,7 @@ def _program(value: Value, executable: str, context: Context) -> tuple[str, ...]
         value.problem(f"program {executable} does not exist beside the launch file")
         return None
     if executable in paths.node_names():
-        return (sys.executable, str(_NODE_MAIN), str(paths.node_file(executable)))
+        return (sys.executable, str(NODE_MAIN), str(paths.node_file(executable)))
     value.problem(f"unknown exec {executable!r} (nodes: {', '.join(paths.node_names())})")
     return None
 
