@@ -14,16 +14,17 @@ def _require(ok: bool, key: str, value: object, rule: str) -> None:
 
 @dataclass(frozen=True)
 class SkidSteerConfig:
-    """Geometry of a skid-steered base, by instantaneous centres of rotation (Martinez et al., 2005).
+    """Geometry of a skid-steer base, modelled by instantaneous centres of rotation (Martinez et al., 2005).
 
     Attributes:
         track_width: distance between the tracks' centre lines, metres.
-        track_width_multiplier: effective over geometric width; tracks slip sideways when they turn, 1.2-2.
-        x_icr: how far ahead of base_link the centre of rotation lies, metres; 0 for an even load.
-        pulses_per_metre: encoder pulses for a metre of track.
-        left_motor: which of the controller's motors drives the left track, 1 or 2.
-        invert_left: the left motor's positive direction drives backwards.
-        invert_right: the right motor's positive direction drives backwards.
+        track_width_multiplier: effective width divided by geometric width, 1.2-2; above 1 because tracks slip
+            sideways in turns.
+        x_icr: distance of the centre of rotation ahead of base_link, metres; 0 for an even load.
+        pulses_per_metre: encoder pulses per metre of track.
+        left_motor: controller motor that drives the left track, 1 or 2.
+        invert_left: whether the left motor's positive direction drives backwards.
+        invert_right: whether the right motor's positive direction drives backwards.
     """
 
     track_width: float = 0.40
@@ -49,20 +50,20 @@ class SkidSteerConfig:
 
     @property
     def effective_width(self) -> float:
-        """y_l - y_r of the model: distance between the tracks' instantaneous centres of rotation, metres."""
+        """Distance between the tracks' instantaneous centres of rotation (y_l - y_r in the model), metres."""
         return self.track_width * self.track_width_multiplier
 
 
 @dataclass(frozen=True)
 class LimitsConfig:
-    """What the base may do at most.
+    """Speed and acceleration limits of the base.
 
     Attributes:
-        max_v: speed along x, m/s.
-        max_w: turn rate, rad/s.
-        max_v_acceleration: change of the speed, m/s^2.
-        max_w_acceleration: change of the turn rate, rad/s^2.
-        hard_deceleration: of each track when the command is lost or asks for a hard stop, m/s^2.
+        max_v: largest speed along x, m/s.
+        max_w: largest turn rate, rad/s.
+        max_v_acceleration: largest change of the speed, m/s^2.
+        max_w_acceleration: largest change of the turn rate, rad/s^2.
+        hard_deceleration: deceleration of each track when commands stop or a command asks for a hard stop, m/s^2.
     """
 
     max_v: Positive = 0.5
@@ -84,12 +85,12 @@ class LimitsConfig:
 
 @dataclass(frozen=True)
 class OdometryNoiseConfig:
-    """How fast the odometry's uncertainty grows.
+    """Growth of the odometry's uncertainty.
 
     Attributes:
-        position_per_metre: variance of the position gained with each metre driven, m^2/m.
-        yaw_per_metre: variance of the yaw gained with each metre driven, rad^2/m.
-        yaw_per_radian: variance of the yaw gained with each radian turned (tracks slip), rad^2/rad.
+        position_per_metre: variance added to the position per metre driven, m^2/m.
+        yaw_per_metre: variance added to the yaw per metre driven, rad^2/m.
+        yaw_per_radian: variance added to the yaw per radian turned, because tracks slip, rad^2/rad.
         v_floor: standard deviation of the speed at rest, m/s.
         w_floor: standard deviation of the turn rate at rest, rad/s.
     """
@@ -107,17 +108,17 @@ class OdometryNoiseConfig:
 
 @dataclass(frozen=True)
 class RoboclawConfig:
-    """The serial line to the motor controller.
+    """Serial link to the motor controller.
 
     Attributes:
         port: serial device, such as /dev/ttyACM0, or a pseudo-terminal.
-        baud: 2400-460800; of no effect over USB.
-        address: of the controller, 0x80-0x87 (128-135).
-        reply_timeout_s: how long a reply may take; after that the motors are stopped before anything is repeated.
-        retries: how often a command is repeated before the link counts as lost.
-        watchdog_s: the controller itself stops the motors when no packet came for this long; steps of 0.1 s.
-        reconnect_min_s: first wait before the port is opened again.
-        reconnect_max_s: longest wait.
+        baud: baud rate, 2400-460800; no effect over USB.
+        address: packet serial address of the controller, 0x80-0x87 (128-135).
+        reply_timeout_s: longest wait for a reply; then the motors are stopped before the command is repeated.
+        retries: repeats of a command before the link counts as lost.
+        watchdog_s: the controller itself stops the motors after this time without a packet; steps of 0.1 s.
+        reconnect_min_s: first wait before the port is reopened.
+        reconnect_max_s: longest wait before the port is reopened.
     """
 
     port: str = "/dev/ttyACM0"

@@ -1,4 +1,4 @@
-"""Drives the base at a fixed rate: newest command in, odometry and health out, stop when in doubt."""
+"""Control loop of the base at a fixed rate: takes the newest command, returns odometry and health, stops on faults."""
 
 import threading
 from collections.abc import Callable
@@ -16,20 +16,21 @@ from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.pace import current
 
 _COUNTED_SINCE_M = 0.2
-"""Metres of track that a controller may have counted between its restart and the next reading."""
+"""Largest count, in metres of track, that a restarted controller can reach before the next reading."""
 
 
 @dataclass(frozen=True)
 class ControllerConfig:
-    """The tracked base as a whole.
+    """Parameters of the whole tracked base.
 
     Attributes:
-        roboclaw: serial line.
+        roboclaw: serial link.
         geometry: tracks and encoders.
         limits: speeds and accelerations.
-        odometry: growth of the uncertainty.
-        command_timeout_s: a command older than this is dropped, and without a newer one the base stops hard.
-        health_period_s: battery, status and the controller's watchdog are asked for this often.
+        odometry: growth of the odometry's uncertainty.
+        command_timeout_s: largest age of a command; older commands are dropped, and without a newer one the base
+            stops hard.
+        health_period_s: time between reads of battery, status and the controller's watchdog.
     """
 
     roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
@@ -46,7 +47,7 @@ class ControllerConfig:
 
 @dataclass(frozen=True)
 class Health:
-    """What the controller told of itself at one instant."""
+    """Battery and status that the controller reported at one instant."""
 
     stamp_ns: int
     battery_v: float
@@ -58,11 +59,11 @@ class BaseState:
     """Result of one step.
 
     Attributes:
-        connected: the controller answers.
-        link: what happened on the line in this step, in words; empty when nothing did.
-        odometry: new estimate, if there is one.
-        health: newest battery and status, when they were asked for in this step.
-        command_fresh: there was a command that was young enough.
+        connected: whether the controller answers.
+        link: text of the link event in this step; empty without one.
+        odometry: new estimate, if any.
+        health: battery and status, if they were read in this step.
+        command_fresh: whether a command within the time-out was available.
         v: speed sent to the motors, m/s.
         w: turn rate sent to the motors, rad/s.
     """
@@ -86,7 +87,10 @@ class _Command:
 
 
 class BaseController:
-    """Steps the base; `command` and `emergency_stop` may be called from any thread, everything else from one."""
+    """Steps the base.
+
+    `command` and `emergency_stop` may be called from any thread, everything else from one thread only.
+    """
 
     def __init__(
         self,
@@ -95,13 +99,13 @@ class BaseController:
         steady_ns: Callable[[], int],
         open_port: Callable[[RoboclawConfig], SerialPort] = open_serial,
     ) -> None:
-        """Nothing is opened yet: the first `step` connects.
+        """Create the controller without opening the port: the first `step` connects.
 
         Args:
             config: parameters.
-            now_ns: clock of the stamps, nanoseconds since the epoch; it may be set at any time.
-            steady_ns: clock of every age, period and time-out, which nobody can set.
-            open_port: how the serial port is opened.
+            now_ns: clock of the stamps, nanoseconds since the epoch; the system may set this clock at any time.
+            steady_ns: monotonic clock of every age, period and time-out.
+            open_port: opens the serial port.
         """
         self.config = config
         self.roboclaw = Roboclaw(config.roboclaw, open_port)
@@ -119,21 +123,21 @@ class BaseController:
         self._backoff_s = config.roboclaw.reconnect_min_s
 
     def command(self, v: float, w: float, given_ns: int, hard: bool = False) -> None:
-        """Set what the base shall do from now on.
+        """Set the command that the base follows from now on.
 
         Args:
             v: speed along x, m/s.
             w: turn rate, rad/s.
-            given_ns: when the command was given, by the steady clock.
-            hard: stop at the hard deceleration instead, whatever the speeds.
+            given_ns: time of the command on the steady clock.
+            hard: ignore the speeds and stop at the hard deceleration.
         """
         with self._lock:
             self._command = _Command(v, w, hard, given_ns)
 
     def emergency_stop(self, stopped: bool) -> None:
-        """Hold the motors at speed zero, reached without a ramp, for as long as ``stopped``.
+        """Set the motors to speed zero without a ramp and hold them there while ``stopped``.
 
-        The command at hand is void: nothing drives after the release until a new one comes.
+        The current command is discarded: after the release the base stands until a new command arrives.
         """
         with self._lock:
             if stopped or self._stopped:
@@ -141,14 +145,14 @@ class BaseController:
             self._stopped = stopped
 
     def step(self) -> BaseState:
-        """Send the speeds that are due, read the encoders and, from time to time, the health."""
+        """Send the motor speeds, read the encoders and, every ``health_period_s``, the health."""
         now_ns = self._steady_ns()
         if not self.roboclaw.connected:
             return self._connect(now_ns)
         dt_s = 0.0 if self._last_step_ns is None else max(0.0, (now_ns - self._last_step_ns) * 1e-9)
         self._last_step_ns = now_ns
         if dt_s > self.config.roboclaw.watchdog_s:
-            # The controller has stopped the motors meanwhile.
+            # The controller's watchdog has stopped the motors in the meantime.
             self.limiter.reset()
             dt_s = 0.0
         command = self._fresh_command()
@@ -173,10 +177,10 @@ class BaseController:
             self._lost(now_ns, 0.0 if restarted else self._backoff_s)
             return BaseState(connected=False, link=str(error))
         if self.roboclaw.counters.stops != stops:
-            self.limiter.reset()  # a reply was missing, and the motors were stopped for it
+            self.limiter.reset()  # a reply was missing, so the motors were stopped
         return BaseState(
             connected=True,
-            # Speeds are by the steady clock, the stamp by the other.
+            # Speeds use the steady clock, the stamp uses the system clock.
             odometry=None if estimate is None else replace(estimate, stamp_ns=stamp_ns),
             health=health,
             command_fresh=command is not None,
@@ -185,7 +189,7 @@ class BaseController:
         )
 
     def _fresh_command(self) -> _Command | None:
-        """The command at hand while it is young enough; what is stale is forgotten, and never fresh again."""
+        """Return the current command if it is fresh; discard a stale command, so that it never becomes fresh again."""
         with self._lock:
             command = self._command
             if command is not None:
@@ -202,24 +206,24 @@ class BaseController:
             return 0.0, 0.0
         half_width = 0.5 * geometry.effective_width
         if command is None or command.hard:
-            # The controller's own ramp down to zero: it ends even if nothing is sent any more. The limiter follows.
+            # The controller ramps down by itself, so the ramp ends even if no packet follows. The limiter tracks it.
             self.roboclaw.drive([0.0, 0.0], geometry.pulses_per_metre * limits.hard_deceleration)
             return self.limiter.brake(limits.hard_deceleration, limits.hard_deceleration / half_width, dt_s)
         v, w = self.limiter.step(command.v, command.w, dt_s)
-        # The limiter shapes the twist; the controller's ramp is what one track needs for both parts at once.
+        # The limiter shapes the twist; the controller's ramp allows both parts at once on one track.
         ramp = limits.max_v_acceleration + half_width * limits.max_w_acceleration
         speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
         self.roboclaw.drive(speeds.tolist(), geometry.pulses_per_metre * ramp)
         return v, w
 
     def _check_counts(self, encoders: NDArray[np.int64]) -> None:
-        """Counts of exactly zero are a place on the way, or a controller that restarted: its watchdog says which."""
+        """Check the watchdog when both counts jump to zero: the controller may have restarted."""
         last, self._encoders = self._encoders, encoders
         if last is not None and last.any() and not encoders.any():
             self.roboclaw.check_watchdog()
 
     def _near_zero(self, encoders: NDArray[np.int64]) -> bool:
-        """Whether both counts are what a restarted controller may have counted since."""
+        """Whether both counts are small enough for a controller that has just restarted."""
         metres = unwrap_counts(np.zeros(2, np.int64), encoders) / self.config.geometry.pulses_per_metre
         return bool(np.abs(metres).max() < _COUNTED_SINCE_M)
 
@@ -227,8 +231,8 @@ class BaseController:
         """Stop the motors at once and release the port.
 
         Returns:
-            Why the motors could not be told to stop (then the controller's watchdog does it); empty if they
-            were, or if there was no connection.
+            Why the stop command failed (the controller's watchdog then stops the motors). Empty if it succeeded or
+            there was no connection.
         """
         if not self.roboclaw.connected:
             return ""
@@ -264,7 +268,7 @@ class BaseController:
 
 
 class ControllerThread(threading.Thread):
-    """Steps a controller at a rate on its own thread, so that nothing else delays the motors' commands."""
+    """Steps a controller at a fixed rate on its own thread, so that other work does not delay motor commands."""
 
     def __init__(
         self,
@@ -273,14 +277,14 @@ class ControllerThread(threading.Thread):
         on_state: Callable[[BaseState], None],
         on_end: Callable[[BaseException | None, str], None],
     ) -> None:
-        """Not started yet.
+        """Create the thread without starting it.
 
         Args:
-            controller: used by this thread only, apart from `BaseController.command` and `emergency_stop`.
-            rate_hz: steps a second.
+            controller: used by this thread only, except `BaseController.command` and `emergency_stop`.
+            rate_hz: steps per second.
             on_state: called on this thread after each step.
-            on_end: called on this thread when it ends: the exception that ended it, and what
-                `BaseController.close` said.
+            on_end: called on this thread when it ends, with the exception that ended it and the result of
+                `BaseController.close`.
         """
         super().__init__(name="crawler_base serial", daemon=True)
         self._controller = controller
@@ -291,12 +295,12 @@ class ControllerThread(threading.Thread):
         self._wake = threading.Event()
 
     def run(self) -> None:
-        """Step until `end`; the motors are stopped however it ends."""
+        """Step until `end`; stop the motors in every case."""
         fault: BaseException | None = None
         pace = current()
         due_s = pace.steady_s()
         try:
-            # By a grid of times, so that what a step takes does not slow the rate; steps missed are left out.
+            # Fixed due times: the duration of a step does not slow the rate, and missed steps are skipped.
             while not self._end.is_set():
                 self._wake.wait(pace.wait_s(max(0.0, due_s - pace.steady_s())))
                 if self._end.is_set():
@@ -311,11 +315,11 @@ class ControllerThread(threading.Thread):
         self._on_end(fault, self._controller.close())
 
     def hurry(self) -> None:
-        """Make a step now, beside those of the rate: a stop does not wait for its turn."""
+        """Run an extra step now, so that a stop does not wait for the next period."""
         self._wake.set()
 
     def end(self, timeout_s: float = 2.0) -> bool:
-        """Stop the motors and the thread; False when it does not end in time."""
+        """Stop the motors and the thread; return False if the thread does not end in time."""
         self._end.set()
         self._wake.set()
         if self.is_alive():

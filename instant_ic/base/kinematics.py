@@ -11,7 +11,7 @@ from instant_ic.base.config import SkidSteerConfig
 
 
 class SkidSteer:
-    """Between body twist, track speeds and the controller's motors."""
+    """Converts between body twist, track speeds and motor speeds."""
 
     def __init__(self, config: SkidSteerConfig) -> None:
         self.config = config
@@ -25,17 +25,17 @@ class SkidSteer:
         return np.array([v - w * half, v + w * half])
 
     def twist_from_tracks(self, tracks: ArrayLike) -> NDArray[np.float64]:
-        """Body twist (v_x, v_y, w) from track speeds (left, right); distances give displacements alike."""
+        """Body twist (v_x, v_y, w) from track speeds (left, right), or body displacement from track distances."""
         left, right = np.asarray(tracks, float)
         w = (right - left) / self.config.effective_width
         return np.array([0.5 * (left + right), -w * self.config.x_icr, w])
 
     def motors_from_tracks(self, tracks: ArrayLike) -> NDArray[np.float64]:
-        """Pulses (or pulses/s) of motors M1, M2 from metres (or m/s) of the tracks (left, right)."""
+        """Pulses (or pulses/s) of motors M1, M2 from track metres (or m/s), (left, right)."""
         motors = np.zeros(2)
         motors[self._order] = np.asarray(tracks, float) * self._sign * self.config.pulses_per_metre
         return motors
 
     def tracks_from_motors(self, motors: ArrayLike) -> NDArray[np.float64]:
-        """Metres (or m/s) of the tracks (left, right) from pulses (or pulses/s) of motors M1, M2."""
+        """Track metres (or m/s), (left, right), from pulses (or pulses/s) of motors M1, M2."""
         return np.asarray(motors, float)[self._order] * self._sign / self.config.pulses_per_metre

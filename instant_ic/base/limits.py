@@ -6,11 +6,11 @@ from instant_ic.base.config import LimitsConfig
 
 
 class TwistLimiter:
-    """Brings a wanted twist within speed and acceleration limits, step by step.
+    """Moves the twist towards a target within speed and acceleration limits, step by step.
 
     Attributes:
-        v: speed along x that was given out last, m/s.
-        w: turn rate that was given out last, rad/s.
+        v: last returned speed along x, m/s.
+        w: last returned turn rate, rad/s.
     """
 
     def __init__(self, config: LimitsConfig) -> None:
@@ -21,8 +21,8 @@ class TwistLimiter:
     def step(self, v: float, w: float, dt_s: float) -> tuple[float, float]:
         """Next twist towards (v, w) after ``dt_s`` seconds.
 
-        Too fast a twist is scaled as a whole, so that the curve that was asked for is kept; accelerations are
-        limited one by one.
+        A twist above the speed limits is scaled as a whole, which keeps its curvature. Accelerations are limited
+        separately.
 
         Raises:
             ValueError: v or w is not finite, or dt_s is negative.
@@ -37,19 +37,19 @@ class TwistLimiter:
         return self.v, self.w
 
     def brake(self, deceleration: float, w_deceleration: float, dt_s: float) -> tuple[float, float]:
-        """Next twist towards zero after ``dt_s`` seconds at other rates than the configured ones, m/s^2, rad/s^2."""
+        """Next twist towards zero after ``dt_s`` seconds, at the given rates (m/s^2, rad/s^2)."""
         self.v = _towards(self.v, 0.0, deceleration * dt_s)
         self.w = _towards(self.w, 0.0, w_deceleration * dt_s)
         return self.v, self.w
 
     def reset(self, v: float = 0.0, w: float = 0.0) -> None:
-        """Start anew from a twist, as after an emergency stop."""
+        """Restart from a twist, for example after an emergency stop."""
         self.v = v
         self.w = w
 
 
 def clamp_twist(v: float, w: float, config: LimitsConfig) -> tuple[float, float]:
-    """The twist scaled down, both parts by one factor, until it is within the speed limits."""
+    """Scale both parts of the twist by one factor to bring it within the speed limits."""
     scale = 1.0
     if abs(v) > config.max_v:
         scale = config.max_v / abs(v)

@@ -9,19 +9,19 @@ from instant_ic.base.config import OdometryNoiseConfig, SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
 
 UNMEASURED_VARIANCE = 1e6
-"""Variance of z, roll and pitch, which encoders tell nothing about."""
+"""Variance of z, roll and pitch, which encoders do not measure."""
 
 
 @dataclass(frozen=True)
 class OdometryEstimate:
-    """Pose and twist by the encoders at one instant.
+    """Pose and twist from the encoders at one instant.
 
     Attributes:
         stamp_ns: time of measurement.
         pose: base_link in odom, (x, y, yaw), metres and radians, (3,).
         twist: (v_x, v_y, w) in base_link, m/s and rad/s, (3,).
-        pose_covariance: order x y z rx ry rz, in odom, (6, 6).
-        twist_covariance: the same order, in base_link, (6, 6).
+        pose_covariance: in the order x y z rx ry rz, in odom, (6, 6).
+        twist_covariance: in the same order, in base_link, (6, 6).
     """
 
     stamp_ns: int
@@ -32,11 +32,11 @@ class OdometryEstimate:
 
 
 class WheelOdometry:
-    """Integrates encoder counts to a pose with covariance.
+    """Integrates encoder counts into a pose with covariance.
 
     Attributes:
-        rejected: readings too far from the one before to be true (a controller that lost its counts); the
-            pose stays, and counting goes on from the new reading.
+        rejected: number of readings implausibly far from the previous one (the controller lost its counts). The pose
+            stays, and integration continues from the new reading.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ class WheelOdometry:
         Args:
             geometry: tracks and encoders.
             noise: growth of the uncertainty.
-            max_track_speed: a reading that asks for a faster track, m/s, is not believed.
+            max_track_speed: largest plausible track speed, m/s; a reading that implies more is rejected.
         """
         self.kinematics = SkidSteer(geometry)
         self.noise = noise or OdometryNoiseConfig()
@@ -61,18 +61,18 @@ class WheelOdometry:
         self._last: tuple[NDArray[np.int64], int] | None = None
 
     def forget_counts(self) -> None:
-        """Keep the pose, and count from the next reading on: the controller has lost its counts."""
+        """Keep the pose and integrate from the next reading on, because the controller has lost its counts."""
         self._last = None
 
     def update(self, encoders: ArrayLike, stamp_ns: int) -> OdometryEstimate | None:
-        """Take one reading.
+        """Integrate one reading.
 
         Args:
             encoders: counts of M1 and M2 modulo 2^32, (2,).
             stamp_ns: when they were read.
 
         Returns:
-            The new estimate; None for the first reading, one that is not newer, and one that was rejected.
+            The new estimate; None for the first reading, a reading that is not newer, and a rejected reading.
         """
         counts = np.asarray(encoders, np.int64)
         last, self._last = self._last, (counts, stamp_ns)
@@ -97,9 +97,9 @@ class WheelOdometry:
         )
 
     def _integrate(self, step: NDArray[np.float64]) -> None:
-        """Move by a body displacement (x, y, yaw) along its arc, and let the covariance grow."""
+        """Move the pose by a body displacement (x, y, yaw) along its arc, and grow the covariance."""
         dx, dy, dyaw = step
-        # Exponential map of SE(2); the series keeps it exact where the turn is too small to divide by.
+        # Exponential map of SE(2); the series replaces it where the turn is too small to divide by.
         if abs(dyaw) > 1e-6:
             a, b = np.sin(dyaw) / dyaw, (1.0 - np.cos(dyaw)) / dyaw
         else:
@@ -121,7 +121,7 @@ class WheelOdometry:
         self._pose[2] = (self._pose[2] + dyaw + np.pi) % (2.0 * np.pi) - np.pi
 
     def _twist_covariance(self, step: NDArray[np.float64], dt_s: float) -> NDArray[np.float64]:
-        """Variances of the mean twist over the step: what the pose gained, by time, on top of a floor."""
+        """Covariance of the mean twist over the step: growth of the pose variance per second plus a floor, (6, 6)."""
         distance, turn = abs(float(step[0])), abs(float(step[2]))
         planar = np.diag(
             [
@@ -134,12 +134,12 @@ class WheelOdometry:
 
 
 def unwrap_counts(before: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Signed pulses from one unsigned 32-bit count to the next, by the shorter way round."""
+    """Signed pulses from one unsigned 32-bit count to the next, in the shorter direction."""
     return (now - before + 2**31) % 2**32 - 2**31
 
 
 def _six(planar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A (3, 3) covariance of x, y, yaw as the (6, 6) one of x, y, z, rx, ry, rz."""
+    """Expand a (3, 3) covariance of x, y, yaw to (6, 6) of x, y, z, rx, ry, rz."""
     full = np.diag(np.full(6, UNMEASURED_VARIANCE))
     rows = np.array([0, 1, 5])
     full[np.ix_(rows, rows)] = planar

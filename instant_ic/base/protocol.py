@@ -11,11 +11,11 @@ BAUD_RATES = (2400, 9600, 19200, 38400, 57600, 115200, 230400, 460800)
 ADDRESSES = range(0x80, 0x88)
 ACKNOWLEDGE = b"\xff"
 INTER_BYTE_GAP_S = 0.010
-"""The controller drops a packet whose bytes lie further apart than this."""
+"""Longest gap between bytes; the controller drops a packet with a longer one."""
 
 
 class Command(IntEnum):
-    """The commands this package speaks; the name says what, the manual's number is the value."""
+    """Commands that this package uses; each value is the number in the manual."""
 
     SET_TIMEOUT = 14
     READ_TIMEOUT = 15
@@ -41,7 +41,7 @@ WRITE_DATA_BYTES: dict[int, int] = {
     Command.SPEED_BOTH: 8,
     Command.SPEED_ACCELERATION_BOTH: 12,
 }
-"""Commands that write (acknowledged with 0xFF) and the bytes of data that each carries."""
+"""Write commands (acknowledged with 0xFF) and the number of data bytes in each."""
 
 STATUS_FAULTS: dict[int, str] = {
     0x0001: "emergency stop",
@@ -79,7 +79,7 @@ _WARNINGS_2_BYTES = 0x0001 | 0x0002 | 0x3C00
 
 
 class ProtocolError(Exception):
-    """A reply that is missing, cut or damaged; the text says which command and what came."""
+    """A missing, truncated or damaged reply; the text names the command and the received bytes."""
 
 
 @cache
@@ -103,26 +103,26 @@ def crc16(data: bytes) -> int:
 
 
 def write_frame(address: int, command: int, data: bytes = b"") -> bytes:
-    """Frame of a command that writes: address, command, data, CRC."""
+    """Frame of a write command: address, command, data, CRC."""
     body = bytes((address, command)) + data
     return body + struct.pack(">H", crc16(body))
 
 
 def read_request(address: int, command: int) -> bytes:
-    """Frame of a command that reads; it has no CRC."""
+    """Frame of a read command, which has no CRC."""
     return bytes((address, command))
 
 
 def encode_reply(address: int, command: int, data: bytes) -> bytes:
-    """The controller's reply to a read: data and the CRC over address, command and data."""
+    """Reply of the controller to a read command: data, then the CRC over address, command and data."""
     return data + struct.pack(">H", crc16(bytes((address, command)) + data))
 
 
 def decode_reply(address: int, command: int, reply: bytes) -> bytes:
-    """Data of a reply.
+    """Return the data of a reply.
 
     Raises:
-        ProtocolError: the CRC does not fit.
+        ProtocolError: the CRC does not match.
     """
     if len(reply) < 2:
         raise ProtocolError(f"command {command}: reply of {len(reply)} bytes has no CRC")
@@ -134,14 +134,14 @@ def decode_reply(address: int, command: int, reply: bytes) -> bytes:
 
 
 def describe_status(status: int, status_bytes: int) -> tuple[list[str], list[str]]:
-    """Faults and warnings in words.
+    """Texts of the faults and warnings in a status.
 
     Args:
         status: value of command 90.
-        status_bytes: 2 or 4, the length it came in; the two have different bits.
+        status_bytes: length of the reply, 2 or 4; the two lengths define different bits.
 
     Returns:
-        (faults, warnings): motors do not run, or not reliably, with a fault.
+        (faults, warnings); with a fault the motors do not run, or not reliably.
     """
     if status_bytes == 2:
         named = [(bit, text) for bit, text in STATUS_FAULTS_2_BYTES.items() if status & bit]

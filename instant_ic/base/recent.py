@@ -1,23 +1,23 @@
-"""How often something happened lately."""
+"""Count of recent events."""
 
 from collections import deque
 
 
 class RecentCount:
-    """Events of the last ``window_s`` seconds; the clock is the caller's."""
+    """Counts the events of the last ``window_s`` seconds; the caller supplies the time."""
 
     def __init__(self, window_s: float) -> None:
-        """Nothing has happened yet."""
+        """Start without events."""
         self.window_s = window_s
         self._events: deque[tuple[int, int]] = deque()
 
     def add(self, events: int, now_ns: int) -> None:
-        """Note events that happened now; zero is no event."""
+        """Add events at ``now_ns``; zero adds none."""
         if events > 0:
             self._events.append((now_ns, events))
 
     def count(self, now_ns: int) -> int:
-        """Events of the window that ends now."""
+        """Number of events in the window that ends at ``now_ns``."""
         oldest_ns = now_ns - int(self.window_s * 1e9)
         while self._events and self._events[0][0] <= oldest_ns:
             self._events.popleft()

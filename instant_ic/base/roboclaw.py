@@ -1,4 +1,4 @@
-"""Talks to a RoboClaw over a serial line."""
+"""Driver of a RoboClaw over a serial link."""
 
 import struct
 import termios
@@ -25,24 +25,24 @@ from instant_ic.base.protocol import (
 
 
 class LinkError(ConnectionError):
-    """The controller cannot be reached; the text says what was tried and what to look at."""
+    """The controller cannot be reached; the text says what was tried and what to check."""
 
 
 class ControllerRestarted(LinkError):
-    """The controller lost what it was set to, as after a brown-out: it must be stopped and set up again at once."""
+    """The controller lost its settings, for example in a brown-out: stop it and set it up again at once."""
 
 
 class SerialPort(Protocol):
-    """The part of pyserial's ``Serial`` that is used here."""
+    """Part of pyserial's ``Serial`` that the driver uses."""
 
     def write(self, data: bytes, /) -> int | None:
         """Send bytes."""
 
     def read(self, size: int = 1, /) -> bytes:
-        """Receive up to size bytes; fewer when the port's time-out passes."""
+        """Receive up to ``size`` bytes, fewer if the port's time-out expires."""
 
     def reset_input_buffer(self) -> None:
-        """Drop what was received and not read."""
+        """Drop received bytes that were not read."""
 
     def close(self) -> None:
         """Release the port."""
@@ -53,8 +53,8 @@ class Status:
     """Reply to command 90.
 
     Attributes:
-        value: the bits.
-        size: 2 or 4, bytes; the two have different bits.
+        value: status bits.
+        size: length in bytes, 2 or 4; the two lengths define different bits.
     """
 
     value: int
@@ -62,25 +62,25 @@ class Status:
 
     @property
     def faults(self) -> list[str]:
-        """Faults in words."""
+        """Texts of the faults."""
         return describe_status(self.value, self.size)[0]
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings in words."""
+        """Texts of the warnings."""
         return describe_status(self.value, self.size)[1]
 
 
 @dataclass
 class LinkCounters:
-    """What went wrong on the line since the driver was made.
+    """Link statistics since the driver was created.
 
     Attributes:
-        transactions: commands sent, repeats not counted.
-        retries: repeats.
-        timeouts: replies that did not come whole.
-        crc_errors: replies that came damaged.
-        stops: times that the motors were stopped because a reply did not come.
+        transactions: commands sent, without repeats.
+        retries: repeated commands.
+        timeouts: missing or incomplete replies.
+        crc_errors: damaged replies.
+        stops: stops of the motors because of a missing reply.
     """
 
     transactions: int = 0
@@ -94,7 +94,7 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
     """Open the port named in the configuration.
 
     Raises:
-        LinkError: it cannot be opened.
+        LinkError: the port cannot be opened.
     """
     import serial
 
@@ -117,7 +117,7 @@ _MOVING = (Command.DUTY_BOTH, Command.SPEED_BOTH, Command.SPEED_ACCELERATION_BOT
 
 
 def _tenths(timeout_s: float) -> int:
-    """Value of command 14 for a watchdog: never longer than asked for, never off."""
+    """Value of command 14 for a watchdog time: rounded down, at least 1, because 0 turns the watchdog off."""
     return max(1, int(timeout_s * 10 + 1e-6))
 
 
@@ -131,11 +131,11 @@ def _acknowledged(port: SerialPort, command: int) -> bytes:
 
 
 class Roboclaw:
-    """One controller: a method a command, each repeated up to ``retries`` times.
+    """One controller with one method per command; each command is repeated up to ``retries`` times.
 
-    Every valid packet feeds the controller's watchdog, so a request that goes out while replies are missing could keep
-    the motors running. After a missing reply, and on each `connect`, nothing but speed zero is sent until the
-    controller has acknowledged one.
+    Every valid packet feeds the controller's watchdog, so a request sent while replies are missing could keep the
+    motors running. After a missing reply, and on each `connect`, the driver sends only speed zero until the controller
+    has acknowledged it.
 
     Example:
         >>> with Roboclaw(RoboclawConfig(port="/dev/ttyACM0")) as roboclaw:   # doctest: +SKIP
@@ -152,7 +152,7 @@ class Roboclaw:
         self.config = config
         self.counters = LinkCounters()
         self.restarted = False
-        """At the last `connect` the controller did not have the watchdog that an earlier one had set."""
+        """Whether the controller had lost the watchdog setting of an earlier connection at the last `connect`."""
         self._was_set = False
         self._stop_frame = write_frame(config.address, Command.SPEED_BOTH, struct.pack(">ii", 0, 0))
         self._open_port = open_port
@@ -166,13 +166,13 @@ class Roboclaw:
         return self._port is not None
 
     def connect(self) -> str:
-        """Open the port, stop the motors, ask for the firmware's version and set the controller's own watchdog.
+        """Open the port, stop the motors, read the firmware version and set the controller's watchdog.
 
         Returns:
-            The version.
+            Firmware version.
 
         Raises:
-            LinkError: no port, nobody answers on it, or the watchdog cannot be set.
+            LinkError: the port cannot be opened, no controller answers, or the watchdog cannot be set.
         """
         self.close()
         self._port = self._open_port(self.config)
@@ -205,7 +205,7 @@ class Roboclaw:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop the motors and release the port, whatever happened."""
+        """Stop the motors and release the port in every case."""
         try:
             if self.connected:
                 self.stop()
@@ -213,24 +213,24 @@ class Roboclaw:
             self.close()
 
     def drive(self, speed_pps: NDArray[np.float64] | list[float], acceleration_pps2: float) -> None:
-        """Closed-loop speeds of M1 and M2, pulses/s, with a ramp, pulses/s^2 (command 40)."""
+        """Set closed-loop speeds of M1 and M2, pulses/s, with a ramp, pulses/s^2 (command 40)."""
         m1, m2 = (round(float(speed)) for speed in speed_pps)
         self._write(Command.SPEED_ACCELERATION_BOTH, struct.pack(">Iii", round(acceleration_pps2), m1, m2))
 
     def stop(self) -> None:
-        """Speed zero for both motors at once, without a ramp (command 37)."""
+        """Set both motors to speed zero without a ramp (command 37)."""
         self._acknowledge(Command.SPEED_BOTH, self._stop_frame)
 
     def set_watchdog(self, timeout_s: float) -> None:
-        """Let the controller stop the motors after a silence; rounded down to whole 0.1 s (command 14)."""
+        """Make the controller stop the motors after this time without a packet; rounded down to 0.1 s (command 14)."""
         self._write(Command.SET_TIMEOUT, bytes((_tenths(timeout_s),)))
 
     def check_watchdog(self) -> None:
-        """Read the watchdog back.
+        """Read the watchdog back and compare it with the configuration.
 
         Raises:
-            ControllerRestarted: it is not what was set.
-            LinkError: it cannot be read.
+            ControllerRestarted: the watchdog has another value.
+            LinkError: the watchdog cannot be read.
         """
         found_s = self.watchdog_s()
         if not self._watchdog_holds(found_s):
@@ -244,7 +244,7 @@ class Roboclaw:
         self._write(Command.RESET_ENCODERS)
 
     def watchdog_s(self) -> float:
-        """The controller's watchdog, seconds, 0 is off (command 15)."""
+        """Watchdog time of the controller, seconds; 0 is off (command 15)."""
         return self._read(Command.READ_TIMEOUT, 1)[0] * 0.1
 
     def encoders(self) -> NDArray[np.int64]:
@@ -260,14 +260,14 @@ class Roboclaw:
         return np.array(speeds)
 
     def battery_v(self) -> float:
-        """Main battery, volts (command 24)."""
+        """Main battery voltage, volts (command 24)."""
         return int.from_bytes(self._read(Command.READ_MAIN_BATTERY, 2), "big") * 0.1
 
     def status(self) -> Status:
         """Faults and warnings (command 90).
 
-        Old firmware replies with 2 bytes, newer with 4. Which it is shows by length and CRC once, and is
-        kept until the next connect, so that old firmware does not cost a time-out each time.
+        Old firmware replies with 2 bytes, newer firmware with 4. The first reply determines the size, which is kept
+        until the next connect, so that old firmware does not cost a time-out on each call.
         """
         size = self._status_size
         data = self._transact(Command.READ_STATUS, self._status_reply if size is None else self._reply(size))
@@ -275,14 +275,14 @@ class Roboclaw:
         return Status(int.from_bytes(data, "big"), len(data))
 
     def version(self) -> str:
-        """Text of the firmware's version (command 21)."""
+        """Firmware version text (command 21)."""
         return self._transact(Command.READ_VERSION, self._version_reply).decode("ascii", "replace").strip()
 
     def _watchdog_holds(self, found_s: float) -> bool:
         return round(found_s * 10) == _tenths(self.config.watchdog_s)
 
     def _stop_blind(self) -> None:
-        """Write speed zero twice and await no reply: the first frame may meet the rest of a damaged one."""
+        """Write speed zero twice without awaiting a reply; the first frame may be lost behind a damaged one."""
         if self._port is None:
             return
         try:
@@ -290,8 +290,8 @@ class Roboclaw:
             self._sleep(1.5 * INTER_BYTE_GAP_S)
             self._port.write(self._stop_frame)
         except (OSError, termios.error):
-            # Unplugged: nothing reaches the controller any more, and its watchdog stops the motors. Whoever closes
-            # the port for that has raised a LinkError.
+            # Unplugged: the controller is out of reach, and its watchdog stops the motors. The caller that closes the
+            # port has already raised a LinkError.
             return
 
     def _write(self, command: int, data: bytes = b"") -> None:
@@ -321,7 +321,7 @@ class Roboclaw:
         return decode_reply(self.config.address, command, received)
 
     def _version_reply(self, port: SerialPort, command: int) -> bytes:
-        """Text up to its null byte, then the CRC: the length is not known before."""
+        """Read text up to its null byte, then the CRC; the length is not known in advance."""
         received = bytearray()
         while not received.endswith(b"\0"):
             byte = port.read(1)
@@ -334,23 +334,23 @@ class Roboclaw:
     def _transact(self, command: int, receive: Callable[[SerialPort, int], bytes], frame: bytes | None = None) -> bytes:
         """Send a frame and receive its reply, with repeats.
 
-        When a reply does not come, the motors are stopped first, and a command that moves them is not repeated: an
-        acknowledged stop is its end.
+        After a missing reply the motors are stopped first. A command that moves them is not repeated: it ends with the
+        acknowledged stop.
 
         Raises:
-            LinkError: not connected, the port failed, or no try got a good reply.
+            LinkError: not connected, the port failed, or no attempt got a valid reply.
         """
         port = self._port
         if port is None:
             raise LinkError(f"{self.config.port}: not connected; call connect() first")
-        # One write call a frame: bytes that follow one another late would be dropped by the controller.
+        # One write call per frame: the controller drops a frame with gaps between its bytes.
         sent = frame or read_request(self.config.address, command)
         self.counters.transactions += 1
         failure, silent = "", False
         for attempt in range(self.config.retries + 1):
             if attempt:
                 self.counters.retries += 1
-                # What the controller has of a damaged frame, it drops after this gap.
+                # After this gap the controller drops the remains of a damaged frame.
                 self._sleep(1.5 * INTER_BYTE_GAP_S)
             try:
                 port.reset_input_buffer()
@@ -371,7 +371,7 @@ class Roboclaw:
             except ProtocolError as error:
                 self.counters.crc_errors += 1
                 failure = failure or str(error)
-            # Unplugged, or the pseudo-terminal is gone; pyserial's own exception is an OSError.
+            # Unplugged, or the pseudo-terminal is gone; pyserial's exception is an OSError.
             except (OSError, termios.error) as error:
                 self.close()
                 raise LinkError(f"{self.config.port}: lost ({error})") from error

@@ -1,1 +1,1 @@
-"""Equirectangular cameras: Theta Z1 live preview, video devices and streams, picture files."""
+"""Equirectangular cameras: Theta Z1 live preview, video devices and streams, image files."""

@@ -10,17 +10,17 @@ PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 3
 
 @dataclass(frozen=True)
 class ThetaConfig:
-    """Theta Z1 by its Web API.
+    """Theta Z1 over its Web API.
 
     Attributes:
-        width: of the preview, pixels; with height and rate_hz one of the camera's formats.
-        height: of the preview, pixels.
-        rate_hz: of the preview.
-        latency_s: from the exposure to the arrival of a picture.
-        read_timeout_s: silence after which the preview is given up.
-        connect_timeout_s: for commands, and for opening a connection.
-        settle_s: between setting options and starting the preview; the camera needs 1 s.
-        busy_retries: how often a command is repeated while the camera is busy (503).
+        width: preview width, pixels; width, height and rate_hz together must be one of the camera's formats.
+        height: preview height, pixels.
+        rate_hz: preview frame rate.
+        latency_s: time from the exposure to the arrival of an image.
+        read_timeout_s: time without data after which the preview is closed.
+        connect_timeout_s: time-out of commands and of opening a connection.
+        settle_s: wait between setting options and starting the preview; the camera needs 1 s.
+        busy_retries: repeats of a command while the camera is busy (503).
         busy_wait_s: first wait before such a repeat; doubled each time.
     """
 
@@ -48,11 +48,11 @@ class VideoConfig:
     """A video device or a network stream, read by OpenCV.
 
     Attributes:
-        latency_s: from the exposure to the arrival of a picture (about 0.25 s over USB).
-        read_timeout_s: silence after which the stream is given up.
-        quality: of the JPEGs made here, 1-100.
-        width: wanted from a device, pixels; 0 leaves it as it is.
-        height: wanted from a device, pixels; 0 leaves it as it is.
+        latency_s: time from the exposure to the arrival of an image (about 0.25 s over USB).
+        read_timeout_s: time without data after which the stream is closed.
+        quality: quality of the encoded JPEGs, 1-100.
+        width: width requested from a device, pixels; 0 keeps the device's setting.
+        height: height requested from a device, pixels; 0 keeps the device's setting.
     """
 
     latency_s: NotNegative = 0.25
@@ -68,13 +68,13 @@ class VideoConfig:
 
 @dataclass(frozen=True)
 class FilesConfig:
-    """Equirectangular pictures from files.
+    """Equirectangular images from files.
 
     Attributes:
-        rate_hz: pictures a second.
-        loop: start again after the last one; else it is repeated.
-        quality: of the JPEGs made of files that are none, 1-100.
-        latency_s: taken off the stamps.
+        rate_hz: images per second.
+        loop: whether to restart after the last image; otherwise the last image is repeated.
+        quality: JPEG quality for files in other formats, 1-100.
+        latency_s: subtracted from the stamps.
     """
 
     rate_hz: Positive = 5.0

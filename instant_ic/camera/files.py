@@ -1,4 +1,4 @@
-"""Equirectangular pictures from a file or a folder, at a rate."""
+"""Equirectangular images from a file or a folder, at a fixed rate."""
 
 import time
 from collections.abc import Callable
@@ -14,7 +14,7 @@ SUFFIXES = (*JPEG_SUFFIXES, ".png", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class FileCamera(Camera):
-    """Pictures in the order of their names; JPEG files go out byte for byte."""
+    """Returns images in the order of their names; JPEG files are passed through unchanged."""
 
     def __init__(
         self,
@@ -23,13 +23,13 @@ class FileCamera(Camera):
         now_ns: Callable[[], int] = time.time_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Nothing is read yet.
+        """Create the camera without reading a file.
 
         Args:
-            path: picture, or folder of pictures.
+            path: image, or folder of images.
             config: rate and order.
             now_ns: clock of the stamps and of the rate.
-            sleep: how the next picture's time is waited for.
+            sleep: waits until the next image is due.
         """
         self.path = Path(path)
         self.config = config or FilesConfig()
@@ -41,10 +41,10 @@ class FileCamera(Camera):
         self._due_ns: int | None = None
 
     def connect(self) -> str:
-        """Find the pictures and read the first.
+        """Find the images and read the first.
 
         Raises:
-            CameraError: there is none, or it cannot be read.
+            CameraError: there is no image, or the first one cannot be read.
         """
         self.close()
         if self.path.is_dir():
@@ -57,7 +57,7 @@ class FileCamera(Camera):
         return f"{len(self._paths)} pictures from {self.path}, {width}x{height} at {self.config.rate_hz} Hz"
 
     def read(self) -> Frame:
-        """The next picture, when it is due.
+        """Wait until the next image is due and return it.
 
         Raises:
             CameraError: not connected, or the file cannot be read.
@@ -68,12 +68,12 @@ class FileCamera(Camera):
             self._due_ns = now_ns
         if now_ns < self._due_ns:
             self._sleep((self._due_ns - now_ns) * 1e-9)
-        # A picture that comes late does not make the following ones come faster.
+        # A late image does not make the following ones come faster.
         self._due_ns = max(self._due_ns, now_ns - period_ns) + period_ns
         return self.next_frame()
 
     def next_frame(self) -> Frame:
-        """The next picture now, stamped with now.
+        """Return the next image immediately, stamped with the current time.
 
         Raises:
             CameraError: not connected, or the file cannot be read.
@@ -88,7 +88,7 @@ class FileCamera(Camera):
         return Frame(jpeg, self._stamp_ns(), width, height)
 
     def close(self) -> None:
-        """Forget the pictures."""
+        """Drop the loaded images."""
         self._paths = []
         self._loaded.clear()
         self._index = 0

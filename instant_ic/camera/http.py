@@ -1,4 +1,4 @@
-"""HTTP to a device that may not be the one expected: no redirects, no encodings, limits of size and of time."""
+"""HTTP client for a device that may not be the expected one: no redirects or encodings, limits on size and time."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from requests.auth import HTTPDigestAuth
 from instant_ic.camera.source import CameraError
 
 MOST_REPLY_BYTES = 256 << 10
-"""Of a reply that is no preview; the camera's longest has a few thousand."""
+"""Size limit of a reply other than the preview; the camera's longest has a few thousand bytes."""
 _CHUNK = 16 << 10
 
 
 class Deadline:
-    """When a session's reading ends, however slowly bytes still come.
+    """Time limit for reading a reply, independent of how slowly the bytes arrive.
 
     Attributes:
         at_s: monotonic time, seconds.
@@ -32,12 +32,12 @@ class Deadline:
         self.at_s = math.inf
 
     def start(self, seconds: float) -> None:
-        """End all reading ``seconds`` from now."""
+        """Set the limit to ``seconds`` from now."""
         self.at_s = time.monotonic() + seconds
 
 
 class _Socket(socket.socket):
-    """A socket whose reads end at a deadline; its own time-out alone would start again with each byte."""
+    """Socket whose reads end at a deadline; the socket's own time-out restarts with each byte."""
 
     deadline: Deadline
 
@@ -45,7 +45,7 @@ class _Socket(socket.socket):
         """As the base class.
 
         Raises:
-            TimeoutError: also past the deadline.
+            TimeoutError: also after the deadline.
         """
         left_s = self.deadline.at_s - time.monotonic()
         if left_s <= 0:
@@ -59,7 +59,7 @@ class _Socket(socket.socket):
 
 
 class _Adapter(HTTPAdapter):
-    """Reads all replies but the preview here, so that authentication, too, only sees what is within the limits."""
+    """Reads every reply except the preview, so that authentication also sees only replies within the limits."""
 
     def __init__(self, deadline: Deadline) -> None:
         self._deadline = deadline
@@ -88,7 +88,7 @@ class _Adapter(HTTPAdapter):
         """As the base class.
 
         Raises:
-            CameraError: an encoded reply, or one that is too long.
+            CameraError: the reply is encoded or too long.
         """
         response = super().send(request, *arguments, **keywords)
         try:
@@ -104,13 +104,13 @@ class _Adapter(HTTPAdapter):
 
 
 class _Digest(HTTPDigestAuth):
-    """Digest authentication whose challenge may be anything."""
+    """Digest authentication that validates the challenge."""
 
     def build_digest_header(self, method: str, url: str) -> str:
         """As the base class.
 
         Raises:
-            CameraError: a challenge that cannot be answered.
+            CameraError: the challenge cannot be answered.
         """
         try:
             answer = super().build_digest_header(method, url)
@@ -118,19 +118,19 @@ class _Digest(HTTPDigestAuth):
             raise CameraError(f"{url}: the camera's digest challenge is incomplete ({error!r})") from error
         if answer is None:
             raise CameraError(f"{url}: the camera's digest challenge has an unknown algorithm or quality")
-        # What the challenge quotes goes into a header: no line of another header may hide in it.
+        # Text of the challenge goes into a header and must not inject another header line.
         if not answer.isprintable():
             raise CameraError(f"{url}: the camera's digest challenge has control characters")
         return answer
 
 
 class Session(requests.Session):
-    """A session with one device by plain HTTP; set ``deadline`` before each request."""
+    """Session with one device over plain HTTP; set ``deadline`` before each request."""
 
     def __init__(self, user: str, password: str) -> None:
         super().__init__()
         self.deadline = Deadline()
-        # Proxies and .netrc of the environment are not for a camera on the local network.
+        # Proxies and .netrc from the environment do not apply to a camera on the local network.
         self.trust_env = False
         if user:
             self.auth = _Digest(user, password)
@@ -139,7 +139,7 @@ class Session(requests.Session):
         self.mount("http://", _Adapter(self.deadline))
 
     def get_redirect_target(self, resp: requests.Response) -> None:
-        """None: no redirect is followed, nor even read."""
+        """Return None: redirects are neither followed nor read."""
 
     def ask(
         self,
@@ -149,18 +149,18 @@ class Session(requests.Session):
         headers: Mapping[str, str],
         timeout_s: float,
     ) -> requests.Response:
-        """One request; the reply is read, but for the parts of a multipart one, which are left to be streamed.
+        """Send one request and read its reply; the parts of a multipart reply are left for streaming.
 
         Args:
-            method: of HTTP.
-            url: whole address.
+            method: HTTP method.
+            url: complete address.
             body: sent as JSON.
-            headers: of the request.
-            timeout_s: for the connection, and for the whole reply.
+            headers: request headers.
+            timeout_s: time-out of the connection and of the whole reply.
 
         Raises:
             requests.RequestException: no reply in time.
-            CameraError: a reply that no camera gives.
+            CameraError: the reply cannot come from a camera.
         """
         self.deadline.start(timeout_s)
         try:
@@ -177,7 +177,7 @@ def is_multipart(response: requests.Response) -> bool:
 
 
 def _whole(response: requests.Response, url: str) -> urllib3.HTTPResponse:
-    """The body, read to its end."""
+    """Read the body to its end."""
     body = bytearray()
     raw = response.raw
     try:

@@ -1,4 +1,4 @@
-"""The little that has to be known of a JPEG without decoding it (ITU-T T.81, annex B), and decoding it small."""
+"""Checks and size of a JPEG without decoding it (ITU-T T.81, annex B), and decoding at reduced size."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD8)))
 
 
 class JpegError(ValueError):
-    """Bytes that are no whole JPEG; the text says what is wrong."""
+    """Bytes that are not a complete JPEG; the text says what is wrong."""
 
 
 def check_whole(data: bytes | bytearray) -> None:
-    """See that the data starts and ends as a JPEG does.
+    """Check that the data starts and ends like a JPEG.
 
     Raises:
-        JpegError: it does not.
+        JpegError: the start or end marker is missing.
     """
     if data[:2] != SOI:
         raise JpegError(f"starts with {bytes(data[:2]).hex() or 'nothing'} instead of ffd8 (SOI)")
@@ -34,10 +34,10 @@ def check_whole(data: bytes | bytearray) -> None:
 
 
 def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
-    """(width, height) by the frame header.
+    """(width, height) from the frame header.
 
     Raises:
-        JpegError: there is no frame header before the picture's data.
+        JpegError: there is no frame header before the image data.
     """
     if data[:2] != SOI:
         raise JpegError(f"starts with {bytes(data[:2]).hex() or 'nothing'} instead of ffd8 (SOI)")
@@ -64,13 +64,13 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
 
 
 def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Decodes to (H, W, 3) uint8 RGB of at least the size that is needed.
+    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``.
 
-    The decoder makes the picture 2, 4 or 8 times smaller where that is still enough: it then computes that much less of
-    the inverse cosine transform. The size is rounded up.
+    The decoder reduces the image 2, 4 or 8 times where the result is still large enough, and then computes
+    correspondingly less of the inverse cosine transform. The reduced size is rounded up.
 
     Raises:
-        JpegError: it cannot be decoded.
+        JpegError: the data cannot be decoded.
     """
     import cv2
     import numpy as np
@@ -78,7 +78,7 @@ def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: 
     flag = cv2.IMREAD_COLOR
     try:
         full_width, full_height = jpeg_size(bytes(data[:65536]))
-    except JpegError:  # a PNG perhaps
+    except JpegError:  # may be a PNG
         full_width, full_height = 0, 0
     for n, reduced in (
         (2, cv2.IMREAD_REDUCED_COLOR_2),

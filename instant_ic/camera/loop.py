@@ -1,4 +1,4 @@
-"""Keeps a camera running on a thread of its own: connect, read, and connect again with growing waits."""
+"""Runs a camera on its own thread: connects, reads, and reconnects with growing waits."""
 
 import threading
 from collections.abc import Callable
@@ -13,8 +13,8 @@ class ReconnectConfig:
     """Waits between attempts to connect.
 
     Attributes:
-        min_s: the first wait.
-        max_s: the longest; waits double up to it.
+        min_s: first wait.
+        max_s: longest wait; waits double up to it.
     """
 
     min_s: Positive = 0.5
@@ -28,11 +28,11 @@ class ReconnectConfig:
 
 
 class CameraLoop(threading.Thread):
-    """Reads a camera until `end`.
+    """Thread that reads a camera until `end`.
 
     Attributes:
-        frames: pictures read.
-        connections: how often the camera was connected.
+        frames: images read.
+        connections: successful connections.
         failures: attempts and connections that ended with an error.
     """
 
@@ -43,12 +43,12 @@ class CameraLoop(threading.Thread):
         on_event: Callable[[bool, str], None],
         reconnect: ReconnectConfig | None = None,
     ) -> None:
-        """Not started yet.
+        """Create the thread without starting it.
 
         Args:
             camera: used by this thread only.
-            on_frame: called on this thread with each picture.
-            on_event: called on this thread when the connection comes (True) or goes (False), with words.
+            on_frame: called on this thread with each image.
+            on_event: called on this thread when the connection opens (True) or ends (False), with a text.
             reconnect: waits between attempts.
         """
         super().__init__(name="camera", daemon=True)
@@ -71,11 +71,11 @@ class CameraLoop(threading.Thread):
                     self.connections += 1
                     while not self._end.is_set():
                         frame = self._camera.read()
-                        # Only a picture shows that the connection is worth something.
+                        # Only an image proves that the connection works.
                         wait_s = self._reconnect.min_s
                         self.frames += 1
                         self._on_frame(frame)
-                except Exception as error:  # noqa: BLE001 - nobody else hears what ends a thread
+                except Exception as error:  # noqa: BLE001 - nothing else reports an exception of this thread
                     self.failures += 1
                     text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
                     self._on_event(False, f"{text}; trying again in {wait_s:.1f} s")
@@ -85,7 +85,7 @@ class CameraLoop(threading.Thread):
             self._camera.close()
 
     def end(self, timeout_s: float = 3.0) -> bool:
-        """Stop reading; False when the thread does not end in time."""
+        """Stop reading; return False if the thread does not end in time."""
         self._end.set()
         if self.is_alive():
             self.join(timeout_s)

@@ -1,8 +1,8 @@
-"""The multipart stream of ``camera.getLivePreview``, which ordinary multipart parsers do not read.
+"""Parser of the multipart stream of ``camera.getLivePreview``, which standard multipart parsers cannot read.
 
-Its parts begin with the literal ``---osclivepreview---`` where RFC 2046 asks for two more dashes; other firmware
-and other cameras have the RFC's form. So the boundary is only looked for after a part that was cut, and parts are
-read by their Content-Length.
+Its parts begin with the literal ``---osclivepreview---``, without the two additional dashes of RFC 2046. Other firmware
+and other cameras follow the RFC. The parser therefore reads each part by its Content-Length and searches for the
+boundary only after a truncated part.
 """
 
 import re
@@ -16,19 +16,19 @@ _BOUNDARY = "osclivepreview"
 
 
 class PreviewParser:
-    """Takes the stream in pieces of any size and gives whole JPEGs.
+    """Takes the stream in chunks of any size and returns complete JPEGs.
 
     Attributes:
-        bad_frames: parts dropped: cut, no JPEG, or without a usable length.
-        last_fault: why the last one was dropped, in words.
+        bad_frames: number of dropped parts: truncated, not a JPEG, or without a usable length.
+        last_fault: text of the reason for the last drop.
     """
 
     def __init__(self, boundary: str = _BOUNDARY, max_frame_bytes: int = 4 << 20) -> None:
         """Start before the first part.
 
         Args:
-            boundary: as the Content-Type gives it; dashes and quotes round it do not matter.
-            max_frame_bytes: a longer part is not believed.
+            boundary: boundary from the Content-Type; dashes and quotes around it are ignored.
+            max_frame_bytes: largest accepted part.
         """
         self.bad_frames = 0
         self.last_fault = ""
@@ -38,7 +38,7 @@ class PreviewParser:
         self._length: int | None = None
 
     def feed(self, data: bytes) -> list[bytes]:
-        """Take the next piece; returns the JPEGs that it completes, oldest first."""
+        """Take the next chunk and return the JPEGs that it completes, oldest first."""
         self._buffer += data
         frames: list[bytes] = []
         while True:
@@ -61,7 +61,7 @@ class PreviewParser:
             self._length = None
 
     def _read_header(self) -> bool:
-        """Take a part's header out of the buffer; False when it is not whole yet."""
+        """Take a part's header out of the buffer; return False if it is not complete yet."""
         while True:
             end = self._buffer.find(_HEADER_END)
             if end < 0:
@@ -73,7 +73,7 @@ class PreviewParser:
             header = bytes(self._buffer[:end])
             del self._buffer[: end + len(_HEADER_END)]
             lengths = _LENGTH.findall(header)
-            # After rubbish, the last one belongs to the part that begins here.
+            # After garbage, the last length belongs to the part that begins here.
             length = int(lengths[-1]) if lengths else 0
             if 4 <= length <= self._max_frame_bytes:
                 self._length = length
@@ -82,7 +82,7 @@ class PreviewParser:
             self._skip_to_boundary()
 
     def _resync_in_body(self) -> bool:
-        """Where a part was cut, the next one begins inside its announced length: go there."""
+        """Skip to the next part if it begins inside the announced length of this one, which was truncated."""
         assert self._length is not None
         at = self._buffer.find(self._boundary, 0, self._length)
         if at < 0:

@@ -1,4 +1,4 @@
-"""What every camera has in common."""
+"""Base class of all cameras."""
 
 import time
 from abc import ABC, abstractmethod
@@ -9,18 +9,18 @@ from typing import Self
 
 
 class CameraError(ConnectionError):
-    """The camera gives no pictures; the text says why and what to do. Connecting again may help."""
+    """The camera delivers no images; the text says why and what to do. Reconnecting may help."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One equirectangular picture as JPEG.
+    """One equirectangular image as JPEG.
 
     Attributes:
-        jpeg: encoded bytes, as the camera sent them where it sends JPEG.
-        stamp_ns: when the picture was taken, since the epoch: its arrival less the configured latency.
-        width: pixels, by the JPEG's header.
-        height: pixels.
+        jpeg: encoded bytes; unchanged if the camera sends JPEG.
+        stamp_ns: time of exposure since the epoch: time of arrival minus the configured latency.
+        width: pixels, from the JPEG header.
+        height: pixels, from the JPEG header.
     """
 
     jpeg: bytes
@@ -38,36 +38,36 @@ class Camera(ABC):
     """
 
     def __init__(self, latency_s: float, now_ns: Callable[[], int] = time.time_ns) -> None:
-        """Nothing is opened yet.
+        """Create the camera without opening it.
 
         Args:
-            latency_s: from the exposure to the arrival here.
+            latency_s: time from the exposure to the arrival.
             now_ns: clock of the stamps.
         """
         self.bad_frames = 0
-        """Pictures dropped because they were cut or damaged, since the object was made."""
+        """Images dropped because they were truncated or damaged, since the object was created."""
         self._latency_ns = round(latency_s * 1e9)
         self._now_ns = now_ns
 
     @abstractmethod
     def connect(self) -> str:
-        """Open the camera; returns what it is, in words.
+        """Open the camera and return its description.
 
         Raises:
-            CameraError: it cannot be opened.
+            CameraError: the camera cannot be opened.
         """
 
     @abstractmethod
     def read(self) -> Frame:
-        """The next picture.
+        """Return the next image.
 
         Raises:
-            CameraError: none came within the camera's time-out, or the connection ended.
+            CameraError: no image arrived within the camera's time-out, or the connection ended.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Release the camera; harmless when it is not open."""
+        """Release the camera; has no effect if it is not open."""
 
     def __enter__(self) -> Self:
         """Connect."""

@@ -20,19 +20,19 @@ from instant_ic.limits import MOST_PIXELS
 from instant_ic.pace import current
 
 NEVER = 65535
-"""Value of sleepDelay and offDelay with which the camera does not sleep or switch itself off."""
+"""Value of sleepDelay and offDelay that keeps the camera from sleeping or switching itself off."""
 
 _JSON = {"Content-Type": "application/json;charset=utf-8"}
 _CHUNK = 64 << 10
 _MOST_TEXT = 200
-"""Characters of a text of the camera that go into logs and diagnostics."""
+"""Characters of a text from the camera that go into logs and diagnostics."""
 
 
 class ThetaError(CameraError):
     """The camera refused a command.
 
     Attributes:
-        code: of the API, such as ``disabledCommand``; ``http`` and the status where it gave none.
+        code: error code of the API, such as ``disabledCommand``; ``http`` and the status if the reply has none.
     """
 
     def __init__(self, text: str, code: str) -> None:
@@ -42,13 +42,13 @@ class ThetaError(CameraError):
 
 @dataclass(frozen=True)
 class ThetaState:
-    """What the camera tells of itself.
+    """State that the camera reports.
 
     Attributes:
-        battery: charge, 0-1; None where the camera does not tell.
-        battery_temperature_c: degrees Celsius, or None.
-        board_temperature_c: degrees Celsius, or None.
-        errors: its error codes, such as HIGH_TEMPERATURE.
+        battery: charge, 0-1; None if not reported.
+        battery_temperature_c: degrees Celsius; None if not reported.
+        board_temperature_c: degrees Celsius; None if not reported.
+        errors: error codes, such as HIGH_TEMPERATURE.
     """
 
     battery: float | None
@@ -58,7 +58,7 @@ class ThetaState:
 
 
 class ThetaClient:
-    """Commands to the camera over one persistent connection; may be used from several threads.
+    """Sends commands to the camera over one persistent connection; safe to use from several threads.
 
     Example:
         >>> client = ThetaClient("http://192.168.1.1", ThetaConfig())       # doctest: +SKIP
@@ -74,19 +74,19 @@ class ThetaClient:
         password: str = "",
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Nothing is sent yet.
+        """Create the client without sending anything.
 
         Args:
-            url: such as http://192.168.1.1 (the camera's own network) or its address in yours.
+            url: such as http://192.168.1.1 (the camera's own network), or the camera's address in your network.
             config: time-outs and retries.
-            user: for digest authentication, which the camera asks for in client mode; its serial number.
-            password: the digits of the serial number unless changed.
-            sleep: how waits are waited.
+            user: for digest authentication, which the camera requires in client mode; its serial number.
+            password: the digits of the serial number, unless changed.
+            sleep: waits between repeats.
         """
         self.url = url.rstrip("/")
         self.config = config
         self.busy_replies = 0
-        """Replies with which the camera said that it was busy (503)."""
+        """Number of replies that reported a busy camera (503)."""
         self._user = user
         self._password = password
         self._sleep = sleep
@@ -106,7 +106,7 @@ class ThetaClient:
         return self._call("GET", "/osc/info", None)
 
     def state(self) -> ThetaState:
-        """``POST /osc/state``.
+        """``POST /osc/state``: battery, temperatures, error codes.
 
         Raises:
             CameraError: no answer.
@@ -123,7 +123,7 @@ class ThetaClient:
         )
 
     def execute(self, name: str, parameters: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """Run a command and return its results; one that takes long is waited for.
+        """Run a command, wait until it ends and return its results.
 
         Raises:
             ThetaError: the camera refused it.
@@ -149,7 +149,7 @@ class ThetaClient:
         self.execute("camera.setOptions", {"options": dict(options)})
 
     def open_preview(self) -> tuple[Session, requests.Response]:
-        """Start ``camera.getLivePreview`` on a connection of its own; both have to be closed by the caller.
+        """Start ``camera.getLivePreview`` on its own connection; the caller must close both.
 
         Raises:
             ThetaError: the camera refused it.
@@ -192,7 +192,7 @@ class ThetaClient:
         body: Mapping[str, Any] | None,
         timeout_s: float,
     ) -> requests.Response:
-        """One request, repeated with growing waits while the camera is busy."""
+        """Send one request; repeat it with growing waits while the camera is busy."""
         wait_s = self.config.busy_wait_s
         for attempt in range(self.config.busy_retries + 1):
             try:
@@ -231,7 +231,7 @@ class ThetaCamera(Camera):
         now_ns: Callable[[], int] = time.time_ns,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """As `ThetaClient`, whose arguments these are."""
+        """Take the same arguments as `ThetaClient`."""
         self.config = config or ThetaConfig()
         super().__init__(self.config.latency_s, now_ns)
         self.client = ThetaClient(url, self.config, user, password, sleep)
@@ -247,7 +247,7 @@ class ThetaCamera(Camera):
             Model, firmware and preview format.
 
         Raises:
-            CameraError: no answer, or it refused.
+            CameraError: no answer, or the camera refused a command.
         """
         self._end_preview()
         config = self.config
@@ -259,7 +259,7 @@ class ThetaCamera(Camera):
                 "previewFormat": {"width": config.width, "height": config.height, "framerate": config.rate_hz},
             }
         )
-        # Started sooner, the preview comes in the format of before, or stops at once.
+        # If started sooner, the preview has the previous format or stops at once.
         self._sleep(config.settle_s)
         self._session, self._response = self.client.open_preview()
         found = re.search(r"boundary=\"?([^\";]+)", self._response.headers.get("Content-Type", ""))
@@ -271,10 +271,10 @@ class ThetaCamera(Camera):
         )
 
     def read(self) -> Frame:
-        """The newest whole picture of what has come.
+        """Return the newest complete image.
 
         Raises:
-            CameraError: nothing within the read time-out, or the camera ended the preview (button, shooting,
+            CameraError: no image within the read time-out, or the camera ended the preview (button, shooting,
                 change of mode).
         """
         response, session = self._response, self._session
@@ -282,14 +282,14 @@ class ThetaCamera(Camera):
             raise CameraError(f"{self.client.url}: not connected; call connect() first")
         timeout_s = current().wait_s(self.config.read_timeout_s)
         deadline = time.monotonic() + timeout_s
-        # One read may take several receptions: the head of a chunk could come byte by byte.
+        # One read may need several receives: the head of a chunk can arrive byte by byte.
         session.deadline.start(2.0 * timeout_s)
         while True:
             if time.monotonic() > deadline:
                 fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""
                 raise self._ended(f"data came, but no whole picture for {self.config.read_timeout_s} s{fault}")
             try:
-                # read1: what is there now, instead of waiting until the buffer is full.
+                # read1 returns the available data instead of waiting until the buffer is full.
                 data = response.raw.read1(_CHUNK)
             except (urllib3.exceptions.HTTPError, OSError) as error:
                 raise self._ended(_cause(error)) from error
@@ -362,7 +362,7 @@ def _refusal(where: str, body: Mapping[str, Any] | None, status: int, reply: Map
 
 
 def _cause(error: BaseException) -> str:
-    """The innermost exception, which says what happened; the outer ones repeat addresses."""
+    """Text of the innermost exception, which names the cause; the outer ones only repeat addresses."""
     seen = {id(error)}
     while True:
         inner = error.__cause__ or error.__context__ or getattr(error, "reason", None)

@@ -1,4 +1,4 @@
-"""A video device or network stream that OpenCV opens; frames are encoded to JPEG here."""
+"""Video device or network stream read by OpenCV; frames are encoded to JPEG."""
 
 import os
 import time
@@ -12,11 +12,11 @@ from instant_ic.camera.source import Camera, CameraError, Frame
 class VideoCamera(Camera):
     """Equirectangular video from ``/dev/videoN`` (or just N), ``rtsp://...``, or a video file.
 
-    A Theta over USB shows up as such a device through v4l2loopback (gst_loopback).
+    A Theta over USB appears as a device through v4l2loopback (gst_loopback).
     """
 
     def __init__(self, url: str, config: VideoConfig | None = None, now_ns: Callable[[], int] = time.time_ns) -> None:
-        """Nothing is opened yet.
+        """Create the camera without opening it.
 
         Args:
             url: device path or number, stream address, or file.
@@ -58,7 +58,7 @@ class VideoCamera(Camera):
         return f"video {self.url}, {width}x{height} by {capture.getBackendName()}"
 
     def read(self) -> Frame:
-        """The next frame, encoded.
+        """Return the next frame as JPEG.
 
         Raises:
             CameraError: the stream ended.
