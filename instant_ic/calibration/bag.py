@@ -1,4 +1,4 @@
-"""Pairs of panorama and LiDAR revolution out of a bag, for the calibration of the camera against the LiDAR."""
+"""Reads pairs of panorama and LiDAR revolution from a bag, for the camera-LiDAR calibration."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ _FEW = 12
 
 @dataclass(frozen=True)
 class Selection:
-    """What is taken out of a recording.
+    """Parameters of reading a recording.
 
     Attributes:
-        image_topic, points_topic: empty: the usual ones (``/camera/image/compressed``, ``/lidar/points``, else
-            ``/lidar/packets``).
-        base_frame, odom_frame: of the transforms.
-        most_frames: most pictures.
-        distance_m, angle_deg: a place is another one after so much motion.
-        most_gap_s: between a picture and the middle of its revolution.
+        image_topic, points_topic: topics; empty selects the defaults (``/camera/image/compressed``, ``/lidar/points``,
+            otherwise ``/lidar/packets``).
+        base_frame, odom_frame: frames of the transforms.
+        most_frames: largest number of images.
+        distance_m, angle_deg: motion after which a new place begins.
+        most_gap_s: largest time between an image and the middle of its revolution.
     """
 
     image_topic: str = ""
@@ -53,14 +53,14 @@ class Selection:
 
 @dataclass(frozen=True)
 class CalibrationRecording:
-    """What a bag holds for the calibration.
+    """Calibration data of a bag.
 
     Attributes:
-        frames: the pairs, of as many places as the recording has.
-        camera_from_lidar: (4, 4) as the transforms in the bag tell; None where they do not.
-        base_from_lidar: (4, 4) likewise.
-        pictures, places: number of pictures in the bag, and of places that it was made from.
-        moves: whether odometry was there to compensate the motion.
+        frames: pairs of image and revolution, from as many places as the recording has.
+        camera_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
+        base_from_lidar: (4, 4) from the transforms in the bag; None if they are missing.
+        pictures, places: number of images in the bag, and number of places in the recording.
+        moves: whether odometry was available to compensate the motion.
     """
 
     frames: list[Frame]
@@ -85,11 +85,11 @@ class _Cloud:
 
 
 def read_recording(path: Path, selection: Selection | None = None) -> CalibrationRecording:
-    """Reads a bag.
+    """Read a bag.
 
     Raises:
-        BagError: no bag, or a damaged one.
-        CalibrationError: it lacks pictures or revolutions, or none are of the same time.
+        BagError: the path is not a bag, or the bag is damaged.
+        CalibrationError: the bag lacks images or revolutions, or none of them coincide in time.
     """
     selection = selection or Selection()
     with BagReader(path) as bag:
@@ -157,7 +157,7 @@ def _transforms(bag: BagReader, types: dict[str, str]) -> TransformBuffer:
 
 
 def _stamps(path: Path, bag: BagReader, topic: str) -> tuple[list[int], str]:
-    """Rising stamps of the pictures, and their frame."""
+    """Stamps of the images in rising order, and their frame id."""
     stamps, frame = set(), ""
     for message in bag.messages([topic]):
         picture = deserialize(message.payload, message.type_name)
@@ -180,14 +180,15 @@ def _known(transforms: TransformBuffer, target: str, source: str) -> Matrix | No
 
 
 def _places(stamps: list[int], transforms: TransformBuffer | None, selection: Selection) -> tuple[dict[int, int], int]:
-    """Stamps of the pictures to take, each with the number of its place; and how many places there are.
+    """Select images: stamp → number of its place; and the number of places.
 
-    A stretch ends when the robot has moved or turned enough; of each the picture of the slowest moment is taken,
-    because what is left of wrong stamps shows least there. A place is a position, whatever the heading.
+    The drive is divided into sections, each of which ends when the robot has moved or turned enough. Each section
+    contributes the image of its slowest moment, where errors of the stamps matter least. A place is a position,
+    independent of the heading.
     """
     centres: list[NDArray[np.float64]] = []
     place: dict[int, int] = {}
-    best: list[tuple[float, int]] = []  # of each stretch: speed and stamp
+    best: list[tuple[float, int]] = []  # speed and stamp of each section
     start: Matrix | None = None
     for stamp in stamps:
         speed = 0.0
@@ -198,7 +199,7 @@ def _places(stamps: list[int], transforms: TransformBuffer | None, selection: Se
                     for shift in (-50_000_000, 0, 50_000_000)
                 )
             except TransformError:
-                continue  # before the odometry or after it: cannot be compensated
+                continue  # outside the odometry: cannot be compensated
             speed = sum(_moved(before, after)) / 0.1
         else:
             pose = np.eye(4)
@@ -219,7 +220,7 @@ def _places(stamps: list[int], transforms: TransformBuffer | None, selection: Se
 
 
 def _moved(a: Matrix, b: Matrix) -> tuple[float, float]:
-    """Metres and radians of yaw between two poses."""
+    """Distance in metres and yaw in radians between two poses."""
     return float(np.linalg.norm(b[:3, 3] - a[:3, 3])), abs(wrap_angle(yaw_of(b) - yaw_of(a)))
 
 
@@ -230,7 +231,7 @@ def _evenly(values: list[int], most: int) -> list[int]:
 
 
 def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) -> Iterator[_Cloud]:
-    """Revolutions whose message is near a picture, from points or from packets."""
+    """Revolutions from points or packets whose messages are close in time to an image."""
     if kind == CLOUD:
         for message in bag.messages([topic]):
             if near(message.stamp_ns):
@@ -251,8 +252,8 @@ def _clouds(bag: BagReader, topic: str, kind: str, near: Callable[[int], bool]) 
 def _nearest_clouds(
     path: Path, bag: BagReader, topic: str, kind: str, stamps: list[int], selection: Selection
 ) -> dict[int, _Cloud]:
-    """For each stamp the revolution nearest in time, where one is near enough."""
-    # A bag's own stamp is of the arrival, up to a second late on a busy machine.
+    """Revolution nearest in time to each stamp, where one is near enough."""
+    # The bag stamps messages on arrival, up to a second late on a busy machine.
     at = np.array(stamps)
     found: dict[int, _Cloud] = {}
     count = 0
@@ -295,7 +296,7 @@ def _frame(
     transforms: TransformBuffer | None,
     selection: Selection,
 ) -> Frame:
-    """The revolution as the LiDAR would have seen it from where it was at the picture's time."""
+    """Frame of image and revolution, with the points moved to the LiDAR's pose at the time of the image."""
     cloud_points = cloud.points
     xyz = np.stack([cloud_points[name] for name in "xyz"], axis=1).astype(np.float64)
     usable = np.isfinite(xyz).all(axis=1) & np.isfinite(cloud_points["time"])

@@ -1,4 +1,4 @@
-"""Edges that a spinning LiDAR and a panorama both see: what ``calibration`` aligns. Arrays in, arrays out."""
+"""Edges that a spinning LiDAR and a panorama both see, which the calibration aligns. Arrays in, arrays out."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.floating]
 CUES = ("jump", "shade", "floor", "shade_across")
-"""Kinds of edge: a jump of the range along a ring and a step of the intensity along a ring (upright in the picture),
-the foot of a wall and a step of the intensity from ring to ring (lying)."""
+"""Kinds of edge. Vertical in the image: depth discontinuity along a ring, intensity step along a ring. Horizontal: foot
+of a wall, intensity step between rings."""
 UPRIGHT = ("jump", "shade")
 _MARGIN = 32
 
 
 @dataclass(frozen=True)
 class LidarEdges:
-    """Points on edges.
+    """Edge points of a revolution.
 
     Attributes:
         points: (N, 3) in the LiDAR's frame, metres.
@@ -31,17 +31,17 @@ class LidarEdges:
 
 @dataclass(frozen=True)
 class FloorPlane:
-    """The floor in the LiDAR's frame: normal (3,), upward, and height in metres with normal · p = height on it."""
+    """Floor in the LiDAR's frame: upward normal (3,), and height in metres with normal · p = height for its points."""
 
     normal: NDArray[np.float64]
     height: float
 
 
 def find_floor(points: Floats, most_tilt_deg: float = 15.0, seed: int = 0) -> FloorPlane | None:
-    """Largest plane below the LiDAR that is level within ``most_tilt_deg``, by RANSAC; points (N, 3), finite.
+    """Find the largest plane below the LiDAR that is level within ``most_tilt_deg``, by RANSAC; points (N, 3), finite.
 
     Returns:
-        None where fewer than 200 points or a tenth of those below the LiDAR lie on one.
+        None if fewer than 200 points, or fewer than a tenth of the points below the LiDAR, lie on one plane.
     """
     low = np.asarray(points[points[:, 2] < -0.15], np.float64)
     if len(low) < 200:
@@ -63,7 +63,7 @@ def find_floor(points: Floats, most_tilt_deg: float = 15.0, seed: int = 0) -> Fl
     on_it = low[np.abs(low @ normal - height) < 0.03]
     near, far = np.quantile(np.hypot(on_it[:, 0], on_it[:, 1]), (0.1, 0.9))
     if far - near < 0.2:
-        return None  # one ring on walls around, flat by itself
+        return None  # a single ring on surrounding walls, which is always planar
     centre = on_it.mean(axis=0)
     normal = np.linalg.svd(on_it - centre, full_matrices=False)[2][2]
     normal *= np.sign(normal[2])
@@ -73,14 +73,14 @@ def find_floor(points: Floats, most_tilt_deg: float = 15.0, seed: int = 0) -> Fl
 def lidar_edges(
     points: Floats, intensity: Floats, ring: NDArray[np.integer], floor: FloorPlane | None, intensity_step: float = 6.0
 ) -> LidarEdges:
-    """Edges in one revolution.
+    """Find the edges in one revolution.
 
     Args:
         points: (N, 3) in the LiDAR's frame, metres, finite.
         intensity: (N,).
-        ring: number of the laser, rising upwards, (N,).
-        floor: for the feet of walls; None leaves them out.
-        intensity_step: least step of the intensity that is an edge.
+        ring: number of the laser, from the lowest upwards, (N,).
+        floor: floor plane for the feet of walls; None leaves them out.
+        intensity_step: smallest intensity step that counts as an edge.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     order = np.lexsort((azimuth, ring))
@@ -97,13 +97,13 @@ def lidar_edges(
 
 
 def _between(points: Floats, range_m: Floats, a: NDArray[np.intp], b: NDArray[np.intp], at_m: Floats) -> Floats:
-    """Points (K, 3) in the directions halfway between points ``a`` and ``b``, ``at_m`` away."""
+    """Points (K, 3) at distance ``at_m`` in the directions halfway between points ``a`` and ``b``."""
     middle = points[a] / range_m[a][:, None] + points[b] / range_m[b][:, None]
     return np.asarray(middle * (at_m / np.linalg.norm(middle, axis=1))[:, None])
 
 
 def _jumps(points: Floats, range_m: Floats, ring: NDArray[np.int64], azimuth: Floats) -> Floats:
-    """The nearer side of jumps of the range along a ring: that side ends there, for the camera too."""
+    """Near side of depth discontinuities along a ring; that surface ends there in the image too."""
     a = np.arange(max(len(range_m) - 1, 0))
     b = a + 1
     near = np.minimum(range_m[a], range_m[b])
@@ -115,7 +115,7 @@ def _jumps(points: Floats, range_m: Floats, ring: NDArray[np.int64], azimuth: Fl
 def _shades(
     points: Floats, range_m: Floats, intensity: Floats, ring: NDArray[np.int64], azimuth: Floats, step: float
 ) -> Floats:
-    """Where the mean intensity of three points before and three after differs most, on one surface."""
+    """Points on one surface where the mean intensities of the three points before and after differ most."""
     if len(range_m) < 7:
         return np.empty((0, 3))
     i = np.arange(3, len(range_m) - 2)
@@ -139,7 +139,7 @@ def _across_rings(
     step: float,
     columns: int = 900,
 ) -> tuple[Floats, Floats]:
-    """Feet of walls, and steps of the intensity from a ring to the next."""
+    """Feet of walls, and intensity steps between neighbouring rings."""
     table = np.full((int(ring.max(initial=0)) + 1, columns), -1)
     table[ring, ((azimuth + np.pi) * (columns / (2 * np.pi))).astype(np.intp) % columns] = np.arange(len(ring))
     low, high = table[:-1].ravel(), table[1:].ravel()
@@ -153,18 +153,18 @@ def _across_rings(
         return np.empty((0, 3)), lying
     above = points @ floor.normal - floor.height
     out = np.linalg.norm(points - (points @ floor.normal)[:, None] * floor.normal, axis=1)
-    # The lower beam ends on the floor in front of the wall that the upper one hits: between them the wall meets the
-    # floor. Its place follows from wall and plane, far finer than the two degrees between the beams.
+    # The lower beam hits the floor in front of the wall that the upper beam hits, so the wall meets the floor between
+    # them. Wall and plane locate the foot far more accurately than the two degrees between the beams.
     foot = (np.abs(above[low]) < 0.05) & (above[high] > 0.08) & (out[high] > out[low]) & (out[high] < out[low] + 1.0)
     wall = high[foot]
     return points[wall] - above[wall][:, None] * floor.normal, lying
 
 
 def picture_edges(rgb: NDArray[np.uint8], sigma_px: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Strength of upright and of lying edges of a panorama (H, W, 3), blurred, each (H, W) over its mean.
+    """Blurred strength of vertical and of horizontal edges of a panorama (H, W, 3), each (H, W), divided by its mean.
 
-    Of the logarithm of the brightness, so that a dark corner counts like a bright one; the strongest twentieth is cut,
-    so that no lamp outweighs everything else.
+    Computed from the logarithm of the brightness, so that dark and bright corners count alike. The strongest twentieth
+    is clipped, so that a lamp does not outweigh everything else.
     """
     import cv2
 

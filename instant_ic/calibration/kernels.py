@@ -1,4 +1,4 @@
-"""Strength of the pictures' edges under projected points, compiled."""
+"""Compiled lookup of image edge strength at projected points."""
 
 import math
 
@@ -15,14 +15,14 @@ def strength_under(
     camera_from_lidar: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> None:
-    """Bilinear samples of edge pictures at projected points.
+    """Sample edge images bilinearly at projected points.
 
     Args:
         points: (N, 3) in the LiDAR's frame.
-        plane: which picture each point belongs to, (N,).
-        strengths: (P, H, W + 1) equirect pictures, the first column repeated at the end.
+        plane: index of the edge image of each point, (N,).
+        strengths: (P, H, W + 1) equirect edge images, the first column repeated at the end.
         camera_from_lidar: (4, 4).
-        out: (N,) is filled.
+        out: (N,) receives the samples.
     """
     height, width = strengths.shape[1], strengths.shape[2] - 1
     m = camera_from_lidar

@@ -1,9 +1,9 @@
-"""Camera from LiDAR by the edges that both see: in yaw around the full circle first, then in six degrees of freedom.
+"""Estimates camera_from_lidar from edges that both see: first the yaw around the full circle, then all six parameters.
 
-Edges of the LiDAR's revolutions (``calibration_edges``) are projected into the panoramas of the same moments; the pose
-under which they fall on the strongest edges there, over all frames, is the calibration. The edges of the pictures
-are blurred, less from level to level, so that the way to the maximum is smooth. In the manner of Levinson and Thrun
-(RSS 2013), with the foot of the walls as a cue of its own, because rings two degrees apart locate lying edges badly.
+The edges of each LiDAR revolution (``calibration.edges``) are projected into the panorama of the same moment. The
+calibration is the pose under which they fall on the strongest image edges over all frames. The image edges are blurred,
+less from level to level, so that the score rises smoothly to its maximum. The method follows Levinson and Thrun (RSS
+2013). The foot of the walls is an additional cue, because rings two degrees apart locate horizontal edges poorly.
 """
 
 from __future__ import annotations
@@ -25,29 +25,31 @@ _SECTORS = 16
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 _WEIGHTS = {"jump": 1.0, "shade": 1.0, "floor": 0.5, "shade_across": 0.25}
 _SYSTEMATIC = np.array([0.01] * 3 + [math.radians(0.1)] * 3)
-"""What no scatter shows: a skirting board stands before its wall, an edge is round. Measured: docs/calibration.md."""
+"""Systematic error that the scatter does not show: a skirting board in front of its wall, a rounded edge. Measured, see
+docs/calibration.md."""
 _PLACES_FOR_HEIGHT, _UNCHECKED_HEIGHT = 3, 5.0
-"""From fewer places a skirting board's upper edge may pass for the foot of its wall: so many units of doubt in z."""
+"""With fewer places, the upper edge of a skirting board can pass for the foot of its wall; z then gets an additional
+standard deviation of this many units."""
 _RIVAL_REACH = 12
-"""So many units around the maximum are searched for others: 12 cm, 2.4 degrees."""
+"""Search radius for other maxima, in units: 12 cm, 2.4 degrees."""
 _UNIT = np.array([0.01] * 3 + [math.radians(0.2)] * 3)
-"""A step of the search: a centimetre, and the angle that moves an edge 3 m away by as much."""
+"""Unit of the search: a centimetre, and the angle that moves an edge 3 m away by about as much."""
 
 
 class CalibrationError(ValueError):
-    """The recording does not give a calibration; the text says why and what to record."""
+    """The recording does not yield a calibration; the text says why and what to record."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A panorama and the revolution of the same moment.
+    """Panorama and revolution of the same moment.
 
     Attributes:
         rgb: (H, W, 3) uint8 panorama.
-        points: (N, 3) in the LiDAR's frame at the picture's time, metres, finite.
+        points: (N, 3) in the LiDAR's frame at the time of the image, metres, finite.
         intensity: (N,).
-        ring: number of the laser, rising upwards, (N,).
-        place: frames of one place carry the same number: what they see is the same and counts once in the uncertainty.
+        ring: number of the laser, from the lowest upwards, (N,).
+        place: number of the place; frames of one place see the same things and count once in the uncertainty.
     """
 
     rgb: NDArray[np.uint8]
@@ -59,16 +61,17 @@ class Frame:
 
 @dataclass(frozen=True)
 class CalibrationConfig:
-    """How the pose is searched.
+    """Parameters of the pose search.
 
     Attributes:
-        blur_px: of the pictures' edges, from level to level, at 1024 columns.
-        yaw_step_deg: of the search around the full circle.
-        full_circle: false: the yaw given is right within a few degrees.
-        reach_m, reach_deg: standard deviations of the pose given; a weak pull towards it, for what nothing else tells.
-        most_sigma_m, most_sigma_deg: what stays less certain than this is not constrained, and kept as given.
-        min_edges: fewer edge points in all frames give no calibration.
-        intensity_step: least step of the LiDAR's intensity that is an edge.
+        blur_px: blur of the image edges at each level, for 1024 columns.
+        yaw_step_deg: step of the yaw search around the full circle.
+        full_circle: whether to search the full circle; false if the given yaw is right within a few degrees.
+        reach_m, reach_deg: standard deviations of the given pose; a weak prior for directions without other evidence.
+        most_sigma_m, most_sigma_deg: a direction with a larger standard deviation is not constrained and keeps its
+            given value.
+        min_edges: smallest number of edge points in all frames.
+        intensity_step: smallest step of the LiDAR's intensity that counts as an edge.
     """
 
     blur_px: tuple[float, ...] = (8.0, 4.0, 2.0, 1.0)
@@ -90,17 +93,16 @@ class CalibrationConfig:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result.
+    """Result of the calibration.
 
     Attributes:
         camera_from_lidar: (4, 4).
         sigma: standard deviations in x, y, z (metres), roll, pitch, yaw (radians) in the camera's frame, (6,).
-        constrained: for each of them whether the recording constrains it, (6,). Directions that it does not constrain
-            are as they were given.
-        score_before, score_after: mean strength of the pictures' edges under the LiDAR's; 1 is what chance gives.
+        constrained: whether the recording constrains each of them, (6,); the others keep their given values.
+        score_before, score_after: mean strength of the image edges under the LiDAR's edges; 1 is the level of chance.
         edges: number of edge points used, by cue.
-        yaw_rival: score of the best yaw more than 20 degrees away over the best one's, both above chance; near 1 the
-            place looks alike in two directions.
+        yaw_rival: score of the best yaw more than 20 degrees away divided by the best score, both above chance; near 1
+            the place looks alike in two directions.
     """
 
     camera_from_lidar: Matrix
@@ -114,7 +116,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Edges:
-    """The LiDAR's edges of all frames, and in which block of the uncertainty each lies."""
+    """LiDAR edges of all frames, and the block of each edge in the uncertainty estimate."""
 
     points: NDArray[np.float64]
     frame: NDArray[np.intp]
@@ -125,15 +127,15 @@ class _Edges:
 
 
 class _Level:
-    """Score of a pose at one blur of the pictures' edges."""
+    """Score of a pose at one blur level of the image edges."""
 
     def __init__(self, edges: _Edges, frames: Sequence[Frame], blur_px: float) -> None:
         sigma_px = blur_px * frames[0].rgb.shape[1] / 1024.0
-        # What is blurred that much needs no more pixels.
+        # A strongly blurred image needs fewer pixels.
         smaller = 2 ** max(int(math.log2(sigma_px / 2)), 0) if sigma_px >= 4 else 1
         strengths = [picture_edges(_reduced(frame.rgb, smaller), sigma_px / smaller) for frame in frames]
         stack = np.stack([pair[kind] for kind in (0, 1) for pair in strengths])
-        # One column more, so that a point on the seam lies between the last and the first.
+        # One extra column, so that a point on the seam is interpolated between the last and the first column.
         self.strengths = np.ascontiguousarray(np.concatenate([stack, stack[:, :, :1]], axis=2))
         self.edges = edges
         self.plane = (edges.frame + np.where(edges.upright, 0, len(frames))).astype(np.int64)
@@ -165,16 +167,16 @@ def calibrate(
     config: CalibrationConfig | None = None,
     report: Callable[[str], None] = lambda line: None,
 ) -> Calibration:
-    """Estimates the pose of the LiDAR in the camera's frame.
+    """Estimate the pose of the LiDAR in the camera's frame.
 
     Args:
-        frames: pairs of picture and revolution, best from many places.
-        camera_from_lidar: (4, 4) as measured by hand; yaw may be far off with ``full_circle``.
-        config: how it is searched.
-        report: told what is being done.
+        frames: pairs of image and revolution, preferably from many places.
+        camera_from_lidar: (4, 4) measured by hand; with ``full_circle`` the yaw may be far off.
+        config: parameters of the search.
+        report: called with progress messages.
 
     Raises:
-        CalibrationError: no frames, too few edges, or edges that fit nowhere better than by chance.
+        CalibrationError: no frames, too few edges, or no pose fits better than chance.
     """
     config = config or CalibrationConfig()
     if not frames:
@@ -199,7 +201,7 @@ def calibrate(
         centimetres = ", ".join(f"{value:+.1f}" for value in shift[:3] * 100)
         report(f"a pose {centimetres} cm away fits as well")
     chance = float(np.mean([level.score(_turned(found, yaw)) for yaw in np.radians(np.arange(15, 360, 15))]))
-    chance = max(chance, 1e-9)  # a picture without any edge
+    chance = max(chance, 1e-9)  # an image without any edge
     before, after = level.score(camera_from_lidar) / chance, level.score(found) / chance
     if after < 1.05:
         raise CalibrationError(
@@ -209,7 +211,7 @@ def calibrate(
     covariance = _covariance(level, found)
     if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
         covariance[2, 2] += _UNCHECKED_HEIGHT**2
-    for other in rivals:  # either may be true: the one believed is off by nothing or by all of the way
+    for other in rivals:  # either may be true: the selected pose is off by nothing or by the whole difference
         shift = _correction(found, other) / _UNIT
         covariance += 0.5 * np.outer(shift, shift)
     units = _correction(start, found) / _UNIT
@@ -241,7 +243,7 @@ def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix, config: Calibrati
         )
     points = np.concatenate([edges.points for edges in found]).astype(np.float64)
     number = np.repeat(np.arange(len(frames)), [len(edges.cue) for edges in found])
-    # Edges of one direction at one place are one sample: they err together.
+    # Edges of one direction at one place are one sample, because their errors are correlated.
     place = np.array([frame.place for frame in frames])[number]
     in_camera = transform_points(camera_from_lidar, points)
     azimuth = np.arctan2(in_camera[:, 1], in_camera[:, 0])
@@ -259,12 +261,12 @@ def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix, config: Calibrati
 
 
 def _turned(camera_from_lidar: Matrix, yaw_rad: float) -> Matrix:
-    """The camera turned about its own axis."""
+    """Turn the camera about its vertical axis."""
     return pose_matrix(yaw=yaw_rad) @ camera_from_lidar
 
 
 def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
-    """Pose after a small motion (6,) in ``_UNIT`` in the camera's frame."""
+    """Apply a small motion (6,), in ``_UNIT`` in the camera's frame, to the pose."""
     step = np.asarray(units) * _UNIT
     angle = float(np.linalg.norm(step[3:]))
     change = np.eye(4)
@@ -277,7 +279,7 @@ def _moved(camera_from_lidar: Matrix, units: Floats) -> Matrix:
 
 
 def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
-    """Motion (6,) in the camera's frame, metres and radians, that ``_moved`` takes from one pose to another."""
+    """Motion (6,) in the camera's frame, metres and radians, from one pose to another; inverse of ``_moved``."""
     change = after @ np.linalg.inv(before)
     angle = math.acos(float(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1)))
     axis = np.array([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
@@ -286,7 +288,7 @@ def _correction(before: Matrix, after: Matrix) -> NDArray[np.float64]:
 
 
 def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[Matrix, float]:
-    """Pose turned to the best yaw of the full circle, and how near another one comes."""
+    """Pose with the best yaw of the full circle, and the score ratio of its closest rival."""
     count = round(360 / step_deg)
     yaws = np.arange(count) * (2 * np.pi / count)
     scores = np.array([level.score(_turned(camera_from_lidar, yaw)) for yaw in yaws])
@@ -298,7 +300,7 @@ def _around(level: _Level, camera_from_lidar: Matrix, step_deg: float) -> tuple[
 
 
 def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfig) -> Matrix:
-    """Pose of the highest score near ``found``, weakly pulled towards ``start``."""
+    """Pose of the highest score near ``found``, with a weak prior towards ``start``."""
     from scipy.optimize import minimize
 
     reach = np.array([config.reach_m] * 3 + [math.radians(config.reach_deg)] * 3) / _UNIT
@@ -308,7 +310,7 @@ def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfi
         return -level.score(_moved(start, units)) / base + 0.005 * float(((units / reach) ** 2).sum())
 
     def slope(units: Floats) -> NDArray[np.float64]:
-        # Over a third of a unit: nearer, the steps of the bilinear pictures would be seen.
+        # A third of a unit: smaller differences would show the steps of bilinear interpolation.
         steps = np.eye(6) / 3
         return np.array([(cost(units + step) - cost(units - step)) * 1.5 for step in steps])
 
@@ -320,11 +322,11 @@ def _climb(level: _Level, start: Matrix, found: Matrix, config: CalibrationConfi
 def _among_rivals(
     level: _Level, start: Matrix, found: Matrix, config: CalibrationConfig
 ) -> tuple[Matrix, list[Matrix]]:
-    """The maximum to believe, and others that fit as well: parallel edges can be taken for each other.
+    """Select the maximum, and return other maxima that fit as well because parallel edges can be confused.
 
-    The foot of a wall falls on the upper edge of its skirting board when the camera is taken to be that much lower.
-    From several places only one of the two fits; from one, both may. Of those that cannot be told apart by the scatter
-    over the blocks, the one nearest to the pose given is believed.
+    With a camera height that is too low, the foot of a wall falls on the upper edge of its skirting board. From several
+    places only one of the two heights fits; from one place both may. Among maxima that the scatter over the blocks
+    cannot distinguish, the one nearest to the given pose is selected.
     """
     peaks = []
     for axis in np.eye(6):
@@ -347,7 +349,7 @@ def _among_rivals(
 
 
 def _difference(level: _Level, best: Matrix, other: Matrix) -> float:
-    """How many standard deviations of the blocks' scatter one pose scores above another."""
+    """Score difference between two poses in standard deviations of the scatter over the blocks."""
     apart = np.bincount(level.edges.block, level.each(best) - level.each(other))
     return float(apart.sum() / max(float(np.sqrt((apart**2).sum())), 1e-12))
 
@@ -372,7 +374,7 @@ def _covariance(level: _Level, found: Matrix) -> NDArray[np.float64]:
     blocks = len(centre)
     scatter = gradients.T @ gradients * (blocks / max(blocks - 6, 1e-3))
     values, vectors = np.linalg.eigh(hessian)
-    # A score that does not fall in some direction tells nothing of it.
+    # A direction in which the score does not fall has no information.
     values = np.maximum(values, 1e-3 * max(float(values.max()), 1e-9))
     inverse = vectors @ np.diag(1 / values) @ vectors.T
     return np.asarray(inverse @ scatter @ inverse)

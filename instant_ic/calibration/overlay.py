@@ -1,4 +1,4 @@
-"""LiDAR points over the panorama, before and after the calibration, for people."""
+"""Overlay of LiDAR points on the panorama before and after the calibration, for visual inspection."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from instant_ic.geometry.poses import Matrix, transform_points
 
 
 def overlay(frame: Frame, camera_from_lidar: Matrix, width: int = 1600) -> NDArray[np.uint8]:
-    """Points coloured by range (near bright, far dark) over a dimmed panorama, (width / 2, width, 3) RGB."""
+    """Points coloured by range (near bright, far dark) on a dimmed panorama, (width / 2, width, 3) RGB."""
     import cv2
 
     picture = cv2.resize(frame.rgb, (width, width // 2), interpolation=cv2.INTER_AREA)
@@ -28,7 +28,7 @@ def overlay(frame: Frame, camera_from_lidar: Matrix, width: int = 1600) -> NDArr
 def before_and_after(
     frames: list[Frame], before: Matrix, after: Matrix, most: int = 3, width: int = 1600
 ) -> NDArray[np.uint8]:
-    """Sheet of some frames, each with the overlay before and after; the band that the LiDAR sees."""
+    """Sheet of some frames, each with the overlay before and after, cropped to the rows that the LiDAR sees."""
     import cv2
 
     places = np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int)

@@ -1,4 +1,4 @@
-"""UDP payloads out of captures: pcap (either endianness, micro- and nanoseconds) and pcapng.
+"""UDP payloads from capture files: pcap (either endianness, micro- and nanoseconds) and pcapng.
 
 Source: the pcap and pcapng drafts of the IETF opsawg (draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng).
 """
@@ -22,14 +22,14 @@ _PCAPNG_MAGIC = b"\x0a\x0d\x0d\x0a"
 
 
 class CaptureError(ValueError):
-    """A file that is no capture; the text says which file and what it starts with."""
+    """A file that is not a capture; the text names the file and its first bytes."""
 
 
 class Datagram(NamedTuple):
     """One UDP payload of a capture."""
 
     stamp_ns: int
-    """When it was captured, since the epoch."""
+    """Time of capture since the epoch."""
     port: int
     """Destination port."""
     payload: bytes
@@ -37,12 +37,12 @@ class Datagram(NamedTuple):
 
 @dataclass
 class CaptureCounters:
-    """What a capture held.
+    """Counts of a capture's contents.
 
     Attributes:
         records: frames read.
-        datagrams: UDP payloads given out.
-        skipped: what was left out, by reason.
+        datagrams: UDP payloads returned.
+        skipped: skipped frames by reason.
     """
 
     records: int = 0
@@ -51,7 +51,7 @@ class CaptureCounters:
 
 
 class CaptureReader:
-    """Iterates over the UDP payloads of a capture file; what is not one is counted by reason, never raised.
+    """Iterates over the UDP payloads of a capture file; other frames are counted by reason and raise no error.
 
     Example:
         >>> reader = CaptureReader("recording.pcap")        # doctest: +SKIP
@@ -64,8 +64,8 @@ class CaptureReader:
         """Open and read the file.
 
         Raises:
-            CaptureError: it is neither pcap nor pcapng.
-            OSError: it cannot be read.
+            CaptureError: the file is neither pcap nor pcapng.
+            OSError: the file cannot be read.
         """
         self.path = Path(path)
         self.counters = CaptureCounters()
@@ -78,7 +78,7 @@ class CaptureReader:
             )
 
     def __iter__(self) -> Iterator[Datagram]:
-        """All UDP payloads, in the order of the file; the counters start at zero."""
+        """Iterate over all UDP payloads in file order; the counters restart at zero."""
         self.counters = CaptureCounters()
         frames = self._pcapng() if self._data[:4] == _PCAPNG_MAGIC else self._pcap()
         counters = self.counters
@@ -109,7 +109,7 @@ class CaptureReader:
                 self.counters.skipped["cut record"] += 1
                 return
             if captured < original:
-                # A frame that the snapshot length cut: its payload is not whole.
+                # The snapshot length truncated this frame, so its payload is incomplete.
                 self.counters.records += 1
                 self.counters.skipped["cut frame"] += 1
             else:
@@ -119,7 +119,7 @@ class CaptureReader:
             self.counters.skipped["cut record"] += 1
 
     def _pcapng(self) -> Iterator[tuple[int, int, int, int]]:
-        """(stamp, link type, start, end) of each frame of the enhanced packet blocks."""
+        """(stamp, link type, start, end) of each frame in the enhanced packet blocks."""
         data, size = self._data, len(self._data)
         at, order = 0, "<"
         interfaces: list[tuple[int, float]] = []
@@ -155,7 +155,7 @@ class CaptureReader:
 
 
 def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
-    """Nanoseconds of a timestamp's unit by the interface's options (if_tsresol, code 9)."""
+    """Nanoseconds per timestamp unit, from the interface options (if_tsresol, code 9)."""
     while at + 4 <= end:
         code, length = struct.unpack_from(order + "HH", data, at)
         if code == 0:
@@ -168,7 +168,7 @@ def _tick_ns(data: bytes, at: int, end: int, order: str) -> float:
 
 
 def _udp(data: bytes, start: int, end: int, link: int) -> tuple[int, int, int] | str:
-    """(destination port, start, end) of the UDP payload of a frame, or why there is none."""
+    """(destination port, start, end) of a frame's UDP payload, or the reason why it has none."""
     if link == LINK_ETHERNET:
         at = start + 12
         while end - at >= 4 and data[at : at + 2] in (b"\x81\x00", b"\x88\xa8"):

@@ -1,23 +1,24 @@
-"""The sensor's clock, which starts anew every hour, against the host's."""
+"""Offset between the sensor's clock, which wraps every hour, and the host's clock."""
 
 from instant_ic.lidar.packets import HOUR_US
 
 
 class DeviceClock:
-    """Unrolls device time over the hours and estimates what to add to it for host time.
+    """Unwraps device time over the hours and estimates its offset to host time.
 
-    Transport only ever delays a packet, so the smallest difference seen is the truest. It is let rise slowly,
-    as the two clocks drift apart. A difference that stays elsewhere means that one of the clocks was set.
+    Transport can only delay a packet, so the smallest observed difference is the best estimate of the offset. The
+    estimate may rise slowly, because the clocks drift. A lasting change of the difference means that one of the clocks
+    was set.
 
     Attributes:
-        resets: how often the offset was estimated anew after a clock was set.
+        resets: how often the offset was re-estimated after a clock was set.
     """
 
     JUMP_NS = 500_000_000
     JUMP_PACKETS = 20
 
     def __init__(self, max_drift_ppm: float = 50.0) -> None:
-        """Start without an offset: the first packet gives it."""
+        """Start without an offset; the first packet sets it."""
         self.max_drift_ppm = max_drift_ppm
         self.resets = 0
         self._device_us: int | None = None
@@ -25,9 +26,9 @@ class DeviceClock:
         self._jumped = 0
 
     def step_us(self, timestamp_us: int) -> int | None:
-        """Microseconds from the last packet taken to this one, by the shorter way round the hour.
+        """Microseconds from the last accepted packet to this one, in the shorter direction around the hour.
 
-        Negative for a packet that is older; None before the first.
+        Negative for an older packet; None before the first packet.
         """
         if self._device_us is None:
             return None
@@ -37,11 +38,11 @@ class DeviceClock:
         """Take the time of a packet.
 
         Args:
-            timestamp_us: microseconds past the hour, as the packet says.
-            host_ns: host time of the same instant, late by the transport.
+            timestamp_us: microseconds past the hour, from the packet.
+            host_ns: host time of the same instant, including the transport delay.
 
         Returns:
-            Microseconds on the unrolled device clock.
+            Microseconds on the unwrapped device clock.
         """
         step = self.step_us(timestamp_us)
         if self._device_us is None or step is None:
@@ -63,10 +64,10 @@ class DeviceClock:
         return self._device_us
 
     def restart(self) -> None:
-        """Forget everything, as after the sensor was switched on anew."""
+        """Reset the estimate, for example after a restart of the sensor."""
         self._device_us = None
         self._jumped = 0
 
     def host_ns(self, device_us: float) -> int:
-        """Host time of an instant on the unrolled device clock."""
+        """Host time of an instant on the unwrapped device clock."""
         return round(device_us * 1000.0 + self._offset_ns)

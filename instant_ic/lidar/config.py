@@ -9,12 +9,12 @@ from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_
 
 @dataclass(frozen=True)
 class DecoderConfig:
-    """From packets to revolutions.
+    """Parameters of decoding packets into revolutions.
 
     Attributes:
-        cut_angle_deg: a revolution ends where the sensor passes this azimuth (clockwise from ahead), degrees.
-        min_range: nearer returns are left out as too close, metres.
-        max_range: farther returns are left out, metres.
+        cut_angle_deg: azimuth at which a revolution ends, clockwise from ahead, degrees.
+        min_range: smallest range of a return, metres; nearer ones are dropped as too close.
+        max_range: largest range of a return, metres; farther ones are dropped.
     """
 
     cut_angle_deg: Annotated[float, Range(0, below=360)] = 180.0
@@ -30,15 +30,15 @@ class DecoderConfig:
 
 @dataclass(frozen=True)
 class FlatScanConfig:
-    """From a revolution to one range a direction.
+    """Parameters of the flat scan: one range per direction from a revolution.
 
     Attributes:
-        min_height: points lower than this above the ground (z of base_link) are no obstacles, metres.
-        max_height: points higher than this are passed under, metres.
-        beams: directions over 360 degrees.
-        range_min: what the scan says of its nearest range, metres.
+        min_height: lower points are not obstacles, metres above the ground (z of base_link).
+        max_height: the robot passes under higher points, metres above the ground.
+        beams: number of directions over 360 degrees.
+        range_min: nearest range that the scan declares, metres.
         range_max: farther points are left out of the scan, metres.
-        min_coverage: a revolution that looked into a smaller share of the circle gives no scan, 0-1.
+        min_coverage: smallest measured share of the circle for a scan, 0-1.
     """
 
     min_height: float = 0.10

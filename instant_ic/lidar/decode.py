@@ -1,4 +1,4 @@
-"""From data packets to points, a whole revolution at a time."""
+"""Decoder from data packets to points, one revolution at a time."""
 
 from dataclasses import dataclass
 
@@ -29,7 +29,7 @@ POINT_DTYPE = np.dtype(
         "itemsize": 22,
     }
 )
-"""A point in the layout of ros-drivers/velodyne; ``time`` is seconds after the first firing."""
+"""Point in the layout of ros-drivers/velodyne; ``time`` is in seconds after the first firing."""
 
 _ELEVATION = np.radians(LASER_ELEVATION_DEG)
 _COS_ELEVATION = np.cos(_ELEVATION)
@@ -38,19 +38,19 @@ _AZIMUTH = np.radians(np.arange(36000) / 100.0)
 _COS_AZIMUTH = np.cos(_AZIMUTH)
 _SIN_AZIMUTH = np.sin(_AZIMUTH)
 _RAY_TIME_US = FIRING_PERIOD_US * np.arange(FIRINGS)[:, None] + LASER_PERIOD_US * np.arange(LASERS)
-"""Time of each ray of a block after the block's first, (2, 16)."""
+"""Time of each ray of a block after the first ray of the block, (2, 16)."""
 
 
 @dataclass(frozen=True)
 class DecodedPackets:
-    """Points of consecutive packets, and what is known of the directions that gave none.
+    """Points of consecutive packets, and the firing sequences, including those without a return.
 
     Attributes:
-        points: returns within the range limits by time of firing, `POINT_DTYPE`, (N,).
+        points: returns within the range limits, ordered by firing time, `POINT_DTYPE`, (N,).
         firing_azimuth: azimuth of each firing sequence, rad, clockwise from ahead, (F,).
-        firing_time: its time after the first one, seconds, (F,).
-        firing_too_close: whether one of its lasers had a return nearer than min_range, (F,).
-        duration_s: from the first firing to the end of the last one.
+        firing_time: time of each firing sequence after the first one, seconds, (F,).
+        firing_too_close: whether a laser of the firing sequence had a return nearer than min_range, (F,).
+        duration_s: time from the first firing to the end of the last one.
     """
 
     points: NDArray[np.void]
@@ -70,15 +70,15 @@ def decode_packets(
 ) -> DecodedPackets:
     """Decode consecutive packets of one return mode.
 
-    Axes are those of ROS: x ahead (azimuth 0), y left, z up. The azimuth of each ray is interpolated by the
-    mean turn rate of its packet and rounded to the sensor's own unit, 0.01 degrees. In dual return mode a ray
-    gives its last return and then its strongest (or second strongest) one; a pair of one distance gives one point.
+    Axes follow ROS: x ahead (azimuth 0), y left, z up. The azimuth of each ray is interpolated with the mean turn rate
+    of its packet and rounded to the sensor's unit, 0.01 degrees. In dual return mode a ray yields its last return, then
+    its strongest (or second strongest) one; two returns at the same distance yield one point.
 
     Args:
-        packets: payloads, (P, 1206); all of them with the return mode of the first.
+        packets: payloads, (P, 1206); all have the return mode of the first.
         time_us: time of each packet's first firing, any origin, (P,).
-        first_block: the first packet is read from this block on; even in dual return mode.
-        end_block: the last packet is read up to this block, which is left out; even in dual return mode.
+        first_block: first block to read in the first packet; an even number in dual return mode.
+        end_block: first block not to read in the last packet; an even number in dual return mode.
         min_range: nearer returns are left out, metres.
         max_range: farther returns are left out, metres.
     """
@@ -122,7 +122,7 @@ def _decode(  # type: ignore[no-untyped-def]
     firing_time,
     firing_too_close,
 ):
-    """Kernel of `decode_packets`; returns the number of points, of firings, and the end's time in us."""
+    """Kernel of `decode_packets`; returns the number of points, the number of firings, and the end time in us."""
     n_points = 0
     n_firings = 0
     n_packets = packets.shape[0]
@@ -133,7 +133,7 @@ def _decode(  # type: ignore[no-untyped-def]
         first_azimuth = packet[2] | np.int32(packet[3]) << 8
         last_azimuth = packet[1102] | np.int32(packet[1103]) << 8
         turned = (last_azimuth - first_azimuth) % 36000
-        # Single precision and the order of additions are those of the C++ drivers: ties round alike.
+        # Single precision and order of additions as in the C++ drivers, so that ties round the same way.
         per_us = np.float32(turned) / np.float32(BLOCKS // pair - 1) / np.float32(BLOCK_PERIOD_US)
         start = first_block if p == 0 else 0
         stop = end_block if p == n_packets - 1 else BLOCKS

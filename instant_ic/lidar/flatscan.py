@@ -1,4 +1,4 @@
-"""One range a direction, from the points within a band of heights, all brought to one instant."""
+"""Flat scan: one range per direction from the points in a height interval, motion-compensated to one instant."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from instant_ic.lidar.packets import BLOCKS, FIRINGS, LASERS, encode_data_packet
 from instant_ic.lidar.stream import PacketStream, Revolution
 
 _MOTION_SAMPLES = 65
-"""Nodes of the motion over a revolution; within 1.6 ms the motion is straight enough (1 um at 1 rad/s)."""
+"""Samples of the motion over a revolution; within 1.6 ms it is straight enough (1 um at 1 rad/s)."""
 
 
 @dataclass(frozen=True)
@@ -20,12 +20,12 @@ class FlatScan:
     """A planar scan in the sensor's frame.
 
     Attributes:
-        ranges: metres by REP-117: +inf nothing met, -inf too close, nan not measured; (beams,). Beam i looks
+        ranges: metres as in REP-117: +inf no return, -inf too close, nan not measured; (beams,). Beam i points
             to angle_min + i * angle_increment, counter-clockwise from ahead.
         angle_min: direction of the first beam, rad; the centre of its sector.
-        angle_increment: rad.
-        stamp_ns: the instant that all ranges are brought to: the revolution's end.
-        compensated: the base's motion during the revolution was taken out.
+        angle_increment: angle between beams, rad.
+        stamp_ns: instant of all ranges: the end of the revolution.
+        compensated: whether the base's motion during the revolution was compensated.
     """
 
     ranges: NDArray[np.float32]
@@ -43,17 +43,17 @@ def flat_scan(
 ) -> FlatScan:
     """Project a revolution to a planar scan.
 
-    Each point is moved by what the base moved from the point's firing to the revolution's end. The smallest
-    range of each beam counts.
+    Each point is moved by the base's motion from its firing to the end of the revolution. Each beam takes its smallest
+    range.
 
     Args:
         revolution: decoded points.
-        base_from_lidar: mount of the sensor, base_link's origin on the ground, (4, 4).
-        config: band of heights and beams.
-        motion: the base's poses around the revolution; without them the base is taken to stand.
+        base_from_lidar: mount of the sensor; the origin of base_link is on the ground, (4, 4).
+        config: height interval and beams.
+        motion: poses of the base around the revolution; without them the base is assumed to stand still.
 
     Raises:
-        MotionError: the poses do not reach to the revolution.
+        MotionError: the poses do not cover the revolution.
     """
     duration_s = max(1e-6, (revolution.end_ns - revolution.stamp_ns) * 1e-9)
     shifts = np.zeros((_MOTION_SAMPLES, 3))
@@ -86,19 +86,19 @@ def flat_scan(
 
 
 def coverage(revolution: Revolution) -> float:
-    """Share of the circle that a revolution looked into, by whole degrees, 0-1.
+    """Share of the circle that a revolution measured, counted in whole degrees, 0-1.
 
-    Less than all where it was cut short: after a start, at a jump of the sensor's clock, with packets missing.
+    Below 1 for a partial revolution: after the start, at a jump of the sensor's clock, or with missing packets.
     """
     degrees = np.floor(np.degrees(revolution.firing_azimuth)).astype(np.int64) % 360
     return float(len(np.unique(degrees))) / 360.0
 
 
 def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion: PlanarMotion) -> NDArray[np.float32]:
-    """Positions of all points as the sensor would see them from where it is at the revolution's end, (N, 3).
+    """Positions of all points in the sensor's frame at the end of the revolution, (N, 3).
 
     Raises:
-        MotionError: the poses do not reach to the revolution.
+        MotionError: the poses do not cover the revolution.
     """
     rotation, translation = base_from_lidar[:3, :3], base_from_lidar[:3, 3]
     stamps_ns = revolution.stamp_ns + (revolution.points["time"].astype(np.float64) * 1e9).astype(np.int64)
@@ -113,7 +113,7 @@ def deskew(revolution: Revolution, base_from_lidar: NDArray[np.float64], motion:
 
 
 def warm_up() -> None:
-    """Compile decoder and projection now (seconds, the first time on a machine), not when packets wait."""
+    """Compile decoder and projection now (takes seconds the first time on a machine), before packets arrive."""
     stream = PacketStream()
     nothing = np.zeros((BLOCKS, FIRINGS, LASERS), np.int64)
     stream.feed(encode_data_packet(np.zeros(BLOCKS, np.int64), nothing + 1000, nothing, 0), 0)
@@ -138,19 +138,19 @@ def _project(  # type: ignore[no-untyped-def]
     range_max,
     ranges,
 ):
-    """Kernel of `flat_scan`; ``shifts`` are the base's poses over the revolution, seen from its end."""
+    """Kernel of `flat_scan`; ``shifts`` are the base's poses over the revolution relative to its end."""
     beams = ranges.shape[0]
     per_beam = 2.0 * np.pi / beams
     last = shifts.shape[0] - 1
     per_sample = last / duration_s
     ranges[:] = np.nan
 
-    # Directions that were looked into, and those with something closer than the sensor can measure.
+    # Measured directions, and those with a return closer than the minimum range.
     for i in range(firing_azimuth.shape[0]):
         at = min(max(firing_time[i] * per_sample, 0.0), float(last))
         k = min(int(at), last - 1)
         yaw = shifts[k, 2] + (at - k) * (shifts[k + 1, 2] - shifts[k, 2])
-        # The mount turns the sensor against the base; a turn of the base about z turns the sensor alike.
+        # The mount's rotation drops out: a yaw of the base turns the sensor by the same angle.
         direction = yaw - firing_azimuth[i]
         beam = int(np.floor((direction + np.pi) / per_beam + 0.5)) % beams
         if firing_too_close[i]:
@@ -185,5 +185,5 @@ def _project(  # type: ignore[no-untyped-def]
         if distance < range_min:
             ranges[beam] = -np.inf
         elif not distance >= found:
-            # Also where the beam was not known to be looked into (nan compares false).
+            # This also fills beams that no firing marked as measured (nan compares false).
             ranges[beam] = distance

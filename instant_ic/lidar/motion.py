@@ -1,4 +1,4 @@
-"""The base's motion during a revolution."""
+"""Motion of the base during a revolution."""
 
 from dataclasses import dataclass
 
@@ -7,17 +7,17 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class MotionError(ValueError):
-    """Poses that tell nothing of the time asked for; the text says which is missing."""
+    """The poses do not cover the requested time; the text says which part is missing."""
 
 
 @dataclass(frozen=True)
 class PlanarMotion:
-    """Poses of the base over time; between them it moves evenly, after them as over the last ones.
+    """Poses of the base over time, interpolated linearly and extrapolated with the velocity of the last poses.
 
     Attributes:
-        stamps_ns: rising, (M,), M >= 1.
+        stamps_ns: stamps in rising order, (M,), M >= 1.
         odom_from_base: (x, y, yaw), metres and radians, (M, 3).
-        max_extrapolation_s: how far beyond the first and the last pose `at` goes.
+        max_extrapolation_s: largest extrapolation of `at` beyond the first and the last pose.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -32,10 +32,10 @@ class PlanarMotion:
             raise MotionError("stamps must rise, and there must be one at least")
 
     def at(self, stamps_ns: ArrayLike) -> NDArray[np.float64]:
-        """Poses at times, (..., 3); yaw is not wrapped.
+        """Poses at the given times, (..., 3); yaw is not wrapped.
 
         Raises:
-            MotionError: a time is too far outside the poses.
+            MotionError: a time is too far before the first or after the last pose.
         """
         wanted = np.asarray(stamps_ns, np.int64)
         first, last = int(self.stamps_ns[0]), int(self.stamps_ns[-1])
@@ -48,7 +48,7 @@ class PlanarMotion:
             return np.broadcast_to(self.odom_from_base[0], (*wanted.shape, 3)).copy()
         poses = self.odom_from_base.copy()
         poses[:, 2] = np.unwrap(poses[:, 2])
-        # Relative to the first stamp: nanoseconds since the epoch do not fit a float64.
+        # Relative to the first stamp, because a float64 cannot hold nanoseconds since the epoch exactly.
         times = (self.stamps_ns - first) * 1e-9
         queries = (wanted - first) * 1e-9
         at = np.clip(np.searchsorted(times, queries, side="right") - 1, 0, len(times) - 2)
@@ -56,7 +56,7 @@ class PlanarMotion:
         return np.asarray(poses[at] + alpha[..., None] * (poses[at + 1] - poses[at]))
 
     def end_from_time(self, end_ns: int, stamps_ns: ArrayLike) -> NDArray[np.float64]:
-        """Poses of the base at times, seen from the base at ``end_ns``: (x, y, yaw), (..., 3)."""
+        """Poses of the base at the given times relative to the base at ``end_ns``: (x, y, yaw), (..., 3)."""
         end = self.at(end_ns)
         relative = self.at(stamps_ns) - end
         c, s = np.cos(end[2]), np.sin(end[2])

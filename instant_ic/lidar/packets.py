@@ -1,4 +1,4 @@
-"""VLP-16 wire format: data packets (1206 bytes) and position packets (512 bytes), both ways.
+"""VLP-16 wire format: encodes and decodes data packets (1206 bytes) and position packets (512 bytes).
 
 Source: Velodyne VLP-16 User Manual (63-9243), chapters 9 and 12.
 """
@@ -20,7 +20,7 @@ LASER_PERIOD_US = 2.304
 FIRING_PERIOD_US = 55.296
 BLOCK_PERIOD_US = 110.592
 PACKET_PERIOD_US = BLOCKS * BLOCK_PERIOD_US
-"""From one single-return packet to the next; half of it in dual return mode."""
+"""Time from one packet to the next in single return mode; half of it in dual return mode."""
 HOUR_US = 3_600_000_000
 
 RETURN_STRONGEST = 0x37
@@ -32,17 +32,17 @@ PRODUCT_PUCK_HI_RES = 0x24
 LASER_ELEVATION_DEG: NDArray[np.float64] = np.array(
     [-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0]
 )
-"""Elevation of each laser by its id, degrees, (16,)."""
+"""Elevation of each laser, indexed by laser id, degrees, (16,)."""
 LASER_VERTICAL_OFFSET_M: NDArray[np.float64] = 0.04191 * np.tan(np.radians(-LASER_ELEVATION_DEG))
-"""What is added to z of each laser's points by its id, metres, (16,).
+"""Offset added to z of each laser's points, indexed by laser id, metres, (16,).
 
-The lasers meet 41.91 mm in front of the axis; the manual's table is this, rounded to 0.1 mm.
+The lasers meet 41.91 mm in front of the axis; the manual's table has these values rounded to 0.1 mm.
 """
 LASER_RING: NDArray[np.uint16] = np.argsort(np.argsort(LASER_ELEVATION_DEG)).astype(np.uint16)
-"""Rank of each laser by elevation, 0 is the lowest, (16,)."""
+"""Rank of each laser by elevation, 0 for the lowest, (16,)."""
 
 BLOCK_FLAG = 0xEEFF
-"""The two bytes FF EE read as a little-endian number."""
+"""Bytes FF EE as a little-endian number."""
 
 RETURN_DTYPE = np.dtype([("distance", "<u2"), ("reflectivity", "u1")])
 BLOCK_DTYPE = np.dtype([("flag", "<u2"), ("azimuth", "<u2"), ("returns", RETURN_DTYPE, (FIRINGS, LASERS))])
@@ -52,7 +52,7 @@ PACKET_DTYPE = np.dtype(
 
 
 class PacketError(ValueError):
-    """A payload that is not the packet it should be; the text says why."""
+    """The payload is not the expected packet; the text says why."""
 
 
 def encode_data_packet(
@@ -65,14 +65,14 @@ def encode_data_packet(
 ) -> bytes:
     """Bytes of one data packet.
 
-    In dual return mode (0x39) blocks come in pairs of one azimuth: even ones the last return, odd ones the
-    strongest, or the second strongest where the strongest is also the last (manual, page 57).
+    In dual return mode (0x39) blocks come in pairs of equal azimuth: even blocks hold the last return, odd blocks the
+    strongest, or the second strongest if the strongest is also the last (manual, page 57).
 
     Args:
         azimuth_cdeg: azimuth of each block's first laser, 0.01 degrees, clockwise, (12,).
-        distance_mm2: distances in units of 2 mm by block, firing and laser id; 0 is no return; (12, 2, 16).
+        distance_mm2: distance per block, firing and laser id, in units of 2 mm; 0 is no return; (12, 2, 16).
         reflectivity: 0-255, (12, 2, 16).
-        timestamp_us: microseconds past the hour of the first firing.
+        timestamp_us: time of the first firing, microseconds past the hour.
         return_mode: 0x37 strongest, 0x38 last, 0x39 dual.
         product: 0x22 VLP-16, 0x24 Puck Hi-Res.
 
@@ -80,7 +80,7 @@ def encode_data_packet(
         1206 bytes, the UDP payload.
 
     Raises:
-        PacketError: a value that the format cannot hold, or arrays of another shape.
+        PacketError: a value does not fit the format, or an array has the wrong shape.
     """
     azimuth = np.asarray(azimuth_cdeg)
     distance = np.asarray(distance_mm2)
@@ -109,12 +109,12 @@ def encode_data_packet(
 
 @dataclass(frozen=True)
 class PositionPacket:
-    """What a position packet tells of the sensor's clock.
+    """State of the sensor's clock from a position packet.
 
     Attributes:
         timestamp_us: microseconds past the hour.
         pps: 0 absent, 1 synchronising, 2 locked, 3 error.
-        nmea: the sentence that the GPS receiver sent last, without CR LF; empty when there is no receiver.
+        nmea: last sentence of the GPS receiver, without CR LF; empty without a receiver.
     """
 
     timestamp_us: int
@@ -123,7 +123,7 @@ class PositionPacket:
 
     @property
     def utc_seconds_of_day(self) -> float | None:
-        """Time of day of the ``$GPRMC`` sentence in seconds; None without a valid fix (status A)."""
+        """Time of day in the ``$GPRMC`` sentence, seconds; None without a valid fix (status A)."""
         fields = self.nmea.split(",")
         if len(fields) < 3 or fields[0] != "$GPRMC" or fields[2] != "A":
             return None
@@ -142,10 +142,10 @@ _POSITION_NMEA = 0xCE
 
 
 def encode_position_packet(timestamp_us: int, pps: int = 0, nmea: str = "") -> bytes:
-    """Bytes of one position packet (512), see `PositionPacket` for the fields.
+    """Bytes of one position packet (512); see `PositionPacket` for the fields.
 
     Raises:
-        PacketError: a value that the format cannot hold.
+        PacketError: a value does not fit the format.
     """
     if not 0 <= timestamp_us < HOUR_US:
         raise PacketError(f"timestamp_us must be in 0..{HOUR_US - 1}, microseconds past the hour (got {timestamp_us})")
@@ -162,7 +162,7 @@ def encode_position_packet(timestamp_us: int, pps: int = 0, nmea: str = "") -> b
 
 
 def decode_position_packet(payload: bytes) -> PositionPacket:
-    """Read one position packet.
+    """Decode one position packet.
 
     Raises:
         PacketError: not 512 bytes, or a time past the hour.
@@ -177,7 +177,7 @@ def decode_position_packet(payload: bytes) -> PositionPacket:
 
 
 def check_data_packet(payload: bytes | memoryview) -> str | None:
-    """Why the payload is not a VLP-16 data packet, or None when it is one."""
+    """Return why the payload is not a VLP-16 data packet, or None if it is one."""
     if len(payload) != DATA_PACKET_BYTES:
         return f"{len(payload)} bytes instead of {DATA_PACKET_BYTES}"
     if bytes(payload[:2]) != b"\xff\xee":

@@ -1,4 +1,4 @@
-"""Receives the sensor's UDP packets."""
+"""Receiver of the sensor's UDP packets."""
 
 import ipaddress
 import selectors
@@ -15,25 +15,25 @@ from instant_ic.lidar.sources import SourceGuard
 from instant_ic.pace import current
 
 _SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Linux's number; Python 3.11 does not name it."""
+"""Constant of Linux, which Python 3.11 does not define."""
 _TIMESPEC = struct.Struct("@ll")
 _MOST_AT_ONCE = 512
-"""Datagrams that one read takes from a port: a flood on it must not keep the other port and the shutdown waiting."""
+"""Datagrams per read from one port, so that a flood on it delays neither the other port nor the shutdown."""
 
 
 class ReceiverError(OSError):
-    """A port that cannot be bound; the text says which and why."""
+    """A port cannot be bound; the text says which one and why."""
 
 
 @dataclass(frozen=True)
 class ReceiverConfig:
-    """Where packets are received.
+    """Addresses and ports of the receiver.
 
     Attributes:
-        host: local address; 0.0.0.0 also takes the broadcasts of a sensor in its factory state.
-        port: of data packets; 0 lets the system choose (then see `PacketReceiver.port`).
-        position_port: of position packets; -1 does without.
-        sensor: the sensor's IPv4 address; empty locks onto the first sender.
+        host: local address; 0.0.0.0 also receives the broadcasts of a sensor with factory settings.
+        port: UDP port of data packets; 0 lets the system choose (see `PacketReceiver.port`).
+        position_port: UDP port of position packets; -1 disables it.
+        sensor: IPv4 address of the sensor; empty locks onto the first sender.
     """
 
     host: str = "0.0.0.0"
@@ -58,21 +58,21 @@ class Received(NamedTuple):
     """A datagram from the sensor."""
 
     stamp_ns: int
-    """When the kernel took it in, since the epoch."""
+    """Time of arrival in the kernel, since the epoch."""
     payload: bytes
     is_data: bool
-    """From the data port; else from the position port."""
+    """True from the data port, False from the position port."""
 
 
 class PacketReceiver:
-    """Both of the sensor's ports.
+    """Receives on both ports of the sensor.
 
     Example:
         >>> with PacketReceiver(ReceiverConfig()) as receiver:      # doctest: +SKIP
         ...     for received in receiver.read(timeout_s=0.1): ...
 
     Attributes:
-        sources: whose packets are taken.
+        sources: decides which senders' packets are accepted.
     """
 
     def __init__(
@@ -90,19 +90,19 @@ class PacketReceiver:
 
     @property
     def port(self) -> int:
-        """The data port that was bound."""
+        """Bound data port."""
         return int(self._data.getsockname()[1]) if self._data else self.config.port
 
     @property
     def position_port(self) -> int:
-        """The position port that was bound."""
+        """Bound position port."""
         return int(self._position.getsockname()[1]) if self._position else self.config.position_port
 
     def connect(self) -> None:
         """Bind the ports.
 
         Raises:
-            ReceiverError: one is taken or not allowed.
+            ReceiverError: a port is in use or not permitted.
         """
         self.close()
         self._selector = selectors.DefaultSelector()
@@ -135,7 +135,7 @@ class PacketReceiver:
         self.close()
 
     def read(self, timeout_s: float) -> Iterator[Received]:
-        """What has come from the sensor, waiting at most ``timeout_s`` for the first datagram; nothing on a time-out.
+        """Yield the sensor's datagrams; wait at most ``timeout_s`` for the first one and yield nothing on a time-out.
 
         Raises:
             ReceiverError: not connected.
@@ -159,7 +159,7 @@ class PacketReceiver:
         bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             bound.setblocking(False)
-            # Room for half a second of packets: the decoder's thread may have to wait for its turn.
+            # Room for half a second of packets, because the decoder's thread may be delayed.
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
             bound.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
             bound.bind((self.config.host, port))

@@ -1,4 +1,4 @@
-"""Revolutions out of a capture file."""
+"""Revolutions from a capture file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +10,15 @@ from instant_ic.lidar.stream import PacketStream, Revolution
 
 
 class Recording:
-    """All revolutions of a capture, first and last, which are not whole, included.
+    """All revolutions of a capture, including the partial first and last ones.
 
     Example:
         >>> for revolution in Recording("recording.pcap"):   # doctest: +SKIP
         ...     print(revolution.stamp_ns, len(revolution.points))
 
     Attributes:
-        capture: the file, with its counters.
-        stream: the decoder of the iteration in progress (or the last one), with its counters.
+        capture: reader of the file, with its counters.
+        stream: decoder of the current or last iteration, with its counters.
     """
 
     def __init__(self, path: str | Path, config: DecoderConfig | None = None, port: int | None = None) -> None:
@@ -27,10 +27,10 @@ class Recording:
         Args:
             path: pcap or pcapng.
             config: decoding.
-            port: only datagrams to this port; all of 1206 bytes without it.
+            port: read only datagrams to this port; without it, all datagrams of 1206 bytes.
 
         Raises:
-            CaptureError: it is no capture.
+            CaptureError: the file is not a capture.
         """
         self.capture = CaptureReader(path)
         self.config = config or DecoderConfig()

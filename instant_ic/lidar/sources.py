@@ -1,37 +1,37 @@
-"""Decides whose packets are believed: one sensor, in its own order; anything beside it puts the scan in doubt.
+"""Accepts packets of one sensor only, and reports when another sender may interfere.
 
-UDP has no sender that can be trusted. A second sender whose clock runs ahead would make every packet of the
-sensor late, and its walls would replace the real ones. So one address and port is taken, a second one is
-reported, and so are packets out of order, which a sender that forges the sensor's address cannot avoid.
+UDP does not authenticate the sender. If a second sender's clock runs ahead, every packet of the sensor counts as late,
+and the second sender's walls replace the real ones. The guard therefore accepts one address and port and reports a
+second sender. It also reports packets out of order, which a sender with a forged address cannot avoid.
 """
 
 _LATE_SHARE = 0.03
-"""Share of late packets that is tolerated for any time. A cable to the sensor reorders none."""
+"""Tolerated share of late packets over any time. A cable to the sensor reorders none."""
 _LATE_BURST = 3.0
-"""Late packets tolerated at once, above the share: 4 are 19 degrees of a turn at 600 rpm."""
+"""Late packets tolerated at once, above the share; 4 packets are 19 degrees of a revolution at 600 rpm."""
 
 
 class SourceGuard:
-    """One sensor's sender and order of packets.
+    """Checks the sender and the packet order of one sensor.
 
     Attributes:
-        foreign: datagrams refused because the sensor did not send them.
+        foreign: datagrams rejected because another sender sent them.
     """
 
     QUIET_S = 3.0
-    """The doubt lasts until nothing was wrong for this long."""
+    """Time without a fault after which the points are trusted again."""
 
     def __init__(self, sensor: str = "") -> None:
         """Start without a sender.
 
         Args:
-            sensor: the sensor's address; empty locks onto the first sender's until the process ends.
+            sensor: address of the sensor; empty locks onto the first sender until the process ends.
         """
         self.foreign = 0
         self._configured = bool(sensor)
         self._address = sensor
         self._ports: dict[bool, tuple[int, int]] = {}
-        """Source port of data (True) and position packets, and when it was last heard."""
+        """Source port of data (True) and position packets, and the time of the last packet from it."""
         self._rival = ""
         self._rival_ns: int | None = None
         self._late_level = 0.0
@@ -40,18 +40,18 @@ class SourceGuard:
     def admit(self, sender: tuple[str, int], is_data: bool, well_formed: bool, now_ns: int) -> bool:
         """Whether a datagram is from the sensor.
 
-        Another port of the same address is a sensor that was restarted, once the old port has been silent.
+        Another port of the same address is accepted as a restarted sensor once the old port has been silent.
 
         Args:
             sender: address and port.
-            is_data: from the data port; else from the position port.
-            well_formed: whether the payload could be the sensor's; else it neither locks nor casts doubt.
+            is_data: True from the data port, False from the position port.
+            well_formed: whether the payload can be the sensor's; otherwise it neither locks nor counts as a fault.
             now_ns: steady time.
         """
         address, port = sender
         if not self._address:
             if not well_formed:
-                return True  # another product, perhaps: the stream says what it is
+                return True  # may be another product: the stream reports which one
             self._address = address
         if address != self._address:
             self.foreign += 1
@@ -69,14 +69,14 @@ class SourceGuard:
         return True
 
     def count(self, taken: int, out_of_order: int, now_ns: int) -> None:
-        """Take note of packets that the stream took, and of those that it found late or of another clock."""
+        """Count packets that the stream accepted, and those that were late or from another clock."""
         self._late_level = max(0.0, self._late_level + out_of_order - _LATE_SHARE * (taken + out_of_order))
         if self._late_level > _LATE_BURST:
             self._late_level = _LATE_BURST
             self._late_ns = now_ns
 
     def doubt(self, now_ns: int) -> str | None:
-        """Why the points cannot be trusted at a steady time, and what to do; None while they can."""
+        """Return why the points cannot be trusted at a steady time, and what to do; None if they can."""
         if self._recent(self._rival_ns, now_ns):
             return (
                 f"Packets come from {self._rival} beside {self._address}. No scan until it has been silent for "

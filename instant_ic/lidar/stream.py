@@ -1,4 +1,4 @@
-"""Cuts the stream of data packets into revolutions, and counts what is missing."""
+"""Splits the stream of data packets into revolutions and counts missing packets."""
 
 import struct
 from dataclasses import dataclass, field
@@ -21,37 +21,37 @@ from instant_ic.lidar.packets import (
 
 _TAIL = struct.Struct("<H96xIBB")
 _TAIL_AT = 1102
-"""From the last block's azimuth to the end: azimuth, 96 bytes of returns, time, return mode, product."""
+"""Offset of the last block's azimuth; then follow 96 bytes of returns, time, return mode and product."""
 
 _OTHER_PRODUCTS = (0x21, 0x24, 0x28)
-"""HDL-32E, Puck Hi-Res, VLP-32C: same packets, other elevations. Old firmware tells no product."""
+"""HDL-32E, Puck Hi-Res, VLP-32C: same packets, other elevations. Old firmware sends no product."""
 
 _MAX_GAP_US = 20_000
-"""A longer silence ends the revolution: at 1200 rpm the head may pass the cut unseen in half a turn, 25 ms."""
+"""A longer gap ends the revolution: at 1200 rpm half a turn takes 25 ms, and the head may pass the cut in the gap."""
 _LATE_US = -100_000
-"""A packet this much older than the newest is a late one; older still, and the sensor's clock was reset."""
+"""Age limit of a late packet, relative to the newest; an even older one means that the sensor's clock was reset."""
 _LEAST_STEP = 0.75
-"""Share of the period by which a packet must follow the newest: one sensor cannot fire two packets at once."""
+"""Smallest interval to the newest packet, in periods; one sensor cannot fire two packets at once."""
 _CLOCK_SET_US = 500_000
-"""The sensor's time ran ahead of the host's by this much over a silence: it was set, no packets are missing."""
+"""If the sensor's time gains this much on the host's over a gap, its clock was set and no packets are missing."""
 _MAX_PACKETS = 400
-"""Above one revolution at 300 rpm in dual mode (302): without a cut until then the head does not turn."""
+"""More than one revolution at 300 rpm in dual mode (302); without a cut until then, the head does not turn."""
 
 
 @dataclass(frozen=True)
 class Revolution:
-    """One turn of the sensor.
+    """One revolution of the sensor.
 
     Attributes:
         points: `instant_ic.lidar.decode.POINT_DTYPE`, (N,); ``time`` counts seconds from ``stamp_ns``.
         stamp_ns: host time of the first firing.
         end_ns: host time of the end of the last firing.
         firing_azimuth: azimuth of each firing sequence, rad, clockwise from ahead, (F,).
-        firing_time: its time after ``stamp_ns``, seconds, (F,).
-        firing_too_close: whether it had a return nearer than the decoder's min_range, (F,).
-        complete: it was cut at the cut angle on both ends and no packet is missing.
-        missing_packets: packets that never came, by the sensor's own clock.
-        dual: dual return mode.
+        firing_time: time of each firing sequence after ``stamp_ns``, seconds, (F,).
+        firing_too_close: whether the firing sequence had a return nearer than the decoder's min_range, (F,).
+        complete: whether both ends are at the cut angle and no packet is missing.
+        missing_packets: packets that never arrived, found in the sensor's clock.
+        dual: whether the sensor was in dual return mode.
     """
 
     points: NDArray[np.void]
@@ -72,15 +72,15 @@ class Revolution:
 
 @dataclass
 class StreamCounters:
-    """What came, and what was wrong with it, since the start.
+    """Packet statistics since the start.
 
     Attributes:
-        packets: data packets taken.
-        missing: packets that never came.
-        late: packets dropped because newer ones, or one of the same time, had come before.
-        bad: payloads dropped because they are no data packets; by reason in ``bad_reasons``.
-        clock_resets: jumps of the sensor's clock (it was switched on anew, or a capture starts again).
-        revolutions: revolutions given out.
+        packets: accepted data packets.
+        missing: packets that never arrived.
+        late: packets dropped because a newer one, or one of the same time, had already arrived.
+        bad: payloads dropped because they are not data packets; by reason in ``bad_reasons``.
+        clock_resets: jumps of the sensor's clock (the sensor or a capture was restarted).
+        revolutions: returned revolutions.
     """
 
     packets: int = 0
@@ -93,7 +93,7 @@ class StreamCounters:
 
 
 class PacketStream:
-    """Takes data packets one by one and gives each revolution as soon as it is whole."""
+    """Takes data packets one by one and returns each revolution as soon as it ends."""
 
     def __init__(self, config: DecoderConfig | None = None) -> None:
         self.config = config or DecoderConfig()
@@ -113,11 +113,11 @@ class PacketStream:
         """Take one payload.
 
         Args:
-            payload: 1206 bytes; anything else is counted and dropped.
-            received_ns: host time of its arrival.
+            payload: 1206 bytes; other payloads are counted and dropped.
+            received_ns: host time of arrival.
 
         Returns:
-            The revolution that this packet ends, if it ends one.
+            The revolution that this packet ends, if any.
         """
         reason = check_data_packet(payload)
         azimuth = timestamp_us = mode = 0
@@ -153,12 +153,12 @@ class PacketStream:
                 if step_us > _MAX_GAP_US:
                     done = self._end_early()
         if dual != self._dual or len(self._payloads) >= _MAX_PACKETS:
-            # One revolution has one return mode; and it ends, even when the head stands still.
+            # A revolution has one return mode, and it also ends if the head does not turn.
             done = self._end_early() or done
             self._dual = dual
 
         self.counters.packets += 1
-        # A packet arrives after its last firing, but its time is that of its first.
+        # A packet arrives after its last firing, but carries the time of its first firing.
         device_us = self.clock.take(timestamp_us, received_ns - round(period_us * 1000.0))
         self._payloads.append(payload)
         self._times_us.append(device_us)
@@ -169,16 +169,16 @@ class PacketStream:
         return done
 
     def restart(self) -> None:
-        """Forget the revolution so far and the sensor's clock: what came before is not to be trusted."""
+        """Drop the current revolution and the sensor's clock, because earlier packets cannot be trusted."""
         self._end_early()
         self.clock.restart()
 
     def finish(self) -> Revolution | None:
-        """Give what there is of the last revolution, as at the end of a capture."""
+        """Return the rest as the last revolution, for example at the end of a capture."""
         return self._end_early()
 
     def _end_at_cut(self, turned: int) -> Revolution | None:
-        """End the revolution inside the newest packet, where the azimuth passes the cut."""
+        """End the revolution inside the newest packet, where the azimuth passes the cut angle."""
         packet = self._payloads[-1]
         block = 0
         while block < BLOCKS:
@@ -202,7 +202,7 @@ class PacketStream:
         return revolution
 
     def _end_early(self) -> Revolution | None:
-        """End the revolution where it stands; the next one starts with the next packet."""
+        """End the revolution here; the next one starts with the next packet."""
         revolution = self._decode(self._payloads, BLOCKS, cut_after=False)
         self._payloads = []
         self._times_us = []

@@ -1,1 +1,1 @@
-"""Simulated worlds, rendering, robot dynamics, and devices that speak the real wire protocols."""
+"""Simulated worlds, rendering, robot dynamics, and devices with the real wire protocols."""

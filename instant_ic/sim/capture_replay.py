@@ -1,4 +1,4 @@
-"""A recording's UDP payloads, sent again at their own pace."""
+"""Replays the UDP payloads of a recording at their recorded pace."""
 
 import contextlib
 import socket
@@ -9,21 +9,21 @@ from instant_ic.lidar.packets import DATA_PACKET_BYTES, POSITION_PACKET_BYTES
 
 
 class CaptureReplay:
-    """Sends the data and position packets of a VLP-16 capture, payloads untouched, in the recorded rhythm.
+    """Sends the data and position packets of a VLP-16 capture with unchanged payloads and recorded timing.
 
     Args:
         path: pcap or pcapng.
-        host: where to send.
-        data_port, position_port: UDP ports there; the recorded ones do not matter.
-        loop: start again after the end; the pause between is one packet's.
+        host: destination address.
+        data_port, position_port: destination UDP ports; the recorded ports are ignored.
+        loop: whether to restart after the end, with a pause of one packet.
 
     Attributes:
         sent: datagrams sent.
         duration_s: length of the recording.
 
     Raises:
-        CaptureError: it is no capture.
-        ValueError: it holds no VLP-16 packets.
+        CaptureError: the file is not a capture.
+        ValueError: the file has no VLP-16 packets.
     """
 
     def __init__(self, path: str | Path, host: str, data_port: int, position_port: int, loop: bool = True) -> None:
@@ -32,7 +32,7 @@ class CaptureReplay:
         if not datagrams:
             raise ValueError(f"pcap {path} holds no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
         first = min(d.stamp_ns for d in datagrams)
-        # By time alone: packets of one stamp keep their order, or the driver would find them late.
+        # Sorted by time only: packets with equal stamps keep their order, or the driver would count them as late.
         self._items = sorted(
             (((d.stamp_ns - first) * 1e-9, (host, ports[len(d.payload)]), d.payload) for d in datagrams),
             key=lambda item: item[0],
@@ -49,14 +49,14 @@ class CaptureReplay:
 
     @property
     def finished(self) -> bool:
-        """Whether everything was sent (never with ``loop``)."""
+        """Whether all packets were sent; always false with ``loop``."""
         return self._next >= len(self._items)
 
     def pump(self, time_s: float) -> None:
-        """Sends what is due at ``time_s`` (seconds since the start)."""
+        """Send the packets that are due at ``time_s`` (seconds since the start)."""
         while not self.finished and self._items[self._next][0] + self._began_s <= time_s:
             _, address, payload = self._items[self._next]
-            # An earlier datagram that nobody read is told of here; a sensor would not know.
+            # The kernel reports the refusal of an earlier datagram here; a real sensor ignores it.
             with contextlib.suppress(ConnectionRefusedError):
                 self._socket.sendto(payload, address)
             self.sent += 1
@@ -66,5 +66,5 @@ class CaptureReplay:
                 self._began_s = max(self._began_s + self._period_s, time_s - self._period_s)
 
     def close(self) -> None:
-        """Closes the socket."""
+        """Close the socket."""
         self._socket.close()

@@ -1,4 +1,4 @@
-"""Where a mesh fills the floor plan, and whether a footprint touches it."""
+"""Occupancy of the floor plan by a mesh, for contact tests."""
 
 from dataclasses import dataclass
 
@@ -11,12 +11,12 @@ FloatArray = npt.NDArray[np.floating]
 
 @dataclass(frozen=True)
 class OccupancyMask:
-    """Floor plan of what stands in a band of heights.
+    """Floor plan of the objects in a height interval.
 
     Attributes:
         cells: (H, W) bool, row 0 = lowest y.
         origin: (2,) x and y of the lower corner of cell (0, 0), metres.
-        cell_m: edge of a cell.
+        cell_m: edge length of a cell, metres.
     """
 
     cells: npt.NDArray[np.bool_]
@@ -24,15 +24,15 @@ class OccupancyMask:
     cell_m: float
 
     def centre(self, rows_columns: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
-        """(N, 2) x and y of the centres of cells (N, 2) row, column."""
+        """Centres (N, 2), x and y, of cells (N, 2), row and column."""
         return np.asarray((rows_columns[:, ::-1] + 0.5) * self.cell_m + self.origin, np.float64)
 
     def index(self, xy: FloatArray) -> npt.NDArray[np.int64]:
-        """(N, 2) row, column of points (N, 2); may lie outside."""
+        """Cells (N, 2), row and column, of points (N, 2); may lie outside the mask."""
         return np.floor((np.asarray(xy) - self.origin) / self.cell_m).astype(np.int64)[:, ::-1]
 
     def at(self, xy: FloatArray) -> npt.NDArray[np.bool_]:
-        """Whether points (N, 2) lie in occupied cells; outside the mask nothing is occupied."""
+        """Whether points (N, 2) lie in occupied cells; everything outside the mask is free."""
         index = self.index(xy)
         inside = ((index >= 0) & (index < self.cells.shape)).all(axis=1)
         result = np.zeros(len(index), bool)
@@ -40,14 +40,14 @@ class OccupancyMask:
         return result
 
     def distance_m(self) -> npt.NDArray[np.float32]:
-        """(H, W) distance from each cell to the nearest occupied one."""
+        """Distance (H, W) from each cell to the nearest occupied cell, metres."""
         import cv2
 
         free = np.ascontiguousarray((~self.cells).astype(np.uint8))
         return np.asarray(cv2.distanceTransform(free, cv2.DIST_L2, 5) * self.cell_m, np.float32)
 
     def reachable(self, start_xy: tuple[float, float], clearance_m: float) -> npt.NDArray[np.int64]:
-        """(N, 2) row, column of cells with that clearance, connected with the one nearest to ``start_xy``."""
+        """Cells (N, 2), row and column, with this clearance that connect to the one nearest to ``start_xy``."""
         import cv2
 
         free = self.distance_m() >= clearance_m
@@ -85,10 +85,10 @@ def _fill(
     cell: float,
     mask: npt.NDArray[np.bool_],
 ) -> None:
-    """Marks the cells over which triangles (N, 3, 3) have a point between two heights.
+    """Mark the cells over which triangles (N, 3, 3) have a point between two heights.
 
-    The triangle is clipped to the band (a convex polygon of at most five corners), then filled by segments from its
-    first corner to points along its other edges, half a cell apart; an upright triangle is one segment.
+    Each triangle is clipped to the height interval (a convex polygon of at most five corners), then filled with segments
+    from its first corner to points along its other edges, half a cell apart. A vertical triangle is one segment.
     """
     polygon = np.empty((8, 2))
     for i in range(triangles.shape[0]):
@@ -131,7 +131,7 @@ def _fill(
 def occupied_mask(
     vertices: FloatArray, faces: npt.NDArray[np.integer], low_m: float, high_m: float, cell_m: float
 ) -> OccupancyMask:
-    """Cells over which the mesh has a surface between two heights."""
+    """Mask of the cells over which the mesh has a surface between two heights."""
     triangles = np.ascontiguousarray(np.asarray(vertices, np.float64)[faces])
     margin = 4 * cell_m
     origin = triangles[..., :2].reshape(-1, 2).min(axis=0) - margin

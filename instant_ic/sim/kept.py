@@ -1,4 +1,4 @@
-"""Arrays that are dear to make and always come out the same, kept on disk between runs (textures, baked light)."""
+"""Disk cache of expensive deterministic arrays (textures, baked light)."""
 
 from __future__ import annotations
 
@@ -18,20 +18,19 @@ from instant_ic import paths
 Arrays = dict[str, npt.NDArray[np.generic]]
 
 MOST_BYTES = 256 << 20
-"""What is kept in all; beyond it the files that were used least recently go."""
+"""Size limit of the cache; beyond it the least recently used files are deleted."""
 
 
 def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callable[[], Arrays]) -> Arrays:
-    """The arrays that ``make`` gives, from disk where they have been made before.
+    """Return the arrays of ``make``, from disk if they are in the cache.
 
     Args:
-        kind: what they are; part of the file's name.
-        parts: everything that they depend on; the code of this package is added.
-        make: makes them.
+        kind: kind of the arrays; part of the file name.
+        parts: everything that the arrays depend on; the code of this package is added.
+        make: computes the arrays.
 
     Returns:
-        Arrays by name, equal to the last bit to what ``make`` gives. A folder that cannot be used, and a file that is
-        broken, cost time and nothing else.
+        Arrays by name, bit-identical to those of ``make``. An unusable folder or a damaged file costs only time.
     """
     digest = hashlib.sha256(_code())
     for part in parts:
@@ -60,7 +59,7 @@ def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callab
 
 @cache
 def _code() -> bytes:
-    """Changes whenever the code that makes such arrays may."""
+    """Key that changes with the code of this package."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files) + np.__version__.encode()).digest()
 
@@ -68,7 +67,7 @@ def _code() -> bytes:
 def _make_room(folder: Path) -> None:
     files = []
     for file in folder.iterdir():
-        with suppress(FileNotFoundError):  # another process makes room too
+        with suppress(FileNotFoundError):  # another process also deletes files
             status = file.stat()
             files.append((status.st_mtime, status.st_size, file))
     total = sum(size for _, size, _ in files)

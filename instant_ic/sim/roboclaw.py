@@ -1,4 +1,4 @@
-"""RoboClaw controller on a pseudo-terminal: the driver opens it as it would a serial port."""
+"""RoboClaw controller on a pseudo-terminal, which the driver opens like a serial port."""
 
 import contextlib
 import logging
@@ -17,15 +17,15 @@ class RoboClawServer:
     """Serves an emulated controller on a pseudo-terminal.
 
     Args:
-        emulator: the controller; whoever simulates the robot moves its time.
-        lock: held whenever the emulator is touched.
-        link: symbolic link to make to the terminal, None for none; replaced if it is there.
+        emulator: the controller; the robot simulation advances its time.
+        lock: held during each access to the emulator.
+        link: symbolic link to create to the terminal, replaced if it exists; None creates no link.
     """
 
     def __init__(self, emulator: RoboclawEmulator, lock: threading.Lock, link: Path | None = None) -> None:
         self._emulator = emulator
         self._lock = lock
-        # The slave end stays open here, so that the master never sees the line drop when a driver closes it.
+        # The slave end stays open here, so that the master sees no hang-up when a driver closes its end.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
         self.device = os.ttyname(self._slave)
@@ -40,7 +40,7 @@ class RoboClawServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Ends the thread, takes the link away and closes the terminal."""
+        """End the thread, remove the link and close the terminal."""
         os.write(self._wake_write, b"x")
         self._thread.join(1.0)
         if self.link is not None and self.link.is_symlink() and str(self.link.readlink()) == self.device:
@@ -57,7 +57,7 @@ class RoboClawServer:
             with self._lock:
                 reply = self._emulator.feed(data)
             while reply:
-                # A driver that asks and never reads must not stop the simulator for good.
+                # A driver that sends requests and never reads must not block the simulator.
                 _, writable, _ = select.select([], [self._master], [], 0.5)
                 if not writable:
                     log.warning("%s: %d bytes of a reply were not read and are dropped", self.device, len(reply))

@@ -1,6 +1,6 @@
-"""A RoboClaw that exists in memory only: real bytes in, real bytes out.
+"""RoboClaw emulated in memory: request bytes in, reply bytes out.
 
-It is pure: no clock, no port. Whoever holds it feeds it bytes and moves its time with
+The emulator has no clock and no port. The caller feeds it bytes and advances its time with
 `RoboclawEmulator.advance`.
 """
 
@@ -23,22 +23,22 @@ from instant_ic.base.protocol import (
 class RoboclawEmulator:
     """State of the controller and of two motors with encoders.
 
-    The motors follow `setpoint_pps` exactly unless ``ideal_motors`` is False: then whoever simulates the
-    robot writes `speed_pps` and `encoder` itself.
+    The motors follow `setpoint_pps` exactly unless ``ideal_motors`` is False; then the robot simulation writes
+    `speed_pps` and `encoder`.
 
     Attributes:
-        target_speed_pps: what the last command asked for, pulses/s, (2,) M1 and M2.
-        acceleration_pps2: ramp of the last command, pulses/s^2; 0 is none, the set point jumps.
+        target_speed_pps: target speed of the last command, pulses/s, (2,) M1 and M2.
+        acceleration_pps2: ramp of the last command, pulses/s^2; 0 means no ramp.
         setpoint_pps: target after the ramp, pulses/s, (2,).
-        speed_pps: speed that the encoders measure, pulses/s, (2,).
-        encoder: pulses counted, (2,); replies carry them modulo 2^32.
+        speed_pps: speed measured by the encoders, pulses/s, (2,).
+        encoder: counted pulses, (2,); replies carry them modulo 2^32.
         battery_v: main battery, volts.
-        status: bits of command 90; bit 0 (emergency stop of the 4-byte form) keeps the motors still.
-        status_bytes: 4, or 2 as old firmware replies.
-        timeout_s: serial watchdog, 0 is off.
-        watchdog_fired: motors were stopped by the watchdog; false again with the next valid packet.
+        status: bits of command 90; bit 0 (emergency stop in the 4-byte form) stops the motors.
+        status_bytes: length of the status reply: 4, or 2 for old firmware.
+        timeout_s: serial watchdog; 0 is off.
+        watchdog_fired: whether the watchdog stopped the motors; the next valid packet resets it.
         bad_packets: frames dropped for their CRC, an unknown command or a gap between bytes.
-        packets: frames understood.
+        packets: valid frames.
     """
 
     def __init__(self, address: int = 0x80, max_speed_pps: float = 4000.0, ideal_motors: bool = True) -> None:
@@ -65,7 +65,7 @@ class RoboclawEmulator:
         self._since_packet_s = 0.0
 
     def feed(self, data: bytes) -> bytes:
-        """Take bytes from the line; returns what the controller sends back, in order."""
+        """Take bytes from the line and return the controller's replies in order."""
         if data:
             self._silent_s = 0.0
         self._received += data
@@ -75,7 +75,7 @@ class RoboclawEmulator:
         return bytes(sent)
 
     def advance(self, dt_s: float) -> None:
-        """Move the controller's time: byte gap, watchdog, speed ramps and, for ideal motors, the encoders."""
+        """Advance the time of byte gap, watchdog, speed ramps and, for ideal motors, the encoders."""
         self._silent_s += dt_s
         if self._received and self._silent_s > INTER_BYTE_GAP_S:
             self._received.clear()
@@ -102,13 +102,13 @@ class RoboclawEmulator:
         self.setpoint_pps[:] = 0.0
 
     def _next_reply(self) -> bytes | None:
-        """Consume one frame; None when there is no whole one."""
+        """Consume one frame and return its reply; None without a complete frame."""
         received = self._received
         if len(received) < 2:
             return None
         address, command = received[0], received[1]
         if address != self.address:
-            # Another controller's packet, or noise: its end cannot be known, so wait for the next one.
+            # Another controller's packet, or noise: its end is unknown, so wait for the next one.
             received.clear()
             self.bad_packets += 1
             return None
@@ -160,7 +160,7 @@ class RoboclawEmulator:
         self.acceleration_pps2 = acceleration_pps2
 
     def _read(self, command: int) -> bytes | None:
-        """Data of the reply to a command that reads; None for an unknown command."""
+        """Data of the reply to a read command; None for an unknown command."""
         if command == Command.READ_TIMEOUT:
             return bytes((round(self.timeout_s * 10),))
         if command in (Command.READ_ENCODER_1, Command.READ_ENCODER_2):

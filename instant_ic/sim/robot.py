@@ -1,4 +1,4 @@
-"""Dynamics of the tracked robot: motors, tracks that slip, encoders, contact with the world."""
+"""Dynamics of the tracked robot: motors, slipping tracks, encoders, contact with the world."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,26 +12,26 @@ from instant_ic.sim.contact import OccupancyMask
 
 FloatArray = npt.NDArray[np.float64]
 
-#: A contact is over when the robot is this far from where it was held, metres and radians.
+#: A contact ends when the robot is this far from its pose at contact, metres and radians.
 _LET_GO = 0.015
 
 
 @dataclass(frozen=True)
 class RobotConfig:
-    """What the simulated robot is like.
+    """Parameters of the simulated robot.
 
     Attributes:
-        length, width: footprint, metres, centred on base_link.
-        contact_low, contact_high: things between these heights are run into, metres.
-        track_acceleration: most that the motors can change a track's speed, m/s².
+        length, width: size of the footprint, metres, centred on base_link.
+        contact_low, contact_high: objects between these heights stop the robot, metres.
+        track_acceleration: largest acceleration of a track by its motor, m/s².
         motor_lag_s: time constant with which a track follows its set point.
-        rolling_resistance: deceleration of a track by its own friction, m/s². The speed controller makes up for it,
-            except at set point zero, where it brakes and ends the motion.
-        slip: standard deviation of the share of a track's motion that is lost, 0 = none.
-        turn_slip: standard deviation of the effective track width, as a share of it, 0 = none.
-        slip_time_s: over which time the slip changes.
-        encoder_noise_pulses: standard deviation of the encoder count while a track moves.
-        steering: geometry, the same as the driver's when its odometry shall be without bias.
+        rolling_resistance: deceleration of a track by friction, m/s². The speed controller compensates for it, except
+            at set point zero, where friction ends the motion.
+        slip: standard deviation of the share of a track's motion that is lost; 0 disables slip.
+        turn_slip: relative standard deviation of the effective track width; 0 disables it.
+        slip_time_s: time constant of the slip.
+        encoder_noise_pulses: standard deviation of the encoder counts while a track moves.
+        steering: geometry; must equal the driver's, or its odometry has a bias.
     """
 
     length: float = 0.60
@@ -62,14 +62,14 @@ class RobotConfig:
 
 
 class TrackedRobot:
-    """The robot on the floor plan.
+    """Robot on the floor plan.
 
     Attributes:
         pose: (3,) x, y, yaw (unwrapped) in the world's frame.
-        twist: (3,) v_x, v_y, yaw rate in the robot's own frame, as it really moves.
-        tracks: (2,) speeds of the left and right track over the sprockets, m/s: what encoders measure.
-        contact: whether the robot pushes against something now.
-        contacts: how often a contact began.
+        twist: (3,) true v_x, v_y, yaw rate in the robot's frame.
+        tracks: (2,) speeds of the left and right track at the sprockets, m/s, which the encoders measure.
+        contact: whether the robot pushes against something.
+        contacts: number of contacts so far.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class TrackedRobot:
 
     @property
     def encoder_pulses(self) -> FloatArray:
-        """(2,) counts of the motors M1 and M2 since the start (not rounded)."""
+        """(2,) encoder counts of the motors M1 and M2 since the start, not rounded."""
         return self.kinematics.motors_from_tracks(self._travelled) + self._jitter
 
     @property
@@ -103,14 +103,14 @@ class TrackedRobot:
         return self.kinematics.motors_from_tracks(self.tracks)
 
     def touches(self, pose: npt.ArrayLike) -> bool:
-        """Whether the footprint's outline at a pose (x, y, yaw) meets something."""
+        """Whether the footprint's outline at a pose (x, y, yaw) touches something."""
         x, y, yaw = np.asarray(pose, float)
         c, s = math.cos(yaw), math.sin(yaw)
         points = self._outline @ np.asarray([[c, s], [-s, c]]) + (x, y)
         return bool(self._mask.at(points).any())
 
     def step(self, setpoint_pps: npt.ArrayLike, dt_s: float) -> None:
-        """Moves the robot by ``dt_s`` (at most about 20 ms) with the motors' set points (2,) in pulses/s."""
+        """Advance the robot by ``dt_s`` (at most about 20 ms) with motor set points (2,) in pulses/s."""
         config = self.config
         wanted = self.kinematics.tracks_from_motors(setpoint_pps)
         follow = (wanted - self.tracks) * (1 - math.exp(-dt_s / config.motor_lag_s))
@@ -145,7 +145,7 @@ class TrackedRobot:
             self.twist = np.zeros(3)
             return
         self.pose, self.twist = target, twist
-        # Creeping by less than a cell while it is held is the same contact still.
+        # Creeping by less than a cell during a contact does not start a new contact.
         if self.contact and float(np.abs(self.pose - self._held_at).max()) > _LET_GO:
             self.contact = False
 

@@ -1,4 +1,4 @@
-"""The whole robot in a world: dynamics, pose history, and what its devices would say; no threads, no sockets."""
+"""Simulation of the whole robot in a world: dynamics, pose history and device data, without threads or sockets."""
 
 import math
 import threading
@@ -16,19 +16,19 @@ from instant_ic.sim.vlp16 import Vlp16, Vlp16Config
 from instant_ic.sim.world import World
 from instant_ic.sim.worlds import make_world
 
-#: Longest step of the dynamics.
+#: Longest step of the dynamics, seconds.
 STEP_S = 0.02
-#: How long poses are remembered.
+#: Length of the pose history, seconds.
 HISTORY_S = 3.0
 
 
 @dataclass(frozen=True)
 class BaseConfig:
-    """The simulated motor controller.
+    """Parameters of the simulated motor controller.
 
     Attributes:
-        enabled: whether there is one.
-        link: name under RUN_DIR/dev of the link to its pseudo-terminal.
+        enabled: whether the controller is simulated.
+        link: name of the link to its pseudo-terminal under RUN_DIR/dev.
         address: packet serial address.
         battery_v: voltage of the full battery at rest.
     """
@@ -48,13 +48,13 @@ class BaseConfig:
 
 @dataclass(frozen=True)
 class SimulationConfig:
-    """What is simulated.
+    """Parameters of the simulation.
 
     Attributes:
         world: corridor, corridor:SEED, corridor-free, random:SEED, or a mesh file (see ``make_world``).
-        start: x, y, yaw of the robot in the world, radians; empty: the world's own place.
-        seed: of all noise.
-        robot, camera, lidar, base: its parts.
+        start: start pose x, y (metres), yaw (radians) of the robot; empty selects the world's start.
+        seed: seed of all noise.
+        robot, camera, lidar, base: parameters of the parts.
     """
 
     world: str = "corridor"
@@ -72,7 +72,7 @@ class SimulationConfig:
 
 
 class Simulation:
-    """Robot and world, moved by ``step``; as fast as the machine allows.
+    """Robot and world, advanced by ``step`` as fast as the machine allows.
 
     Example:
         >>> simulation = Simulation(SimulationConfig(world="corridor"))       # doctest: +SKIP
@@ -82,7 +82,7 @@ class Simulation:
 
     Attributes:
         time_s: simulated time since the start.
-        lock: held while the controller is touched; whoever serves it to a serial line holds it too.
+        lock: held during access to the controller, also by the code that serves it on a serial line.
     """
 
     def __init__(self, config: SimulationConfig, start_ns: int = 0, world: World | None = None) -> None:
@@ -103,11 +103,11 @@ class Simulation:
         self.scanner = Vlp16(config.lidar, self.world, self.poses_at, self.epoch_ns, config.seed)
 
     def epoch_ns(self, time_s: float) -> int:
-        """Epoch time of a simulated time; ``start_ns`` may be moved when the simulation had to stand still."""
+        """Epoch time of a simulated time; ``start_ns`` may be shifted after a pause of the simulation."""
         return self.start_ns + round(time_s * 1e9)
 
     def step(self, dt_s: float) -> None:
-        """Moves robot and controller on."""
+        """Advance robot and controller by ``dt_s``."""
         if dt_s < 0:
             raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
         count = max(1, math.ceil(dt_s / STEP_S - 1e-9)) if dt_s > 0 else 0
@@ -125,7 +125,7 @@ class Simulation:
             self._remember()
 
     def drive(self, v: float, w: float) -> None:
-        """Sets the motors as a driver would, for simulations without a serial line: m/s and rad/s."""
+        """Set the motors for a speed (m/s) and turn rate (rad/s), in simulations without a serial line."""
         kinematics = self.robot.kinematics
         pulses = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
         with self.lock:
@@ -133,26 +133,26 @@ class Simulation:
             self.controller.acceleration_pps2 = 0.0
 
     def poses_at(self, times_s: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """x, y, yaw (N, 3) of base_link in the world at simulated times (N,), interpolated; the ends are held."""
+        """Interpolated x, y, yaw (N, 3) of base_link in the world at simulated times (N,), clamped at the ends."""
         times = np.asarray(times_s, float)
         history = self._history
         return np.stack([np.interp(times, history[:, 0], history[:, k]) for k in (1, 2, 3)], axis=-1)
 
     def world_from_base(self, time_s: float | None = None) -> npt.NDArray[np.float64]:
-        """Pose (4, 4) of base_link now or at a simulated time."""
+        """Pose (4, 4) of base_link at a simulated time, by default the current one."""
         x, y, yaw = self.robot.pose if time_s is None else self.poses_at([time_s])[0]
         return pose_matrix(x, y, 0.0, 0.0, 0.0, yaw)
 
     def panorama(self, width: int, height: int) -> Frame:
-        """What the camera sees now."""
+        """Render the camera's current view."""
         mount = self.config.camera
         base_from_camera = pose_matrix(*mount.mount_xyz, 0.0, 0.0, math.radians(mount.mount_yaw_deg))
         return self.renderer.render(self.world_from_base() @ base_from_camera, width, height)
 
     def scan_packets(self, count: int | None = None) -> list[bytes]:
-        """The scanner's next data packets: ``count``, or all that are complete by now."""
+        """Return the scanner's next ``count`` data packets, or all packets that are complete."""
         return self.scanner.make(self.scanner.due(self.time_s) if count is None else count)
 
     def _remember(self) -> None:
-        # A new array instead of a shift in place: another thread may be reading the old one.
+        # A new array instead of a shift in place, because another thread may be reading the old one.
         self._history = np.vstack([self._history[1:], [self.time_s, *self.robot.pose]])

@@ -1,4 +1,4 @@
-"""Ricoh Theta Z1's Web API (OSC 2): state, options and the live preview, over HTTP."""
+"""Web API of the Ricoh Theta Z1 (OSC 2) over HTTP: state, options and live preview."""
 
 import hashlib
 import json
@@ -20,28 +20,28 @@ from instant_ic.pace import current
 
 log = logging.getLogger(__name__)
 
-#: Formats of the live preview (facts: Z1, firmware 2.21.1): width, height, frames a second.
+#: Formats of the live preview (Z1, firmware 2.21.1): width, height, frames per second.
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 BOUNDARY = "---osclivepreview---"
-#: After options were set the preview is not ready for this long.
+#: Time after setting options during which the preview is not ready, seconds.
 SETTLE_S = 0.8
 
 
 @dataclass(frozen=True)
 class ThetaConfig:
-    """The simulated camera.
+    """Parameters of the simulated camera.
 
     Attributes:
-        enabled: whether there is one.
-        host, port: where its Web API listens; port 0 takes a free one.
+        enabled: whether the camera is simulated.
+        host, port: address of its Web API; port 0 selects a free one.
         width, height: preview format until a driver sets another.
-        rate: most frames a second that are made, whatever the format promises.
-        latency_s: from the moment a picture shows to its delivery.
-        quality: of the JPEG, 1-100.
-        noise: standard deviation of a pixel's value, of 255.
-        user, password: HTTP digest (client mode); an empty user means none.
-        mount_xyz: place on the robot, metres from base_link.
-        mount_yaw_deg: turn on the robot.
+        rate: largest frame rate, even if the format promises more.
+        latency_s: time from the exposure of an image to its delivery.
+        quality: JPEG quality, 1-100.
+        noise: standard deviation of a pixel value, of 255.
+        user, password: credentials of HTTP digest (client mode); an empty user disables it.
+        mount_xyz: position on base_link, metres.
+        mount_yaw_deg: yaw on base_link, degrees.
     """
 
     enabled: bool = True
@@ -75,15 +75,15 @@ class ThetaConfig:
             raise ValueError(f"port must be in 0..65535 (got {self.port})")
 
 
-#: Gives a panorama (H, W, 3) sRGB for a width and height: what the camera sees now.
+#: Returns the camera's current view for a width and height: panorama (H, W, 3), sRGB.
 PictureSource = Callable[[int, int], npt.NDArray[np.uint8]]
 
 
 def panorama_file(path: str | Path) -> PictureSource:
-    """Source that always shows one panorama file, area-averaged to the format asked for.
+    """Source that always returns one panorama file, area-averaged to the requested size.
 
     Raises:
-        ValueError: it cannot be read as a picture.
+        ValueError: the file cannot be decoded as an image.
     """
     import cv2
 
@@ -108,20 +108,20 @@ class _ApiError(Exception):
 
 
 class ThetaServer:
-    """Camera with its Web API. Pictures are made only while somebody watches the preview.
+    """Camera with its Web API; it renders images only while a client reads the preview.
 
     Args:
         config: parameters.
-        source: what the camera sees; called from the camera's own thread.
-        seed: of the noise.
+        source: returns the camera's view; called on the camera's thread.
+        seed: seed of the noise.
 
     Raises:
-        OSError: the port is taken.
+        OSError: the port is in use.
 
     Attributes:
-        port: where it listens.
-        rate_hz: frames a second made lately; 0 while nobody watches and for the first four.
-        frames: pictures made.
+        port: listening port.
+        rate_hz: recent frame rate; 0 without a viewer and for the first four frames.
+        frames: number of rendered images.
     """
 
     def __init__(self, config: ThetaConfig, source: PictureSource, seed: int = 0) -> None:
@@ -164,18 +164,18 @@ class ThetaServer:
 
     @property
     def watched(self) -> bool:
-        """Whether somebody watches the preview."""
+        """Whether a client reads the preview."""
         return self._viewers > 0
 
     def close(self) -> None:
-        """Ends the streams and the server."""
+        """End the streams and the server."""
         with self._changed:
             self._stopping = True
             self._changed.notify_all()
         self._http.shutdown()
         self._http.server_close()
         for thread in self._threads:
-            # A picture under way on a busy machine is not waited for: nobody gets it, and the thread is a daemon.
+            # Do not wait for an image in progress on a busy machine: no client gets it, and the thread is a daemon.
             thread.join(0.3)
 
     # --- pictures -----------------------------------------------------------------------------------
@@ -211,24 +211,24 @@ class ThetaServer:
                 self.frames += 1
                 self._changed.notify_all()
             period = 1.0 / min(self.config.rate, promised)
-            # A camera whose picture takes too long shows fewer, never old ones.
+            # If rendering takes too long, the camera delivers fewer images, never old ones.
             due = max(due + period, current().steady_s())
             self._sleep(due)
             took = current().steady_s() - began
             made += 1
             period_s = took if made == 1 else 0.8 * period_s + 0.2 * took
-            # The first pictures come late for many reasons; a rate is told once it means something.
+            # The first images are late for many reasons, so the rate is reported only after them.
             if made >= 5:
                 self.rate_hz = 1 / period_s
 
     def _sleep(self, until: float) -> None:
-        """Until a time of the stack's steady clock."""
+        """Sleep until a time on the stack's steady clock."""
         with self._changed:
             while not self._stopping and (left := until - current().steady_s()) > 0:
                 self._changed.wait(current().wait_s(left))
 
     def next_frame(self, after: int, timeout_s: float) -> tuple[int, bytes] | None:
-        """Number and JPEG of the newest picture after number ``after``; None when none came in time or at the end."""
+        """Number and JPEG of the newest image after number ``after``; None on a time-out or at shutdown."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while (self._number <= after or self._frame is None) and not self._stopping:
@@ -243,7 +243,7 @@ class ThetaServer:
     # --- Web API ------------------------------------------------------------------------------------
 
     def authorised(self, header: str | None, method: str, path: str) -> bool:
-        """Whether an Authorization header is the right answer to this camera's digest challenge (RFC 7616, MD5)."""
+        """Whether an Authorization header answers this camera's digest challenge correctly (RFC 7616, MD5)."""
         if not self.config.user:
             return True
         if not header or not header.lower().startswith("digest "):
@@ -312,7 +312,7 @@ class ThetaServer:
         """Reply to a command other than the live preview.
 
         Raises:
-            _ApiError: it is refused.
+            _ApiError: the command is refused.
         """
         name = request.get("name") if isinstance(request, dict) else None
         parameters = request.get("parameters", {}) if isinstance(request, dict) else {}
@@ -361,7 +361,7 @@ class ThetaServer:
             self._options_set_s = time.monotonic()
 
     def open_preview(self) -> int:
-        """Takes one more viewer; returns the number of the newest picture, which is not theirs.
+        """Add a viewer and return the number of the newest image, which this viewer does not get.
 
         Raises:
             _ApiError: the camera is not ready after a change of options.
@@ -374,7 +374,7 @@ class ThetaServer:
             return self._number
 
     def close_preview(self) -> None:
-        """A viewer left."""
+        """Remove a viewer."""
         with self._changed:
             self._viewers -= 1
 
@@ -389,11 +389,11 @@ class _Handler(BaseHTTPRequestHandler):
 
     camera: ThetaServer
     protocol_version = "HTTP/1.1"
-    # A client that stops reading is let go after this long.
+    # A client that stops reading is disconnected after this time, seconds.
     timeout = 30.0
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests go to the debug log."""
+        """Write requests to the debug log."""
         log.debug("theta: " + format, *args)
 
     def do_GET(self) -> None:
@@ -469,7 +469,7 @@ class _Handler(BaseHTTPRequestHandler):
                 if frame is None:
                     continue
                 number, jpeg = frame
-                # The camera writes its boundary as it is, without the two dashes that RFC 2046 puts before it.
+                # The camera sends its boundary without the two leading dashes of RFC 2046.
                 head = f"{BOUNDARY}\r\nContent-type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n".encode()
                 part = head + jpeg + b"\r\n"
                 self.wfile.write(f"{len(part):x}\r\n".encode() + part + b"\r\n")

@@ -1,4 +1,4 @@
-"""VLP-16: rays with firing times and motion distortion, as UDP packets; or a recording's packets at its own pace."""
+"""VLP-16 as UDP packets: rays with firing times and motion distortion."""
 
 import math
 import socket
@@ -13,24 +13,24 @@ from instant_ic.lidar import packets as wire
 from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.float64]
-#: Gives x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
+#: Returns x, y, yaw (N, 3) of base_link at simulated times (N,) in seconds.
 PoseAt = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class Vlp16Config:
-    """The simulated scanner.
+    """Parameters of the simulated scanner.
 
     Attributes:
-        enabled: whether there is one.
-        host: where packets are sent.
-        data_port, position_port: UDP ports there.
-        rpm: revolutions a minute, 300-1200.
+        enabled: whether the scanner is simulated.
+        host: destination of the packets.
+        data_port, position_port: destination UDP ports.
+        rpm: revolutions per minute, 300-1200.
         range_noise: standard deviation of a range, metres.
-        min_range, max_range: what gives no return, metres.
-        burst: packets sent together (1.33 ms each); more costs less.
-        mount_xyz: place on the robot, metres from base_link.
-        mount_yaw_deg: turn on the robot.
+        min_range, max_range: limits of a return, metres; anything nearer or farther gives none.
+        burst: packets sent together (1.33 ms each); larger bursts need less CPU.
+        mount_xyz: position on base_link, metres.
+        mount_yaw_deg: yaw on base_link, degrees.
     """
 
     enabled: bool = True
@@ -61,14 +61,14 @@ class Vlp16Config:
 
 
 class Vlp16:
-    """The scanner's optics and clock: packets for stretches of simulated time.
+    """Optics and clock of the scanner: produces packets for intervals of simulated time.
 
     Args:
         config: parameters.
-        world: what is seen.
+        world: the world to scan.
         pose_at: pose of base_link at given times.
-        epoch_ns: epoch time of a simulated time, from which packets take their microseconds past the hour.
-        seed: of the noise.
+        epoch_ns: epoch time of a simulated time, which gives the packets' microseconds past the hour.
+        seed: seed of the noise.
     """
 
     def __init__(
@@ -92,22 +92,22 @@ class Vlp16:
 
     @property
     def next_packet_end_s(self) -> float:
-        """When the last laser of the next packet fires."""
+        """Time at which the last laser of the next packet fires."""
         return (self.packets + 1) * wire.PACKET_PERIOD_US * 1e-6
 
     def skip_to(self, time_s: float) -> int:
-        """Leaves out the packets that begin before a time; returns their number."""
+        """Skip the packets that begin before a time and return their number."""
         target = math.ceil(time_s / (wire.PACKET_PERIOD_US * 1e-6))
         skipped = max(0, target - self.packets)
         self.packets += skipped
         return skipped
 
     def due(self, time_s: float) -> int:
-        """Number of packets that are complete at a time and were not made yet."""
+        """Number of packets that are complete at a time and not yet made."""
         return max(0, math.floor(time_s / (wire.PACKET_PERIOD_US * 1e-6)) - self.packets)
 
     def make(self, count: int) -> list[bytes]:
-        """The next ``count`` data packets; poses up to the end of the last must be known."""
+        """Make the next ``count`` data packets; the poses up to the end of the last one must be known."""
         if count < 1:
             return []
         config = self.config
@@ -166,15 +166,15 @@ class Vlp16:
 
 
 class Vlp16Server:
-    """Sends the scanner's packets by UDP as simulated time goes on.
+    """Sends the scanner's packets over UDP as simulated time advances.
 
     Attributes:
         sent: data packets sent.
-        skipped: data packets left out because the machine was too slow.
+        skipped: data packets skipped because the machine was too slow.
     """
 
     POSITION_PERIOD_S = 0.1
-    #: Lag at which packets are left out instead of made up for.
+    #: Lag above which packets are skipped, seconds.
     MOST_LAG_S = 0.5
 
     def __init__(self, scanner: Vlp16) -> None:
@@ -188,7 +188,7 @@ class Vlp16Server:
         self.refused = 0
 
     def pump(self, time_s: float) -> None:
-        """Sends what is complete at simulated time ``time_s``, in bursts."""
+        """Send the packets that are complete at simulated time ``time_s``, in bursts."""
         due = self._scanner.due(time_s)
         if due * wire.PACKET_PERIOD_US * 1e-6 > self.MOST_LAG_S:
             self.skipped += self._scanner.skip_to(time_s - 0.1)
@@ -202,12 +202,12 @@ class Vlp16Server:
             self._next_position_s = time_s + self.POSITION_PERIOD_S
 
     def close(self) -> None:
-        """Closes the socket."""
+        """Close the socket."""
         self._socket.close()
 
     def _send(self, payload: bytes, port: int) -> None:
         try:
             self._socket.sendto(payload, (self._config.host, port))
         except ConnectionRefusedError:
-            # Nobody listens yet: the kernel tells of an earlier packet. The sensor would not know either.
+            # No listener yet: the kernel reports the error of an earlier packet. A real sensor ignores it too.
             self.refused += 1
