@@ -36,7 +36,6 @@ class SkidSteerConfig:
     invert_right: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         _require(self.track_width > 0.0, "track_width", self.track_width, "> 0 m")
         _require(
             0.5 <= self.track_width_multiplier <= 5.0,
@@ -73,7 +72,6 @@ class LimitsConfig:
     hard_deceleration: Positive = 4.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         _require(
             self.hard_deceleration >= self.max_v_acceleration,
@@ -102,7 +100,6 @@ class OdometryNoiseConfig:
     w_floor: NotNegative = 0.01
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
 
 
@@ -131,7 +128,6 @@ class RoboclawConfig:
     reconnect_max_s: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         _require(self.port != "", "port", self.port, "the path of a serial device")
         _require(self.baud in BAUD_RATES, "baud", self.baud, f"one of {BAUD_RATES}")
         _require(self.address in ADDRESSES, "address", self.address, "in 128..135")

@@ -41,7 +41,6 @@ class ControllerConfig:
     health_period_s: Positive = 0.25
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
 
 
@@ -83,7 +82,7 @@ class _Command:
     w: float
     hard: bool
     given_ns: int
-    """By the steady clock."""
+    """Time of the command on the steady clock."""
 
 
 class BaseController:

@@ -7,7 +7,6 @@ class RecentCount:
     """Counts the events of the last ``window_s`` seconds; the caller supplies the time."""
 
     def __init__(self, window_s: float) -> None:
-        """Start without events."""
         self.window_s = window_s
         self._events: deque[tuple[int, int]] = deque()
 

@@ -198,7 +198,6 @@ class Roboclaw:
             port.close()
 
     def __enter__(self) -> Self:
-        """Connect."""
         self.connect()
         return self
 

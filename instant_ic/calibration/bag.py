@@ -79,7 +79,6 @@ class _Cloud:
 
     @property
     def middle_ns(self) -> int:
-        """Time of the middle of the revolution."""
         time = self.points["time"]
         return self.stamp_ns + round(0.5e9 * float(time.min() + time.max()))
 

@@ -85,7 +85,6 @@ class CalibrationConfig:
     intensity_step: Positive = 6.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         if not self.blur_px or min(self.blur_px) <= 0:
             raise ValueError(f"blur_px must hold values > 0 (got {self.blur_px})")

@@ -35,7 +35,6 @@ class ThetaConfig:
     busy_wait_s: Positive = 0.25
 
     def __post_init__(self) -> None:
-        """Check the values."""
         wanted = (self.width, self.height, self.rate_hz)
         if wanted not in PREVIEW_FORMATS:
             known = ", ".join(f"{w}x{h}@{r}" for w, h, r in PREVIEW_FORMATS)
@@ -62,7 +61,6 @@ class VideoConfig:
     height: NotNegativeInt = 0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
 
 
@@ -83,5 +81,4 @@ class FilesConfig:
     latency_s: NotNegative = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)

@@ -21,7 +21,6 @@ class ReconnectConfig:
     max_s: Positive = 5.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         if not self.min_s <= self.max_s:
             raise ValueError(f"min_s must be at most max_s (got {self.min_s}, {self.max_s})")

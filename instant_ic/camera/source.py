@@ -70,14 +70,12 @@ class Camera(ABC):
         """Release the camera; has no effect if it is not open."""
 
     def __enter__(self) -> Self:
-        """Connect."""
         self.connect()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close."""
         self.close()
 
     def _stamp_ns(self) -> int:

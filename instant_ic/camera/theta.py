@@ -94,7 +94,6 @@ class ThetaClient:
         self._session = self._new_session()
 
     def close(self) -> None:
-        """Close the connection."""
         self._session.close()
 
     def info(self) -> dict[str, Any]:

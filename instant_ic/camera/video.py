@@ -78,7 +78,6 @@ class VideoCamera(Camera):
         return Frame(jpeg.tobytes(), stamp_ns, int(image.shape[1]), int(image.shape[0]))
 
     def close(self) -> None:
-        """Release the device."""
         capture, self._capture = self._capture, None
         if capture is not None:
             capture.release()

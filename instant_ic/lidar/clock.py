@@ -35,7 +35,7 @@ class DeviceClock:
         return (timestamp_us - self._device_us + HOUR_US // 2) % HOUR_US - HOUR_US // 2
 
     def take(self, timestamp_us: int, host_ns: int) -> int:
-        """Take the time of a packet.
+        """Add the time of a packet and update the offset.
 
         Args:
             timestamp_us: microseconds past the hour, from the packet.

@@ -22,7 +22,6 @@ class DecoderConfig:
     max_range: Annotated[float, Range(above=0, high=131.07)] = 130.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         if not self.min_range < self.max_range:
             raise ValueError(f"min_range must be below max_range (got {self.min_range}, {self.max_range})")
@@ -49,7 +48,6 @@ class FlatScanConfig:
     min_coverage: Share = 0.75
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         if not (math.isfinite(self.min_height) and self.min_height < self.max_height):
             raise ValueError(f"min_height must be below max_height (got {self.min_height}, {self.max_height})")

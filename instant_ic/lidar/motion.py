@@ -25,7 +25,6 @@ class PlanarMotion:
     max_extrapolation_s: float = 0.2
 
     def __post_init__(self) -> None:
-        """Check shapes and order."""
         if self.stamps_ns.ndim != 1 or self.odom_from_base.shape != (len(self.stamps_ns), 3):
             raise MotionError(f"poses {self.odom_from_base.shape} do not fit stamps {self.stamps_ns.shape}")
         if len(self.stamps_ns) == 0 or (np.diff(self.stamps_ns) <= 0).any():

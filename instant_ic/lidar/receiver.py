@@ -42,7 +42,6 @@ class ReceiverConfig:
     sensor: str = ""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 <= self.port <= 65535:
             raise ValueError(f"port must be in 0..65535 (got {self.port})")
         if not -1 <= self.position_port <= 65535:
@@ -90,12 +89,10 @@ class PacketReceiver:
 
     @property
     def port(self) -> int:
-        """Bound data port."""
         return int(self._data.getsockname()[1]) if self._data else self.config.port
 
     @property
     def position_port(self) -> int:
-        """Bound position port."""
         return int(self._position.getsockname()[1]) if self._position else self.config.position_port
 
     def connect(self) -> None:
@@ -115,7 +112,6 @@ class PacketReceiver:
             raise
 
     def close(self) -> None:
-        """Release the ports."""
         for bound in (self._data, self._position):
             if bound is not None:
                 bound.close()
@@ -124,14 +120,12 @@ class PacketReceiver:
         self._selector = self._data = self._position = None
 
     def __enter__(self) -> Self:
-        """Bind."""
         self.connect()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Release."""
         self.close()
 
     def read(self, timeout_s: float) -> Iterator[Received]:

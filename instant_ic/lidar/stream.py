@@ -110,7 +110,7 @@ class PacketStream:
         self._received_ns = 0
 
     def feed(self, payload: bytes, received_ns: int) -> Revolution | None:
-        """Take one payload.
+        """Add one payload.
 
         Args:
             payload: 1206 bytes; other payloads are counted and dropped.

@@ -1,4 +1,4 @@
-"""Buildings from zones: rectangles of free space become floors, ceilings, walls, doorways and their fittings."""
+"""Builds worlds from zones: rectangles of free space become floors, ceilings, walls, doorways and their fittings."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ class Finish:
 
 @dataclass(frozen=True)
 class Zone:
-    """Rectangle of free space from the floor to ``height``; zones that touch are open to each other."""
+    """Rectangle of free space from the floor to ``height``; zones that touch have an opening between them."""
 
     x0: float
     y0: float
@@ -42,7 +42,7 @@ class Zone:
         return 0.5 * (self.x0 + self.x1), 0.5 * (self.y0 + self.y1)
 
     def side(self, name: str) -> tuple[Point, Point]:
-        """Ends of a wall, left to right as one looks at it from inside: ``north`` is the wall at y1, ``east`` at x1."""
+        """Ends of a wall, left to right as viewed from inside: ``north`` is the wall at y1, ``east`` at x1."""
         return {
             "north": ((self.x0, self.y1), (self.x1, self.y1)),
             "south": ((self.x1, self.y0), (self.x0, self.y0)),
@@ -56,18 +56,18 @@ SIDES = ("north", "south", "east", "west")
 
 @dataclass
 class Building:
-    """Zones and what stands in them; ``world()`` makes the mesh."""
+    """Zones and their contents; ``world()`` builds the mesh."""
 
     zones: list[Zone] = field(default_factory=list)
     builder: WorldBuilder = field(default_factory=WorldBuilder)
 
     def add(self, zone: Zone) -> Zone:
-        """Adds a zone and returns it."""
+        """Add a zone and return it."""
         self.zones.append(zone)
         return zone
 
     def door(self, room: Zone, side: str, at: float, thickness: float, width: float = 0.95) -> Zone:
-        """Doorway through the wall on one side of ``room``; ``at`` is the centre's x (north, south) or y."""
+        """Add a doorway through the wall on one side of ``room``; ``at`` is its centre in x (north, south) or y."""
         low, high = at - width / 2, at + width / 2
         rect = {
             "north": (low, room.y1, high, room.y1 + thickness),
@@ -100,7 +100,7 @@ class Building:
         return sorted(found, key=lambda o: o[0])
 
     def free_runs(self, zone: Zone, side: str, margin: float = 0.15) -> list[tuple[float, float]]:
-        """Parts of a wall without openings, drawn in by ``margin``."""
+        """Parts of a wall without openings, shortened by ``margin`` at each end."""
         length = math.dist(*zone.side(side))
         runs, at = [], 0.0
         for low, high, _ in self.openings(zone, side):
@@ -119,11 +119,11 @@ class Building:
         front: Material,
         edge: Material | None = None,
     ) -> None:
-        """Board that stands out from the wall start → end by ``depth``, between two lengths and two heights."""
+        """Add a board that protrudes by ``depth`` from the wall start → end, between two lengths and two heights."""
         edge = edge or front
         a, b = np.asarray(start, float), np.asarray(end, float)
         right = (b - a) / np.linalg.norm(b - a)
-        # Inside is behind the viewer who looks at the wall with its start on the left.
+        # Inward points towards the viewer who sees the start of the wall on the left.
         inward = np.asarray([right[1], -right[0]])
         low, high = heights
         p, q = a + right * along[0], a + right * along[1]
@@ -144,14 +144,14 @@ class Building:
     def picture(
         self, zone: Zone, side: str, at: float, centre_m: float, size: tuple[float, float], material: Material
     ) -> None:
-        """Poster or board on a wall, its centre ``at`` metres from the wall's start."""
+        """Add a poster or board to a wall, with its centre ``at`` metres from the wall's start."""
         start, end = zone.side(side)
         heights = (centre_m - size[1] / 2, centre_m + size[1] / 2)
         edge = Material("wood", 0.5, (0.4, 0.4, 0.4))
         self.relief(start, end, (at - size[0] / 2, at + size[0] / 2), heights, 0.012, replace(material, size_m=0), edge)
 
     def window(self, zone: Zone, side: str, at: float, width: float, variant: int, shine: float = 1.6) -> None:
-        """Window with frame and sill; the outside is a picture that shines."""
+        """Add a window with frame and sill; the outside is a luminous image."""
         start, end = zone.side(side)
         frame = Material("white", 1.0, (0.95, 0.95, 0.95))
         low, high = 0.9, min(zone.height - 0.3, 2.2)
@@ -163,7 +163,7 @@ class Building:
         self.relief(start, end, (a - 0.06, b + 0.06), (high, high + 0.06), 0.05, frame)
 
     def closed_door(self, zone: Zone, side: str, at: float, variant: int = 0, tint: Material | None = None) -> None:
-        """Door that is shut: leaf and frame on the wall."""
+        """Add a closed door: leaf and frame on the wall."""
         start, end = zone.side(side)
         leaf = replace(tint or Material("door"), texture=f"door:{variant}", size_m=0)
         self.relief(start, end, (at - 0.46, at + 0.46), (0.0, 2.02), 0.015, leaf, zone.finish.trim)
@@ -175,7 +175,7 @@ class Building:
         self.relief(start, end, (low - 0.08, high + 0.08), (top, top + 0.08), 0.03, trim)
 
     def lamps(self, zone: Zone, spacing: float = 2.4, shine: float = 4.5, square: bool = False) -> None:
-        """Ceiling lights on a grid."""
+        """Add ceiling lights on a grid."""
         w, h = zone.x1 - zone.x0, zone.y1 - zone.y0
         nx, ny = max(1, round(w / spacing)), max(1, round(h / spacing))
         lx, ly = (0.6, 0.6) if square else ((1.2, 0.3) if w >= h else (0.3, 1.2))
@@ -194,7 +194,7 @@ class Building:
                 )
 
     def open_leaf(self, door: Zone, towards: str, hinge_high: bool, angle_deg: float, variant: int) -> None:
-        """Door leaf that stands open into the zone on one side (``north``...) of the doorway."""
+        """Add a door leaf that is open into the zone on one side (``north``...) of the doorway."""
         width = (door.x1 - door.x0) if towards in ("north", "south") else (door.y1 - door.y0)
         if towards in ("north", "south"):
             hinge = np.asarray([door.x1 if hinge_high else door.x0, door.y1 if towards == "north" else door.y0])
@@ -217,14 +217,14 @@ class Building:
     ) -> None:
         at = (float(centre[0]), float(centre[1]))
         self.builder.box(at, size, 0.0, yaw, side=edge, front=face)
-        # The back gets its picture too: a hair in front of the box's own side.
+        # The back also gets the door texture, on a panel just in front of the box.
         c, s = math.cos(yaw), math.sin(yaw)
         x, y = np.asarray([c, s, 0.0]), np.asarray([-s, c, 0.0])
         corner = np.asarray([*at, size[2]]) - x * (size[0] / 2 + 0.001) + y * size[1] / 2
         self.builder.panel(corner, -y * size[1], np.asarray([0, 0, -size[2]]), face)
 
     def world(self, name: str, spawn: tuple[float, float, float], light_cell_m: float = 0.1, rays: int = 48) -> World:
-        """Mesh, textures and baked light of the building."""
+        """Build the world: mesh, textures and baked light."""
         for zone in self.zones:
             self._shell(zone)
         world = self.builder.build(name, light_cell_m, spawn)

@@ -87,8 +87,8 @@ def _fill(
 ) -> None:
     """Mark the cells over which triangles (N, 3, 3) have a point between two heights.
 
-    Each triangle is clipped to the height interval (a convex polygon of at most five corners), then filled with segments
-    from its first corner to points along its other edges, half a cell apart. A vertical triangle is one segment.
+    Each triangle is clipped to the height interval (a convex polygon of at most five corners). Segments from its first
+    corner to points along its other edges, half a cell apart, then fill it. A vertical triangle is one segment.
     """
     polygon = np.empty((8, 2))
     for i in range(triangles.shape[0]):

@@ -59,7 +59,7 @@ def kept(kind: str, parts: Iterable[str | npt.NDArray[np.generic]], make: Callab
 
 @cache
 def _code() -> bytes:
-    """Key that changes with the code of this package."""
+    """Hash of this package's code and the numpy version."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files) + np.__version__.encode()).digest()
 

@@ -1,4 +1,4 @@
-"""Compiled loops of the renderer: adaptive ray casting, filtered texture lookup, shading. They release the GIL."""
+"""Compiled loops of the renderer: adaptive ray casting, filtered texture lookup, shading. All release the GIL."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy.typing as npt
 F32 = npt.NDArray[np.float32]
 I32 = npt.NDArray[np.int32]
 U8 = npt.NDArray[np.uint8]
-#: float32 in compiled code; numpy's stubs call it by several names.
+#: float32 in compiled code; numpy's stubs have several types for it.
 Scalar = Any
 
 #: Entries of the tone table, which maps radiance 0..TONE_MAX to sRGB.
@@ -21,7 +21,7 @@ _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "arcp", "nsz", "
 
 @_jit
 def rotate(directions: F32, rotation: F32, out: F32) -> None:
-    """Writes to ``out`` (N, 3) the rotation (3, 3) applied to directions (N, 3)."""
+    """Rotate directions (N, 3) by ``rotation`` (3, 3) into ``out`` (N, 3)."""
     for i in range(directions.shape[0]):
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
         for k in range(3):
@@ -30,7 +30,7 @@ def rotate(directions: F32, rotation: F32, out: F32) -> None:
 
 @_jit
 def surfaces_of(face: I32, face_surface: I32) -> None:
-    """Replaces face numbers by surface numbers, in place; -1 stays."""
+    """Replace face numbers by surface numbers in place; -1 stays."""
     for i in range(face.shape[0]):
         if face[i] >= 0:
             face[i] = face_surface[face[i]]
@@ -48,14 +48,14 @@ def refine(
     wraps: bool,
     todo: I32,
 ) -> int:
-    """Fills in the pixels between those of a coarse grid.
+    """Fill in the pixels between those of a coarse grid.
 
-    ``surface`` and ``range_m`` (H, W) are known where both row and column are multiples of ``2 * step``. A pixel at
-    multiples of ``step`` whose known neighbours all lie on one surface lies on it too (surfaces are planar and convex),
-    so its range is worked out; others are listed in ``todo`` (flat indices).
+    ``surface`` and ``range_m`` (H, W) are known where both row and column are multiples of ``2 * step``. If all known
+    neighbours of a pixel at multiples of ``step`` lie on one surface, the pixel lies on it too, because surfaces are
+    planar and convex; its range is computed. Other pixels are listed in ``todo`` (flat indices).
 
     Returns:
-        Number of pixels listed.
+        Number of listed pixels.
     """
     height, width = surface.shape
     coarse = 2 * step
@@ -63,7 +63,7 @@ def refine(
     for row in range(0, height, step):
         above = row - row % coarse
         below = above if row % coarse == 0 else min(above + coarse, height - 1)
-        # The last rows have no coarse row under them: they are cast.
+        # The last rows have no coarse row below them, so they are cast.
         row_open = below != above and below % coarse != 0
         for column in range(0, width, step):
             left = column - column % coarse
@@ -99,7 +99,7 @@ def refine(
 def _bilinear(
     texels: npt.NDArray[np.uint32], first: int, width: int, height: int, u: Scalar, v: Scalar, clamp: bool
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Square-root-coded colour 0..255 squared (linear · 65025) at texture coordinates 0..1."""
+    """Bilinear colour at texture coordinates 0..1, linear · 65025 (square of the square-root-coded 0..255)."""
     x = u * np.float32(width) - np.float32(0.5)
     y = v * np.float32(height) - np.float32(0.5)
     floor_x = np.floor(x)
@@ -159,7 +159,7 @@ def _albedo(
     v: Scalar,
     lod: Scalar,
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Linear albedo of texture ``t``, trilinear."""
+    """Trilinear lookup of the linear albedo of texture ``t``."""
     clamp = clamps[t] != 0
     if clamp:
         u = min(max(u, np.float32(0.0)), np.float32(1.0))
@@ -194,7 +194,7 @@ def _log2(value: Scalar) -> Scalar:
 def _light_texel(
     light: F32, first: int, width: int, height: int, a: Scalar, b: Scalar
 ) -> tuple[Scalar, Scalar, Scalar]:
-    """Light map at texel coordinates (a, b), bilinear."""
+    """Bilinear lookup of a light map at texel coordinates (a, b)."""
     a = min(max(a, np.float32(0.0)), np.float32(width) - np.float32(1.001))
     b = min(max(b, np.float32(0.0)), np.float32(height) - np.float32(1.001))
     i = np.int32(a)
@@ -261,19 +261,19 @@ def shade(
     listed: I32,
     out: F32,
 ) -> None:
-    """Radiance of rays whose surface (N,) and range (N,) are known; ``pixel_rad`` is the angle of a pixel.
+    """Compute the radiance of rays with known surface (N,) and range (N,); ``pixel_rad`` is the angle of a pixel.
 
-    Written to ``out`` (N, 3) for the rays in ``listed`` alone.
+    Only the rays in ``listed`` are written to ``out`` (N, 3).
 
-    The texture is averaged over the pixel's footprint on the surface: two trilinear lookups along its long axis where
-    the surface is seen aslant, one elsewhere.
+    The texture is averaged over the pixel's footprint on the surface: two trilinear lookups along its long axis at
+    oblique view angles, one elsewhere.
     """
     last = np.int32(-1)
     one = np.float32(1)
     half = np.float32(0.5)
     angle = np.float32(pixel_rad)
     ox, oy, oz = origin[0], origin[1], origin[2]
-    # What belongs to the surface is loaded when it changes, which is seldom along a row.
+    # Surface data is reloaded only when the surface changes, which is rare along a row.
     nx = ny = nz = ux = uy = uz = uw = vx = vy = vz = vw = np.float32(0)
     tr = tg = tb = glow = density = np.float32(0)
     ax = ay = az = aw = bx = by = bz = bw = np.float32(0)
@@ -285,7 +285,7 @@ def shade(
         s = surface[i]
         dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
         if s < 0:
-            # Open sky for worlds that are not closed.
+            # Open sky, for worlds that are not closed.
             up = max(dz, np.float32(0.0))
             out[i, 0] = np.float32(0.62) - np.float32(0.30) * up
             out[i, 1] = np.float32(0.72) - np.float32(0.22) * up
@@ -340,10 +340,10 @@ def shade(
 
 @_jit
 def edges(surface: I32, range_m: F32, normal: F32, texture: I32, wraps: bool, out: I32) -> int:
-    """Lists (flat indices) the pixels whose right or lower neighbour shows something else; returns their number.
+    """List the pixels (flat indices) whose right or lower neighbour shows something else; return their number.
 
-    Two surfaces of the same texture that continue each other (one wall in two pieces, the triangles of a smooth mesh)
-    make no edge.
+    Two adjoining surfaces of the same texture (one wall in two pieces, the triangles of a smooth mesh) do not form an
+    edge.
     """
     height, width = surface.shape
     count = 0
@@ -387,7 +387,7 @@ def edges(surface: I32, range_m: F32, normal: F32, texture: I32, wraps: bool, ou
 
 @_jit
 def plain_pixels(strides: I32, edge: U8, out: I32) -> int:
-    """Lists (flat indices) the pixels at multiples of their row's stride that are no edges; returns their number."""
+    """List the non-edge pixels (flat indices) at multiples of their row's stride; return their number."""
     height, width = edge.shape
     count = 0
     for row in range(height):
@@ -400,7 +400,7 @@ def plain_pixels(strides: I32, edge: U8, out: I32) -> int:
 
 @_jit
 def anchored(listed: I32, strides: I32, width: int) -> int:
-    """Keeps of ``listed`` the pixels at multiples of their row's stride, in place; returns their number."""
+    """Keep in ``listed`` only the pixels at multiples of their row's stride, in place; return their number."""
     count = 0
     for k in range(listed.shape[0]):
         row = listed[k] // width
@@ -412,7 +412,7 @@ def anchored(listed: I32, strides: I32, width: int) -> int:
 
 @_jit
 def fill_rows(radiance: F32, strides: I32) -> None:
-    """Writes the pixels between multiples of their row's stride, linear between both neighbours; rows wrap."""
+    """Interpolate linearly the pixels between multiples of their row's stride; rows wrap."""
     height, width = radiance.shape[:2]
     for row in range(height):
         stride = strides[row]
@@ -433,7 +433,7 @@ def fill_rows(radiance: F32, strides: I32) -> None:
 
 @_jit
 def tone(radiance: F32, table: U8, out: U8) -> None:
-    """Writes sRGB bytes (N, 3) of radiance (N, 3) by the tone table."""
+    """Convert radiance (N, 3) to sRGB bytes (N, 3) with the tone table."""
     scale = np.float32((TONE_SIZE - 1) / TONE_MAX)
     for i in range(radiance.shape[0]):
         for k in range(3):
@@ -453,7 +453,7 @@ def light_at_hits(
     albedo: F32,
     out: F32,
 ) -> None:
-    """Light (N, 3) that surfaces hit by rays send back (irradiance · albedo); nothing where the range is negative."""
+    """Light (N, 3) reflected by the surfaces that rays hit (irradiance · albedo); zero where the range is negative."""
     for i in range(surface.shape[0]):
         r = range_m[i]
         if r < 0:

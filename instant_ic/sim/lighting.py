@@ -1,4 +1,4 @@
-"""Baked light: lamps and windows with soft shadows, one bounce, ambient occlusion."""
+"""Baked light: lamps and windows with soft shadows, one bounce, and ambient occlusion."""
 
 import math
 
@@ -12,16 +12,16 @@ from instant_ic.sim.world import World
 
 F32 = npt.NDArray[np.float32]
 
-#: Emitters are cut into pieces of at most this size for soft shadows.
+#: Largest size of an emitter piece; emitters are split for soft shadows.
 _PIECE_M = 0.7
-#: Light that reaches everything (what many bounces would bring), as a share of a lamp-lit wall.
+#: Ambient light, which stands for further bounces, as a share of the light on a lamp-lit wall.
 _AMBIENT = 0.34
-#: Occlusion counts up to this distance.
+#: Largest distance of an occluder.
 _AMBIENT_REACH_M = 1.6
 
 
 def _texel_points(world: World) -> tuple[F32, npt.NDArray[np.int32]]:
-    """Centres (L, 3) of all light texels, drawn in from the border by 15 mm, and their surfaces (L,)."""
+    """Centres (L, 3) of all light texels, inset by 15 mm from the border, and their surfaces (L,)."""
     points: list[F32] = []
     owner: list[npt.NDArray[np.int32]] = []
     corners = world.vertices.reshape(-1, 4, 3).astype(np.float64)
@@ -38,7 +38,7 @@ def _texel_points(world: World) -> tuple[F32, npt.NDArray[np.int32]]:
 
 
 def _emitter_pieces(world: World) -> tuple[F32, F32, F32]:
-    """Points (E, 3), normals (E, 3) and power (E, 3) (radiance · area) of the pieces of what shines."""
+    """Points (E, 3), normals (E, 3) and power (E, 3) (radiance · area) of the pieces of all emitters."""
     points, normals, powers = [], [], []
     corners = world.vertices.reshape(-1, 4, 3)
     for s in np.flatnonzero(world.emission > 0):
@@ -65,7 +65,7 @@ def _pairs(
     points: F32, normals: F32, emitter: F32, emitter_normal: F32, power: F32, reach_m: float, least: float,
     texel: npt.NDArray[np.int32], source: npt.NDArray[np.int32], weight: F32,
 ) -> int:  # fmt: skip
-    """Lists the (texel, emitter) pairs that matter with their geometric factor; returns their number."""
+    """List the relevant (texel, emitter) pairs with their geometric factors; return their number."""
     count = 0
     for i in range(points.shape[0]):
         for e in range(emitter.shape[0]):
@@ -79,7 +79,7 @@ def _pairs(
             cos_e = -(emitter_normal[e, 0] * dx + emitter_normal[e, 1] * dy + emitter_normal[e, 2] * dz)
             if cos_i <= 0.0 or cos_e <= 0.0:
                 continue
-            # Softened near the emitter, which is no point.
+            # Softened near the emitter, because it is not a point.
             factor = cos_i * cos_e / (math.pi * square * (square + 0.15))
             if factor * power[e, 0] < least:
                 continue
@@ -93,7 +93,7 @@ def _pairs(
 
 
 def _cosine_directions(count: int) -> npt.NDArray[np.float64]:
-    """(count, 3) directions about +z, cosine-weighted, evenly spread (golden angle)."""
+    """Directions (count, 3) about +z, cosine-weighted and evenly spread (golden angle)."""
     k = np.arange(count)
     radius = np.sqrt((k + 0.5) / count)
     angle = k * math.pi * (3 - math.sqrt(5))
@@ -101,7 +101,7 @@ def _cosine_directions(count: int) -> npt.NDArray[np.float64]:
 
 
 def _frames(normals: F32) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Two unit vectors (N, 3) each across the normals (N, 3)."""
+    """Two unit vectors (N, 3) perpendicular to each of the normals (N, 3)."""
     n = normals.astype(np.float64)
     helper = np.where(np.abs(n[:, 2:3]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
     tangent = np.cross(helper, n)
@@ -110,7 +110,7 @@ def _frames(normals: F32) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float
 
 
 def _direct(world: World, points: F32, normals: F32) -> F32:
-    """Irradiance / pi (L, 3) straight from lamps and windows."""
+    """Direct irradiance / pi (L, 3) from lamps and windows."""
     light = np.zeros((len(points), 3), np.float32)
     emitter, emitter_normal, power = _emitter_pieces(world)
     if len(emitter) == 0:
@@ -130,7 +130,7 @@ def _direct(world: World, points: F32, normals: F32) -> F32:
 
 
 def _gather(world: World, points: F32, normals: F32, rays: int) -> tuple[F32, npt.NDArray[np.bool_]]:
-    """Light of one bounce plus ambient (L, 3), and whether a texel can be seen at all (L,)."""
+    """Light of one bounce plus ambient light (L, 3), and whether a texel is visible at all (L,)."""
     count = len(points)
     result = np.zeros((count, 3), np.float32)
     inside = np.zeros(count, np.int32)
@@ -159,14 +159,14 @@ def _gather(world: World, points: F32, normals: F32, rays: int) -> tuple[F32, np
 
 
 def _smooth(light: F32, valid: npt.NDArray[np.bool_], world: World) -> None:
-    """Blurs each map by a texel (it was sampled, not measured) and fills texels that lie inside something."""
+    """Blur each map by a texel against sampling noise, and fill the texels that lie inside objects."""
     import cv2
 
     for first, width, height in world.light_at:
         part = slice(int(first), int(first + width * height))
         known = valid[part].reshape(height, width).astype(np.float32)
         image = light[part].reshape(height, width, 3) * known[..., None]
-        # Unknown texels take the light of known ones near them: the blur is normalised, and widened until all have it.
+        # Unknown texels take the light of known neighbours: the blur is normalised and widened until all are filled.
         total = cv2.GaussianBlur(image, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE).reshape(height, width, 3)
         share = cv2.GaussianBlur(known, (3, 3), 0.8, borderType=cv2.BORDER_REPLICATE)
         size = 3
@@ -180,12 +180,12 @@ def _smooth(light: F32, valid: npt.NDArray[np.bool_], world: World) -> None:
 
 
 def bake(world: World, rays: int = 48, level: float = 0.72) -> None:
-    """Fills ``world.light`` in place.
+    """Compute ``world.light`` in place.
 
     Args:
         world: a procedural world (rectangles only).
-        rays: rays a texel for bounce and occlusion.
-        level: median light of upright surfaces after baking (the exposure).
+        rays: rays per texel for bounce and occlusion.
+        level: median light of vertical surfaces after baking (the exposure).
     """
     fields: list[npt.NDArray[np.generic]] = [value for value in vars(world).values() if isinstance(value, np.ndarray)]
     parts: list[str | npt.NDArray[np.generic]] = [*fields, world.textures.mean, f"{rays} {level} {world.two_sided}"]
@@ -206,9 +206,9 @@ def _baked(world: World, rays: int, level: float) -> F32:
 
 
 def bake_mesh(world: World, rays: int = 24) -> None:
-    """Ambient light with occlusion for a mesh from a file: ``light_linear`` of each triangle, on both sides.
+    """Compute ambient light with occlusion for a mesh from a file: ``light_linear`` of each triangle, on both sides.
 
-    The mesh has no lamps, so light is a soft sky inside the rooms, stronger from above, dimmed near other things.
+    The mesh has no lamps, so the light is a soft sky inside the rooms, stronger from above and dimmer near objects.
     """
     triangles = world.vertices[world.faces].astype(np.float64)
     count = len(triangles)
@@ -229,7 +229,7 @@ def bake_mesh(world: World, rays: int = 24) -> None:
                 total += np.minimum(distance / _AMBIENT_REACH_M, 1.0) * (0.75 + 0.25 * direction[:, 2])
             best = np.maximum(best, total / rays)
         value[:, corner] = 0.20 + 0.85 * best
-    # Affine function on the triangle's plane through its corners' values, constant along the normal.
+    # Affine function on the triangle's plane through the values at its corners, constant along the normal.
     edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)
     rise = np.stack([value[:, 1] - value[:, 0], value[:, 2] - value[:, 0]], axis=1)
     gram = np.einsum("nij,nkj->nik", edges, edges) + 1e-9 * np.eye(2)

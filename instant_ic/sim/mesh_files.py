@@ -1,4 +1,4 @@
-"""Worlds from mesh files (GLB, glTF, OBJ and what else trimesh reads)."""
+"""Worlds from mesh files (GLB, glTF, OBJ and other formats that trimesh reads)."""
 
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ _Z_UP_FROM_Y_UP = np.asarray([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 def _look(material: Any) -> tuple[npt.NDArray[np.float32] | None, tuple[float, float, float]]:
-    """Picture (H, W, 3) in sRGB in 0..1 or None, and linear colour factor, of a trimesh material."""
+    """Image (H, W, 3) in sRGB 0..1 or None, and linear colour factor, of a trimesh material."""
     image = getattr(material, "baseColorTexture", None)
     if image is None:
         image = getattr(material, "image", None)
@@ -26,14 +26,14 @@ def _look(material: Any) -> tuple[npt.NDArray[np.float32] | None, tuple[float, f
     colour = np.ones(3)
     if factor is not None:
         factor = np.asarray(factor)
-        # trimesh keeps integer factors for 0..255 and floats for 0..1.
+        # trimesh stores factors as integers in 0..255 or floats in 0..1.
         colour = factor[:3] / 255.0 if factor.dtype.kind in "ui" else factor[:3].astype(float)
     picture = None if image is None else np.asarray(image.convert("RGB"), np.float32) / 255.0
     return picture, (float(colour[0]), float(colour[1]), float(colour[2]))
 
 
 def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(F, 2, 4) affine maps from points on triangles (F, 3, 3) to their texture coordinates (F, 3, 2)."""
+    """Affine maps (F, 2, 4) from points on triangles (F, 3, 3) to their texture coordinates (F, 3, 2)."""
     edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=1)
     change = np.stack([uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]], axis=1)
     gram = np.einsum("nij,nkj->nik", edges, edges)
@@ -46,7 +46,7 @@ def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) 
 
 
 def _spawn(world: World) -> tuple[float, float, float]:
-    """Centre of the largest free place of the floor plan that has a floor and something overhead."""
+    """Centre of the largest free area of the floor plan that has a floor and something overhead."""
     mask = world.occupied(0.05, 1.9, 0.05)
     clearance = mask.distance_m()
     candidates = np.argwhere(clearance > 0.3)
@@ -66,14 +66,14 @@ def _spawn(world: World) -> tuple[float, float, float]:
 
 
 def load_world(path: str | Path, y_up: bool | None = None) -> World:
-    """World from a mesh file: node transforms applied, textures repeated, soft light baked in.
+    """Load a world from a mesh file: apply node transforms, repeat textures, bake soft light.
 
     Args:
         path: the file.
-        y_up: whether the file has y up (default: glTF has, others have z up).
+        y_up: whether y is up in the file; by default true for glTF and false for other formats (z up).
 
     Raises:
-        ValueError: the file cannot be read or holds no triangles.
+        ValueError: the file cannot be read or has no triangles.
     """
     import trimesh
 
@@ -106,7 +106,7 @@ def load_world(path: str | Path, y_up: bool | None = None) -> World:
         else:
             key, source = id(material), srgb_to_linear(picture)
             corner_uv = np.asarray(uv, float)[mesh.faces]
-            # Rows of a picture run downwards, trimesh's v upwards.
+            # Image rows run downwards, trimesh's v upwards.
             corner_uv[..., 1] = 1.0 - corner_uv[..., 1]
         if key not in known:
             known[key] = len(sources)

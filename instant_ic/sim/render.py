@@ -1,4 +1,4 @@
-"""Panoramas and perspective pictures of a world, with depth, as clean as a real camera's."""
+"""Renders anti-aliased panoramas and perspective images of a world, with depth."""
 
 import math
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ from instant_ic.sim.world import World
 
 FloatArray = npt.NDArray[np.floating]
 
-#: Where edge pixels are sampled (rows, columns, in pixels from the centre): rotated grid, one sample a row and column.
+#: Sample positions in edge pixels (rows, columns, pixels from the centre): rotated grid, one sample per row and column.
 _SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 
-#: Share of a pixel over which a texture is averaged. Trilinear lookup blurs by itself: against 16 samples a pixel,
-#: 0.65 gives 41-44 dB in the corridor, 1.0 gives 38-40 dB, 0.5 gives 39-43 dB and begins to alias.
+#: Share of a pixel over which a texture is averaged; below 1 because trilinear lookup also blurs. Compared with 16
+#: samples per pixel in the corridor, 0.65 gives 41-44 dB, 1.0 gives 38-40 dB, 0.5 gives 39-43 dB and starts to alias.
 _FOOTPRINT = 0.65
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture with depth.
+    """Image with depth.
 
     Attributes:
         rgb: (H, W, 3) uint8 sRGB.
@@ -36,7 +36,7 @@ class Frame:
 
 @lru_cache(maxsize=1)
 def _tone_table() -> npt.NDArray[np.uint8]:
-    """Tone table, sRGB of radiance: linear up to 0.6, then a soft shoulder; lamps are white without a hard cut."""
+    """Tone table from radiance to sRGB: linear up to 0.6, then a soft shoulder, so that lamps turn white gradually."""
     radiance = np.linspace(0.0, kernels.TONE_MAX, kernels.TONE_SIZE)
     knee = 0.6
     shoulder = knee + (1 - knee) * (1 - np.exp(-(radiance - knee) / (1 - knee)))
@@ -44,7 +44,7 @@ def _tone_table() -> npt.NDArray[np.uint8]:
 
 
 def _equirect_rays(rows: FloatArray, columns: FloatArray, width: int, height: int) -> npt.NDArray[np.float32]:
-    """Unit vectors (N, 3) of index coordinates: centre column along x, columns clockwise, rows from +90° down."""
+    """Unit vectors (N, 3) at pixel indices: centre column along x, columns clockwise, rows from +90° down."""
     azimuth = math.pi - (columns + 0.5) * (2 * math.pi / width)
     elevation = math.pi / 2 - (rows + 0.5) * (math.pi / height)
     cosine = np.cos(elevation)
@@ -64,7 +64,7 @@ def _perspective_rays(
 
 @dataclass(frozen=True)
 class _Lens:
-    """Projection of a picture: width, height, and the horizontal field of view (None: equirect)."""
+    """Projection of an image: width, height, and horizontal field of view (None: equirect)."""
 
     width: int
     height: int
@@ -84,9 +84,9 @@ class _Lens:
 
 @lru_cache(maxsize=8)
 def _strides(lens: _Lens) -> npt.NDArray[np.int32]:
-    """How many columns of each row share a shaded pixel: towards the poles of a panorama columns lie close together.
+    """Number of columns per shaded pixel in each row; columns lie close together near the poles of a panorama.
 
-    A stride is taken where it is no wider than a pixel on the horizon.
+    A stride covers at most the width of a pixel on the horizon.
     """
     if lens.hfov_rad is not None:
         return np.ones(lens.height, np.int32)
@@ -104,10 +104,10 @@ def _all_rays(lens: _Lens) -> npt.NDArray[np.float32]:
 class EquirectRenderer:
     """Renders a world from any pose.
 
-    Rays are cast for every fourth pixel in each direction and wherever neighbours show different surfaces; between,
+    Rays are cast for every fourth pixel in each direction and wherever neighbours show different surfaces. In between,
     the range follows from the surface's plane. Pixels on edges are cast and shaded at four points. Near the poles of a
-    panorama every second, fourth... pixel of a row is shaded, and the colours between are interpolated.
-    One renderer may be used by one thread at a time.
+    panorama only every second, fourth... pixel of a row is shaded, and the colours in between are interpolated.
+    Only one thread at a time may use a renderer.
     """
 
     def __init__(self, world: World) -> None:
@@ -115,19 +115,19 @@ class EquirectRenderer:
         self._caster = world.caster
 
     def render(self, map_from_camera: FloatArray, width: int, height: int, supersample: int = 1) -> Frame:
-        """Equirect panorama (architecture: centre column along x, rows from +90° to −90°).
+        """Render an equirect panorama: centre column along x, rows from +90° to −90°.
 
         Args:
             map_from_camera: (4, 4) pose of the camera (x forward, y left, z up).
             width, height: pixels; usually 2:1.
-            supersample: rendered at this multiple and area-averaged (depth is taken at the centre, not averaged).
+            supersample: render at this multiple of the size and area-average; depth is taken at the centre instead.
         """
         return self._picture(np.asarray(map_from_camera), _Lens(width, height), supersample)
 
     def render_perspective(
         self, map_from_camera: FloatArray, width: int, height: int, hfov_rad: float, supersample: int = 1
     ) -> Frame:
-        """Perspective picture along the camera's x, square pixels; depth is radial too."""
+        """Render a perspective image along the camera's x with square pixels; depth is radial too."""
         if not 0 < hfov_rad < math.pi:
             raise ValueError(f"hfov_rad must be between 0 and pi (got {hfov_rad})")
         return self._picture(np.asarray(map_from_camera), _Lens(width, height, hfov_rad), supersample)
@@ -135,7 +135,7 @@ class EquirectRenderer:
     def cast(
         self, origins: FloatArray, directions: FloatArray
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """Ranges (N,) in metres (inf = nothing) and faces (N,) (-1 = nothing) of rays in the world's frame."""
+        """Ranges (N,) in metres (inf = no hit) and faces (N,) (-1 = no hit) of rays in the world's frame."""
         return self._caster.cast(origins, directions)
 
     def _picture(self, map_from_camera: FloatArray, lens: _Lens, supersample: int) -> Frame:
@@ -146,7 +146,7 @@ class EquirectRenderer:
         else:
             n = supersample
             fine, fine_depth = self._radiance(map_from_camera, _Lens(lens.width * n, lens.height * n, lens.hfov_rad))
-            # Averaged as light, cut off at white as a sensor does, so that lamps keep smooth borders.
+            # Averaged as radiance and clipped at white like a sensor, so that lamps keep smooth borders.
             radiance = np.ascontiguousarray(
                 np.minimum(fine, 1.5).reshape(lens.height, n, lens.width, n, 3).mean(axis=(1, 3)), np.float32
             )
@@ -158,7 +158,7 @@ class EquirectRenderer:
     def _radiance(
         self, map_from_camera: FloatArray, lens: _Lens
     ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Radiance (H, W, 3) and radial depth (H, W), edges anti-aliased."""
+        """Radiance (H, W, 3) with anti-aliased edges, and radial depth (H, W)."""
         height, width = lens.height, lens.width
         rotation = np.ascontiguousarray(map_from_camera[:3, :3], np.float32)
         origin = np.ascontiguousarray(map_from_camera[:3, 3], np.float32)
@@ -199,7 +199,7 @@ class EquirectRenderer:
     def _visible(
         self, directions: npt.NDArray[np.float32], origin: npt.NDArray[np.float32], lens: _Lens
     ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
-        """Surface (H, W), -1 = nothing, and range (H, W) of every pixel."""
+        """Surface (H, W), -1 = no hit, and range (H, W) of every pixel."""
         height, width = lens.height, lens.width
         world = self.world
         surface = np.full((height, width), -1, np.int32)

@@ -48,7 +48,6 @@ class RobotConfig:
     steering: SkidSteerConfig = field(default_factory=SkidSteerConfig)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for key in ("length", "width", "track_acceleration", "motor_lag_s", "rolling_resistance", "slip_time_s"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")

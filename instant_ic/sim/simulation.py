@@ -39,7 +39,6 @@ class BaseConfig:
     battery_v: float = 25.2
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not self.link or "/" in self.link:
             raise ValueError(f"link must be a plain file name (got {self.link!r})")
         if self.battery_v <= 0:
@@ -66,7 +65,6 @@ class SimulationConfig:
     base: BaseConfig = field(default_factory=BaseConfig)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if len(self.start) not in (0, 3):
             raise ValueError(f"start must be empty or x, y, yaw (got {list(self.start)})")
 

@@ -1,7 +1,7 @@
 """Procedural textures and their mip pyramids.
 
-Every texture is periodic, high-frequency enough that depth and view synthesis have something to hold on to, and is
-only ever looked up filtered (trilinear in a pyramid that is averaged in linear light), as a camera's optics would.
+Every texture is periodic and has enough high-frequency detail for depth and view synthesis. Lookups are always filtered
+(trilinear in a pyramid that is averaged in linear light), like the optics of a camera.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ MAX_LEVELS = 12
 
 @dataclass(frozen=True)
 class TextureSet:
-    """Mip pyramids of several textures in one buffer, as the kernels read them.
+    """Mip pyramids of several textures in one buffer, in the layout that the kernels read.
 
     Attributes:
-        texels: (N,) uint32, one texel each: red, green, blue in bytes 0..2, square roots of linear albedo · 255.
-        level_offset: (T, MAX_LEVELS) int64, where a level starts in ``texels``.
+        texels: (N,) uint32, one texel each: red, green, blue in bytes 0..2, as square root of linear albedo · 255.
+        level_offset: (T, MAX_LEVELS) int64, index of a level's first entry in ``texels``.
         level_size: (T, MAX_LEVELS, 2) int32, width and height of a level.
         levels: (T,) int32, number of levels.
         clamp: (T,) uint8, 1 where the texture ends at its border instead of repeating.
@@ -40,13 +40,13 @@ class TextureSet:
 
 
 def srgb_to_linear(value: FloatArray) -> npt.NDArray[np.float32]:
-    """Linear light of sRGB values in 0..1 (IEC 61966-2-1)."""
+    """Convert sRGB values in 0..1 to linear light (IEC 61966-2-1)."""
     value = np.asarray(value, np.float32)
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def linear_to_srgb(value: FloatArray) -> npt.NDArray[np.float32]:
-    """Linear light in 0..1 to sRGB values (IEC 61966-2-1)."""
+    """Convert linear light in 0..1 to sRGB values (IEC 61966-2-1)."""
     value = np.clip(np.asarray(value, np.float32), 0.0, None)
     return np.where(value <= 0.0031308, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
 
@@ -63,7 +63,7 @@ def _halve(image: FloatArray) -> npt.NDArray[np.float32]:
 
 
 def pyramid(albedo: FloatArray) -> list[npt.NDArray[np.float32]]:
-    """Levels of a linear-light image (H, W, 3), each half the size of the one before, down to one texel."""
+    """Mip levels of a linear-light image (H, W, 3), each half the size of the previous one, down to one texel."""
     levels = [np.asarray(albedo, np.float32)]
     while max(levels[-1].shape[:2]) > 1 and len(levels) < MAX_LEVELS:
         levels.append(_halve(levels[-1]))
@@ -97,7 +97,7 @@ def _packed(
 
 
 def texture_set(sources: list[str | FloatArray], clamped: list[bool]) -> TextureSet:
-    """Texture set of named procedural textures (str) or linear-light images (H, W, 3) in 0..1."""
+    """Make a texture set of named procedural textures (str) and linear-light images (H, W, 3) in 0..1."""
     count = len(sources)
     offset = np.zeros((count, MAX_LEVELS), np.int64)
     size = np.ones((count, MAX_LEVELS, 2), np.int32)
@@ -322,7 +322,7 @@ def _door(rng: np.random.Generator) -> FloatArray:
 
 
 def _poster(rng: np.random.Generator) -> FloatArray:
-    """Printed sheet: a title, a picture of coloured shapes, lines of text."""
+    """Printed sheet: a title, an image of coloured shapes, lines of text."""
     height, width = 384, 272
     paper = np.asarray(rng.uniform(0.62, 0.86, 3), np.float32)
     image = np.ones((height, width, 3), np.float32) * paper
@@ -373,7 +373,7 @@ def _notices(rng: np.random.Generator) -> FloatArray:
 
 
 def _window(rng: np.random.Generator) -> FloatArray:
-    """What is outside, behind a sash: sky, far houses, trees."""
+    """View through a sash window: sky, distant houses, trees."""
     height, width = 320, 384
     y = np.arange(height)[:, None] / height
     sky = np.stack([0.62 + 0.3 * y, 0.76 + 0.2 * y, np.full_like(y, 0.98)], axis=-1)
@@ -433,12 +433,12 @@ _GENERATORS: dict[str, Callable[[np.random.Generator], FloatArray]] = {
     "lamp": _lamp,
 }
 
-#: Textures that end at their border (one picture stretched over its surface).
+#: Textures that end at their border (one image stretched over its surface).
 CLAMPED = frozenset({"books", "door", "poster", "notices", "window", "cardboard"})
 
 
 def make_texture(name: str) -> npt.NDArray[np.float32]:
-    """Linear albedo (H, W, 3) of a texture named ``kind`` or ``kind:variant`` (variant: an integer seed).
+    """Make the linear albedo (H, W, 3) of a texture named ``kind`` or ``kind:variant`` (variant: an integer seed).
 
     Raises:
         ValueError: there is no such kind.

@@ -59,7 +59,6 @@ class ThetaConfig:
     mount_yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if (self.width, self.height) not in {f[:2] for f in PREVIEW_FORMATS}:
             formats = ", ".join(sorted({f"{w}x{h}" for w, h, _ in PREVIEW_FORMATS}))
             raise ValueError(f"width and height must be one of {formats} (got {self.width}x{self.height})")
@@ -178,7 +177,7 @@ class ThetaServer:
             # Do not wait for an image in progress on a busy machine: no client gets it, and the thread is a daemon.
             thread.join(0.3)
 
-    # --- pictures -----------------------------------------------------------------------------------
+    # --- images -------------------------------------------------------------------------------------
 
     def _make_frames(self) -> None:
         import cv2
@@ -270,7 +269,6 @@ class ThetaServer:
 
     @property
     def challenge(self) -> str:
-        """Value of WWW-Authenticate."""
         return f'Digest realm="RICOH THETA Z1", qop="auth", nonce="{self._nonce}", algorithm=MD5'
 
     def info(self) -> dict[str, Any]:
@@ -380,7 +378,6 @@ class ThetaServer:
 
     @property
     def stopping(self) -> bool:
-        """Whether the server is closing."""
         return self._stopping
 
 
@@ -397,7 +394,6 @@ class _Handler(BaseHTTPRequestHandler):
         log.debug("theta: " + format, *args)
 
     def do_GET(self) -> None:
-        """GET /osc/info."""
         if not self._authorised():
             return
         if self.path == "/osc/info":
@@ -406,7 +402,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(_ApiError(404, "invalidParameterValue", f"{self.path} does not exist"))
 
     def do_POST(self) -> None:
-        """The other end points."""
+        """POST end points: state and commands."""
         length = int(self.headers.get("Content-Length") or 0)
         body = self.rfile.read(length) if 0 <= length < 1_000_000 else b""
         if not self._authorised():

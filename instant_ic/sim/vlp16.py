@@ -46,7 +46,6 @@ class Vlp16Config:
     mount_yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 300 <= self.rpm <= 1200:
             raise ValueError(f"rpm must be in 300..1200 (got {self.rpm})")
         if self.range_noise < 0:
@@ -115,7 +114,7 @@ class Vlp16:
         self.packets += count
         times = first_s[:, None, None, None] + self._firing_s
         degrees_per_s = config.rpm * 6.0
-        # Azimuth is clockwise seen from above, 0 ahead (the sensor's x in ROS axes).
+        # Azimuth is clockwise when viewed from above, 0 ahead (the sensor's x in ROS axes).
         alpha = np.radians((times * degrees_per_s) % 360.0)
         pose = self._pose_at(times.ravel()).reshape(*times.shape, 3)
         heading = pose[..., 2] + math.radians(config.mount_yaw_deg) - alpha

@@ -1,4 +1,4 @@
-"""A world: a triangle mesh of planar surfaces with filtered textures and baked light."""
+"""World: triangle mesh of planar surfaces with filtered textures and baked light."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,29 +15,29 @@ FloatArray = npt.NDArray[np.floating]
 
 @dataclass
 class World:
-    """Everything that the renderer, the LiDAR and the contact test need to know of a place (metres, z up, floor 0).
+    """Geometry, textures and light of a place, for renderer, LiDAR and contact test (metres, z up, floor at 0).
 
     A *surface* is a planar convex piece with one texture: a rectangle of a procedural world, or one triangle of a mesh
-    file. Texture and light coordinates are affine in the hit point, so no barycentric coordinates are kept.
+    file. Texture and light coordinates are affine in the hit point, so no barycentric coordinates are stored.
 
     Attributes:
-        name: as given to ``make_world``.
+        name: name given to ``make_world``.
         vertices: (V, 3) float32.
-        faces: (F, 3) int32, counter-clockwise seen from the visible side.
-        face_surface: (F,) int32, surface of each face.
+        faces: (F, 3) int32, counter-clockwise when viewed from the visible side.
+        face_surface: (F,) int32, surface index of each face.
         normal: (S, 3) float32 unit normals.
-        offset: (S,) float32, normal · p on the surface.
+        offset: (S,) float32, normal · p for points p on the surface.
         uv: (S, 2, 4) float32; (u, v) = uv @ (x, y, z, 1) in texture repeats, v downwards.
         texture: (S,) int32, index into ``textures``.
-        tint: (S, 3) float32, multiplies the texture's albedo.
-        emission: (S,) float32; over 0: the surface shines by itself with this radiance, and light does not matter.
-        two_sided: whether surfaces are seen (and lit) from both sides.
-        light_at: (S, 3) int64: first texel, width and height in ``light`` (width 0: ``light_linear`` is used).
-        light_uv: (S, 2, 4) float32; light texel coordinates of a point.
-        light_linear: (S, 4) float32; light of a point where there is no map (meshes from files).
-        light: (L, 3) float32 baked irradiance (times albedo = radiance).
-        spawn: (x, y, yaw) where a robot starts.
-        zones: rectangles (x0, y0, x1, y1, height) of free space the world was made of, if it was made so.
+        tint: (S, 3) float32, factor of the texture's albedo.
+        emission: (S,) float32; a surface with a value above 0 emits this radiance and ignores light.
+        two_sided: whether surfaces are visible (and lit) from both sides.
+        light_at: (S, 3) int64: first texel, width and height in ``light``; width 0 selects ``light_linear``.
+        light_uv: (S, 2, 4) float32; maps a point to light texel coordinates.
+        light_linear: (S, 4) float32; light of a point on a surface without a light map (meshes from files).
+        light: (L, 3) float32 baked irradiance; times albedo it is radiance.
+        spawn: start pose (x, y, yaw) of a robot.
+        zones: rectangles (x0, y0, x1, y1, height) of free space from which the world was built, if any.
     """
 
     name: str
@@ -61,22 +61,22 @@ class World:
 
     @cached_property
     def caster(self) -> RayCaster:
-        """Ray caster of the mesh, built on first use."""
+        """Ray caster of the mesh, created on first use."""
         return RayCaster(self.vertices, self.faces)
 
     @cached_property
     def texel_per_m(self) -> npt.NDArray[np.float32]:
-        """(S,) texels of the finest level per metre, the larger of u and v."""
+        """Texels per metre of the finest level (S,), the larger of u and v."""
         gradient = np.linalg.norm(self.uv[:, :, :3], axis=2)
         return np.asarray((gradient * self.textures.level_size[self.texture, 0]).max(axis=1), np.float32)
 
     @property
     def bounds(self) -> FloatArray:
-        """(2, 3) lowest and highest corner."""
+        """Lowest and highest corner (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def occupied(self, low_m: float = 0.03, high_m: float = 0.9, cell_m: float = 0.02) -> OccupancyMask:
-        """Cells (seen from above) in which some surface lies between two heights; kept after the first call."""
+        """Floor plan cells with a surface between two heights; cached after the first call."""
         key = (low_m, high_m, cell_m)
         if key not in self._masks:
             self._masks[key] = occupied_mask(self.vertices, self.faces, low_m, high_m, cell_m)
@@ -89,16 +89,16 @@ class World:
     def sample_free_poses(
         self, rng: np.random.Generator, n: int, clearance_m: float = 0.35, up_to_m: float = 1.9
     ) -> npt.NDArray[np.float64]:
-        """Random poses (n, 3) x, y, yaw that can be reached from the spawn pose.
+        """Random poses (n, 3), x, y, yaw, that are reachable from the spawn pose.
 
         Args:
             rng: source of randomness.
             n: number of poses.
-            clearance_m: distance to everything between 0.03 m and ``up_to_m`` above the floor.
-            up_to_m: height under which things count.
+            clearance_m: smallest distance to objects between 0.03 m and ``up_to_m`` above the floor.
+            up_to_m: height below which objects count.
 
         Raises:
-            ValueError: nowhere is there that much clearance.
+            ValueError: no pose has this much clearance.
         """
         mask = self.occupied(0.03, up_to_m, 0.05)
         cells = mask.reachable(self.spawn[:2], clearance_m)
@@ -111,7 +111,7 @@ class World:
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks: a procedural texture, its size in metres (0 = stretched over the surface), a tint."""
+    """Look of a surface: procedural texture, texture size in metres (0 = stretched over the surface), tint."""
 
     texture: str
     size_m: float = 2.0
@@ -128,13 +128,13 @@ class _Panel:
 
 
 class WorldBuilder:
-    """Collects rectangles and makes them a ``World`` (without light: see ``lighting.bake``)."""
+    """Collects rectangles and builds a ``World`` from them; ``lighting.bake`` adds the light."""
 
     def __init__(self) -> None:
         self.panels: list[_Panel] = []
 
     def panel(self, origin: FloatArray, along_u: FloatArray, along_v: FloatArray, material: Material) -> None:
-        """Rectangle seen from its front: ``origin`` top left, ``along_u`` to the right, ``along_v`` down."""
+        """Add a rectangle; viewed from its front, ``origin`` is top left, ``along_u`` right, ``along_v`` down."""
         self.panels.append(
             _Panel(np.asarray(origin, float), np.asarray(along_u, float), np.asarray(along_v, float), material)
         )
@@ -142,7 +142,7 @@ class WorldBuilder:
     def wall(
         self, start: tuple[float, float], end: tuple[float, float], low: float, high: float, material: Material
     ) -> None:
-        """Upright rectangle whose front is on the right of start → end (left to right as one looks at it)."""
+        """Add a vertical rectangle whose front is on the right of start → end (left to right in front view)."""
         a, b = np.asarray(start, float), np.asarray(end, float)
         self.panel(
             np.asarray([a[0], a[1], high]),
@@ -161,7 +161,7 @@ class WorldBuilder:
         top: Material | None = None,
         front: Material | None = None,
     ) -> None:
-        """Box standing on z = ``low``; ``front`` is the side at +x of its own frame."""
+        """Add a box that stands on z = ``low``; ``front`` is the side at +x of its own frame."""
         side = side or Material("white")
         c, s = np.cos(yaw), np.sin(yaw)
         x = np.asarray([c, s, 0.0]) * size[0] / 2
@@ -180,7 +180,7 @@ class WorldBuilder:
             self.panel(base + x - y, 2 * y, -2 * x, side)
 
     def build(self, name: str, light_cell_m: float, spawn: tuple[float, float, float]) -> World:
-        """World with light maps of about ``light_cell_m`` a texel, all 1."""
+        """Build the world with light maps of about ``light_cell_m`` per texel, all set to 1."""
         panels = self.panels
         count = len(panels)
         origin = np.stack([p.origin for p in panels])
@@ -201,7 +201,7 @@ class WorldBuilder:
         for i, panel in enumerate(panels):
             size = panel.material.size_m
             if size > 0:
-                # Anchored to the world, so that neighbouring panels of one wall continue each other.
+                # Anchored to the world, so that the texture continues across neighbouring panels of one wall.
                 level = textures.level_size[index[i], 0]
                 uv[i, 0, :3] = unit_u[i] / size
                 uv[i, 1, :3] = unit_v[i] / (size * level[1] / level[0])

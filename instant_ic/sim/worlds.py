@@ -1,4 +1,4 @@
-"""The worlds: the corridor of the experiments, random interiors for training, and meshes from files."""
+"""Worlds: the corridor of the experiments, random interiors for training, and meshes from files."""
 
 import math
 from dataclasses import replace
@@ -19,13 +19,13 @@ _WALL_M = 0.16
 def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0.1) -> World:
     """L-shaped office corridor with side rooms, and the white obstacle of the experiments.
 
-    The corridor is 2.4 m wide and 2.7 m high: 14 m along x from x = -2, then 9 m along +y at its far end. The robot
-    starts at the origin and looks along +x. The obstacle, a box of 0.5 x 0.5 x 0.8 m in nearly the colour of the walls,
-    stands in the middle with its front 4 m ahead, so that 0.95 m is free on either side.
+    The corridor is 2.4 m wide and 2.7 m high. It runs 14 m along x from x = -2, then 9 m along +y at its far end. The
+    robot starts at the origin and faces +x. The obstacle is a box of 0.5 x 0.5 x 0.8 m, nearly in the colour of the
+    walls. It stands in the middle with its front 4 m ahead, which leaves 0.95 m free on either side.
 
     Args:
-        seed: changes pictures on the walls and what stands in the rooms, not the floor plan.
-        obstacle: whether the obstacle is there.
+        seed: changes the posters on the walls and the contents of the rooms, not the floor plan.
+        obstacle: whether to include the obstacle.
         light_cell_m: resolution of the baked light.
     """
     rng = np.random.default_rng([11, seed])
@@ -61,7 +61,7 @@ def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0
     for number, (door, towards, high, angle) in enumerate(doors):
         building.open_leaf(door, towards, high, angle, number % 3)
 
-    # Shut doors along the corridor, windows at its ends, pictures between.
+    # Closed doors along the corridor, windows at its ends, posters in between.
     building.closed_door(arm, "north", 8.7, 1)
     building.closed_door(arm, "north", 10.2, 2)
     building.closed_door(arm, "south", 2.2, 0)
@@ -166,7 +166,7 @@ def random_finish(rng: np.random.Generator) -> Finish:
 
 
 def plan(rng: np.random.Generator, building: Building, kind: str = "") -> list[Zone]:
-    """Zones of one of five kinds of floor plan (empty: drawn); the first holds the spawn point at its centre."""
+    """Zones of one of five kinds of floor plan (empty: random); the first zone has the spawn point at its centre."""
     drawn = rng.choice(["room", "hall", "corridor", "corner", "crossing"], p=[0.28, 0.12, 0.26, 0.18, 0.16])
     kind = kind or str(drawn)
     finish, height = random_finish(rng), float(rng.uniform(2.3, 3.4))
@@ -218,7 +218,7 @@ def side_room(
     wall: float,
     run: tuple[float, float] | None = None,
 ) -> Zone:
-    """Room behind a wall of ``zone`` with an open doorway."""
+    """Add a room with an open doorway behind a wall of ``zone``."""
     start, end = zone.side(side)
     length = math.dist(start, end)
     low, high = run or (0.4, length - 0.4)
@@ -227,7 +227,7 @@ def side_room(
     centre = start[0] + sign_x * at if side in ("north", "south") else start[1] + sign_y * at
     width = float(rng.uniform(0.85, 1.2))
     building.door(zone, side, centre, wall, width)
-    # No wider than its share of the wall, so that neighbouring side rooms do not overlap.
+    # At most as wide as its share of the wall, so that neighbouring side rooms do not overlap.
     left, right = min(at - low, 3.0) + 0.15, min(high - at, 3.0) + 0.15
     ends = sorted((centre - left, centre + right) if sign_x + sign_y > 0 else (centre + left, centre - right))
     depth = float(rng.uniform(2.2, 5.0))
@@ -242,7 +242,7 @@ def side_room(
 
 
 def decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
-    """Pictures, windows and shut doors on the free parts of a zone's walls."""
+    """Add posters, windows and closed doors to the free parts of a zone's walls."""
     for side in SIDES:
         for low, high in building.free_runs(zone, side, 0.2):
             at = low
@@ -276,7 +276,7 @@ def decorate(rng: np.random.Generator, building: Building, zone: Zone) -> None:
 
 
 def _furnish(rng: np.random.Generator, building: Building, zone: Zone, keep: tuple[float, float] | None) -> None:
-    """Furniture, mostly along the walls; ``keep`` (x, y) stays free."""
+    """Add furniture, mostly along the walls; ``keep`` (x, y) stays free."""
     w, d = zone.x1 - zone.x0, zone.y1 - zone.y0
     build = building.builder
     narrow = min(w, d) < 2.0
@@ -348,12 +348,12 @@ def _piece(
 
 
 def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World:
-    """Random interior: a room, a hall, a corridor, a corner or a crossing, with side rooms and furniture.
+    """Generate a random interior: room, hall, corridor, corner or crossing, with side rooms and furniture.
 
     Args:
         seed: the same seed gives the same world.
         light_cell_m: resolution of the baked light.
-        rays: rays a light texel.
+        rays: rays per light texel.
     """
     rng = np.random.default_rng([23, seed])
     building = Building()
@@ -366,13 +366,13 @@ def random_world(seed: int, light_cell_m: float = 0.25, rays: int = 20) -> World
         decorate(rng, building, zone)
         _furnish(rng, building, zone, (spawn[0], spawn[1]) if zone is first else None)
     world = building.world(f"random:{seed}", spawn, light_cell_m, rays)
-    # Exposure differs from room to room as with a real camera.
+    # Exposure varies between worlds, as with a real camera.
     world.light *= np.float32(rng.uniform(0.75, 1.25))
     return world
 
 
 def make_world(name_or_path: str) -> World:
-    """World by name: ``corridor``, ``corridor:SEED``, ``corridor-free`` (no obstacle), ``random:SEED``, or a mesh file.
+    """Make a world: ``corridor``, ``corridor:SEED``, ``corridor-free`` (no obstacle), ``random:SEED``, or a mesh file.
 
     Raises:
         ValueError: neither a known name nor an existing file.
