@@ -108,8 +108,8 @@ def open_serial(config: RoboclawConfig) -> SerialPort:
         )
     except (serial.SerialException, OSError) as error:
         raise LinkError(
-            f"{config.port}: cannot be opened ({error}); is the controller plugged in and switched on, "
-            "is no other program using it, and may you use it (group dialout)?"
+            f"{config.port}: cannot be opened ({error}). Check that the controller is plugged in and switched on, that "
+            "no other program uses the port, and that you are in the group dialout."
         ) from error
 
 
@@ -235,7 +235,7 @@ class Roboclaw:
         if not self._watchdog_holds(found_s):
             raise ControllerRestarted(
                 f"{self.config.port}: the controller's watchdog is {found_s:.1f} s instead of "
-                f"{_tenths(self.config.watchdog_s) / 10:.1f} s: it restarted, look at its supply voltage"
+                f"{_tenths(self.config.watchdog_s) / 10:.1f} s: it has restarted. Check its supply voltage."
             )
 
     def reset_encoders(self) -> None:
@@ -308,7 +308,7 @@ class Roboclaw:
         def read(port: SerialPort, command: int) -> bytes:
             received = port.read(size + 2)
             if len(received) < size + 2:
-                raise TimeoutError(f"command {command}: {len(received)} of {size + 2} bytes came")
+                raise TimeoutError(f"command {command}: received {len(received)} of {size + 2} bytes")
             return decode_reply(self.config.address, command, received)
 
         return read
@@ -316,7 +316,7 @@ class Roboclaw:
     def _status_reply(self, port: SerialPort, command: int) -> bytes:
         received = port.read(6)
         if len(received) not in (4, 6):
-            raise TimeoutError(f"command {command}: {len(received)} bytes came, which is neither 4 nor 6")
+            raise TimeoutError(f"command {command}: received {len(received)} bytes instead of 4 or 6")
         return decode_reply(self.config.address, command, received)
 
     def _version_reply(self, port: SerialPort, command: int) -> bytes:
@@ -325,7 +325,7 @@ class Roboclaw:
         while not received.endswith(b"\0"):
             byte = port.read(1)
             if not byte or len(received) > 48:
-                raise TimeoutError(f"command {command}: the version's text does not end ({received.hex()})")
+                raise TimeoutError(f"command {command}: the version text has no end ({received.hex()})")
             received += byte
         received += port.read(2)
         return decode_reply(self.config.address, command, bytes(received)).rstrip(b"\0")
@@ -373,8 +373,8 @@ class Roboclaw:
             # Unplugged, or the pseudo-terminal is gone; pyserial's exception is an OSError.
             except (OSError, termios.error) as error:
                 self.close()
-                raise LinkError(f"{self.config.port}: lost ({error})") from error
+                raise LinkError(f"{self.config.port}: connection lost ({error})") from error
         raise LinkError(
-            f"{self.config.port}: no good reply in {self.config.retries + 1} tries ({failure}); "
-            f"look at cable, baud rate ({self.config.baud}) and address (0x{self.config.address:02x})"
+            f"{self.config.port}: no valid reply in {self.config.retries + 1} attempts ({failure}). "
+            f"Check the cable, the baud rate ({self.config.baud}) and the address (0x{self.config.address:02x})."
         )

@@ -102,7 +102,7 @@ def read_recording(path: Path, selection: Selection | None = None) -> Calibratio
         moves = _knows(transforms, selection)
         chosen, places = _places(stamps, transforms if moves else None, selection)
         if not chosen:
-            raise CalibrationError(f"{path}: odometry on /tf and the {len(stamps)} pictures are not of the same time")
+            raise CalibrationError(f"{path}: odometry on /tf does not overlap in time with the {len(stamps)} images")
         clouds = _nearest_clouds(path, bag, points_topic, types[points_topic], list(chosen), selection)
         frames = []
         for message in bag.messages([image_topic]):
@@ -115,7 +115,7 @@ def read_recording(path: Path, selection: Selection | None = None) -> Calibratio
                         _frame(rgb, clouds[stamp], stamp, chosen[stamp], transforms if moves else None, selection)
                     )
                 except TransformError as error:
-                    raise CalibrationError(f"{path}: the motion at {stamp / 1e9:.3f} s is not known: {error}") from None
+                    raise CalibrationError(f"{path}: no odometry at {stamp / 1e9:.3f} s: {error}") from None
     lidar = next(iter(clouds.values())).frame_id
     return CalibrationRecording(
         frames=frames,
@@ -131,12 +131,10 @@ def _choose(path: Path, types: dict[str, str], kinds: tuple[str, ...], wanted: s
     found = sorted(topic for topic, kind in types.items() if kind in kinds)
     names = " or ".join(kind.rsplit("/", 1)[-1] for kind in kinds)
     if wanted and wanted not in found:
-        raise CalibrationError(f"{path}: no topic {wanted} of type {names}; there is {', '.join(found) or 'none'}")
+        raise CalibrationError(f"{path}: no topic {wanted} of type {names}; available: {', '.join(found) or 'none'}")
     choice = wanted or next((topic for topic in usual if topic in found), "") or (found[0] if len(found) == 1 else "")
     if not choice:
-        there = (
-            f"several of them ({', '.join(found)}): choose one" if found else f"it has {', '.join(types) or 'nothing'}"
-        )
+        there = f"select one of {', '.join(found)}" if found else f"topics of the bag: {', '.join(types) or 'none'}"
         raise CalibrationError(f"{path}: no {' or '.join(usual)} ({names}); {there}")
     return choice
 
@@ -163,7 +161,7 @@ def _stamps(path: Path, bag: BagReader, topic: str) -> tuple[list[int], str]:
         stamps.add(stamp_ns(picture))
         frame = picture.header.frame_id
     if not stamps:
-        raise CalibrationError(f"{path}: no picture on {topic}")
+        raise CalibrationError(f"{path}: no image on {topic}")
     return sorted(stamps), frame
 
 
@@ -271,7 +269,7 @@ def _nearest_clouds(
     if not found:
         raise CalibrationError(
             f"{path}: {count} revolutions on {topic}, none within {selection.most_gap_s} s of "
-            f"one of the {len(stamps)} pictures chosen: were both clocks set?"
+            f"one of the {len(stamps)} selected images. Check that both clocks were synchronised."
         )
     return found
 
@@ -281,9 +279,9 @@ def _decoded(path: Path, picture: Any) -> NDArray[np.uint8]:
 
     bgr = decode_image(bytes(picture.data), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise CalibrationError(f"{path}: the picture of {stamp_ns(picture) / 1e9:.3f} s cannot be decoded")
+        raise CalibrationError(f"{path}: the image at {stamp_ns(picture) / 1e9:.3f} s cannot be decoded")
     if bgr.shape[1] != 2 * bgr.shape[0]:
-        raise CalibrationError(f"{path}: a picture of {bgr.shape[1]} x {bgr.shape[0]} is no whole panorama (2:1)")
+        raise CalibrationError(f"{path}: an image of {bgr.shape[1]} x {bgr.shape[0]} is not a full panorama (2:1)")
     return np.ascontiguousarray(bgr[..., ::-1])
 
 

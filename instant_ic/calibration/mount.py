@@ -87,7 +87,7 @@ class CalibrationConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         if not self.blur_px or min(self.blur_px) <= 0:
-            raise ValueError(f"blur_px must hold values > 0 (got {self.blur_px})")
+            raise ValueError(f"blur_px values must be > 0 (got {self.blur_px})")
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,9 @@ def calibrate(
     """
     config = config or CalibrationConfig()
     if not frames:
-        raise CalibrationError("no pair of picture and LiDAR revolution")
+        raise CalibrationError("no pair of image and LiDAR revolution")
     if len({frame.rgb.shape for frame in frames}) != 1:
-        raise CalibrationError(f"pictures of different sizes: {sorted({frame.rgb.shape for frame in frames})}")
+        raise CalibrationError(f"images have different sizes: {sorted({frame.rgb.shape for frame in frames})}")
     edges = _edges(frames, camera_from_lidar, config)
     report(f"{len(frames)} frames, edges: " + ", ".join(f"{count} {cue}" for cue, count in edges.counts.items()))
     start, rival = camera_from_lidar, 0.0
@@ -204,8 +204,8 @@ def calibrate(
     before, after = level.score(camera_from_lidar) / chance, level.score(found) / chance
     if after < 1.05:
         raise CalibrationError(
-            f"the LiDAR's edges fit the pictures' nowhere better than by chance ({after:.2f} times): record in a "
-            "furnished room, with light, and see that pictures and LiDAR are of the same time"
+            f"the LiDAR's edges fit the image edges nowhere better than by chance ({after:.2f} times). Record in a "
+            "lit, furnished room, and check that the stamps of images and LiDAR match."
         )
     covariance = _covariance(level, found)
     if len({frame.place for frame in frames}) < _PLACES_FOR_HEIGHT:
@@ -237,8 +237,8 @@ def _edges(frames: Sequence[Frame], camera_from_lidar: Matrix, config: Calibrati
     counts = {name: int((cue == k).sum()) for k, name in enumerate(CUES)}
     if len(cue) < config.min_edges:
         raise CalibrationError(
-            f"only {len(cue)} edge points in {len(frames)} frames, {config.min_edges} are needed: "
-            "record in a furnished room, from several places"
+            f"only {len(cue)} edge points in {len(frames)} frames, {config.min_edges} are needed. "
+            "Record in a furnished room, from several places."
         )
     points = np.concatenate([edges.points for edges in found]).astype(np.float64)
     number = np.repeat(np.arange(len(frames)), [len(edges.cue) for edges in found])

@@ -38,7 +38,7 @@ def before_and_after(
             picture = overlay(frames[number], pose, width)
             band = np.ascontiguousarray(picture[round(0.25 * len(picture)) : round(0.72 * len(picture))])
             cv2.putText(
-                band, f"{name}, picture {number + 1}", (12, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2
+                band, f"{name}, image {number + 1}", (12, 30), cv2.FONT_HERSHEY_SIMPLEX, 0.8, (255, 255, 255), 2
             )
             strips.append(band)
     return np.concatenate(strips)

@@ -52,9 +52,9 @@ class FileCamera(Camera):
         elif self.path.is_file():
             self._paths = [self.path]
         if not self._paths:
-            raise CameraError(f"{self.path}: no picture ({', '.join(SUFFIXES)}) there")
+            raise CameraError(f"{self.path}: no image found ({', '.join(SUFFIXES)})")
         _, width, height = self._load(self._paths[0])
-        return f"{len(self._paths)} pictures from {self.path}, {width}x{height} at {self.config.rate_hz} Hz"
+        return f"{len(self._paths)} images from {self.path}, {width}x{height} at {self.config.rate_hz} Hz"
 
     def read(self) -> Frame:
         """Wait until the next image is due and return it.
@@ -113,5 +113,5 @@ class FileCamera(Camera):
 
         image = load_image(path, cv2.IMREAD_COLOR)
         if image is None:
-            raise JpegError("OpenCV cannot read it as a picture")
+            raise JpegError("cannot be decoded as an image")
         return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])[1].tobytes())

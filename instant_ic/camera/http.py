@@ -49,7 +49,7 @@ class _Socket(socket.socket):
         """
         left_s = self.deadline.at_s - time.monotonic()
         if left_s <= 0:
-            raise TimeoutError("the reply takes too long")
+            raise TimeoutError("the reply took too long")
         before = self.gettimeout()
         self.settimeout(min(left_s, math.inf if before is None else before) if left_s < math.inf else before)
         try:
@@ -94,7 +94,7 @@ class _Adapter(HTTPAdapter):
         try:
             encoding = response.headers.get("Content-Encoding", "identity").strip().lower()
             if encoding != "identity":
-                raise CameraError(f"{request.url}: the reply is encoded ({encoding[:40]}), which no Theta does")
+                raise CameraError(f"{request.url}: the reply is encoded ({encoding[:40]}), which a Theta never does")
             if response.status_code != 200 or not is_multipart(response):
                 response.raw = _whole(response, str(request.url))
         except BaseException:
@@ -184,7 +184,7 @@ def _whole(response: requests.Response, url: str) -> urllib3.HTTPResponse:
         while data := raw.read1(_CHUNK):
             body += data
             if len(body) > MOST_REPLY_BYTES:
-                raise CameraError(f"{url}: the reply is longer than {MOST_REPLY_BYTES >> 10} kB, which no Theta sends")
+                raise CameraError(f"{url}: the reply is longer than {MOST_REPLY_BYTES >> 10} kB, the limit for a Theta")
     except (urllib3.exceptions.HTTPError, OSError) as error:
         raise requests.ConnectionError(error, request=response.request) from error
     raw.release_conn()

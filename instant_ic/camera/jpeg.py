@@ -30,7 +30,7 @@ def check_whole(data: bytes | bytearray) -> None:
     if data[:2] != SOI:
         raise JpegError(f"starts with {bytes(data[:2]).hex() or 'nothing'} instead of ffd8 (SOI)")
     if data[-2:] != EOI:
-        raise JpegError(f"ends with {bytes(data[-2:]).hex()} instead of ffd9 (EOI): it was cut")
+        raise JpegError(f"ends with {bytes(data[-2:]).hex()} instead of ffd9 (EOI): the data is truncated")
 
 
 def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:

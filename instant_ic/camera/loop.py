@@ -77,7 +77,7 @@ class CameraLoop(threading.Thread):
                 except Exception as error:  # noqa: BLE001 - nothing else reports an exception of this thread
                     self.failures += 1
                     text = str(error) if isinstance(error, CameraError) else f"unexpected {error!r}"
-                    self._on_event(False, f"{text}; trying again in {wait_s:.1f} s")
+                    self._on_event(False, f"{text.rstrip('.')}. Reconnecting in {wait_s:.1f} s")
                     self._end.wait(wait_s)
                     wait_s = min(2.0 * wait_s, self._reconnect.max_s)
         finally:

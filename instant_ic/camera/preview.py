@@ -87,7 +87,7 @@ class PreviewParser:
         at = self._buffer.find(self._boundary, 0, self._length)
         if at < 0:
             return False
-        self._drop(f"cut after {at} of {self._length} bytes")
+        self._drop(f"truncated after {at} of {self._length} bytes")
         del self._buffer[:at]
         self._length = None
         return True

@@ -132,7 +132,7 @@ class ThetaClient:
         deadline = time.monotonic() + self.config.connect_timeout_s
         while reply.get("state") == "inProgress":
             if time.monotonic() > deadline:
-                raise CameraError(f"{self.url}: {name} has not ended in {self.config.connect_timeout_s} s")
+                raise CameraError(f"{self.url}: {name} did not finish within {self.config.connect_timeout_s} s")
             self._sleep(0.1)
             reply = self._call("POST", "/osc/commands/status", {"id": reply.get("id", "")})
         results = reply.get("results", {})
@@ -178,7 +178,7 @@ class ThetaClient:
         if reply is None:
             found = "a multipart stream" if is_multipart(response) else repr(response.content[:80])
             response.close()
-            raise CameraError(f"{self.url}{path}: the reply is no JSON object ({found})")
+            raise CameraError(f"{self.url}{path}: the reply is not a JSON object ({found})")
         if reply.get("state") == "error":
             raise _refusal(self.url + path, body, response.status_code, reply)
         return reply
@@ -198,8 +198,8 @@ class ThetaClient:
                 response = session.ask(method, self.url + path, body, _JSON, timeout_s)
             except requests.RequestException as error:
                 raise CameraError(
-                    f"{self.url}{path}: no answer ({_cause(error)}); is the camera on, in the same network, "
-                    "and is its wireless mode the one you expect?"
+                    f"{self.url}{path}: no answer ({_cause(error)}). Check that the camera is on, in the same network, "
+                    "and in the expected wireless mode."
                 ) from error
             if response.status_code != 503:
                 break
@@ -286,14 +286,14 @@ class ThetaCamera(Camera):
         while True:
             if time.monotonic() > deadline:
                 fault = f" ({self._parser.last_fault})" if self._parser.last_fault else ""
-                raise self._ended(f"data came, but no whole picture for {self.config.read_timeout_s} s{fault}")
+                raise self._ended(f"data arrived, but no complete image for {self.config.read_timeout_s} s{fault}")
             try:
                 # read1 returns the available data instead of waiting until the buffer is full.
                 data = response.raw.read1(_CHUNK)
             except (urllib3.exceptions.HTTPError, OSError) as error:
                 raise self._ended(_cause(error)) from error
             if not data:
-                raise self._ended("the camera ended it (button, shooting or change of mode?)")
+                raise self._ended("the camera ended it (button, shooting or change of mode)")
             bad_before = self._parser.bad_frames
             frames = self._parser.feed(data)
             self.bad_frames += self._parser.bad_frames - bad_before
@@ -352,11 +352,11 @@ def _refusal(where: str, body: Mapping[str, Any] | None, status: int, reply: Map
     command = f" {body['name']}" if body and "name" in body else ""
     hint = ""
     if status == 401:
-        hint = "; set INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD (serial number, and its digits)"
+        hint = ". Set INSTANT_IC_THETA_USER and INSTANT_IC_THETA_PASSWORD (serial number, and its digits)."
     elif 300 <= status < 400:
-        hint = "; it redirects, which no Theta does: is this the address of another device?"
+        hint = ". The reply redirects, which a Theta never does: check the address."
     elif status == 503:
-        hint = "; it stayed busy: switch the camera off and on again"
+        hint = ". The camera stayed busy: switch it off and on again."
     return ThetaError(f"{where}:{command} refused: {code} {text}".rstrip() + hint, code)
 
 

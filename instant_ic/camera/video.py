@@ -39,8 +39,8 @@ class VideoCamera(Camera):
         self.close()
         source: int | str = int(self.url) if self.url.isdigit() else self.url
         if isinstance(source, str) and source.startswith("/dev/") and not os.access(source, os.R_OK | os.W_OK):
-            why = "may not be read (group video)" if os.path.exists(source) else "does not exist"  # noqa: PTH110
-            raise CameraError(f"{source} {why}; 'v4l2-ctl --list-devices' shows the devices there are")
+            why = "is not readable (join the group video)" if os.path.exists(source) else "does not exist"  # noqa: PTH110
+            raise CameraError(f"{source} {why}; 'v4l2-ctl --list-devices' lists the devices")
         timeout_ms = round(self.config.read_timeout_s * 1000.0)
         parameters = []
         if "://" in self.url:
@@ -48,7 +48,7 @@ class VideoCamera(Camera):
         capture = cv2.VideoCapture(source, cv2.CAP_ANY, parameters)
         if not capture.isOpened():
             capture.release()
-            raise CameraError(f"{self.url}: cannot be opened as video; is it the right device or address?")
+            raise CameraError(f"{self.url}: cannot be opened as video. Check the device or address.")
         if self.config.width and self.config.height:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.config.width)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, self.config.height)
@@ -71,7 +71,7 @@ class VideoCamera(Camera):
         stamp_ns = self._stamp_ns()
         if not ok:
             self.close()
-            raise CameraError(f"{self.url}: no more frames: the stream ended or the device is gone")
+            raise CameraError(f"{self.url}: no more frames: the stream ended or the device was disconnected")
         encoded, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.config.quality])
         if not encoded:
             raise CameraError(f"{self.url}: a frame {image.shape} {image.dtype} cannot be encoded as JPEG")

@@ -73,8 +73,8 @@ class CaptureReader:
         magic = self._data[:4]
         if magic not in _PCAP_MAGIC and magic != _PCAPNG_MAGIC:
             raise CaptureError(
-                f"{self.path}: neither pcap nor pcapng: it starts with {magic.hex(' ') or 'nothing'}; "
-                "convert it with 'editcap -F pcap'"
+                f"{self.path}: neither pcap nor pcapng: it starts with {magic.hex(' ') or 'nothing'}. "
+                "Convert it with 'editcap -F pcap'."
             )
 
     def __iter__(self) -> Iterator[Datagram]:

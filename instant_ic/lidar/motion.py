@@ -26,9 +26,9 @@ class PlanarMotion:
 
     def __post_init__(self) -> None:
         if self.stamps_ns.ndim != 1 or self.odom_from_base.shape != (len(self.stamps_ns), 3):
-            raise MotionError(f"poses {self.odom_from_base.shape} do not fit stamps {self.stamps_ns.shape}")
+            raise MotionError(f"poses {self.odom_from_base.shape} do not match stamps {self.stamps_ns.shape}")
         if len(self.stamps_ns) == 0 or (np.diff(self.stamps_ns) <= 0).any():
-            raise MotionError("stamps must rise, and there must be one at least")
+            raise MotionError("stamps must increase, and at least one is required")
 
     def at(self, stamps_ns: ArrayLike) -> NDArray[np.float64]:
         """Poses at the given times, (..., 3); yaw is not wrapped.
@@ -41,7 +41,7 @@ class PlanarMotion:
         outside_s = max(first - int(wanted.min()), int(wanted.max()) - last) * 1e-9
         if outside_s > self.max_extrapolation_s:
             raise MotionError(
-                f"no pose of the base within {self.max_extrapolation_s} s: {outside_s:.3f} s outside those known"
+                f"no pose of the base within {self.max_extrapolation_s} s (the nearest is {outside_s:.3f} s away)"
             )
         if len(self.stamps_ns) == 1:
             return np.broadcast_to(self.odom_from_base[0], (*wanted.shape, 3)).copy()

@@ -160,8 +160,8 @@ class PacketReceiver:
         except OSError as error:
             bound.close()
             raise ReceiverError(
-                f"UDP {self.config.host}:{port} cannot be bound ({error.strerror}); "
-                "is another driver running? 'ss -ulpn' shows who holds the port"
+                f"UDP {self.config.host}:{port} cannot be bound ({error.strerror}). "
+                "Stop the program that uses the port: 'ss -ulpn' shows it."
             ) from error
         assert self._selector is not None
         self._selector.register(bound, selectors.EVENT_READ)

@@ -79,14 +79,15 @@ class SourceGuard:
         """Return why the points cannot be trusted at a steady time, and what to do; None if they can."""
         if self._recent(self._rival_ns, now_ns):
             return (
-                f"Packets come from {self._rival} beside {self._address}. No scan until it has been silent for "
-                f"{self.QUIET_S:.0f} s. Disconnect it, or set vlp16_driver `sensor` to the sensor's address and "
-                "restart the driver."
+                f"Packets arrive from {self._rival} as well as from {self._address}. No scan until {self._rival} has "
+                f"sent nothing for {self.QUIET_S:.0f} s. Disconnect it, or set vlp16_driver `sensor` to the sensor's "
+                "address and restart the driver."
             )
         if self._recent(self._late_ns, now_ns):
             return (
-                f"Packets come out of order, as if two senders used the address {self._address or 'of the sensor'}. "
-                f"No scan until all was in order for {self.QUIET_S:.0f} s. Look for a second sensor or a forged sender."
+                f"Packets arrive out of order, as if two senders used the address {self._address or 'of the sensor'}. "
+                f"No scan until packets were in order for {self.QUIET_S:.0f} s. Check for a second sensor or a forged "
+                "sender."
             )
         return None
 

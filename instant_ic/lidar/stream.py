@@ -124,7 +124,7 @@ class PacketStream:
         if reason is None:
             azimuth, timestamp_us, mode, product = _TAIL.unpack_from(payload, _TAIL_AT)
             if product in _OTHER_PRODUCTS:
-                reason = f"product 0x{product:02x}, which is no VLP-16"
+                reason = f"product 0x{product:02x} is not a VLP-16"
             elif timestamp_us >= HOUR_US or azimuth >= 36000:
                 reason = "time or azimuth out of range"
         if reason is not None:

@@ -30,7 +30,7 @@ class CaptureReplay:
         ports = {DATA_PACKET_BYTES: data_port, POSITION_PACKET_BYTES: position_port}
         datagrams = [d for d in CaptureReader(path) if len(d.payload) in ports]
         if not datagrams:
-            raise ValueError(f"pcap {path} holds no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
+            raise ValueError(f"pcap {path} has no VLP-16 packets (UDP payloads of 1206 or 512 bytes)")
         first = min(d.stamp_ns for d in datagrams)
         # Sorted by time only: packets with equal stamps keep their order, or the driver would count them as late.
         self._items = sorted(

@@ -121,7 +121,7 @@ def load_world(path: str | Path, y_up: bool | None = None) -> World:
             }
         )
     if not parts:
-        raise ValueError(f"world {path}: the file holds no triangles")
+        raise ValueError(f"world {path}: the file has no triangles")
     joined = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     cross = np.cross(
         joined["triangles"][:, 1] - joined["triangles"][:, 0], joined["triangles"][:, 2] - joined["triangles"][:, 0]

@@ -89,7 +89,7 @@ class TrackedRobot:
         self._held_at: FloatArray = self.pose
         self._outline = _outline(config.length, config.width, mask.cell_m)
         if self.touches(self.pose):
-            raise ValueError(f"the robot would start inside something at x={pose[0]:.2f}, y={pose[1]:.2f}")
+            raise ValueError(f"the start pose x={pose[0]:.2f}, y={pose[1]:.2f} collides with the world")
 
     @property
     def encoder_pulses(self) -> FloatArray:

@@ -445,7 +445,7 @@ def make_texture(name: str) -> npt.NDArray[np.float32]:
     """
     kind, _, variant = name.partition(":")
     if kind not in _GENERATORS:
-        raise ValueError(f"no procedural texture {kind!r}; there are {', '.join(sorted(_GENERATORS))}")
+        raise ValueError(f"no procedural texture {kind!r}; available: {', '.join(sorted(_GENERATORS))}")
     rng = np.random.default_rng([list(_GENERATORS).index(kind), int(variant or 0)])
     return np.asarray(_GENERATORS[kind](rng), np.float32)
 

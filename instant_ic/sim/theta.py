@@ -88,7 +88,7 @@ def panorama_file(path: str | Path) -> PictureSource:
 
     image = load_image(path, cv2.IMREAD_COLOR)
     if image is None:
-        raise ValueError(f"panorama {path} cannot be read as a picture")
+        raise ValueError(f"panorama {path} cannot be decoded as an image")
     rgb = np.ascontiguousarray(image[..., ::-1])
     sized: dict[tuple[int, int], npt.NDArray[np.uint8]] = {}
 
@@ -148,8 +148,8 @@ class ThetaServer:
             self._http = ThreadingHTTPServer((config.host, config.port), Handler)
         except OSError as error:
             raise OSError(
-                f"the camera's Web API cannot listen on {config.host}:{config.port} ({error.strerror}); is another "
-                "simulator running? camera.port chooses another port"
+                f"the camera's Web API cannot listen on {config.host}:{config.port} ({error.strerror}). Stop the "
+                "program that uses the port, or set camera.port."
             ) from error
         self._http.daemon_threads = True
         self.port = int(self._http.server_address[1])
@@ -202,7 +202,7 @@ class ThetaServer:
                 ".jpg", np.ascontiguousarray(rgb[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, self.config.quality]
             )
             if not ok:
-                raise RuntimeError(f"OpenCV could not encode a picture of {width}x{height}")
+                raise RuntimeError(f"OpenCV could not encode an image of {width}x{height}")
             self._sleep(began + self.config.latency_s)
             with self._changed:
                 self._frame = encoded.tobytes()

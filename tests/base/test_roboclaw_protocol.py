@@ -163,7 +163,7 @@ def test_driver_gives_up_in_words_after_its_retries() -> None:
     emulator = RoboclawEmulator()
     roboclaw, port = connected(emulator, retries=1)
     port.damage = lambda reply: b""
-    with pytest.raises(LinkError, match=r"no good reply in 2 tries .*0 of 4 bytes"):
+    with pytest.raises(LinkError, match=r"no valid reply in 2 attempts .*0 of 4 bytes"):
         roboclaw.battery_v()
     assert roboclaw.counters.timeouts == 2
     port.unplugged = True

@@ -127,7 +127,7 @@ def test_cut_frame_is_counted_and_the_next_one_given() -> None:
 def test_nobody_there_is_told_in_words() -> None:
     with FakeTheta() as theta:
         url = theta.url
-    with pytest.raises(CameraError, match=r"no answer .*is the camera on"):
+    with pytest.raises(CameraError, match=r"no answer .*the camera is on"):
         ThetaClient(url, CONFIG).info()
 
 

@@ -42,7 +42,7 @@ def test_files_in_lockstep(tmp_path: Path) -> None:
 def test_device_in_lockstep_and_missing_files_are_refused_in_words(tmp_path: Path) -> None:
     with pytest.raises(NodeError, match="cannot run in lockstep"):
         LockstepBus().add(ThetaCameraNode, ThetaCameraConfig(source="theta"))
-    with pytest.raises(NodeError, match="no picture"):
+    with pytest.raises(NodeError, match="no image"):
         LockstepBus().add(ThetaCameraNode, ThetaCameraConfig(source="files", url=str(tmp_path)))
     with pytest.raises(ValueError, match="source"):
         ThetaCameraConfig(source="usb")

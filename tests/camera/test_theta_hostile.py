@@ -142,7 +142,7 @@ def test_digest_challenge_that_cannot_be_answered_is_an_error(challenge: str) ->
 
 @pytest.mark.parametrize("body", [b"[" * 100_000, b"[]", b"\xff\xfe", b'{"state": ', b"1" * 5000])
 def test_reply_that_is_no_object_is_an_error(body: bytes) -> None:
-    with Stranger(reply(body)) as camera, pytest.raises(CameraError, match="no JSON object"):
+    with Stranger(reply(body)) as camera, pytest.raises(CameraError, match="not a JSON object"):
         ThetaClient(camera.url, PATIENT).info()
 
 

@@ -124,7 +124,7 @@ def test_repeated_late_and_foreign_packets_are_dropped_and_counted() -> None:
     stream.feed(payloads[4][:-1] + b"\x24", received(4))
     assert (stream.counters.packets, stream.counters.late, stream.counters.bad) == (4, 2, 4)
     assert len(stream.counters.bad_reasons) == 4
-    assert stream.counters.bad_reasons["product 0x24, which is no VLP-16"] == 1
+    assert stream.counters.bad_reasons["product 0x24 is not a VLP-16"] == 1
 
 
 @pytest.mark.parametrize("before_us", [900_000_000, 2_700_000_000])  # back by a quarter of an hour, by three

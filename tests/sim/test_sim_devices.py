@@ -198,7 +198,7 @@ def test_a_panorama_file_is_area_averaged(tmp_path: Path) -> None:
     assert small.shape == (320, 640, 3)
     assert small.min() >= 127 and small.max() <= 128
     assert source(640, 320) is small
-    with pytest.raises(ValueError, match="cannot be read as a picture"):
+    with pytest.raises(ValueError, match="cannot be decoded as an image"):
         panorama_file(tmp_path / "none.png")
 
 

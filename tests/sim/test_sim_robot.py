@@ -88,7 +88,7 @@ def test_corners_touch_when_turning(box_room: World) -> None:
 
 
 def test_no_start_inside_a_wall(box_room: World) -> None:
-    with pytest.raises(ValueError, match="would start inside something"):
+    with pytest.raises(ValueError, match="collides with the world"):
         TrackedRobot(EXACT, box_room.occupied(0.03, 0.9, 0.01), (2.9, 0.0, 0.0))
 
 

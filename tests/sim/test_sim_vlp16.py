@@ -229,7 +229,7 @@ def test_a_capture_is_sent_at_its_own_pace_and_untouched(box_room: World, tmp_pa
 def test_a_capture_without_packets_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "dns.pcap"
     write_pcap(path, [(1.0, 53, b"dns")])
-    with pytest.raises(ValueError, match="holds no VLP-16 packets"):
+    with pytest.raises(ValueError, match="has no VLP-16 packets"):
         CaptureReplay(path, "127.0.0.1", 2368, 8308)
 
 
