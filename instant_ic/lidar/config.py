@@ -35,7 +35,7 @@ class FlatScanConfig:
         min_height: lower points are not obstacles, metres above the ground (z of base_link).
         max_height: the robot passes under higher points, metres above the ground.
         beams: number of directions over 360 degrees.
-        range_min: nearest range that the scan declares, metres.
+        range_min: smallest range of the scan, metres; nearer points count as too close (-inf).
         range_max: farther points are left out of the scan, metres.
         min_coverage: smallest measured share of the circle for a scan, 0-1.
     """
