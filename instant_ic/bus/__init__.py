@@ -1,6 +1,6 @@
 """Topics between processes, with the file system as registry: node, publisher, subscriber, clock, parameters.
 
-Names are loaded when they are first used: a command that only reads the registry need not load the whole bus.
+Names are imported on first use, so a command that only reads the registry does not load the whole bus.
 """
 
 import importlib
@@ -45,7 +45,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, from the module that has it."""
+    """Import a public name on first use."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"instant_ic.{_MODULES[name]}"), name)

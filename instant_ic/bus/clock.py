@@ -1,8 +1,7 @@
-"""Clocks: a node asks its clock for the time, never the system.
+"""Clocks: a node reads the time from its clock, never from the system.
 
-Two kinds of time: ``now_ns`` for stamps, which other processes and machines compare with theirs and which jumps when
-somebody sets the machine's clock; ``steady_ns`` for how long something has taken, timers and time-outs, which never
-does.
+There are two kinds of time. ``now_ns`` is for stamps, which other processes and machines compare with their own; it
+jumps when somebody sets the machine's clock. ``steady_ns`` is for durations, timers and time-outs; it never jumps.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ class Clock(Protocol):
         ...
 
     def steady_ns(self) -> int:
-        """Nanoseconds since some moment; only differences mean something."""
+        """Nanoseconds since an arbitrary origin; only differences are meaningful."""
         ...
 
 
@@ -33,34 +32,34 @@ class SystemClock:
         return pace.current().now_ns()
 
     def steady_ns(self) -> int:
-        """Time that goes on evenly when the machine's clock is set."""
+        """Nanoseconds of a clock that never jumps, even when somebody sets the machine's clock."""
         return pace.current().steady_ns()
 
 
 class ManualClock:
-    """A clock that somebody sets: ``/clock`` in replay, the lockstep bus in tests."""
+    """A clock that is set from outside: by ``/clock`` in replay, by the lockstep bus in tests."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
 
     def now_ns(self) -> int:
-        """The time last set."""
+        """The time that was set last."""
         return self._now_ns
 
     def steady_ns(self) -> int:
-        """The same: simulated time is all there is, and a second of it is a second for time-outs too."""
+        """The same value as ``now_ns``: time-outs also run in simulated time."""
         return self._now_ns
 
     def set(self, now_ns: int) -> None:
-        """Sets the time; it may go back, as when a player loops."""
+        """Set the time. It may go back, for example when a player loops."""
         self._now_ns = int(now_ns)
 
 
 class JumpDetector:
-    """Sees that the machine's clock was set, by what it has gone beside the steady one.
+    """Detects that somebody set the machine's clock, by comparing it with the steady clock.
 
     Args:
-        tolerance_s: smaller differences are the machine's own corrections.
+        tolerance_s: smaller differences count as the machine's own corrections.
     """
 
     def __init__(self, tolerance_s: float = 0.5) -> None:
@@ -68,7 +67,7 @@ class JumpDetector:
         self._offset_ns = time.time_ns() - time.monotonic_ns()
 
     def jump_s(self) -> float:
-        """Seconds that the clock was set forward (back: negative) since the last call; 0.0 for none."""
+        """Seconds the clock was set forward since the last call (negative: back); 0.0 if it was not set."""
         offset_ns = time.time_ns() - time.monotonic_ns()
         jumped_ns = offset_ns - self._offset_ns
         self._offset_ns = offset_ns

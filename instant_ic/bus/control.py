@@ -1,9 +1,9 @@
-"""The control channel of a node: its parameters and its log level, asked and changed while it runs.
+"""Control channel of a node: read and change its parameters and log level while it runs.
 
 Each node process listens on ``RUN_DIR/nodes/<node>.sock`` (a Unix socket in a folder of mode 0700). A request is one
-line of JSON, ``{"op": "set", "values": {"rate_hz": 5.0}}``, and so is the answer: ``{"ok": true, ...}`` or ``{"ok":
-false, "error": "what is wrong", "kind": "parameter"}``. Its threads answer also while the node's own thread is in a
-long callback; only a change has to wait for that one, and is dropped when it waits too long.
+line of JSON, ``{"op": "set", "values": {"rate_hz": 5.0}}``. The answer is one line too: ``{"ok": true, ...}`` or
+``{"ok": false, "error": "what is wrong", "kind": "parameter"}``. Separate threads answer, even while the node's own
+thread is in a long callback. Only a change has to wait for the node's thread; it is dropped if it waits too long.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ MAX_ANSWER_BYTES = 16 * 1024 * 1024
 MAX_CONNECTIONS = 8
 LEVELS = ("debug", "info", "warning", "error")
 
-_IDLE_S = 5.0  # a connection that says nothing for so long is closed
-_CHANGE_S = 2.0  # a change waits so long for the node's thread
+_IDLE_S = 5.0  # an idle connection is closed after this time
+_CHANGE_S = 2.0  # how long a change waits for the node's thread
 
 log = logging.getLogger(__name__)
 
 
 class ControlError(RuntimeError):
-    """The node does not run, does not answer, or refuses the request."""
+    """The node is not running, does not answer, or refuses the request."""
 
 
 class NodeMissingError(ControlError):
-    """The node does not run."""
+    """The node is not running."""
 
 
 class NodeBusyError(ControlError):
-    """The node's own thread is in a long callback; nothing was changed."""
+    """The node's own thread is in a long callback; nothing has been changed."""
 
 
 class _RequestError(ControlError):
-    """A request that makes no sense."""
+    """An invalid request."""
 
 
 class ControlServer:
@@ -60,7 +60,7 @@ class ControlServer:
 
     Args:
         node: the node.
-        path: of the socket; what stands there is replaced, the caller holds the node's claim.
+        path: of the socket; an existing file is replaced, since the caller holds the node's claim.
 
     Raises:
         RegistryError: the path is too long for a socket, or cannot be bound.
@@ -82,9 +82,9 @@ class ControlServer:
         self._thread.start()
 
     def close(self) -> None:
-        """Takes no more requests."""
+        """Stop accepting requests."""
         try:
-            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread out of accept()
+            self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread from accept()
         except OSError as error:
             log.debug("control socket %s: %s", self.path, error)
         self._listener.close()
@@ -113,13 +113,13 @@ class ControlServer:
                     _send(connection, self.answer(line))
         except _RequestError as error:
             log.warning("control: %s", error)
-        except OSError as error:  # the other side left, or says nothing
+        except OSError as error:  # the client disconnected or went idle
             log.debug("control: %s", error)
         finally:
             self._slots.release()
 
     def answer(self, line: bytes) -> dict[str, Any]:
-        """The answer to one request."""
+        """Answer one request."""
         try:
             request = _parse(line)
             operation = self._operations().get(str(request.get("op")))
@@ -133,7 +133,7 @@ class ControlServer:
             return _refusal(str(error), "parameter")
         except NodeBusyError as error:
             return _refusal(str(error), "busy")
-        except Exception as error:  # a bug here must be told to the one who asks, and must not end the node
+        except Exception as error:  # report a bug here to the client; it must not end the node
             log.exception("control")
             return _refusal(f"{type(error).__name__}: {error}", "internal")
 
@@ -187,10 +187,10 @@ class ControlServer:
             raise _RequestError(f"{name}: {error}") from error
 
     def _on_node(self, function: Callable[[], Any]) -> Any:
-        """Runs a function on the node's thread and gives its result.
+        """Run a function on the node's thread and return its result.
 
         Raises:
-            NodeBusyError: that thread had no time for it; it will not be run later.
+            NodeBusyError: the node's thread was busy for too long; the function will not run later.
         """
         future: concurrent.futures.Future[Any] = concurrent.futures.Future()
 
@@ -206,7 +206,7 @@ class ControlServer:
         try:
             return future.result(_CHANGE_S)
         except concurrent.futures.TimeoutError:
-            if not future.cancel():  # it has begun in this moment
+            if not future.cancel():  # it has just started
                 return future.result(_CHANGE_S)
             what, busy_s = self._node.activity()
             doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop does not turn"
@@ -214,12 +214,12 @@ class ControlServer:
 
 
 class NodeControl:
-    """Asks one running node; each call is one request with a time-out.
+    """Client of one running node; each call is one request with a time-out.
 
     Args:
         run_dir: run directory of the stack.
         node: name of the node.
-        timeout_s: for each answer.
+        timeout_s: time to wait for each answer.
     """
 
     def __init__(self, run_dir: Path, node: str, timeout_s: float = 5.0) -> None:
@@ -231,7 +231,7 @@ class NodeControl:
         """Every parameter of the node.
 
         Raises:
-            ControlError: the node does not run or does not answer.
+            ControlError: the node is not running or does not answer.
         """
         return [ParameterInfo(**entry) for entry in self.request({"op": "describe"})["parameters"]]
 
@@ -245,11 +245,11 @@ class NodeControl:
         return values
 
     def set(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Changes parameters together, or none of them; returns those that have another value now.
+        """Change several parameters together, or none; returns those whose value has changed.
 
         Raises:
-            ParameterError: a value is refused; the words say why.
-            ControlError: see :meth:`describe`; :class:`NodeBusyError` when the node has no time for it.
+            ParameterError: a value is refused; the message says why.
+            ControlError: see :meth:`describe`; :class:`NodeBusyError` when the node's thread is busy.
         """
         changed: dict[str, Any] = self.request({"op": "set", "values": {k: plain(v) for k, v in values.items()}})[
             "changed"
@@ -257,15 +257,15 @@ class NodeControl:
         return changed
 
     def log_level(self, level: str | None = None) -> str:
-        """The node's log level, after setting it where one is given.
+        """The node's log level, after setting it if ``level`` is given.
 
         Raises:
-            ControlError: see :meth:`describe`, or there is no such level.
+            ControlError: see :meth:`describe`, or the level does not exist.
         """
         return str(self.request({"op": "log_level", "level": level})["level"])
 
     def status(self) -> dict[str, Any]:
-        """``pid``, ``threads``, ``busy`` (what its thread is doing, or empty) and ``busy_s`` (for how long).
+        """``pid``, ``threads``, ``busy`` (the callback its thread is running, or empty) and ``busy_s`` (for how long).
 
         Raises:
             ControlError: see :meth:`describe`.
@@ -273,18 +273,18 @@ class NodeControl:
         return self.request({"op": "status"})
 
     def call(self, command: str, **arguments: Any) -> Any:
-        """Has the node do one of its ``commands`` and gives the result.
+        """Run one of the node's ``commands`` and return its result.
 
         Raises:
-            ControlError: see :meth:`describe`; or the node has no such command, or refuses it with a reason.
+            ControlError: see :meth:`describe`; or the command does not exist; or the node refuses it, with a reason.
         """
         return self.request({"op": "call", "command": command, "arguments": arguments})["result"]
 
     def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Sends one request and gives the answer.
+        """Send one request and return the answer.
 
         Raises:
-            ParameterError, ControlError: what the node refused, or why there is no answer.
+            ParameterError, ControlError: why the node refused, or why there is no answer.
         """
         path = self.run_dir / "nodes" / f"{self.node}.sock"
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
@@ -322,7 +322,7 @@ class NodeControl:
 
 
 class _LineReader:
-    """Lines of a socket, up to a length."""
+    """Reads lines of limited length from a socket."""
 
     def __init__(self, connection: socket.socket, max_bytes: int) -> None:
         self._connection = connection
@@ -330,7 +330,7 @@ class _LineReader:
         self._buffer = bytearray()
 
     def line(self) -> bytes | None:
-        """The next line without its end; None when the other side has closed."""
+        """The next line without its line end; None when the other side has closed."""
         while (end := self._buffer.find(b"\n")) < 0:
             if len(self._buffer) > self._max_bytes:
                 raise _RequestError(f"a line of more than {self._max_bytes} bytes")

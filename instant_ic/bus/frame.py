@@ -1,9 +1,9 @@
-"""What goes over a topic's socket: a fixed header before every body, a greeting first.
+"""Wire format of a topic's socket: a greeting first, then frames with a fixed header.
 
-Publisher to reader: ``HELLO`` (JSON: who sends what), then ``DATA`` (CDR bytes) and ``SHARED`` (a place in shared
-memory; the file descriptor of a buffer that the reader does not know comes along with it). ``RETIRED`` names a buffer
-that will not be used again. Reader to publisher: one :data:`GREETING`, then the number (:data:`BUFFER_ID`) of each
-buffer that it has finished with.
+Publisher to reader: ``HELLO`` (JSON: node, topic and type), then ``DATA`` (CDR bytes) and ``SHARED`` (a place in
+shared memory; with a buffer that is new to the reader comes its file descriptor). ``RETIRED`` names a buffer that will
+not be used again. Reader to publisher: one :data:`GREETING`, then the number (:data:`BUFFER_ID`) of each buffer that
+the reader has finished with.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ VERSION = 2
 MAGIC = b"IIC\0"
 
 HELLO, DATA, SHARED, RETIRED = (int.from_bytes(MAGIC + bytes([VERSION, kind, 0, 0]), "little") for kind in (1, 2, 3, 4))
-"""What a frame is: magic, version and kind in one number, so that one comparison checks all three."""
+"""Frame kinds: magic, version and kind in one number, so that one comparison checks all three."""
 
 HEADER = struct.Struct("<QIIQq")
-"""Kind, messages skipped for this reader, bytes of the body, sequence, publish time in ns."""
+"""Kind, messages skipped for this reader, size of the body in bytes, sequence, publication time in ns."""
 
 SHARED_BODY = struct.Struct("<IIQ")
-"""Number of the buffer, 1 if its file descriptor comes along, bytes of the message in it."""
+"""Buffer number, 1 if its file descriptor comes with this frame, size of the message in bytes."""
 
 BUFFER_ID = struct.Struct("<I")
 
 GREETING = struct.Struct("<4sB?2xI")
-"""Magic, version, whether shared memory is understood, how many messages the reader keeps (1: the newest only)."""
+"""Magic, version, whether the reader supports shared memory, its queue length (1: the newest message only)."""
 
 MOST_BYTES = 0xFFFFFFFF
-"""Largest body."""
+"""Largest body, in bytes."""
 
 
 class FrameError(ValueError):
-    """Bytes that are no frame of this version."""
+    """The bytes are not a frame of this version."""
 
 
 @dataclass(frozen=True)
 class Hello:
-    """What a publisher says of itself to a new reader.
+    """A publisher's greeting to a new reader.
 
     Attributes:
         node: name of its node.
         topic: full name.
         type_name: for example ``sensor_msgs/msg/Image``.
         digest: see :func:`type_digest`.
-        publisher: 8 random bytes in hex, new with every start.
+        publisher: 8 random bytes in hex, new at every start.
     """
 
     node: str
@@ -66,10 +66,10 @@ class Hello:
 
     @classmethod
     def unpack(cls, body: bytes) -> Hello:
-        """Reads the body of a frame.
+        """Parse the body of a ``HELLO`` frame.
 
         Raises:
-            FrameError: not the greeting of a publisher.
+            FrameError: the body is not a publisher's greeting.
         """
         try:
             values = json.loads(body)
@@ -82,8 +82,10 @@ class Hello:
 
 
 def check_kind(kind: int) -> None:
-    """Raises:
-    FrameError: not a kind of this version.
+    """Check that a frame is of a known kind.
+
+    Raises:
+        FrameError: not a kind of this version.
     """
     if kind not in (HELLO, DATA, SHARED, RETIRED):
         words = kind.to_bytes(8, "little")
@@ -92,5 +94,5 @@ def check_kind(kind: int) -> None:
 
 @functools.cache
 def type_digest(type_name: str) -> str:
-    """First 16 hex digits of the SHA-256 of a type's name and RIHS01 hash: two sides agree on the type's fields."""
+    """First 16 hex digits of the SHA-256 of a type's name and RIHS01 hash; equal digests mean equal fields."""
     return hashlib.sha256(f"{type_name} {type_hash(type_name)}".encode()).hexdigest()[:16]

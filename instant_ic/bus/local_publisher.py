@@ -1,7 +1,7 @@
-"""One topic of one node: a Unix socket that readers connect to, and shared memory for what is large.
+"""Publisher of one topic: a Unix socket that readers connect to, and shared memory for large messages.
 
-A message goes from the publishing thread straight into each reader's socket: no thread and no process stands between
-them. A reader that does not keep up gets what it asked for: the newest message, or a queue.
+A message goes from the publishing thread straight into each reader's socket, without another thread or process in
+between. A slow reader gets what its QoS asks for: the newest message, or a queue.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
     from instant_ic.bus.local_transport import LocalTransport
 
 SHARED_FROM_BYTES = 96 << 10
-"""Messages of this size and more go through shared memory: below, the copies through a socket cost less than the
+"""Messages of this size and more go through shared memory. Below it, copying through a socket costs less than the
 bookkeeping (``benchmarks/bus.py --only inline shared``)."""
 
 BUFFERS_A_READER = 8
-"""How many buffers one reader can hold; see also :data:`~.local_subscription.VIEWS_HELD`."""
+"""How many buffers one reader can hold at a time; see also :data:`~.local_subscription.VIEWS_HELD`."""
 
 _SPARE_BUFFERS = 3
 _SOCKET_BYTES = 1 << 20
 _QUEUE_BYTES = 128 << 20
-_LINGER_S = 0.2  # a last zero command still goes out when a node ends
+_LINGER_S = 0.2  # lets a last zero command leave when a node shuts down
 _MEMORY_RETRY_S = 5.0
 _DOOR_S = 0.05
 _SCATTER_FROM_BYTES = 8192
@@ -59,7 +59,7 @@ log = logging.getLogger(__name__)
 
 
 class _Outgoing(NamedTuple):
-    """A message on its way to readers: bytes, or a buffer."""
+    """A message on its way to readers: bytes, or a shared buffer."""
 
     sequence: int
     publish_ns: int
@@ -68,45 +68,45 @@ class _Outgoing(NamedTuple):
     buffer: SharedBuffer | None = None
 
     def kept(self) -> _Outgoing:
-        """The same, independent of the caller's memory."""
+        """The same message, independent of the caller's memory."""
         if self.buffer is not None or isinstance(self.body, bytes):
             return self
         return _Outgoing(self.sequence, self.publish_ns, self.size, bytes(self.body))
 
     def inline(self) -> _Outgoing:
-        """The same as bytes."""
+        """The same message as bytes, without a shared buffer."""
         if self.buffer is None:
             return self
         return _Outgoing(self.sequence, self.publish_ns, self.size, bytes(self.buffer.view(self.size)))
 
 
 class _Reader:
-    """One connected reader; every call holds the publisher's lock."""
+    """One connected reader. Every call requires the publisher's lock."""
 
     def __init__(self, connection: socket.socket, rewatch: Callable[[_Reader], None]) -> None:
         self.socket = connection
         self._rewatch = rewatch
-        self.depth = 0  # 0: it has not greeted yet
+        self.depth = 0  # 0: it has not sent its greeting yet
         self.shared = True
         self.gone = False
-        self.deaf = False  # reads no more, but may still hold buffers
-        self.prompt = False  # has got all that was offered: small messages may go straight into its socket
+        self.deaf = False  # no longer reads, but may still hold buffers
+        self.prompt = False  # has received everything offered: small messages may go straight into its socket
         self.events = _READ_ONLY
         self._send = connection.send
         self._flying: dict[int, SharedBuffer] = {}
         self._known: set[int] = set()
         self._queue: deque[_Outgoing] = deque()
         self._queue_bytes = self._queued_buffers = 0
-        self._part: memoryview | None = None  # what is left of a frame that went out in part
+        self._part: memoryview | None = None  # rest of a frame that was sent only in part
         self._part_fd: int | None = None
         self._skipped = 0
         self._incoming = b""
 
     def greet(self) -> bool:
-        """Reads the reader's greeting; True once it is whole.
+        """Read the reader's greeting; True once it is complete.
 
         Raises:
-            ValueError: it is not of this version.
+            ValueError: the greeting is not of this version.
         """
         self._receive()
         if len(self._incoming) < GREETING.size:
@@ -120,12 +120,12 @@ class _Reader:
         return True
 
     def send_now(self, frame: bytes) -> bool:
-        """Sends a whole frame to a reader that is :attr:`prompt`; False when the message must be offered instead."""
+        """Send a whole frame to a :attr:`prompt` reader; False when the message must be offered instead."""
         try:
             sent = self._send(frame)
         except BlockingIOError:
             return False
-        except OSError:  # EPIPE, ECONNRESET: it reads no more
+        except OSError:  # EPIPE, ECONNRESET: the reader is gone
             self._end()
             return True
         if sent < len(frame):
@@ -134,7 +134,7 @@ class _Reader:
         return True
 
     def offer(self, message: _Outgoing) -> None:
-        """Sends a message, or queues it when the reader does not keep up."""
+        """Send a message, or queue it when the reader does not keep up."""
         if self.deaf or self.gone:
             return
         if not self.shared:
@@ -143,11 +143,11 @@ class _Reader:
             self._start(message)
         else:
             self._enqueue(message)
-            if self._part is None:  # buffers may have come back since, and nobody else would notice
+            if self._part is None:  # buffers may have come back since, and nothing else would notice
                 self.flush()
 
     def flush(self) -> None:
-        """Sends what waits, as far as the socket and the reader's buffers allow."""
+        """Send queued messages as far as the socket and the reader's buffers allow."""
         if self._part is not None:
             self._send_part()
         while self._part is None and self._queue and self._may_fly(self._queue[0]) and not (self.deaf or self.gone):
@@ -155,7 +155,7 @@ class _Reader:
         self.prompt = not (self._part is not None or self._queue or self._skipped or self.deaf or self.gone)
 
     def release(self) -> None:
-        """Takes back the buffers that the reader has finished with."""
+        """Take back the buffers that the reader has finished with."""
         if not self._flying:
             return
         self._receive()
@@ -166,7 +166,7 @@ class _Reader:
         self._incoming = self._incoming[whole:]
 
     def retire(self, buffer: SharedBuffer) -> None:
-        """Tells that a buffer will not come again, so that the reader lets go of its memory."""
+        """Tell the reader that a buffer will not be used again, so that it can unmap it."""
         if buffer.number in self._known:
             self._known.discard(buffer.number)
             frame = HEADER.pack(RETIRED, 0, BUFFER_ID.size, 0, 0) + BUFFER_ID.pack(buffer.number)
@@ -176,23 +176,23 @@ class _Reader:
                 self.write(frame)
 
     def wanted_events(self) -> int:
-        """What epoll should wait for."""
+        """Events that epoll should wait for."""
         if self._part is not None:
             return select.EPOLLRDHUP | select.EPOLLOUT
         return _READ_ONLY if self._queue or not self.depth else select.EPOLLRDHUP
 
     @property
     def waiting(self) -> bool:
-        """Whether something is still to be sent."""
+        """Whether anything is still to be sent."""
         return not (self.gone or self.deaf) and (self._part is not None or bool(self._queue))
 
     @property
     def untaken(self) -> int:
-        """How many messages of a queue are still to be sent; who wants the newest only loses none."""
+        """Number of queued messages still to be sent; 0 for a newest-only reader, which loses none."""
         return len(self._queue) + (self._part is not None) if self.waiting and self.depth > 1 else 0
 
     def close(self) -> None:
-        """Lets go of the connection and of all that was lent to it."""
+        """Close the connection and take back all buffers lent to the reader."""
         self.gone, self.prompt = True, False
         for buffer in self._flying.values():
             buffer.holders.discard(self)
@@ -201,7 +201,7 @@ class _Reader:
         self.socket.close()
 
     def _end(self) -> None:
-        """It reads no more; what it holds comes back when its connection closes."""
+        """Mark the reader as gone; the buffers it holds come back when its connection closes."""
         self.deaf, self.prompt = True, False
         self._drop_queue()
 
@@ -231,7 +231,7 @@ class _Reader:
             old = self._pop()
             if old.buffer is not None:
                 old.buffer.holders.discard(self)
-            if self.depth == 1:  # it asked for the newest only: what it does not see is not lost
+            if self.depth == 1:  # a newest-only reader: a message it skips is not lost
                 self._skipped += 1
         self._queue.append(message)
         self._queue_bytes += message.size
@@ -262,7 +262,7 @@ class _Reader:
         self.write(frame, fd=buffer.fd if new else None)
 
     def write(self, head: bytes, body: bytes | memoryview | None = None, fd: int | None = None) -> None:
-        """Sends a frame; what the socket does not take is kept for :meth:`flush`."""
+        """Send a frame; whatever the socket does not accept is kept for :meth:`flush`."""
         try:
             if fd is not None:
                 sent = socket.send_fds(self.socket, [head], [fd])
@@ -272,14 +272,14 @@ class _Reader:
                 sent = self.socket.sendmsg((head, body))
         except BlockingIOError:
             sent = 0
-        except OSError:  # EPIPE, ECONNRESET: it reads no more
+        except OSError:  # EPIPE, ECONNRESET: the reader is gone
             self._end()
             return
         total = len(head) + (0 if body is None else len(body))
         if sent < total:
             rest = head[sent:] + bytes(body[max(0, sent - len(head)) :] if body is not None else b"")
             self._part, self.prompt = memoryview(rest), False
-            self._part_fd = None if sent else fd  # it goes with the first byte
+            self._part_fd = None if sent else fd  # sent with the first byte
 
     def _send_part(self) -> None:
         assert self._part is not None
@@ -305,15 +305,15 @@ class _Reader:
                     return
         except BlockingIOError:
             return
-        except OSError:  # epoll tells it too, and then the reader is closed
+        except OSError:  # epoll reports it too, and the reader is closed then
             self._end()
 
 
 class LocalPublisher:
-    """One topic of one node.
+    """Publisher of one topic of one node.
 
     Raises:
-        RegistryError: the node publishes the topic already, or the path is too long.
+        RegistryError: the node already publishes the topic, or the path is too long.
     """
 
     def __init__(self, transport: LocalTransport, topic: str, type_name: str, qos: QoS) -> None:
@@ -322,7 +322,7 @@ class LocalPublisher:
         self.qos = qos
         self.stats = PublisherStats()
         self._transport = transport
-        self._lock = threading.RLock()  # publish may come from any thread, the bus thread serves the readers
+        self._lock = threading.RLock()  # publish may be called from any thread; the bus thread serves the readers
         self._sequence = 0
         self._readers: dict[int, _Reader] = {}
         self._pool = BufferPool()
@@ -365,14 +365,14 @@ class LocalPublisher:
 
     @property
     def subscriber_count(self) -> int:
-        """How many readers are connected now."""
+        """Number of connected readers."""
         return sum(1 for reader in list(self._readers.values()) if reader.depth and not reader.deaf)
 
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
-        """Sends one message; never waits. The payload may be changed as soon as this returns.
+        """Send one message without waiting. The payload may be changed as soon as this returns.
 
         Raises:
-            TransportError: more than 4 GiB.
+            TransportError: the message is larger than 4 GiB.
         """
         if not isinstance(payload, (bytes, bytearray, memoryview)):
             payload = payload[0] if len(payload) == 1 else b"".join(payload)
@@ -390,7 +390,7 @@ class LocalPublisher:
                 return
             self._sequence = sequence = self._sequence + 1
             stamp = self._transport.now_ns() if publish_ns is None else publish_ns
-            # Every microsecond between here and the readers is latency; what is not needed for it comes after.
+            # Every microsecond from here to the readers is latency, so everything else comes after.
             head = HEADER.pack(DATA, 0, size, sequence, stamp)
             frame = head + body if size < _SCATTER_FROM_BYTES else None  # one copy costs less than a scattered write
             late = None
@@ -413,10 +413,10 @@ class LocalPublisher:
         self.stats.add(self._transport.steady_ns(), size)
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
-        """Sends ``size`` bytes that ``fill`` writes where they are to be, without a further copy; never waits.
+        """Send ``size`` bytes that ``fill`` writes in place, without a further copy and without waiting.
 
         Raises:
-            TransportError: more than 4 GiB.
+            TransportError: the message is larger than 4 GiB.
         """
         if size > MOST_BYTES:
             raise TransportError(f"{self.topic}: a message of {size} bytes; the bus carries at most {MOST_BYTES}")
@@ -444,7 +444,7 @@ class LocalPublisher:
             self._distribute(sequence, stamp, size, b"", buffer)
 
     def close(self) -> None:
-        """Ends the topic and takes it out of the registry."""
+        """End the topic and remove it from the registry."""
         with self._lock:
             if self._closed:
                 return
@@ -460,7 +460,7 @@ class LocalPublisher:
             time.sleep(0.002)
         with self._lock:
             untaken = sum(reader.untaken for reader in self._readers.values())
-            if untaken:  # no later message will show the readers this gap
+            if untaken:  # no later message will reveal this gap to the readers
                 log.warning(
                     "%s ends with %d messages that its readers were too slow to take: lost", self.topic, untaken
                 )
@@ -490,7 +490,7 @@ class LocalPublisher:
         self.stats.add(self._transport.steady_ns(), size)
 
     def _keep(self, message: _Outgoing) -> None:
-        """Keeps the last value for whoever comes later."""
+        """Keep the last value for late joiners."""
         if self._last is not None and self._last.buffer is not None:
             self._last.buffer.holders.discard(self)
         self._last = message.kept()
@@ -551,7 +551,7 @@ class LocalPublisher:
                     connection, _address = self._listener.accept()
                 except BlockingIOError:
                     return
-                except OSError as error:  # too many open files: it waits at the door until there are fewer
+                except OSError as error:  # too many open files: the reader waits for a connection until there are fewer
                     if not self._told_full:
                         log.error("%s: a reader cannot be let in: %s", self.topic, error)
                     self._told_full = True
@@ -563,7 +563,7 @@ class LocalPublisher:
                 reader = _Reader(connection, self._rewatch)
                 self._readers[connection.fileno()] = reader
                 self._transport.watch(connection.fileno(), reader.events, functools.partial(self._on_reader, reader))
-                self._on_reader(reader, select.EPOLLIN)  # its greeting is there already, as a rule
+                self._on_reader(reader, select.EPOLLIN)  # its greeting is usually there already
 
     def _on_reader(self, reader: _Reader, events: int) -> None:
         with self._lock:

@@ -1,4 +1,4 @@
-"""All publishers of one topic, as one node hears them."""
+"""Subscription of one topic: connections to all its publishers."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ if TYPE_CHECKING:
     from instant_ic.bus.local_transport import LocalTransport
 
 VIEWS_HELD = 4
-"""Views into shared memory that one reader keeps; what comes beyond them is copied, so that a queue or a node that
-collects messages cannot take the publisher's buffers away."""
+"""How many views into shared memory one reader keeps. Further messages are copied, so that a queue, or a node that
+collects messages, cannot use up the publisher's buffers."""
 
-RECEIVE_BYTES = 100_000  # a whole message that does not go through shared memory
+RECEIVE_BYTES = 100_000  # fits any message that does not go through shared memory
 _LEAST_ROOM = 4096
 _VIEW_FROM_BYTES = 16_384
 _FDS_SPACE = socket.CMSG_SPACE(4 * 8)
 _FULL_LOOK_S = 1.0
-_new = tuple.__new__  # what Received(...) ends in, without the call into Python between
+_new = tuple.__new__  # what Received(...) calls in the end, without a Python call in between
 
 log = logging.getLogger(__name__)
 
 
 class Inlet:
-    """The connection to one publisher; reads frames, maps its buffers, gives them back."""
+    """Connection to one publisher: reads frames, maps its buffers, returns them."""
 
     def __init__(self, subscription: LocalSubscription, path: str) -> None:
         self.subscription = subscription
@@ -64,9 +64,9 @@ class Inlet:
         self.node = self.type_name = ""
         self.expected = 0  # sequence of the next message; 0 before the first
         self._deliver = subscription.deliver
-        self._rest = b""  # the start of a frame whose end has not come yet
+        self._rest = b""  # the start of an incomplete frame
         self._header = (0, 0, 0, 0, 0)
-        self._body: memoryview | None = None  # a large body that comes in pieces
+        self._body: memoryview | None = None  # a large body that arrives in pieces
         self._got = 0
         self._room = _LEAST_ROOM
         self._fds: deque[int] = deque()
@@ -83,10 +83,10 @@ class Inlet:
             raise
 
     def read(self) -> bool:
-        """Takes in what waits on the socket; False when the publisher is gone.
+        """Read what waits on the socket; False when the publisher is gone.
 
         Raises:
-            FrameError: what comes is not of this version of the bus.
+            FrameError: the data is not of this version of the bus.
         """
         while True:
             if self._body is not None:
@@ -107,7 +107,7 @@ class Inlet:
                 data, ancillary, flags, _ = self._receive(self._room, _FDS_SPACE, socket.MSG_CMSG_CLOEXEC)
             except BlockingIOError:
                 return True
-            except OSError:  # ECONNRESET: it died with data of ours unread
+            except OSError:  # ECONNRESET: the publisher died before it read our data
                 return False
             if ancillary:
                 for _level, _kind, fds in ancillary:
@@ -118,19 +118,19 @@ class Inlet:
             if not count:
                 return False
             full = count == self._room
-            # Room for as much as came last: much more would cost the allocator more than all the rest of this.
+            # Room for as much as came last: a much larger buffer would cost more than the rest of this loop.
             self._room = min(2 * count, RECEIVE_BYTES) if full else max(count + 256, _LEAST_ROOM)
             if self._rest:
                 data, self._rest = self._rest + data, b""
             elif count >= HEADER.size and not full:
                 kind, skipped, size, sequence, publish_ns = HEADER.unpack_from(data)
-                if kind == DATA and size + HEADER.size == count:  # one whole message: the usual case
+                if kind == DATA and size + HEADER.size == count:  # one complete message, the usual case
                     payload = data[HEADER.size :] if size < _VIEW_FROM_BYTES else memoryview(data)[HEADER.size :]
                     self._deliver(self, sequence, skipped, publish_ns, payload)
                     return True
             self._parse(data)
             if not full and self._body is None and not ancillary:
-                return True  # it was all there was
+                return True  # everything has been read
 
     def _parse(self, data: bytes) -> None:
         at, end = 0, len(data)
@@ -141,13 +141,13 @@ class Inlet:
             if at > end:
                 check_kind(kind)
                 at = body_at - HEADER.size
-                if size > RECEIVE_BYTES:  # comes in pieces, straight to where it stays
+                if size > RECEIVE_BYTES:  # arrives in pieces, received straight into its final place
                     self._header = (kind, skipped, size, sequence, publish_ns)
                     self._body, self._got = memoryview(np.empty(size, np.uint8).data), end - body_at
                     self._body[: self._got] = memoryview(data)[body_at:]
                     return
                 break
-            # A view keeps all that came with it: worth it where the copy would cost more.
+            # A view keeps everything alive that came with it; use one only where the copy would cost more.
             body = data[body_at:at] if size < _VIEW_FROM_BYTES else memoryview(data)[body_at:at]
             if kind == DATA:
                 self._deliver(self, sequence, skipped, publish_ns, body)
@@ -171,7 +171,7 @@ class Inlet:
             self._mappings.pop(BUFFER_ID.unpack(body)[0], None)
 
     def _shared(self, body: bytes, sequence: int) -> memoryview | None:
-        """The message in shared memory; None when it is not what was announced."""
+        """The message in shared memory; None when the buffer does not hold the announced message."""
         if len(body) != SHARED_BODY.size:
             raise FrameError(f"a place in shared memory of {len(body)} bytes")
         number, new, size = SHARED_BODY.unpack(body)
@@ -187,14 +187,14 @@ class Inlet:
             raise FrameError(f"a message of {size} bytes in buffer {number}, which is not known or smaller")
         if mapping.sequence != sequence:
             self._give_back(number)
-            return None  # somebody writes over what was lent
+            return None  # the publisher has overwritten a buffer that it lent
         if len(self._views) >= VIEWS_HELD or self.refused:
             copy = memoryview(b"" if self.refused else bytes(mapping.view(size)))
             torn = mapping.sequence != sequence
             self._give_back(number)
             return None if torn else copy
         array = np.frombuffer(mapping.view(size), np.uint8)
-        # Everything made of the message refers to this array: when it goes, nobody looks at the buffer any more.
+        # Everything derived from the message refers to this array: when it is freed, nothing reads the buffer any more.
         self._views[number] = weakref.ref(array, functools.partial(self._done, number, sequence, mapping))
         return array.data
 
@@ -203,7 +203,7 @@ class Inlet:
         raise FrameError(f"shared memory cannot be used ({why}); connecting again without it, slower")
 
     def _done(self, number: int, sequence: int, mapping: SharedMapping, _: object) -> None:
-        """The last view of a buffer is gone; may run in any thread."""
+        """Return a buffer when its last view is gone; may run in any thread."""
         if mapping.sequence != sequence:
             self.subscription.tell_torn(self)
         self._views.pop(number, None)
@@ -216,8 +216,8 @@ class Inlet:
             self.socket.send(BUFFER_ID.pack(number), socket.MSG_NOSIGNAL)
 
     def close(self) -> None:
-        """No more messages. While the node still looks at one, the publisher must not write over it: so the connection
-        stays for as long as that.
+        """Stop receiving. While the node still holds a view, the publisher must not overwrite that buffer, so the
+        connection stays open until the last view is gone.
         """
         while self._fds:
             os.close(self._fds.popleft())
@@ -231,10 +231,10 @@ class Inlet:
 
 
 class LocalSubscription:
-    """All publishers of one topic.
+    """Subscription of one topic, for all its publishers.
 
     Raises:
-        RegistryError: the topic's name is not legal.
+        RegistryError: the topic's name is invalid.
     """
 
     def __init__(
@@ -245,13 +245,13 @@ class LocalSubscription:
         self.qos = qos
         self.stats = Stats()
         self.on_ready = on_ready
-        self.waker: object = None  # whose `set` on_ready is: it need not be called by whoever waits on it
+        self.waker: object = None  # its `set` is `on_ready`, which the thread waiting on it need not call
         self.fresh = False
-        self.shared = True  # until this process turns out not to be able to map memory
+        self.shared = True  # until this process proves unable to map memory
         self.publishers: list[registry.PublisherInfo] = []
         self._transport = transport
         self._digest = type_digest(type_name) if type_name else None
-        self._expected: dict[str, int] = {}  # next sequence of publishers whose connection was lost
+        self._expected: dict[str, int] = {}  # next sequence, by publisher whose connection was lost
         self._told: set[str] = set()
         self._lock = threading.Lock()
         self._queue: deque[Received] = deque()
@@ -261,12 +261,12 @@ class LocalSubscription:
         registry.own_folder(self._folder)
         self._seen_mtime = -1
         self._next_full_look = 0.0
-        self._inlets: dict[str, tuple[str, Inlet]] = {}  # by the publisher's identity: its socket's path, connection
+        self._inlets: dict[str, tuple[str, Inlet]] = {}  # by the publisher's identity: path of its socket, connection
 
     # -- on the reading thread, under the transport's read lock ------------------------------------
 
     def discover(self) -> None:
-        """Connects to publishers that appeared, lets go of those that left.
+        """Connect to new publishers and disconnect from those that left.
 
         Raises:
             OSError: the run directory is gone.
@@ -279,23 +279,23 @@ class LocalSubscription:
         self.publishers = registry.topic_publishers(self._transport.run_dir, self.topic)
         wanted = {info.id: str(info.socket) for info in self.publishers}
         for identity in [i for i in self._inlets if i not in wanted]:
-            # Its registration went before its socket: what it sent last may still be on the way.
+            # Its registration is removed before its socket: its last messages may still be on the way.
             inlet = self._inlets[identity][1]
             self._transport.read_inlet(inlet)
-            if identity in self._inlets:  # reading has not found its end and let go of it already
+            if identity in self._inlets:  # not yet removed by the read above
                 self.lose_inlet(inlet)
         for identity, path in wanted.items():
             if identity not in self._inlets:
                 try:
                     inlet = Inlet(self, path)
-                except OSError:  # it is just starting or just ending: the next look decides
+                except OSError:  # it is starting up or shutting down: try again at the next look
                     self._next_full_look = now
                     continue
                 self._inlets[identity] = (path, inlet)
                 self._transport.add_inlet(inlet)
 
     def lose_inlet(self, inlet: Inlet) -> None:
-        """Lets go of a connection; a live publisher is found again."""
+        """Close a connection; a publisher that is still alive is found again."""
         for identity, (_, other) in list(self._inlets.items()):
             if other is inlet:
                 del self._inlets[identity]
@@ -305,7 +305,7 @@ class LocalSubscription:
         inlet.close()
 
     def met(self, inlet: Inlet) -> None:
-        """A publisher has said what it sends."""
+        """Handle a publisher's greeting."""
         hello = inlet.hello
         assert hello is not None
         if hello.topic != self.topic:
@@ -317,13 +317,13 @@ class LocalSubscription:
     def deliver(
         self, inlet: Inlet, sequence: int, skipped: int, publish_ns: int, payload: bytes | memoryview | None
     ) -> None:
-        """Takes one message."""
+        """Handle one message."""
         node = inlet.node
         if sequence != inlet.expected + skipped:
             if not inlet.expected:
                 if inlet.hello is None:
                     raise FrameError("a message before the publisher's greeting")
-            elif sequence < inlet.expected:  # a latched value that comes again with a new connection
+            elif sequence < inlet.expected:  # a latched value, sent again over a new connection
                 return
             else:
                 self.stats.lose(node, sequence - inlet.expected - skipped)
@@ -351,7 +351,7 @@ class LocalSubscription:
         self.fresh = True
 
     def tell_torn(self, inlet: Inlet) -> None:
-        """A buffer was written over while it was lent: a fault of the publisher, counted and told."""
+        """Count and log that a publisher overwrote a buffer it had lent, which is a fault of the publisher."""
         self.stats.torn += 1
         node = inlet.hello.node if inlet.hello else "?"
         log.error("%s: %s wrote over a message that was still being read", self.topic, node)
@@ -371,7 +371,7 @@ class LocalSubscription:
             log.error("%s: node %s sends %s; its messages are refused and counted", self.topic, hello.node, why)
 
     def shut(self) -> None:
-        """Closes every connection."""
+        """Close every connection."""
         for _, inlet in list(self._inlets.values()):
             self.lose_inlet(inlet)
 
@@ -387,5 +387,5 @@ class LocalSubscription:
         return messages
 
     def close(self) -> None:
-        """Ends the subscription."""
+        """End the subscription."""
         self._transport.forget(self)

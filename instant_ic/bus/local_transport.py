@@ -1,8 +1,8 @@
 """Topics of one node on one machine: Unix sockets found through the registry; no broker, no master.
 
-Who reads: while the node's thread waits in :meth:`Waker.wait`, it reads its sockets itself, so that a message wakes one
-thread and no other. When a callback lasts, the bus thread reads instead, so that the newest message never turns into
-an old one in a queue. The bus thread also lets readers in, sends on what a slow reader left, and looks for publishers.
+Which thread reads: while the node's thread waits in :meth:`Waker.wait`, it reads its own sockets, so a message wakes
+only that thread. During a long callback the bus thread reads instead, so that the newest message does not grow old in
+a queue. The bus thread also accepts readers, sends what a slow reader has not taken yet, and looks for publishers.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from instant_ic.bus.qos import QoS
 
 _DISCOVERY_S = 0.1
 _IDLE_S = 5.0
-_BUSY_S = 0.015  # a callback that lasts longer has the bus thread read in its place
-_SLOW_FOR_S = 10.0  # for so long after a slow callback the bus thread looks that often
+_BUSY_S = 0.015  # during a longer callback the bus thread reads instead
+_SLOW_FOR_S = 10.0  # how long after a slow callback the bus thread keeps checking at that interval
 _CLOSE_S = 5.0
 
 log = logging.getLogger(__name__)
 
 
 class Waker:
-    """As a :class:`threading.Event` for the one thread that waits; waiting, it reads the node's sockets."""
+    """Like a :class:`threading.Event` for the one thread that waits; its ``wait`` also reads the node's sockets."""
 
     def __init__(self, transport: LocalTransport) -> None:
         self._transport = transport
@@ -42,7 +42,7 @@ class Waker:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
 
     def set(self) -> None:
-        """Ends the present or the next wait; from any thread."""
+        """End the present or the next wait; may be called from any thread."""
         if self._set:
             return
         self._set = True
@@ -51,20 +51,20 @@ class Waker:
             os.eventfd_write(self.fd, 1)
 
     def clear(self) -> None:
-        """Forgets what was set."""
+        """Reset the event."""
         self._set = False
         if self._written:
             self._written = False
-            with contextlib.suppress(BlockingIOError):  # who set it has not written yet: one wait ends for nothing
+            with contextlib.suppress(BlockingIOError):  # not written yet: one later wait ends early
                 os.eventfd_read(self.fd)
 
     def close(self) -> None:
-        """Nothing wakes any more."""
+        """Close the event; later calls of ``set`` do nothing."""
         self._set = True
         os.close(self.fd)
 
     def wait(self, timeout: float) -> None:
-        """Reads the node's sockets until something came, it was set, or the time is over."""
+        """Read the node's sockets until a message arrives, the event is set, or the time is over."""
         if not self._set:
             self._transport.wait(timeout)
 
@@ -73,10 +73,10 @@ class LocalTransport:
     """Topics of one node.
 
     Args:
-        run_dir: the run directory, made if missing.
-        node: the node's name; names the publishers' sockets.
+        run_dir: the run directory; created if missing.
+        node: the node's name; also names its publishers' sockets.
         now_ns: the node's clock, for stamps.
-        steady_ns: the node's clock that never jumps, for rates and ages.
+        steady_ns: the node's steady clock, for rates and ages.
 
     Raises:
         RegistryError: the run directory cannot be used.
@@ -94,7 +94,7 @@ class LocalTransport:
         self.now_ns = now_ns
         self.steady_ns = steady_ns
         self.driver: int | None = None
-        self.next_order: Callable[[], int] = itertools.count().__next__  # place of a message in the order of arrival
+        self.next_order: Callable[[], int] = itertools.count().__next__  # a message's position in order of arrival
         self._lock = threading.Lock()
         self._read_lock = threading.RLock()
         self._publishers: list[LocalPublisher] = []
@@ -117,17 +117,17 @@ class LocalTransport:
         self._thread.start()
 
     def waker(self) -> Waker:
-        """What the node's thread waits on; one a transport."""
+        """The event that the node's thread waits on; one per transport."""
         if self._waker is None:
             self._waker = Waker(self)
             self._inputs.register(self._waker.fd, select.EPOLLIN)
         return self._waker
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> LocalPublisher:
-        """A publisher that readers find from now on.
+        """Create a publisher, which readers can find at once.
 
         Raises:
-            RegistryError: the node publishes the topic already, or the path is too long.
+            RegistryError: the node already publishes the topic, or the path is too long.
         """
         publisher = LocalPublisher(self, registry.check_topic(topic), type_name, qos)
         with self._lock:
@@ -135,7 +135,7 @@ class LocalTransport:
         return publisher
 
     def subscribe(self, topic: str, type_name: str | None, qos: QoS, on_ready: Callable[[], None]) -> LocalSubscription:
-        """A subscription to all present and coming publishers; ``type_name`` None takes any type."""
+        """Subscribe to all present and future publishers; ``type_name`` None accepts any type."""
         subscription = LocalSubscription(self, topic, type_name, qos, on_ready)
         if self._waker is not None and on_ready == self._waker.set:
             subscription.waker = self._waker
@@ -146,7 +146,7 @@ class LocalTransport:
         return subscription
 
     def forget(self, item: LocalPublisher | LocalSubscription) -> None:
-        """Lets go of a closed publisher or subscription."""
+        """Remove a closed publisher or subscription."""
         with self._lock:
             if isinstance(item, LocalPublisher):
                 if item in self._publishers:
@@ -159,7 +159,7 @@ class LocalTransport:
             item.shut()
 
     def close(self) -> None:
-        """Closes everything; last messages get up to 0.2 s to leave."""
+        """Close everything; the last messages get up to 0.2 s to leave."""
         if self._stop.is_set():
             return
         for publisher in list(self._publishers):
@@ -176,36 +176,36 @@ class LocalTransport:
             self._events.close()
             os.close(self._poke)
 
-    # -- for publishers: sockets that the bus thread serves ------------------------------------------
+    # -- for publishers: sockets served by the bus thread --------------------------------------------
 
     def watch(self, fd: int, events: int, handler: Callable[[int], None]) -> None:
-        """Calls ``handler(events)`` on the bus thread."""
+        """Call ``handler(events)`` on the bus thread when the file descriptor has one of these events."""
         self._handlers[fd] = handler
         self._events.register(fd, events)
 
     def rewatch(self, fd: int, events: int) -> None:
-        """Other events from now on."""
+        """Change the events to wait for."""
         self._events.modify(fd, events)
 
     def unwatch(self, fd: int) -> None:
-        """No more calls; before the file descriptor is closed."""
+        """Stop watching; call this before the file descriptor is closed."""
         if self._handlers.pop(fd, None) is not None:
             self._events.unregister(fd)
 
     # -- for subscriptions, under the read lock --------------------------------------------------
 
     def add_inlet(self, inlet: Inlet) -> None:
-        """Reads from a connection from now on."""
+        """Start reading a connection."""
         self._inlets[inlet.socket.fileno()] = inlet
         self._inputs.register(inlet.socket.fileno(), select.EPOLLIN)
 
     def remove_inlet(self, inlet: Inlet) -> None:
-        """Reads from it no more."""
+        """Stop reading a connection."""
         if self._inlets.pop(inlet.socket.fileno(), None) is not None:
             self._inputs.unregister(inlet.socket.fileno())
 
     def read_inlet(self, inlet: Inlet) -> None:
-        """Takes in what came over one connection."""
+        """Read what has arrived over one connection."""
         try:
             alive = inlet.read()
         except (FrameError, OSError) as error:
@@ -217,7 +217,7 @@ class LocalTransport:
     # -- reading ---------------------------------------------------------------------------------
 
     def wait(self, timeout: float) -> None:
-        """Reads the node's sockets until something came or the time is over; on the node's thread."""
+        """Read the node's sockets until a message arrives or the time is over; on the node's thread."""
         self._waiting = True
         if self._bus_reads:
             self._bus_reads = False
@@ -233,7 +233,7 @@ class LocalTransport:
         self._waiting = False
 
     def _drain(self, events: list[tuple[int, int]], reader: Waker | None) -> None:
-        """Reads what waits; whoever is not ``reader`` is told."""
+        """Read what waits, and notify every subscription that ``reader`` does not serve."""
         others: list[LocalSubscription] = []
         with self._read_lock:
             for fd, _ in events:
@@ -270,12 +270,12 @@ class LocalTransport:
                         os.eventfd_read(fd)
                     elif (handler := self._handlers.get(fd)) is not None:
                         handler(events)
-            except Exception:  # a bus that stands still would be worse than one bad event
+            except Exception:  # one bad event must not stop the bus
                 log.exception("%s: fault on the bus thread", self.node)
                 self._stop.wait(_BUSY_S)
 
     def _look(self) -> bool:
-        """Looks for publishers; False when the run directory is gone."""
+        """Look for publishers; False when the run directory is gone."""
         fine = True
         for subscription in list(self._subscriptions):
             with self._read_lock:

@@ -1,7 +1,7 @@
-"""A bus in one process without threads or sockets: real nodes, run in lockstep with the messages.
+"""A bus in one process, without threads or sockets: real nodes run in lockstep with their messages.
 
-Every message still goes through CDR, in the order it was published, so a node behaves as it does between processes,
-and the same input gives the same output bit for bit.
+Every message still goes through CDR, in the order of publication. So a node behaves as it does between processes, and
+the same input gives the same output, bit for bit.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NodeT = TypeVar("NodeT", bound=Node[Any])
 
 @dataclass(frozen=True)
 class Record:
-    """One message that went over the bus."""
+    """One message that was sent over the bus."""
 
     topic: str
     type_name: str
@@ -93,7 +93,7 @@ class _Transport:
         self._bus = bus
         self._node = node
         self.waiting = 0
-        """Messages in all queues."""
+        """Number of messages in all queues."""
 
     def advertise(self, topic: str, name: str, qos: QoS) -> _Publisher:
         return _Publisher(self._bus, self._node, topic, name, qos)
@@ -114,8 +114,8 @@ class LockstepBus:
 
     Args:
         start_ns: the clock's first value.
-        keep: whether :meth:`messages` can tell the past; switch off for long replays.
-        on_record: called with every message of a node, for a recorder.
+        keep: keep all messages for :meth:`messages`; switch it off for long replays.
+        on_record: called with every message that a node publishes, for a recorder.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class LockstepBus:
         namespace: str = "",
         remaps: dict[str, str] | None = None,
     ) -> NodeT:
-        """Makes a node and runs its ``setup``; without a configuration the defaults hold."""
+        """Create a node and run its ``setup``; without a configuration it takes the defaults."""
         configuration = node_class.config_class()() if config is None else config
         label = name or node_class.name
         transport = _Transport(self, label)
@@ -153,7 +153,7 @@ class LockstepBus:
     def publish(
         self, topic: str, message: Any, stamp_ns: int | None = None, latched: bool = False, publisher: str = ""
     ) -> None:
-        """Publishes in the name of ``publisher``; the clock first moves to ``stamp_ns``, firing timers on the way."""
+        """Publish in the name of ``publisher``; first advances the clock to ``stamp_ns``, firing timers on the way."""
         self.publish_bytes(topic, type_name(message), bytes(serialize(message)), stamp_ns, latched, publisher)
 
     def publish_bytes(
@@ -165,7 +165,7 @@ class LockstepBus:
         latched: bool = False,
         publisher: str = "",
     ) -> None:
-        """As :meth:`publish` with CDR bytes."""
+        """Like :meth:`publish`, with CDR bytes."""
         if stamp_ns is not None:
             self.advance_to(stamp_ns)
         qos = LATCHED if latched else QoS("outside", 1000)
@@ -173,7 +173,7 @@ class LockstepBus:
         self._run()
 
     def advance_to(self, now_ns: int) -> None:
-        """Moves the clock, firing every timer at its own time; a time already past changes nothing."""
+        """Advance the clock, firing every timer at its own time; a time in the past changes nothing."""
         while True:
             due = [t for node in self.nodes if (t := node.next_timer_ns()) is not None]
             if not due or min(due) > now_ns:
@@ -184,15 +184,15 @@ class LockstepBus:
         self._run()
 
     def advance(self, seconds: float) -> None:
-        """Moves the clock on."""
+        """Advance the clock."""
         self.advance_to(self.clock.now_ns() + int(seconds * 1e9))
 
     def records(self, topic: str) -> list[Record]:
-        """Messages of a topic as they went over the bus."""
+        """All messages of a topic, as sent over the bus."""
         return list(self._records.get(topic, ()))
 
     def messages(self, topic: str) -> list[Any]:
-        """Messages of a topic, decoded."""
+        """All messages of a topic, decoded."""
         return [deserialize(r.payload, r.type_name) for r in self._records.get(topic, ())]
 
     def last(self, topic: str) -> Any:
@@ -201,14 +201,14 @@ class LockstepBus:
         return deserialize(records[-1].payload, records[-1].type_name) if records else None
 
     def close(self) -> None:
-        """Runs every node's ``teardown``, the last added first."""
+        """Run every node's ``teardown``, the last added first."""
         for node in reversed(self.nodes):
             node.close()
         self.nodes.clear()
         self._transports.clear()
 
     def __enter__(self) -> LockstepBus:
-        """Closes the nodes at the end of the block."""
+        """Return the bus; leaving the block closes the nodes."""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -218,7 +218,7 @@ class LockstepBus:
     # -- for publishers and subscriptions --------------------------------------------------------
 
     def route(self, topic: str, name: str, payload: bytes, node: str, qos: QoS, publish_ns: int | None = None) -> None:
-        """Hands a message to every subscription of its topic."""
+        """Deliver a message to every subscription of its topic."""
         record = Record(topic, name, payload, self.clock.now_ns() if publish_ns is None else publish_ns, node, qos)
         if self._keep:
             self._records[topic].append(record)
@@ -230,7 +230,7 @@ class LockstepBus:
             self.deliver(subscription, record)
 
     def deliver(self, subscription: _Subscription, record: Record) -> None:
-        """Puts a message into one subscription's queue."""
+        """Put a message into the queue of one subscription."""
         if subscription.type_name not in (None, record.type_name):
             subscription.stats.rejected += 1
             logging.getLogger(__name__).error(
@@ -255,11 +255,11 @@ class LockstepBus:
         )
 
     def _run(self) -> None:
-        """Runs the nodes in turn until none has anything left to do at this time."""
+        """Run the nodes in turn until none has anything left to do at this time."""
         for _ in range(100_000):
             ran = False
             for node in list(self.nodes):
-                # Asked first: most nodes have nothing to do most times, and looking into all their queues takes long.
+                # Check first: most nodes have nothing to do most of the time, and polling all queues is slow.
                 if (self._transports[node].waiting or node.due()) and node.spin_once():
                     ran = True
             if not ran:

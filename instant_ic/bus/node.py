@@ -1,4 +1,4 @@
-"""The node: parameters, topics, timers, clock, transforms, heartbeat and diagnostics around a call into the library."""
+"""Base class of nodes: parameters, topics, timers, clock, transforms, heartbeat and diagnostics."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ from instant_ic.msg import (
 from instant_ic.pace import current
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
-"""Levels of a diagnosis (diagnostic_msgs/DiagnosticStatus)."""
+"""Levels of a diagnosis, as in diagnostic_msgs/DiagnosticStatus."""
 
 ConfigT = TypeVar("ConfigT")
 
 _HEARTBEAT_S = 0.5
 _DIAGNOSTICS_S = 1.0
-_WENT_BACK_NS = 100_000_000  # a simulated clock that goes back farther begins anew; less is jitter
-_START_GRACE_S = 15.0  # so long after its start a node may wait for the others without complaining in the log
+_WENT_BACK_NS = 100_000_000  # a simulated clock that goes back farther resets timers and transforms; less is jitter
+_START_GRACE_S = 15.0  # how long after its start a node may wait for others without a warning in the log
 _NO_CLOCK_S = 5.0
-_IDLE_S = 0.5  # longest sleep of the loop, so that a stop flag set by a signal is seen
+_IDLE_S = 0.5  # longest sleep of the loop, so that it sees a stop flag set by a signal
 
 
 class NodeError(RuntimeError):
-    """A fault that plain words explain; ends the process without a trace when it comes out of ``setup``."""
+    """A fault that its message fully explains. Raised in ``setup``, it ends the process without a traceback."""
 
 
 class Publisher:
@@ -63,53 +63,53 @@ class Publisher:
 
     @property
     def subscriber_count(self) -> int:
-        """How many readers there are now; pictures that nobody watches need not be made."""
+        """Number of connected readers; an image that nobody receives need not be made."""
         return self.raw.subscriber_count
 
     def publish(self, message: Any) -> None:
-        """Sends one message.
+        """Send one message.
 
         Raises:
-            MessageError: it is of another type, or a field does not fit.
+            MessageError: the message is of another type, or a field has a wrong value.
         """
         if type_name(message) != self.raw.type_name:
             raise MessageError(f"{self.topic} carries {self.raw.type_name}, not {type_name(message)}")
         self.raw.send_filled(*serializer(message))
 
     def publish_bytes(self, payload: Payload, publish_ns: int | None = None) -> None:
-        """Sends CDR bytes as they are: one buffer, or several that follow each other.
+        """Send CDR bytes as they are: one buffer, or several in a row.
 
         Args:
             payload: must not be changed afterwards; it may still be on its way.
-            publish_ns: the publication time of a message that is only passed on; now, if not given.
+            publish_ns: publication time of a forwarded message; default: now.
         """
         self.raw.send(payload, publish_ns)
 
 
 class Subscription:
-    """A topic and the callback it goes to."""
+    """A subscribed topic with its callback."""
 
     def __init__(self, callback: Callable[[Received], None]) -> None:
         self.callback = callback
-        self.raw: RawSubscription  # set by the node right after making it
+        self.raw: RawSubscription  # set by the node right after construction
 
     def close(self) -> None:
-        """No more messages from now on."""
+        """Stop receiving messages."""
         self.raw.close()
 
 
 class Latest:
-    """The newest message of a topic, for as long as it is fresh."""
+    """The newest message of a topic, as long as it is fresh."""
 
     def __init__(self, clock: Clock, max_age_s: float) -> None:
         self._clock = clock
         self.max_age_s = max_age_s
         self._message: Any = None
-        self._received_ns = 0  # of the steady clock: setting the machine's clock makes nothing older or younger
+        self._received_ns = 0  # on the steady clock, so that setting the machine's clock changes no age
         self._given_ns = 0
 
     def put(self, message: Any, received: Received) -> None:
-        """Takes a newer message, and how it came."""
+        """Store a newer message with its reception data."""
         self._message, self._received_ns = message, received.steady_ns
         self._given_ns = received.given_ns(stamp_ns(message)) if hasattr(message, "header") else received.steady_ns
 
@@ -120,24 +120,24 @@ class Latest:
 
     @property
     def age_s(self) -> float:
-        """Seconds since it came; inf before the first."""
+        """Seconds since the message arrived; inf before the first."""
         return self._since_s(self._received_ns)
 
     @property
     def stamp_age_s(self) -> float:
-        """Seconds since it was measured or given (:meth:`Received.given_ns`); inf before the first."""
+        """Seconds since it was measured or commanded (:meth:`Received.given_ns`); inf before the first."""
         return self._since_s(self._given_ns)
 
     def _since_s(self, instant_ns: int) -> float:
         if self._message is None:
             return float("inf")
         age_ns = self._clock.steady_ns() - instant_ns
-        # From the future: a clock was set back since, as when a player begins again.
+        # From the future: the clock has been set back since, for example when a player restarts.
         return age_ns / 1e9 if age_ns >= -_WENT_BACK_NS else float("inf")
 
 
 class Worker:
-    """Runs slow work beside the node's thread, newest item only; inline in lockstep."""
+    """Runs slow work in a thread beside the node's, on the newest item only; in lockstep it runs inline."""
 
     def __init__(self, node: Node[Any], work: Callable[[Any], Any], on_result: Callable[[Any], None] | None) -> None:
         self._node = node
@@ -154,7 +154,7 @@ class Worker:
             self._thread.start()
 
     def submit(self, item: Any) -> None:
-        """Hands over an item; one that still waits is replaced and counted in ``skipped``."""
+        """Hand over an item. It replaces an item that is still waiting, which is counted in ``skipped``."""
         if self._thread is None:
             self._do(item)
             return
@@ -164,7 +164,7 @@ class Worker:
             self._condition.notify()
 
     def stop(self, timeout_s: float = 3.0) -> None:
-        """Ends the thread after the item in hand; waits for it at most ``timeout_s``."""
+        """End the thread after the current item; waits at most ``timeout_s``."""
         with self._condition:
             self._stopped = True
             self._item = []
@@ -187,7 +187,7 @@ class Worker:
     def _do(self, item: Any) -> None:
         try:
             result = self._work(item)
-        except Exception as error:  # noqa: BLE001 - a node outlives a bad item; told with its trace
+        except Exception as error:  # a node survives a bad item; the fault is logged with its traceback
             self._node.call_soon(self._node.fault, f"background {getattr(self._work, '__name__', 'work')}", error)
             return
         if self._on_result is not None:
@@ -202,28 +202,28 @@ class _Timer:
         self.cancelled = False
 
     def cancel(self) -> None:
-        """Never fires again."""
+        """Stop the timer; it never fires again."""
         self.cancelled = True
 
 
 class Node(Generic[ConfigT]):
-    """Base of every process of the stack; see docs/architecture.md for how one is written.
+    """Base class of every process of the stack; docs/architecture.md explains how to write one.
 
     Args:
         config: typed parameters.
         transport: topics.
         clock: time; a :class:`ManualClock` where ``/clock`` or a test sets it.
-        name: instead of the class's own name.
-        namespace: put before every topic.
+        name: used instead of the class's name.
+        namespace: prefix of every topic.
         remaps: topic → topic, applied before the namespace.
-        lockstep: no threads, no heartbeat; the bus drives the node.
+        lockstep: no threads and no heartbeat; the bus drives the node.
         use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
     """
 
     name: ClassVar[str] = "node"
     live_parameters: ClassVar[tuple[str, ...]] = ()
-    """Parameters, or whole groups, that can be changed while the node runs: those it reads from ``self.config`` at each
-    use, and those that its :meth:`reconfigure` hands on. ``"*"`` is all of them."""
+    """Parameters, or whole groups, that can be changed while the node runs. These are the parameters that the node
+    reads from ``self.config`` at each use, and those that its :meth:`reconfigure` applies. ``"*"`` means all."""
 
     def __init__(
         self,
@@ -262,12 +262,12 @@ class Node(Generic[ConfigT]):
         self._tf_static: dict[str, Any] = {}
         self._state = "STARTING"
         self.commands: dict[str, Callable[..., Any]] = {}
-        """What the control channel's ``call`` can ask of this node: name → function with keyword arguments; its result
-        goes back as JSON, its ``ValueError`` or :class:`NodeError` as the reason of a refusal."""
+        """Commands that the control channel's ``call`` can run: name → function with keyword arguments. The result goes
+        back as JSON; a ``ValueError`` or :class:`NodeError` goes back as the reason of a refusal."""
         self._clock_in: Subscription | None = None
         self._began_s = time.monotonic()
-        self._well: set[str] = set()  # diagnoses that have been OK
-        self._waiting: set[str] = set()  # not yet, and told as information only
+        self._well: set[str] = set()  # diagnoses that have been OK before
+        self._waiting: set[str] = set()  # diagnoses never OK so far, logged as information only
         self._running: tuple[str, float] | None = None
         self._parameter_events: Publisher | None = None
         self.on_registry_change: Callable[[], None] | None = None
@@ -275,15 +275,16 @@ class Node(Generic[ConfigT]):
     # -- for the node's author -------------------------------------------------------------------
 
     def setup(self) -> None:
-        """Makes publishers, subscriptions and timers; overridden by each node."""
+        """Create publishers, subscriptions and timers; overridden by each node."""
 
     def teardown(self) -> None:
-        """Leaves devices safe; called once, also after an error in ``setup``."""
+        """Leave devices in a safe state; called once, also after an error in ``setup``."""
 
     def reconfigure(self, config: ConfigT) -> None:
-        """Takes other values of live parameters, on the node's thread, already checked by the dataclass.
+        """Apply new values of live parameters, already checked by the dataclass; runs on the node's thread.
 
-        A node that built something from its parameters overrides it: build the new thing first, then call this.
+        A node that builds something from its parameters overrides this: build the new object first, then call
+        ``super()``.
 
         Raises:
             ValueError, NodeError: the values cannot be used; nothing has been changed.
@@ -292,7 +293,7 @@ class Node(Generic[ConfigT]):
 
     @classmethod
     def config_class(cls) -> type[Any]:
-        """The dataclass named in ``class X(Node[Config])``."""
+        """The dataclass given in ``class X(Node[Config])``."""
         for base in getattr(cls, "__orig_bases__", ()):
             arguments = get_args(base)
             if arguments and isinstance(arguments[0], type):
@@ -301,20 +302,20 @@ class Node(Generic[ConfigT]):
 
     @property
     def run_dir(self) -> Path | None:
-        """The run directory that the node's topics are in; None in lockstep."""
+        """The run directory of the node's topics; None in lockstep."""
         return self._transport.run_dir
 
     def resolve(self, topic: str) -> str:
-        """A topic's name after remaps and namespace."""
+        """Name of a topic after remaps and namespace."""
         topic = self._remaps.get(topic, topic)
         return f"/{self.namespace}{topic}" if self.namespace else topic
 
     def publisher(self, topic: str, message_class: Any, qos: QoS = SENSOR) -> Publisher:
-        """A typed publisher."""
+        """Create a typed publisher."""
         return self.publisher_raw(topic, type_name(message_class), qos)
 
     def publisher_raw(self, topic: str, type_name: str, qos: QoS = SENSOR) -> Publisher:
-        """A publisher by type name, for bytes that are not decoded here."""
+        """Create a publisher by type name, for bytes that are not decoded here."""
         publisher = Publisher(self._transport.advertise(self.resolve(topic), type_name, qos))
         self.publishers.append(publisher)
         self._registry_changed()
@@ -323,7 +324,7 @@ class Node(Generic[ConfigT]):
     def subscribe(
         self, topic: str, message_class: Any, callback: Callable[[Any], None], qos: QoS = SENSOR
     ) -> Subscription:
-        """Calls ``callback(message)`` on the node's thread."""
+        """Subscribe; ``callback(message)`` runs on the node's thread."""
         name = type_name(message_class)
 
         def decode(received: Received) -> None:
@@ -334,7 +335,7 @@ class Node(Generic[ConfigT]):
     def subscribe_raw(
         self, topic: str, callback: Callable[[str, str, bytes | memoryview, int], None], qos: QoS = RELIABLE
     ) -> Subscription:
-        """Calls ``callback(topic, type_name, payload, publish_ns)`` with bytes of whatever type comes."""
+        """Subscribe to any type; ``callback(topic, type_name, payload, publish_ns)`` gets the bytes."""
 
         def forward(received: Received) -> None:
             callback(received.topic, received.type_name, received.payload, received.publish_ns)
@@ -344,11 +345,11 @@ class Node(Generic[ConfigT]):
     def subscribe_received(
         self, topic: str, callback: Callable[[Received], None], qos: QoS = RELIABLE, message_class: Any = None
     ) -> Subscription:
-        """As :meth:`subscribe_raw` with all that is known of a message, its publisher too; of one type where given."""
+        """Like :meth:`subscribe_raw`, with all that is known of a message; ``message_class`` restricts the type."""
         return self._subscribe(topic, type_name(message_class) if message_class else None, callback, qos)
 
     def drop(self, item: Publisher | Subscription) -> None:
-        """Ends a publisher or a subscription while the node goes on, as a bridge does when a topic leaves."""
+        """Close a publisher or a subscription while the node runs, for example when a bridged topic disappears."""
         item.raw.close()
         if isinstance(item, Publisher):
             self.publishers.remove(item)
@@ -357,7 +358,7 @@ class Node(Generic[ConfigT]):
         self._registry_changed()
 
     def latest(self, topic: str, message_class: Any, max_age_s: float, qos: QoS = SENSOR) -> Latest:
-        """Keeps the newest message of a topic at hand."""
+        """Subscribe and keep the newest message of a topic."""
         latest = Latest(self.clock, max_age_s)
         name = type_name(message_class)
 
@@ -368,7 +369,7 @@ class Node(Generic[ConfigT]):
         return latest
 
     def timer(self, period_s: float, callback: Callable[[], None]) -> _Timer:
-        """Calls back each period of the node's clock; missed periods are not made up for."""
+        """Call back once per period of the node's clock; missed periods are not caught up."""
         if period_s <= 0:
             raise ValueError(f"timer period must be > 0 (got {period_s})")
         period = int(period_s * 1e9)
@@ -378,18 +379,18 @@ class Node(Generic[ConfigT]):
         return timer
 
     def background(self, work: Callable[[Any], Any], on_result: Callable[[Any], None] | None = None) -> Worker:
-        """A worker thread for slow work on the newest item; ``on_result`` runs on the node's thread."""
+        """Start a worker thread for slow work on the newest item; ``on_result`` runs on the node's thread."""
         worker = Worker(self, work, on_result)
         self._workers.append(worker)
         return worker
 
     def call_soon(self, function: Callable[..., None], *args: Any) -> None:
-        """Runs a function on the node's thread; may be called from any thread."""
+        """Run a function on the node's thread; may be called from any thread."""
         self._soon.append((function, args))
         self._wake.set()
 
     def diagnose(self, name: str, level: int, message: str, **values: Any) -> None:
-        """Sets a named diagnosis, shown until the next of that name."""
+        """Set a named diagnosis; it is published until the next one of that name."""
         before = self._diagnoses.get(name)
         self._diagnoses[name] = (level, message, values)
         if level >= WARN and (before is None or before[0] != level):
@@ -401,7 +402,7 @@ class Node(Generic[ConfigT]):
                 self.log.info("%s: %s", name, message)
 
     def _log_diagnosis(self, name: str, level: int, message: str) -> None:
-        """What was never well yet is no fault while the others still start: a line of information, once."""
+        """Log a diagnosis; one that was never OK is logged once, as information, while other nodes still start."""
         if not self.lockstep and name not in self._well and time.monotonic() < self._began_s + _START_GRACE_S:
             if name not in self._waiting:
                 self._waiting.add(name)
@@ -410,31 +411,31 @@ class Node(Generic[ConfigT]):
         self.log.log(logging.WARNING if level == WARN else logging.ERROR, "%s: %s", name, message)
 
     def _end_start_grace(self) -> None:
-        """What is still not well when the others have had their time is told for what it is."""
+        """Log what is still wrong at the end of the start-up grace period, at its own level."""
         for name in sorted(self._waiting) if time.monotonic() >= self._began_s + _START_GRACE_S else ():
             self._waiting.discard(name)
             level, message, _ = self._diagnoses[name]
             self._log_diagnosis(name, level, message)
 
     def stop(self) -> None:
-        """Ends the loop; may be called from any thread and from a signal handler."""
+        """End the loop; may be called from any thread and from a signal handler."""
         self._stop.set()
         self._wake.set()
 
     @property
     def starting(self) -> bool:
-        """Whether ``setup`` has not come to its end."""
+        """Whether ``setup`` has not finished yet."""
         return self._state == "STARTING"
 
     @property
     def stopping(self) -> bool:
-        """Whether the loop is to end."""
+        """Whether the loop has been asked to end."""
         return self._stop.is_set()
 
     # -- parameters and log level while it runs ---------------------------------------------------
 
     def parameters(self) -> list[ParameterInfo]:
-        """Every parameter with its present value; may be called from any thread."""
+        """All parameters with their present values; may be called from any thread."""
         infos = parameter_infos(type(self.config), self.config, self.live_parameters, type(self).name)
         own = {info.name for info in infos}
         process = params.ProcessParameters(self.use_sim_time, self.nice)
@@ -442,7 +443,7 @@ class Node(Generic[ConfigT]):
         return infos + [info for info in common if info.name not in own]
 
     def set_parameters(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Changes live parameters together, or none of them; on the node's thread. Returns what differs now.
+        """Change live parameters together, or none; returns those whose value changed. Runs on the node's thread.
 
         Raises:
             ParameterError: a value is refused, or its parameter takes effect only at the start.
@@ -470,12 +471,12 @@ class Node(Generic[ConfigT]):
         return different
 
     def set_log_level(self, level: str) -> None:
-        """What is logged from now on, by this node and by the library: ``debug``, ``info``, ``warning``, ``error``."""
+        """Set the log level of this node and the library: ``debug``, ``info``, ``warning`` or ``error``."""
         for name in _loggers(self):
             logging.getLogger(name).setLevel(level.upper())
 
     def activity(self) -> tuple[str, float]:
-        """The callback that the node's thread is in, and for how many seconds; ("", 0) between two."""
+        """The callback that the node's thread is running, and for how many seconds; ("", 0) when it is idle."""
         running = self._running
         return ("", 0.0) if running is None else (running[0], time.monotonic() - running[1])
 
@@ -483,7 +484,7 @@ class Node(Generic[ConfigT]):
 
     @property
     def tf(self) -> TransformBuffer:
-        """The transform buffer, fed from ``/tf`` and ``/tf_static`` since the first use."""
+        """The transform buffer; the first use subscribes to ``/tf`` and ``/tf_static``."""
         if self._tf is None:
             self._tf = TransformBuffer()
             transforms = message_type("TFMessage")
@@ -506,14 +507,14 @@ class Node(Generic[ConfigT]):
                 self.diagnose("tf", ERROR, str(error))
 
     def tf_broadcast(self, parent: str, child: str, parent_from_child: Matrix, stamp: int) -> None:
-        """Sends one transform on ``/tf``."""
+        """Publish one transform on ``/tf``."""
         transforms = message_type("TFMessage")
         if self._tf_out is None:
             self._tf_out = self.publisher("/tf", transforms, RELIABLE)
         self._tf_out.publish(transforms([transform_message(parent_from_child, parent, child, stamp)]))
 
     def tf_broadcast_static(self, parent: str, child: str, parent_from_child: Matrix) -> None:
-        """Sends a fixed transform on ``/tf_static``; all of a node's fixed transforms go together."""
+        """Publish a fixed transform on ``/tf_static``, together with the node's other fixed transforms."""
         transforms = message_type("TFMessage")
         if self._tf_static_out is None:
             self._tf_static_out = self.publisher("/tf_static", transforms, LATCHED)
@@ -523,7 +524,7 @@ class Node(Generic[ConfigT]):
     # -- the loop --------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Runs ``setup``; called once by whoever drives the node."""
+        """Run ``setup``; called once by whatever drives the node."""
         if not self.lockstep:
             self._rosout = self.publisher("/rosout", message_type("Log"), RELIABLE)
             for name in _loggers(self):
@@ -555,7 +556,7 @@ class Node(Generic[ConfigT]):
             self._tf.forget_moving()
 
     def _inputs(self) -> list[Subscription]:
-        """Subscriptions to read now: none but ``/clock`` while simulated time has not begun, the others wait for it."""
+        """Subscriptions to read now; before simulated time has started, only ``/clock``."""
         if not self.use_sim_time or self._clock_in is None or self.clock.now_ns() > 0:
             if self._diagnoses.get("simulated time", (OK,))[0] != OK:
                 self.diagnose("simulated time", OK, "comes")
@@ -565,7 +566,7 @@ class Node(Generic[ConfigT]):
         return [self._clock_in]
 
     def spin(self) -> None:
-        """Runs callbacks until :meth:`stop`."""
+        """Run callbacks until :meth:`stop`."""
         next_beat = next_diagnostics = 0.0
         system_clock = JumpDetector()
         while not self._stop.is_set():
@@ -584,14 +585,14 @@ class Node(Generic[ConfigT]):
             wait = min(_IDLE_S, next_beat - now, next_diagnostics - now)
             if self._timers:
                 due = (self._timers[0][0] - self.clock.steady_ns()) / 1e9
-                # Simulated time may run slower or faster than the machine's: its timers are looked at often.
+                # Simulated time may run slower or faster than the machine's, so its timers are checked often.
                 wait = min(wait, 0.01 if self.use_sim_time else current().wait_s(due))
             if self._soon:
                 continue
             self._wake.wait(max(0.0, wait))
 
     def spin_once(self) -> bool:
-        """Runs what is due now: results of workers, messages in order of arrival, timers. True if anything ran."""
+        """Run what is due: results of workers, messages in order of arrival, timers. True if anything ran."""
         ran = False
         while self._soon:
             function, args = self._soon.popleft()
@@ -603,7 +604,7 @@ class Node(Generic[ConfigT]):
         pending.sort(key=lambda entry: entry[0])
         for index, (_, subscription, received) in enumerate(pending):
             if index and subscription.raw.qos.depth == 1 and not self.lockstep:
-                # The callbacks before may have lasted: of a topic whose newest counts, take what came meanwhile.
+                # Earlier callbacks may have taken long: for a newest-only topic, use what has arrived since.
                 for newer in subscription.raw.take():
                     if newer.publisher == received.publisher:
                         received = newer
@@ -622,7 +623,7 @@ class Node(Generic[ConfigT]):
             _, _, timer = heapq.heappop(self._timers)
             if timer.cancelled:
                 continue
-            # On the grid of periods: no drift, no burst after a pause.
+            # On a fixed grid of periods: no drift, and no burst after a pause.
             timer.due_ns += timer.period_ns * ((now - timer.due_ns) // timer.period_ns + 1)
             heapq.heappush(self._timers, (timer.due_ns, next(self._timer_orders), timer))
             self._guard(f"timer {getattr(timer.callback, '__qualname__', '')}", timer.callback)
@@ -630,13 +631,13 @@ class Node(Generic[ConfigT]):
         return fired
 
     def next_timer_ns(self) -> int | None:
-        """When the next timer is due; for the lockstep bus."""
+        """Time of the next timer; for the lockstep bus."""
         while self._timers and self._timers[0][2].cancelled:
             heapq.heappop(self._timers)
         return self._timers[0][0] if self._timers else None
 
     def due(self) -> bool:
-        """Whether results of workers or timers wait to be run; for the lockstep bus."""
+        """Whether results of workers or timers are due; for the lockstep bus."""
         timer_ns = self.next_timer_ns()
         return bool(self._soon) or (timer_ns is not None and timer_ns <= self.clock.steady_ns())
 
@@ -653,7 +654,7 @@ class Node(Generic[ConfigT]):
             self._running = None
 
     def fault(self, what: str, error: Exception) -> None:
-        """Tells an exception with its trace, and counts it."""
+        """Log an exception with its traceback, and count it."""
         self._faults += 1
         self.log.error("%s: %s: %s", what, type(error).__name__, error, exc_info=error)
         self._diagnoses[what] = (ERROR, f"{type(error).__name__}: {error}", {"faults": self._faults})
@@ -661,13 +662,13 @@ class Node(Generic[ConfigT]):
             raise error
 
     def close(self) -> None:
-        """Runs ``teardown`` and lets go of topics and threads."""
+        """Run ``teardown``, then close topics and threads."""
         self._state = "STOPPING"
         self._stop.set()
         try:
             try:
                 if hasattr(self, "_heartbeat"):
-                    self._beat()  # so that nobody takes it for dead
+                    self._beat()  # so that nobody takes the node for dead
             finally:
                 self.teardown()
         finally:
@@ -679,7 +680,7 @@ class Node(Generic[ConfigT]):
                         logger.removeHandler(handler)
             self._transport.close()
 
-    # -- what every node tells -------------------------------------------------------------------
+    # -- what every node reports -----------------------------------------------------------------
 
     @property
     def level(self) -> int:
@@ -782,7 +783,7 @@ class Node(Generic[ConfigT]):
             self.on_registry_change()
 
     def describe(self) -> dict[str, Any]:
-        """What the registry tells of this node."""
+        """The node's entry in the registry."""
         return {
             "name": self.node_name,
             "executable": type(self).name,
@@ -794,12 +795,12 @@ class Node(Generic[ConfigT]):
 
 
 def _loggers(node: Node[Any]) -> tuple[str, str]:
-    """The node's own logger, and that of the library's modules, which know of no node."""
+    """Names of the node's own logger and of the library's, whose modules do not know the node."""
     return node.node_name, "instant_ic"
 
 
 class _RosoutHandler(logging.Handler):
-    """Sends a node's log lines to ``/rosout``."""
+    """Publishes a node's log records on ``/rosout``."""
 
     _LEVELS: ClassVar = {logging.DEBUG: 10, logging.INFO: 20, logging.WARNING: 30, logging.ERROR: 40}
 

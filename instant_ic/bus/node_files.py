@@ -1,4 +1,4 @@
-"""Loads the node class of a node file: the shipped ``nodes/NAME.py``, or a user's own file."""
+"""Load the node class of a node file: a shipped ``nodes/NAME.py``, or a user's own file."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from instant_ic.bus.node import Node
 
 
 class NodeFileError(ValueError):
-    """A file that is not there or does not define exactly one node; the message says which."""
+    """The file is missing or does not define exactly one node; the message says which."""
 
 
 def node_class(name: str) -> type[Node[Any]]:
-    """The class of a shipped node.
+    """Class of a shipped node.
 
     Raises:
         NodeFileError: there is no such node.
@@ -27,7 +27,7 @@ def node_class(name: str) -> type[Node[Any]]:
 
 
 def load(file: Path, module_name: str = "") -> type[Node[Any]]:
-    """The node class that a file defines; the file is run once per process.
+    """The node class that a file defines; each process runs the file only once.
 
     Args:
         file: Python source with one subclass of `Node`.
@@ -42,7 +42,7 @@ def load(file: Path, module_name: str = "") -> type[Node[Any]]:
         spec = importlib.util.spec_from_file_location(name, file)
         if spec is None or spec.loader is None or not file.is_file():
             raise NodeFileError(f"{file} is not a Python file")
-        module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look their module up
+        module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look up their module
         try:
             spec.loader.exec_module(module)
         except BaseException:

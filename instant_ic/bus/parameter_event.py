@@ -1,4 +1,4 @@
-"""Changed parameters as the message of ``/parameter_events`` (rcl_interfaces/ParameterEvent)."""
+"""Parameter changes as messages for ``/parameter_events`` (rcl_interfaces/ParameterEvent)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _NOT_SET, _BOOL, _INTEGER, _DOUBLE, _STRING, _BYTES, _BOOLS, _INTEGERS, _DOUBLES
 
 
 def parameter_event(node: str, changed: Mapping[str, Any], stamp_ns: int) -> Any:
-    """ParameterEvent of values (plain JSON) that a node has taken."""
+    """ParameterEvent for the values (plain JSON) that a node has accepted."""
     return message_type("rcl_interfaces/ParameterEvent")(
         stamp=to_time(stamp_ns),
         node=f"/{node}",
@@ -25,7 +25,7 @@ def parameter_event(node: str, changed: Mapping[str, Any], stamp_ns: int) -> Any
 
 
 def parameter(name: str, value: Any) -> Any:
-    """One rcl_interfaces/Parameter; what has no type there (a mixed list) goes as JSON text."""
+    """One rcl_interfaces/Parameter; a value without a type there (a mixed list) becomes JSON text."""
     return message_type("rcl_interfaces/Parameter")(name=name, value=_parameter_value(value))
 
 

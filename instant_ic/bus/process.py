@@ -1,4 +1,4 @@
-"""Starts one node as a process: command line, parameters, signals, registry."""
+"""Run one node as a process: command line, parameters, signals, registry."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from instant_ic.msg import MessageError
 
 
 def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
-    """Command line of a node."""
+    """Command line parser of a node."""
     parser = argparse.ArgumentParser(
         prog=f"ic run {node_class.name}",
         description=(sys.modules[node_class.__module__].__doc__ or "").strip(),
@@ -53,10 +53,10 @@ def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
 def load_config(
     node_class: type[Node[Any]], name: str, files: Sequence[Path], overrides: Sequence[str]
 ) -> tuple[Any, params.ProcessParameters]:
-    """Typed configuration of a node, and what holds for its process.
+    """Typed configuration of a node, and the parameters of its process.
 
     Raises:
-        ParameterError: something in the files or words is wrong; the message says where.
+        ParameterError: a file or an override is wrong; the message says where.
     """
     values: params.Values = {}
     for path in files:
@@ -67,10 +67,10 @@ def load_config(
 
 
 def parse_remaps(words: Sequence[str]) -> dict[str, str]:
-    """``from:=to`` words.
+    """Parse ``from:=to`` arguments.
 
     Raises:
-        ParameterError: no ``:=``.
+        ParameterError: an argument has no ``:=``.
     """
     remaps = {}
     for word in words:
@@ -82,11 +82,10 @@ def parse_remaps(words: Sequence[str]) -> dict[str, str]:
 
 
 def _stop_on_signals(node: Node[Any]) -> None:
-    """SIGINT and SIGTERM end the loop; teardown then runs on the node's own thread.
+    """End the loop on SIGINT and SIGTERM; teardown then runs on the node's own thread.
 
-    A handler runs between two steps of the main thread, which may hold the very lock that :meth:`Node.stop` needs: it
-    would wait for itself for ever. So the handler does nothing, and a thread that hears of the signal by a pipe stops
-    the node.
+    A signal handler interrupts the main thread, which may hold the lock that :meth:`Node.stop` needs; the handler would
+    deadlock. So the handler does nothing, and a thread that learns of the signal through a pipe stops the node.
     """
     heard, written = os.pipe()
     os.set_blocking(written, False)
@@ -102,9 +101,9 @@ def _stop_on_signals(node: Node[Any]) -> None:
 
 
 def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None:
-    """Runs a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters.
+    """Run a node until SIGINT or SIGTERM; exits with 0, 1 on failure, 2 on wrong usage or parameters.
 
-    With the process's own command line (``argv`` None) the process is the node's, and leaves at once.
+    With the process's own command line (``argv`` None), the process exits without interpreter shutdown.
     """
     status = run(node_class, argv)
     if argv is None:
@@ -113,23 +112,23 @@ def main(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> None
 
 
 def leave(status: int) -> NoReturn:
-    """Ends the process at once, without taking the interpreter down.
+    """End the process at once, without interpreter shutdown.
 
-    That takes 0.7 s of CPU where numba's compiler is loaded, and waits for threads that a library has left behind.
-    What matters (motors, bag, sockets, registry) a node has closed before; the rest is memory.
+    Shutdown takes 0.7 s of CPU with numba's compiler loaded, and waits for threads that a library left running. The
+    node has already closed what matters (motors, bag, sockets, registry); the rest is memory.
     """
     logging.shutdown()
     for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):  # nobody reads it any more, or it is closed
+        with suppress(OSError, ValueError):  # the reader is gone, or the stream is closed
             stream.flush()
     os._exit(status)
 
 
 def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
-    """As :func:`main`, and returns the exit status."""
+    """Like :func:`main`, but returns the exit status."""
     args = argument_parser(node_class).parse_args(argv)
     logging.basicConfig(
-        level=logging.INFO,  # other packages' debugging would flood the node's own
+        level=logging.INFO,  # debug output of other packages would flood the node's own
         format=f"%(asctime)s.%(msecs)03d %(levelname)-7s {args.name}: %(message)s",
         datefmt="%H:%M:%S",
         stream=sys.stderr,
@@ -147,7 +146,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     clock: Clock = ManualClock() if process.use_sim_time else SystemClock()
     run_dir = args.run_dir or paths.run_dir()
     try:
-        registry.prepare(run_dir)  # before anything in it is believed
+        registry.prepare(run_dir)  # before anything in it is trusted
         pace.use(pace.read(run_dir))
         transport = LocalTransport(run_dir, args.name, clock.now_ns, clock.steady_ns)
         claim = registry.Claim(run_dir / "nodes" / args.name, f"node {args.name}")
@@ -172,7 +171,7 @@ def run(node_class: type[Node[Any]], argv: Sequence[str] | None = None) -> int:
     except (NodeError, registry.RegistryError, MessageError) as error:
         log.error("%s", error)
         status = 1
-    except Exception:  # the last line of defence: told with its trace, then teardown still runs
+    except Exception:  # last resort: log the traceback; teardown still runs
         log.exception("failed")
         status = 1
     finally:

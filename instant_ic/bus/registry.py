@@ -1,12 +1,12 @@
-"""The file system as registry: who publishes what, and which nodes run, in one run directory.
+"""The file system as registry: publishers and running nodes of one run directory.
 
 Layout::
 
     RUN_DIR/topics/<topic, "/" as ".">/<node>.{sock,json,lock}
     RUN_DIR/nodes/<node>.{json,lock}
 
-A lock (``flock``) is held for as long as its owner lives; the kernel lets go of it even after SIGKILL. So a JSON whose
-lock can be taken belongs to a dead process and is swept.
+A process holds its lock (``flock``) until it ends; the kernel releases it even after SIGKILL. A JSON file whose lock
+can be taken therefore belongs to a dead process and is removed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MAX_IPC_PATH = 107  # sockaddr_un.sun_path less its final zero
 
 
 class RegistryError(RuntimeError):
-    """The run directory cannot be used, or a name in it is taken."""
+    """The run directory cannot be used, or a name in it is already taken."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +71,10 @@ class NodeInfo:
 
 
 def check_topic(topic: str) -> str:
-    """The topic itself, if its name is legal (``/a/b_c``).
+    """Return the topic if its name is valid (``/a/b_c``).
 
     Raises:
-        RegistryError: otherwise.
+        RegistryError: the name is invalid.
     """
     if not _TOPIC.match(topic):
         raise RegistryError(f"topic name {topic!r} is not legal: it must look like /camera/image")
@@ -82,10 +82,10 @@ def check_topic(topic: str) -> str:
 
 
 def check_node_name(name: str) -> str:
-    """The node's name itself, if it is legal (letters, digits, underscores).
+    """Return the node's name if it is valid (letters, digits, underscores).
 
     Raises:
-        RegistryError: otherwise.
+        RegistryError: the name is invalid.
     """
     if not _NAME.match(name):
         raise RegistryError(f"node name {name!r} is not legal: letters, digits and underscores only")
@@ -93,18 +93,18 @@ def check_node_name(name: str) -> str:
 
 
 def prepare(run_dir: Path) -> Path:
-    """Make the run directory and its folders with mode 0700, or check that nobody else can reach into them.
+    """Create the run directory and its folders with mode 0700, or check that no other user can write to them.
 
     Raises:
-        RegistryError: it cannot be made or written; it, or a folder in it, is a symbolic link or belongs to another
-            user; or others can replace it, for a folder above it can be written by them.
+        RegistryError: the run directory cannot be created or written; it, or a folder in it, is a symbolic link or
+            belongs to another user; or other users can replace it because they can write to a folder above it.
     """
     try:
         for folder in (run_dir, *(run_dir / name for name in ("topics", "nodes", "dev", "log"))):
             own_folder(folder)
         for parent in (folder := run_dir.absolute().parent.resolve(), *folder.parents):
             mode, group = (status := parent.stat()).st_mode, status.st_gid
-            # A group of one's own, the primary one, is usual for a folder in a home.
+            # A home folder is often writable for the user's own primary group.
             by_others = mode & stat.S_IWOTH or (mode & stat.S_IWGRP and group != os.getegid())
             if by_others and not mode & stat.S_ISVTX:
                 raise RegistryError(
@@ -120,11 +120,11 @@ def prepare(run_dir: Path) -> Path:
 
 
 def own_folder(folder: Path) -> None:
-    """Make a folder with mode 0700, or check that it is one of this user and give it this mode.
+    """Create a folder with mode 0700, or check that an existing one belongs to this user, and set its mode.
 
     Raises:
-        RegistryError: it is a symbolic link or no folder, or it belongs to another user.
-        OSError: it cannot be made.
+        RegistryError: it is a symbolic link or not a folder, or it belongs to another user.
+        OSError: it cannot be created.
     """
     with suppress(FileExistsError):
         make_folder(folder)
@@ -142,10 +142,10 @@ def own_folder(folder: Path) -> None:
 
 
 def open_lock(path: Path, create: bool = False) -> int:
-    """Open a lock file; returns its descriptor.
+    """Open a lock file and return its descriptor.
 
     Raises:
-        RegistryError: it is a symbolic link or no plain file, or it belongs to another user.
+        RegistryError: it is a symbolic link or not a regular file, or it belongs to another user.
         OSError: it cannot be opened.
     """
     flags = os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | (os.O_CREAT if create else 0)
@@ -168,12 +168,12 @@ def topic_dir(run_dir: Path, topic: str) -> Path:
 
 
 class Claim:
-    """A name in the registry, held by a lock until it is released or the process ends.
+    """A name in the registry, locked until it is released or the process ends.
 
     Args:
-        stem: path without suffix; ``.lock`` and ``.json`` stand beside each other.
-        what: for the error message.
-        timeout_s: how long to wait for a predecessor that is just ending.
+        stem: path without suffix, for the ``.lock`` and the ``.json`` file.
+        what: description for error messages.
+        timeout_s: how long to wait for a predecessor that is shutting down.
 
     Raises:
         RegistryError: another live process holds the name.
@@ -201,7 +201,7 @@ class Claim:
                 time.sleep(0.02)
 
     def write(self, content: dict[str, Any]) -> None:
-        """Replaces the JSON in one step, so that a reader never sees half of it.
+        """Replace the JSON file atomically.
 
         Raises:
             RegistryError: the disk is full, or the run directory is gone.
@@ -216,7 +216,7 @@ class Claim:
             raise RegistryError(f"{self._what} cannot be told to others: {error}") from error
 
     def release(self) -> None:
-        """Takes the JSON away and gives the lock back; twice does no harm."""
+        """Remove the JSON file and release the lock; a second call does nothing."""
         if self._fd >= 0:
             self.json_path.unlink(missing_ok=True)
             os.close(self._fd)
@@ -224,7 +224,7 @@ class Claim:
 
 
 def check_socket_path(path: Path) -> Path:
-    """The path itself, if a socket can be bound there.
+    """Return the path if a socket can be bound there.
 
     Raises:
         RegistryError: it is too long.
@@ -237,10 +237,10 @@ def check_socket_path(path: Path) -> Path:
 
 
 def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
-    """Claims a publisher's place; the socket path is free to bind.
+    """Claim a publisher's name for a topic; returns the claim and a socket path that is free to bind.
 
     Raises:
-        RegistryError: the place is taken, or the path is too long for a socket.
+        RegistryError: the name is taken, or the path is too long for a socket.
     """
     stem = topic_dir(run_dir, topic) / check_node_name(node)
     socket = check_socket_path(stem.with_name(stem.name + ".sock"))
@@ -250,11 +250,11 @@ def claim_socket(run_dir: Path, topic: str, node: str) -> tuple[Claim, Path]:
 
 
 def _alive(json_path: Path) -> bool:
-    """Whether the owner of a JSON holds its lock."""
+    """Whether the owner of a JSON file holds its lock."""
     lock_path = json_path.with_suffix(".lock")
     try:
         fd = open_lock(lock_path)
-    except (FileNotFoundError, RegistryError):  # what another user has put there is no entry
+    except (FileNotFoundError, RegistryError):  # another user's file is not an entry
         return False
     try:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -271,7 +271,7 @@ def _entries(folder: Path) -> Iterator[dict[str, Any]]:
             continue
         try:
             content = json.loads(path.read_text())
-        except (OSError, ValueError):  # gone in this moment, or the disk is full: the next look decides
+        except (OSError, ValueError):  # just removed, or the disk is full: try again at the next look
             continue
         yield content
 
@@ -311,7 +311,7 @@ def list_nodes(run_dir: Path) -> list[NodeInfo]:
 
 
 def sweep(run_dir: Path) -> int:
-    """Takes away what dead processes left; returns how many places were cleared."""
+    """Remove the files that dead processes left; returns how many entries were removed."""
     swept = 0
     for lock_path in [*(run_dir / "topics").glob("*/*.lock"), *(run_dir / "nodes").glob("*.lock")]:
         fd = open_lock(lock_path)
@@ -321,7 +321,7 @@ def sweep(run_dir: Path) -> int:
             continue
         else:
             stem = lock_path.with_suffix("")
-            # The lock file itself stays: a process that waits for it would lock a file that no path names.
+            # The lock file itself stays: a waiting process would otherwise lock a file that no path names.
             leftovers = [p for s in (".json", ".sock", ".tmp") if (p := stem.with_name(stem.name + s)).exists()]
             for path in leftovers:
                 path.unlink(missing_ok=True)

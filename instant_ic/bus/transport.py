@@ -1,4 +1,4 @@
-"""What a node needs of a transport; the local and the lockstep bus implement it."""
+"""Interface between a node and its transport; implemented by the local and the lockstep bus."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from instant_ic.bus.qos import QoS
 Buffer = bytes | bytearray | memoryview
 
 Payload = Buffer | Sequence[Buffer]
-"""CDR bytes: one buffer, or several that follow each other on the wire."""
+"""CDR bytes: one buffer, or several in a row."""
 
 
 class TransportError(RuntimeError):
-    """A message that the bus cannot carry."""
+    """The bus cannot carry this message."""
 
 
 class Received(NamedTuple):
-    """One message as it came.
+    """One received message.
 
-    ``payload`` is read-only. A large one is a view of its publisher's memory: it stays as it is for as long as
-    anything refers to it, and a reader that keeps many gets copies.
+    ``payload`` is read-only. A large one is a view of its publisher's memory; it does not change while anything refers
+    to it. A reader that keeps many messages gets copies.
     """
 
     topic: str
@@ -32,17 +32,17 @@ class Received(NamedTuple):
     publish_ns: int
     received_ns: int
     order: int
-    """Place in the order of arrival over all subscriptions of a node."""
+    """Position in order of arrival over all subscriptions of a node."""
     publisher: str = ""
     """Name of the node that published it."""
     steady_ns: int = 0
-    """When it came, by the node's steady clock; for ages."""
+    """Time of arrival on the node's steady clock, for ages."""
 
     def given_ns(self, stamp_ns: int) -> int:
-        """When its content was measured or given, by the node's steady clock; every age counts from there.
+        """Time on the node's steady clock when the content was measured or commanded; all ages count from it.
 
-        The stamp is compared with the machine's clock once, on arrival. From then on only the steady clock counts, so
-        setting the machine's clock makes nothing older or younger. A stamp that is ahead counts as the arrival.
+        The stamp is compared with the machine's clock once, on arrival. After that only the steady clock counts, so
+        setting the machine's clock changes no age. A stamp in the future counts as the time of arrival.
         """
         return self.steady_ns - max(0, self.received_ns - stamp_ns)
 
@@ -53,7 +53,7 @@ _TOLERANCE_S = 0.1  # simulated time may go back a little
 class Stats:
     """Counts, rate, age and losses of one direction of a topic.
 
-    Times are of the node's steady clock: setting the machine's clock changes no rate and no age.
+    Times are on the node's steady clock: setting the machine's clock changes no rate and no age.
     """
 
     def __init__(self) -> None:
@@ -67,38 +67,38 @@ class Stats:
 
     @property
     def lost(self) -> int:
-        """Messages that never came, of all publishers together."""
+        """Number of messages that never arrived, over all publishers."""
         return sum(self.lost_by.values())
 
     def lose(self, publisher: str, count: int) -> None:
-        """Counts messages that a publisher (the name of its node) sent and that did not come."""
+        """Count messages that a publisher (named by its node) sent and that did not arrive."""
         if count > 0:
             self.lost_by = {**self.lost_by, publisher: self.lost_by.get(publisher, 0) + count}
 
     def add(self, now_ns: int, size: int) -> None:
-        """Counts one message."""
+        """Count one message."""
         self.count += 1
         self.bytes += size
         self.newest_ns = now_ns
         self._arrivals.append(now_ns)
 
     def rate_hz(self, now_ns: int) -> float:
-        """Messages a second over the last 50 or 5 s, whichever is shorter."""
+        """Messages per second over the last 50 messages or 5 s, whichever is shorter."""
         recent = [t for t in list(self._arrivals) if 0 <= now_ns - t < 5_000_000_000]
         if len(recent) < 2 or recent[-1] <= recent[0]:
             return 0.0
-        # The silence since the last message counts too: a topic that stopped must not keep its old rate.
+        # The time since the last message counts too: a topic that stopped must not keep its old rate.
         span = max(recent[-1] - recent[0], (now_ns - recent[0]) * (len(recent) - 1) // len(recent))
         return (len(recent) - 1) * 1e9 / span
 
     def age_s(self, now_ns: int) -> float:
-        """Seconds since the newest message; inf before the first, and when simulated time went back since."""
+        """Seconds since the newest message; inf before the first, and after simulated time went back."""
         age = (now_ns - self.newest_ns) / 1e9
         return age if self.count and age >= -_TOLERANCE_S else float("inf")
 
 
 class PublisherStats(Stats):
-    """Of a publisher; ``not_shared`` counts large messages for which there was no shared memory, and why."""
+    """Statistics of a publisher; ``not_shared`` counts large messages sent without shared memory, with the reason."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -117,18 +117,18 @@ class RawPublisher(Protocol):
     @property
     def subscriber_count(self) -> int: ...
     def send(self, payload: Payload, publish_ns: int | None = None) -> None:
-        """Sends one message; ``publish_ns`` keeps the publication time of a message that is only passed on."""
+        """Send one message; ``publish_ns`` keeps the publication time of a forwarded message."""
         ...
 
     def send_filled(self, size: int, fill: Callable[[memoryview], None], publish_ns: int | None = None) -> None:
-        """Sends ``size`` bytes that ``fill`` writes straight to where readers find them."""
+        """Send ``size`` bytes that ``fill`` writes straight into the memory that readers see."""
         ...
 
     def close(self) -> None: ...
 
 
 def joined(payload: Payload) -> bytes | memoryview:
-    """A payload as one piece; copied only where it comes in several."""
+    """A payload as one buffer; copied only if it consists of several."""
     if isinstance(payload, (bytes, memoryview)):
         return payload
     return memoryview(payload) if isinstance(payload, bytearray) else b"".join(payload)
@@ -143,14 +143,14 @@ class RawSubscription(Protocol):
     stats: Stats
 
     def take(self) -> list[Received]:
-        """What came since the last call, in the order of arrival; with ``sensor`` the newest of each publisher."""
+        """Messages since the last call, in order of arrival; with ``sensor``, the newest of each publisher."""
         ...
 
     def close(self) -> None: ...
 
 
 class Waker(Protocol):
-    """What a node's thread waits on; a :class:`threading.Event` is one."""
+    """Event that a node's thread waits on; a :class:`threading.Event` is one."""
 
     def set(self) -> None: ...
     def clear(self) -> None: ...
@@ -158,15 +158,15 @@ class Waker(Protocol):
 
 
 class Transport(Protocol):
-    """Topics in and out of one node."""
+    """Topics of one node."""
 
     @property
     def run_dir(self) -> Path | None:
-        """Where the topics are found; None in lockstep."""
+        """Run directory of the topics; None in lockstep."""
         ...
 
     def waker(self) -> Waker:
-        """For the node's own thread; waiting on it may read the node's sockets."""
+        """Event for the node's own thread; waiting on it may read the node's sockets."""
         ...
 
     def advertise(self, topic: str, type_name: str, qos: QoS) -> RawPublisher: ...
