@@ -1,4 +1,4 @@
-"""Instant IC: teleoperation that passes between a real robot and an instantly built virtual one."""
+"""Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."""
 
 from instant_ic.limits import limit_opencv
 

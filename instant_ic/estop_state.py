@@ -1,12 +1,12 @@
-"""What the emergency stop must remember from one run to the next: a stop that nobody released, a run that broke off.
+"""Emergency-stop state that survives a restart: an emergency stop that nobody released, a run that was interrupted.
 
 Two files in a folder of each run directory (:func:`state_dir`):
 
-- ``estop.json``: the emergency stop is pressed. The arbiter writes it at a press and removes it at a release.
-- ``run.json``: a stack runs. The launcher writes it at the start and removes it when every node has ended. Where it
-  stands at the next start, that run broke off (power cut, killed launcher), and the stack starts stopped.
+- ``estop.json``: the emergency stop is latched. The arbiter writes it on a press and removes it on a release.
+- ``run.json``: a stack is running. The launcher writes it at the start and removes it when every node has ended. If
+  it exists at the next start, that run was interrupted (power cut, killed launcher), and the stack starts stopped.
 
-Both are replaced in one step and reach the disk before the caller goes on, mode 0600.
+Both are replaced atomically and synced to disk before the caller continues, mode 0600.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RELEASE = "Release the emergency stop to continue."
 
 
 class EstopStateError(RuntimeError):
-    """The state of the emergency stop cannot be kept; says where and what to do."""
+    """The emergency stop's state cannot be saved; the message says where and what to do."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class KeptStop:
     """An emergency stop that nobody released.
 
     Attributes:
-        publisher: node that pressed it; ``launch`` after a run that broke off.
+        publisher: node that pressed it; ``launch`` after an interrupted run.
         pressed_ns: publication time of the press, nanoseconds since the epoch; older releases do not count.
         why: text for the operator; empty for a plain press.
     """
@@ -43,9 +43,9 @@ class KeptStop:
 
 
 def state_dir(run_dir: Path) -> Path:
-    """Folder of the files: the run directory, unless that is the default one, which a power cut or sign-out empties.
+    """Folder of the state files: the run directory, except for the default one, which a power cut or sign-out empties.
 
-    Then it is the place below ``XDG_STATE_HOME/instant_ic`` (``~/.local/state/instant_ic``).
+    For the default one, the folder lies below ``XDG_STATE_HOME/instant_ic`` (``~/.local/state/instant_ic``).
     """
     default = paths.default_run_dir()
     if run_dir == default or default in run_dir.parents:
@@ -55,7 +55,7 @@ def state_dir(run_dir: Path) -> Path:
 
 
 def read(run_dir: Path) -> KeptStop | None:
-    """The stop that nobody released; None where there is none. A file that cannot be read counts as one."""
+    """The emergency stop that nobody released, or None. An unreadable file counts as an emergency stop."""
     file = state_dir(run_dir) / "estop.json"
     try:
         fields = json.loads(file.read_text(encoding="utf-8"))
@@ -68,7 +68,7 @@ def read(run_dir: Path) -> KeptStop | None:
 
 
 def write(run_dir: Path, stop: KeptStop | None) -> None:
-    """Keeps a press, or forgets it (None).
+    """Save a press, or clear it (None).
 
     Raises:
         EstopStateError: the folder cannot be written.
@@ -77,7 +77,7 @@ def write(run_dir: Path, stop: KeptStop | None) -> None:
 
 
 class RunMark:
-    """Stands in the state folder for as long as a stack runs; one that was left there stops the next stack.
+    """File in the state folder that exists while a stack runs; one left by an earlier run stops the next stack.
 
     Args:
         run_dir: prepared run directory, locked against other stacks.
@@ -88,7 +88,7 @@ class RunMark:
         self._file = state_dir(run_dir) / "run.json"
 
     def __enter__(self) -> Self:
-        """Sees how the last run ended, and begins this one.
+        """Check how the last run ended, and mark this run as started.
 
         Raises:
             EstopStateError: the folder cannot be written.
@@ -103,12 +103,12 @@ class RunMark:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Every node has ended, for whatever reason: this run ended cleanly."""
+        """Mark the run as ended cleanly, for whatever reason every node has ended."""
         _put(self._file, None)
 
 
 def _put(file: Path, content: dict[str, object] | None) -> None:
-    """Replaces a file in one step, or removes it; it is so on the disk, too, when this returns."""
+    """Replace a file atomically, or remove it; the change is on disk when this returns."""
     part = file.with_suffix(".part")
     try:
         if content is None:
@@ -129,7 +129,7 @@ def _put(file: Path, content: dict[str, object] | None) -> None:
             os.close(folder)
     except OSError as error:
         if content is None and isinstance(error, FileNotFoundError):
-            return  # there is no folder, so there is no file
+            return  # without the folder there is no file either
         raise EstopStateError(
             f"the emergency stop's state cannot be kept: {file}: {error.strerror}. Free the disk, or set "
             "INSTANT_IC_RUN_DIR to a folder that can be written"

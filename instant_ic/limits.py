@@ -1,4 +1,4 @@
-"""Limits of what is decoded from files and messages: a few kilobytes can declare an image or an array of gigabytes."""
+"""Limits for decoding files and messages: a few kilobytes can declare an image or an array of gigabytes."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_PIXELS = 32 << 20
-"""Of an image that came over a network or in a bag. The Theta's largest photo (6720x3360) has 22.6 million."""
+"""For images received over a network or from a bag. The Theta's largest photo (6720x3360) has 22.6 million pixels."""
 MOST_FILE_PIXELS = 160 << 20
-"""Of an image file that an operator names: panoramas of 16384x8192."""
+"""For image files that an operator names: panoramas of 16384x8192."""
 MOST_ARRAY_BYTES = 4 << 30
-"""Of all arrays of an ``.npz`` file together, decompressed."""
+"""For all arrays of an ``.npz`` file together, decompressed."""
 
 _MOST_CHUNKS = 20_000
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def limit_opencv() -> None:
-    """Have OpenCV refuse larger images by their declared size; it reads this once, before the first image."""
+    """Make OpenCV refuse images of larger declared size; OpenCV reads this setting once, before its first image."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_FILE_PIXELS))
 
 
 def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
-    """Decode a JPEG or PNG that came from outside, of at most `MOST_PIXELS`; None where that cannot be done.
+    """Decode a JPEG or PNG from an untrusted source, up to `MOST_PIXELS`; None if that fails.
 
     Args:
         data: the encoded image.
-        flags: of ``cv2.imdecode``.
+        flags: as for ``cv2.imdecode``.
     """
     import cv2
     import numpy as np
@@ -58,11 +58,11 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
 
 
 def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
-    """Read an image file of any kind that OpenCV knows, of at most `MOST_FILE_PIXELS`; None where that cannot be done.
+    """Read an image file in any format that OpenCV supports, up to `MOST_FILE_PIXELS`; None if that fails.
 
     Args:
         path: the file.
-        flags: of ``cv2.imread``.
+        flags: as for ``cv2.imread``.
     """
     import cv2
 
@@ -79,7 +79,7 @@ def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:
 
 
 def _chunks_fit(data: bytes | bytearray) -> bool:
-    """Whether the chunks of a PNG are in it: OpenCV takes memory for what a chunk declares, 1 GB in 120 bytes."""
+    """Whether a PNG contains its chunks in full: OpenCV allocates what a chunk declares, up to 1 GB for 120 bytes."""
     view, at = memoryview(data), len(_PNG)
     for _ in range(_MOST_CHUNKS):
         if at + 12 > len(view):
@@ -91,7 +91,7 @@ def _chunks_fit(data: bytes | bytearray) -> bool:
 
 
 def check_arrays(path: str | Path) -> None:
-    """See that an ``.npz`` file does not unpack to more than `MOST_ARRAY_BYTES`.
+    """Check that an ``.npz`` file does not unpack to more than `MOST_ARRAY_BYTES`.
 
     Raises:
         ValueError: it does, or it is damaged.

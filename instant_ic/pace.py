@@ -1,8 +1,8 @@
-"""How fast the time of a simulated stack goes beside the machine's: slow motion for a machine that is too slow.
+"""Pace of a simulated stack's time relative to the machine's: slow motion for a machine that is too slow.
 
-A stack has one pace for all its processes. It stands in the run directory, where the launcher writes it
-(``ic launch sim --pace 0.5``) and each process reads it as it starts. Stamps, timers and time-outs of the nodes follow
-it, and so do the simulated devices; what concerns the machine alone (heartbeats, the end of processes) does not.
+All processes of a stack share one pace. The launcher writes it into the run directory (``ic launch sim --pace 0.5``),
+and each process reads it at start-up. Stamps, timers and time-outs of the nodes follow it, and so do the simulated
+devices. Functions that concern only the machine (heartbeats, shutdown of processes) do not.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ SLOWEST, FASTEST = 0.02, 10.0
 
 
 class PaceError(ValueError):
-    """No pace: a number out of range, or a file of a run directory that cannot be read."""
+    """The pace is out of range, or the run directory's pace file cannot be read."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """A pace, and the moment at which its time was the machine's.
+    """A pace, with the moment at which its time equalled the machine's.
 
     Attributes:
-        factor: seconds of the stack in a second of the machine.
+        factor: seconds of the stack per second of the machine.
         epoch_ns: nanoseconds since the epoch at that moment.
-        monotonic_ns: the machine's steady clock at that moment; one for all processes of a machine.
+        monotonic_ns: the machine's steady clock at that moment; all processes of a machine share it.
     """
 
     factor: float = 1.0
@@ -37,7 +37,7 @@ class Pace:
 
     @classmethod
     def from_now(cls, factor: float) -> Pace:
-        """A pace that begins now.
+        """A pace that starts now.
 
         Raises:
             PaceError: the factor is out of range.
@@ -48,7 +48,7 @@ class Pace:
 
     @property
     def real(self) -> bool:
-        """Whether it is the machine's own time."""
+        """Whether this is the machine's own time."""
         return self.factor == 1.0
 
     def now_ns(self) -> int:
@@ -58,23 +58,23 @@ class Pace:
         return self.epoch_ns + round(self.factor * (time.monotonic_ns() - self.monotonic_ns))
 
     def steady_ns(self) -> int:
-        """Nanoseconds since some moment; only differences mean something."""
+        """Nanoseconds since an arbitrary origin; only differences are meaningful."""
         return time.monotonic_ns() if self.real else round(self.factor * (time.monotonic_ns() - self.monotonic_ns))
 
     def steady_s(self) -> float:
-        """The same in seconds."""
+        """Seconds since an arbitrary origin; only differences are meaningful."""
         return self.steady_ns() * 1e-9
 
     def wait_s(self, seconds: float) -> float:
-        """How long the machine waits for so many seconds of the stack."""
+        """Convert seconds of the stack to seconds of the machine."""
         return seconds / self.factor
 
     def sleep(self, seconds: float) -> None:
-        """Sleeps for so many seconds of the stack."""
+        """Sleep for a number of the stack's seconds."""
         time.sleep(self.wait_s(seconds))
 
     def stamp_ns(self, machine_ns: int) -> int:
-        """The stack's time at a recent moment that the machine's clock has stamped."""
+        """Convert a recent stamp of the machine's clock to the stack's time."""
         return machine_ns if self.real else self.now_ns() - round(self.factor * (time.time_ns() - machine_ns))
 
 
@@ -87,13 +87,13 @@ def current() -> Pace:
 
 
 def use(pace: Pace) -> None:
-    """Makes it this process's; before its clocks are used."""
+    """Set this process's pace; call it before the clocks are used."""
     global _current
     _current = pace
 
 
 def write(run_dir: Path, pace: Pace) -> None:
-    """Makes it the pace of a run directory; the machine's own leaves no file."""
+    """Write the pace into a run directory; the machine's own pace leaves no file."""
     file = run_dir / FILE
     if pace.real:
         file.unlink(missing_ok=True)
@@ -104,7 +104,7 @@ def write(run_dir: Path, pace: Pace) -> None:
 
 
 def read(run_dir: Path) -> Pace:
-    """The pace of a run directory.
+    """Read the pace of a run directory.
 
     Raises:
         PaceError: its file is damaged.

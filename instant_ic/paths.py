@@ -21,7 +21,7 @@ def share_dir(name: str) -> Path:
 
 
 def shipped_file(folder: str, name: str) -> Path:
-    """A file of ``launch``, ``config`` or ``models`` by name, with a clear error when it is not there."""
+    """Path of a file in ``launch``, ``config`` or ``models``; a missing file raises an error that lists the others."""
     path = share_dir(folder) / name
     if not path.is_file():
         have = ", ".join(sorted(entry.name for entry in share_dir(folder).iterdir())) or "nothing"
@@ -35,7 +35,7 @@ def node_names() -> list[str]:
 
 
 def node_file(name: str) -> Path:
-    """Where a shipped node of this name stands, if there is one."""
+    """Path of the shipped node of this name, whether it exists or not."""
     return share_dir("nodes") / f"{name}.py"
 
 
@@ -50,17 +50,17 @@ def run_dir() -> Path:
 
 
 def default_run_dir() -> Path:
-    """The run directory where nobody names one; it does not outlive the machine's shutdown."""
+    """The run directory used when none is given; it does not survive the machine's shutdown."""
     if runtime := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(runtime) / "instant_ic"
     return Path(f"/tmp/instant_ic-{os.getuid()}")
 
 
 def sign_in_file(run_dir: Path, node: str) -> Path:
-    """Where a console leaves its address with the token, for its user alone: others may read the log."""
+    """File with a console's address and token, readable by its user only, unlike the log."""
     return run_dir / f"{node}.sign_in"
 
 
 def cache_dir() -> Path:
-    """What can be made again: ``XDG_CACHE_HOME/instant_ic``, else ``~/.cache/instant_ic``; may not be there yet."""
+    """Folder for recreatable files: ``XDG_CACHE_HOME/instant_ic``, else ``~/.cache/instant_ic``; may not exist yet."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "instant_ic"

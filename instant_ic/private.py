@@ -1,4 +1,4 @@
-"""Folders and files that only their owner can read, whatever the umask."""
+"""Create folders and files that only their owner can read, whatever the umask."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ log = logging.getLogger(__name__)
 
 
 def make_folder(path: Path, exist_ok: bool = False) -> None:
-    """Make a folder and its missing parents, each with mode 0700; one that exists keeps its mode.
+    """Create a folder and its missing parents, each with mode 0700; an existing one keeps its mode.
 
     Raises:
-        FileExistsError: it exists and ``exist_ok`` is false, or it is no folder.
-        OSError: it cannot be made.
+        FileExistsError: it exists and ``exist_ok`` is false, or it is not a folder.
+        OSError: it cannot be created.
     """
     try:
         path.mkdir(mode=0o700)
@@ -30,10 +30,10 @@ def make_folder(path: Path, exist_ok: bool = False) -> None:
 
 
 def open_file(path: Path, flags: int) -> int:
-    """Open a file and give it mode 0600, whether this call makes it or not; never through a symbolic link.
+    """Open a file and set its mode to 0600, whether new or existing; never follows a symbolic link.
 
     Returns:
-        Its descriptor, which no child process inherits.
+        A descriptor that child processes do not inherit.
 
     Raises:
         OSError: it cannot be opened.
@@ -48,5 +48,5 @@ def _restrict(path: Path, present: int, mode: int, change: Callable[[int], None]
         return
     try:
         change(mode)
-    except OSError as error:  # a USB stick with FAT has no modes; a recording on it is better than none
+    except OSError as error:  # a USB stick with FAT has no modes; an unprotected recording is better than none
         log.warning("%s cannot be hidden from other users (mode %04o): %s", path, mode, error.strerror)

@@ -187,7 +187,7 @@ class Worker:
     def _do(self, item: Any) -> None:
         try:
             result = self._work(item)
-        except Exception as error:  # a node survives a bad item; the fault is logged with its traceback
+        except Exception as error:  # noqa: BLE001 - a node survives a bad item; the fault is logged with its traceback
             self._node.call_soon(self._node.fault, f"background {getattr(self._work, '__name__', 'work')}", error)
             return
         if self._on_result is not None:

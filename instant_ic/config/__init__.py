@@ -1,1 +1,1 @@
-"""One schema of parameters for all nodes: dataclasses, their ranges, and the YAML files that override them."""
+"""Parameter schema shared by all nodes: dataclasses, their ranges, and the YAML files that override them."""

@@ -1,4 +1,4 @@
-"""What is known of a node's parameters: type, range, default, meaning, and whether they can be changed live."""
+"""Description of a node's parameters: type, range, default, meaning, and whether they can be changed live."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class ParameterInfo:
     """One parameter of one node.
 
     Attributes:
-        name: key, groups with dots.
-        type: of its value, as Python writes it.
-        value: what holds now; plain JSON.
-        default: what holds where nothing is given; plain JSON.
-        range: where the value may lie, in words; empty without a range.
+        name: key, with dots between groups.
+        type: type of the value, in Python notation.
+        value: present value, as plain JSON.
+        default: default value, as plain JSON.
+        range: allowed range as text; empty without a range.
         live: whether it can be changed while the node runs.
         description: its meaning.
     """
@@ -40,20 +40,20 @@ class ParameterInfo:
 
 
 def is_live(key: str, live: Iterable[str]) -> bool:
-    """Whether a key is among the live ones, which may name whole groups, or everything by ``*``."""
+    """Whether a key is live; ``live`` may also name whole groups, or everything by ``*``."""
     return any(entry in ("*", key) or key.startswith(f"{entry}.") for entry in live)
 
 
 def parameter_infos(
     config_class: type[Any], config: Any = None, live: Iterable[str] = (), node: str = ""
 ) -> list[ParameterInfo]:
-    """Every parameter of a configuration, in the order of its fields.
+    """All parameters of a configuration, in the order of its fields.
 
     Args:
         config_class: dataclass of the configuration.
-        config: the values that hold; None takes the defaults for them.
+        config: configuration that gives the present values; None uses the defaults.
         live: keys and groups that can be changed while the node runs.
-        node: section of ``config/*.yaml`` whose comments tell the meaning before the docstring does.
+        node: section of ``config/*.yaml`` whose comments take precedence over the docstring as descriptions.
     """
     described = shipped_comments().get(node, {})
     return [
@@ -65,7 +65,7 @@ def parameter_infos(
 
 
 def _infos(config_class: type[Any], config: Any, defaults: Any, prefix: str) -> list[ParameterInfo]:
-    """Parameters of one group; ``defaults`` is the group as its parent makes it, None at the top."""
+    """Parameters of one group; ``defaults`` is the group as its parent creates it, None at the top."""
     infos: list[ParameterInfo] = []
     meanings = attributes(config_class)
     hints, bounds = get_type_hints(config_class), ranges(config_class)  # type: ignore[arg-type]
@@ -92,14 +92,14 @@ def _type_words(hint: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it: tuples as lists, paths as strings."""
+    """A value as JSON: tuples become lists, paths become strings."""
     if isinstance(value, (tuple, list)):
         return [plain(part) for part in value]
     return str(value) if isinstance(value, Path) else value
 
 
 def attributes(config_class: type[Any]) -> dict[str, str]:
-    """Texts of the "Attributes:" part of a docstring; ``a, b: text`` holds for both."""
+    """Entries of the "Attributes:" section of a docstring; ``a, b: text`` describes both."""
     doc = inspect.getdoc(config_class) or ""
     part = doc.partition("Attributes:\n")[2].split("\n\n")[0]
     found: dict[str, str] = {}
@@ -114,7 +114,7 @@ def attributes(config_class: type[Any]) -> dict[str, str]:
 
 
 def comments(path: Path) -> dict[str, dict[str, str]]:
-    """Comment of every key of a parameter file: node → dotted key → text."""
+    """Comment of each key of a parameter file: node → dotted key → text."""
     result: dict[str, dict[str, str]] = {}
     stack: list[tuple[int, str]] = []
     above: list[str] = []

@@ -1,4 +1,4 @@
-"""Parameters: ROS 2 YAML files and ``key:=value`` words into a node's typed, checked configuration.
+"""Turn ROS 2 YAML files and ``key:=value`` overrides into a node's typed, checked configuration.
 
 File form::
 
@@ -28,12 +28,12 @@ ConfigT = TypeVar("ConfigT")
 
 
 class ParameterError(ValueError):
-    """A parameter that is unknown, of the wrong type or out of range; the message says where it stands."""
+    """A parameter is unknown, of the wrong type or out of range; the message says where."""
 
 
 @dataclass(frozen=True)
 class Value:
-    """A value with the place it came from (``config/slam.yaml:12`` or ``-p key:=value``)."""
+    """A value with its origin (``config/slam.yaml:12`` or ``-p key:=value``)."""
 
     value: Any
     where: str
@@ -45,11 +45,11 @@ Values = dict[str, Value]
 
 @dataclass(frozen=True)
 class ProcessParameters:
-    """Parameters that every node has beside its own.
+    """Parameters that every node has in addition to its own.
 
     Attributes:
         use_sim_time: the clock follows ``/clock``; callbacks wait for its first value.
-        nice: a node of a higher value leaves the CPU to the others when there is not enough for all.
+        nice: a node with a higher value yields the CPU to the others when there is not enough for all.
     """
 
     use_sim_time: bool = False
@@ -61,10 +61,10 @@ class ProcessParameters:
 
 
 def load_file(path: Path, node: str) -> Values:
-    """Parameters of one node out of a ROS 2 parameter file; ``/**`` sections first.
+    """Read the parameters of one node from a ROS 2 parameter file; ``/**`` sections apply first.
 
     Raises:
-        ParameterError: the file cannot be read, is no YAML, or has another form.
+        ParameterError: the file cannot be read, is not YAML, or has the wrong structure.
     """
     try:
         text = path.read_text()
@@ -121,7 +121,7 @@ def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values) -> None:
 
 
 _YAML_FAULTS = (yaml.YAMLError, ValueError, AttributeError)
-"""What PyYAML raises for a value that is none: 2001-13-45 is a ValueError, ``!!timestamp x`` an AttributeError."""
+"""What PyYAML raises for an invalid value: 2001-13-45 is a ValueError, ``!!timestamp x`` an AttributeError."""
 
 
 def _construct(node: yaml.Node, what: str) -> Any:
@@ -139,14 +139,14 @@ def _one_line(error: BaseException) -> str:
 
 
 def yaml_value(text: str, what: str) -> Any:
-    """A value as the user types it.
+    """Parse a value typed by the user.
 
     Args:
         text: YAML.
-        what: stands in front of the error.
+        what: prefix of the error message.
 
     Raises:
-        ParameterError: it is no YAML.
+        ParameterError: the text is not YAML.
     """
     try:
         return yaml.safe_load(text)
@@ -157,10 +157,10 @@ def yaml_value(text: str, what: str) -> Any:
 
 
 def parse_override(word: str) -> tuple[str, Value]:
-    """``key:=value`` with a YAML value.
+    """Parse ``key:=value`` with a YAML value.
 
     Raises:
-        ParameterError: no ``:=``, or the value is no YAML.
+        ParameterError: there is no ``:=``, or the value is not YAML.
     """
     key, separator, text = word.partition(":=")
     if not separator or not key:
@@ -169,12 +169,12 @@ def parse_override(word: str) -> tuple[str, Value]:
 
 
 def build(config_class: type[ConfigT], values: Mapping[str, Value], base: ConfigT | None = None) -> ConfigT:
-    """Typed configuration from flat values; unknown keys and wrong types are errors that say where.
+    """Typed configuration from flat values; errors name the place of an unknown key or a wrong type.
 
     Args:
         config_class: dataclass of the configuration.
-        values: what is given.
-        base: where the other values come from; None takes the defaults.
+        values: the given values.
+        base: source of all other values; None uses the defaults.
 
     Raises:
         ParameterError: see above, or ``__post_init__`` refused the values.
@@ -203,7 +203,7 @@ def _build(config_class: type[ConfigT], values: Values, prefix: str, base: Confi
         else:
             arguments[head] = _coerce(value.value, hints[head], full, value.where)
     for head, inner in nested.items():
-        # A group's defaults are those of its parent: another group of the same class may have others.
+        # A group's defaults come from its parent: another group of the same class may have different ones.
         group = field_default(fields[head]) if base is None else getattr(base, head)
         arguments[head] = _build(hints[head], inner, f"{prefix}{head}.", group)
     try:
@@ -216,14 +216,14 @@ def _build(config_class: type[ConfigT], values: Values, prefix: str, base: Confi
 
 
 def field_default(field: dataclasses.Field[Any]) -> Any:
-    """Value of a configuration's field where nothing is given; None where the field has no default."""
+    """Default of a configuration's field; None if it has none."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return None if field.default is dataclasses.MISSING else field.default
 
 
 def _coerce(value: Any, hint: Any, key: str, where: str) -> Any:
-    """The value as the type that a field is declared with."""
+    """Convert a value to the declared type of its field."""
     origin = get_origin(hint)
     if origin is Annotated:
         plain = _coerce(value, get_args(hint)[0], key, where)
@@ -269,20 +269,20 @@ def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], 
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Nested plain values of a configuration, for ``ic param`` and the registry."""
+    """Configuration as nested plain values, for ``ic param`` and the registry."""
     return {key: str(value) if isinstance(value, Path) else value for key, value in dataclasses.asdict(config).items()}
 
 
 def change(
     config: ConfigT, values: Mapping[str, Any], is_live: Callable[[str], bool], where: str
 ) -> tuple[ConfigT, dict[str, Any]]:
-    """A configuration with other values, checked as a whole, and what differs (flat).
+    """Apply new values to a configuration and check it as a whole; returns it with what differs (flat).
 
     Args:
-        config: what holds now.
-        values: flat or nested keys; those that are as now do no harm.
+        config: the present configuration.
+        values: flat or nested keys; unchanged values are allowed.
         is_live: whether a key may be changed while the node runs.
-        where: stands in front of the errors.
+        where: prefix of the error messages.
 
     Raises:
         ParameterError: a value is wrong, or its parameter takes effect only at the start.
@@ -297,7 +297,7 @@ def change(
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested values with dotted keys."""
+    """Flatten nested values to dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in values.items():
         if isinstance(value, Mapping) and value:

@@ -1,4 +1,4 @@
-"""Ranges of configuration values, declared where the field is: ``rate_hz: Positive = 20.0``.
+"""Ranges of configuration values, declared with the field: ``rate_hz: Positive = 20.0``.
 
 >>> from dataclasses import dataclass
 >>> @dataclass(frozen=True)
@@ -24,11 +24,11 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args, get_origin, get
 
 @dataclass(frozen=True)
 class Range:
-    """Where a number may lie; it must be finite in any case.
+    """Allowed range of a number, which must always be finite.
 
     Attributes:
-        low: the smallest value that is allowed.
-        high: the largest value that is allowed.
+        low: smallest allowed value.
+        high: largest allowed value.
         above: the value must be larger than this.
         below: the value must be smaller than this.
     """
@@ -49,7 +49,7 @@ class Range:
         )
 
     def __str__(self) -> str:
-        """As it is shown beside a value: ``0..19``, ``> 0``."""
+        """Short form for display: ``0..19``, ``> 0``."""
         if self.low is not None and self.high is not None:
             return f"{self.low:g}..{self.high:g}"
         bounds = ((">=", self.low), (">", self.above), ("<=", self.high), ("<", self.below))
@@ -57,7 +57,7 @@ class Range:
 
     @property
     def words(self) -> str:
-        """What a value that is not allowed is told: ``must lie in 0..19``, ``must be > 0``."""
+        """Text for error messages: ``must lie in 0..19``, ``must be > 0``."""
         return f"must lie in {self}" if ".." in str(self) else f"must be {str(self).replace(', ', ' and ')}"
 
 
@@ -70,7 +70,7 @@ Percent: TypeAlias = Annotated[int, Range(1, 100)]
 
 
 def range_of(hint: Any) -> Range | None:
-    """The range that a type is annotated with, also inside ``X | None``; None without one."""
+    """The range in a type's annotation, also inside ``X | None``; None if there is none."""
     if get_origin(hint) is Annotated:
         return next((extra for extra in get_args(hint)[1:] if isinstance(extra, Range)), None)
     found = (range_of(part) for part in get_args(hint) if get_origin(hint) is not tuple)
@@ -79,13 +79,13 @@ def range_of(hint: Any) -> Range | None:
 
 @functools.cache
 def ranges(config_class: type[Any]) -> dict[str, Range]:
-    """Field → range of a dataclass's own fields (not of groups inside it)."""
+    """Field → range for a dataclass's own fields (not those of nested groups)."""
     hints = get_type_hints(config_class, include_extras=True)
     return {f.name: bounds for f in dataclasses.fields(config_class) if (bounds := _element(hints[f.name])) is not None}
 
 
 def _element(hint: Any) -> Range | None:
-    """The range of a value, or that of every element of a sequence."""
+    """Range of a value, or of every element of a sequence."""
     return range_of(hint) or next((r for part in get_args(hint) if (r := range_of(part)) is not None), None)
 
 
@@ -106,7 +106,7 @@ def _choices(config_class: type[Any]) -> dict[str, tuple[Any, ...]]:
 
 
 def check_ranges(config: Any) -> None:
-    """Refuses a dataclass with a value outside the range, or the ``Literal``, of its field; for ``__post_init__``.
+    """Check every field of a dataclass against its range or ``Literal``; for ``__post_init__``.
 
     Raises:
         ValueError: names the field, its range and the value.

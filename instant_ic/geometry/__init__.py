@@ -1,1 +1,1 @@
-"""Poses, the transform buffer and the projections of panorama, cube and perspective pictures (numpy only)."""
+"""Poses, transform buffer, and projections of panoramas, cube faces and perspective images (numpy only)."""

@@ -1,8 +1,8 @@
-"""The small depth picture that goes with a rendered view, and the view as it looks from a little beside its place.
+"""The small depth image that accompanies a rendered view, and reprojection of the view to a nearby pose.
 
-Virtual-reality headsets call it positional time warp: the newest picture is shown from where the eye is now, so that
-motion is seen before the next picture has been drawn. What is stored is the inverse of the depth along the camera's
-axis: on a plane that is linear over the picture, so little of it is enough.
+Virtual-reality headsets call this positional time warp: the newest image is shown from the eye's present position, so
+that motion is visible before the next image has been rendered. The depth image stores the inverse of the depth along
+the camera's axis. On a plane this value is linear over the image, so a low resolution is enough.
 """
 
 from __future__ import annotations
@@ -18,33 +18,33 @@ from instant_ic.limits import decode_image
 
 WIDTH = 96
 NEAREST_M = 0.2
-"""What is nearer counts as this far."""
+"""Depths below this count as this depth, in metres."""
 STEPS = 2
 MOST_PARALLAX = 0.5
-"""Of the motion over the depth: what is nearer is taken to be so far that it moves by no more."""
+"""Largest motion-to-depth ratio: nearer points are placed so far away that they do not shift more than this."""
 
 
 @functools.lru_cache(maxsize=2)
 def _axial(width: int, height: int, fov_rad: float) -> NDArray[np.float32]:
-    """Metres along the axis for each metre along the ray, (H, W)."""
+    """Metres along the optical axis per metre along the ray, (H, W)."""
     along: NDArray[np.float32] = 1 / np.linalg.norm(perspective_directions(width, height, fov_rad), axis=2)
     return along
 
 
 def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WIDTH) -> tuple[bytes, float]:
-    """Depth of a perspective picture for whoever shows it.
+    """Encode the depth of a perspective image for display.
 
     Args:
-        depth_m: (H, W) along the rays, metres; 0 where nothing is met.
+        depth_m: (H, W) along the rays, metres; 0 where nothing is hit.
         fov_rad: horizontal field of view.
-        width: columns of the result; of all depths in one of its pixels the nearest counts.
+        width: columns of the result; each of its pixels takes the nearest depth inside it.
 
     Returns:
-        Grey PNG, (h, ``width``), and the depth along the axis in metres that its 255 stands for: v means
-        ``near_m * 255 / v``, 0 nothing. Without any depth the PNG is empty, and the number 0.
+        Grey PNG, (h, ``width``), and the axial depth in metres that the value 255 stands for: v means
+        ``near_m * 255 / v``, 0 means no depth. Without any depth the PNG is empty and the number is 0.
 
     Raises:
-        ValueError: no picture, or no field of view.
+        ValueError: the array is not an image, or the field of view is invalid.
     """
     import cv2
 
@@ -56,7 +56,7 @@ def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WID
     inverse = np.where(known, 1 / np.maximum(np.where(known, axial, 1), NEAREST_M), 0).astype(np.float32)
     width = min(width, columns)
     height = max(1, round(rows * width / columns))
-    # An edge that is moved takes a fringe of its background along: it stays whole, and the background stretches.
+    # A moved edge drags a fringe of its background along: dilation keeps the edge whole and stretches the background.
     cell = math.ceil(columns / width) + 1
     small = cv2.resize(cv2.dilate(inverse, np.ones((cell, cell), np.uint8)), (width, height))
     most = float(small.max())
@@ -69,10 +69,10 @@ def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WID
 
 
 def decode_depth(png: bytes, near_m: float) -> NDArray[np.float32]:
-    """Inverse depth along the axis, (h, w), 1/m, of what ``encode_depth`` made.
+    """Inverse axial depth, (h, w), 1/m, from the result of ``encode_depth``.
 
     Raises:
-        ValueError: no grey picture.
+        ValueError: not a grey image.
     """
     import cv2
 
@@ -85,21 +85,21 @@ def decode_depth(png: bytes, near_m: float) -> NDArray[np.float32]:
 def reproject(
     picture: NDArray[np.uint8], inverse: NDArray[np.float32], moved_m: NDArray[np.floating], fov_rad: float
 ) -> NDArray[np.uint8]:
-    """The picture as it looks when the camera has moved: what the page's shader does, for one without a page.
+    """Reproject an image to a moved camera; the same computation as the page's shader, for use without a page.
 
-    Each pixel looks for its place in the picture by steps against the depth there, from the nearest depth on: so what
-    is near covers what is far. At what opens up behind an edge the far side goes on.
+    Each pixel searches its source position iteratively against the depth there, starting at the nearest depth, so that
+    near surfaces cover far ones. Areas that open up behind an edge are filled with the far side.
 
     Args:
         picture: (H, W, C), perspective.
         inverse: (h, w) of ``decode_depth``.
-        moved_m: (3,) in the picture's camera frame (x forward, y left, z up).
+        moved_m: (3,) in the image's camera frame (x forward, y left, z up).
         fov_rad: horizontal field of view.
     """
     import cv2
 
     def sample(image: NDArray[np.generic], at: NDArray[np.float32]) -> NDArray[np.generic]:
-        # 0 is the middle of the picture, 1 its right and its upper edge.
+        # 0 is the centre of the image, 1 its right and its upper edge.
         rows, columns = image.shape[:2]
         u, v = (1 + at[..., 0]) * (columns / 2) - 0.5, (1 - at[..., 1]) * (rows / 2) - 0.5
         return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

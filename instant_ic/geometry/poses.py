@@ -39,7 +39,7 @@ def pose_matrix(
 
 
 def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Matrix:
-    """Pose from a quaternion (x, y, z, w), which need not be of unit length, and a translation.
+    """Pose from a quaternion (x, y, z, w) of any length and a translation.
 
     Raises:
         ValueError: the quaternion is zero or not finite.
@@ -62,7 +62,7 @@ def matrix_from_quaternion(xyzw: ArrayLike, translation: ArrayLike = (0.0, 0.0, 
 def quaternion_from_matrix(matrix: ArrayLike) -> NDArray[np.float64]:
     """Unit quaternion (x, y, z, w), w ≥ 0, of a pose or a rotation matrix."""
     r = np.asarray(matrix, dtype=np.float64)[:3, :3]
-    # The largest of the four squared components is the divisor: no loss of precision near 180°.
+    # Divide by the largest of the four squared components: no loss of precision near 180°.
     squares = np.array(
         [
             1 + r[0, 0] - r[1, 1] - r[2, 2],
@@ -95,7 +95,7 @@ def inverse(matrix: Matrix) -> Matrix:
 
 
 def transform_points(target_from_source: Matrix, points: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Points (..., 3) of the source frame in the target frame, in the points' own float type."""
+    """Transform points (..., 3) from the source frame to the target frame, in their own float type."""
     rotation = target_from_source[:3, :3].astype(points.dtype)
     translation = target_from_source[:3, 3].astype(points.dtype)
     result: NDArray[np.floating] = points @ rotation.T + translation
@@ -108,7 +108,7 @@ def yaw_of(matrix: Matrix) -> float:
 
 
 def interpolate(matrix0: Matrix, matrix1: Matrix, alpha: float) -> Matrix:
-    """Pose between two poses: straight in translation, shortest arc in rotation (slerp).
+    """Pose between two poses: linear in translation, shortest arc in rotation (slerp).
 
     ``alpha`` outside 0..1 extrapolates.
     """
@@ -143,7 +143,7 @@ def matrix_from_pose2(pose: ArrayLike) -> Matrix:
 
 
 def compose2(a: ArrayLike, b: ArrayLike) -> Pose2:
-    """Planar ``a ∘ b``: ``b``, given in ``a``'s frame, in the frame that ``a`` is given in."""
+    """Planar composition ``a ∘ b``: ``b`` is given in ``a``'s frame, the result in the parent frame of ``a``."""
     ax, ay, ayaw = (float(value) for value in np.asarray(a))
     bx, by, byaw = (float(value) for value in np.asarray(b))
     c, s = math.cos(ayaw), math.sin(ayaw)
@@ -158,5 +158,5 @@ def inverse2(a: ArrayLike) -> Pose2:
 
 
 def relative2(a: ArrayLike, b: ArrayLike) -> Pose2:
-    """``b`` seen from ``a``: ``inverse2(a) ∘ b``."""
+    """``b`` in the frame of ``a``: ``inverse2(a) ∘ b``."""
     return compose2(inverse2(a), b)

@@ -1,7 +1,7 @@
 """Directions and pixels of equirect panoramas, cube faces and perspective views.
 
 Camera frame: x forward, y left, z up. Equirect: the centre column looks along x, columns run clockwise seen from
-above, rows from +90° to −90° elevation. Pixel centres lie at integer index coordinates.
+above, rows run from +90° to −90° elevation. Pixel centres have integer coordinates.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Floats = NDArray[np.floating]
 
 
 def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
-    """Unit viewing directions of every pixel of a panorama, (height, width, 3)."""
+    """Unit viewing direction of every pixel of a panorama, (height, width, 3)."""
     azimuth = math.pi - (np.arange(width) + 0.5) * (2 * math.pi / width)
     elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
     horizontal = np.cos(elevation)[:, None]
@@ -29,9 +29,9 @@ def equirect_directions(width: int, height: int) -> NDArray[np.float32]:
 
 
 def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats, Floats]:
-    """Index coordinates ``(u, v)`` of directions (..., 3), which need not be unit vectors.
+    """Index coordinates ``(u, v)`` of directions (..., 3) of any length.
 
-    ``u`` is in [−0.5, width − 0.5): whoever samples wraps the column ``width`` to 0. ``v`` is in [−0.5, height − 0.5].
+    ``u`` is in [−0.5, width − 0.5); the sampler must wrap column ``width`` to 0. ``v`` is in [−0.5, height − 0.5].
     """
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     azimuth = np.arctan2(y, x)
@@ -43,7 +43,7 @@ def equirect_pixels(directions: Floats, width: int, height: int) -> tuple[Floats
 
 
 def perspective_directions(width: int, height: int, hfov_rad: float) -> NDArray[np.float32]:
-    """Viewing directions (not normalised, x = 1) of a pinhole picture that looks along x, (height, width, 3).
+    """Viewing directions (x = 1, not normalised) of a pinhole image that looks along x, (height, width, 3).
 
     Raises:
         ValueError: the field of view is not between 0 and π.
@@ -83,7 +83,7 @@ CUBE_FACES: dict[str, NDArray[np.float64]] = {
     "up": rotation_matrix(pitch=-math.pi / 2),
     "down": rotation_matrix(pitch=math.pi / 2),
 }
-"""``camera_from_face`` rotations of the six 90° faces; each face looks along its own x."""
+"""``camera_from_face`` rotations of the six 90° faces; each face looks along its own x axis."""
 
 
 def equirect_to_cube(image: NDArray[np.generic], size: int) -> NDArray[np.float32]:

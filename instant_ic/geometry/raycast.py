@@ -25,7 +25,7 @@ class RayCaster:
             raise ValueError(f"a mesh of at least one triangle is needed (got triangles of shape {triangles.shape})")
         self._scene = EmbreeScene(robust=True)
         self._mesh = TriangleMesh(self._scene, triangles)
-        # The scene is committed by its first query, which must not happen in two threads at once.
+        # The first query commits the scene, which must not happen in two threads at once.
         self._lock = threading.Lock()
         with self._lock:
             self.cast(np.zeros((1, 3), np.float32), np.asarray([[0.0, 0.0, 1.0]], np.float32))
@@ -51,7 +51,7 @@ class RayCaster:
         return range_m, face
 
     def occluded(self, origins: FloatArray, directions: FloatArray, distance_m: FloatArray) -> npt.NDArray[np.bool_]:
-        """Whether something stands within ``distance_m`` (N,) along each ray (N, 3)."""
+        """Whether anything lies within ``distance_m`` (N,) along each ray (N, 3)."""
         hit = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
             np.ascontiguousarray(directions, np.float32),

@@ -1,4 +1,4 @@
-"""A buffer of time-stamped transforms between named frames, as ROS users know it from tf2."""
+"""A buffer of time-stamped transforms between named frames, like tf2's."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from instant_ic.geometry.poses import Matrix, interpolate, inverse
 
 
 class TransformError(LookupError):
-    """No such frame, no path between two frames, or no value for the time asked."""
+    """No such frame, no path between two frames, or no value at the requested time."""
 
 
 @dataclass
 class _Edge:
-    """What is known of one child frame: its parent, and its poses over time."""
+    """One child frame: its parent, and its poses over time."""
 
     parent: str
     static: bool
@@ -26,11 +26,11 @@ class _Edge:
 
 
 class TransformBuffer:
-    """Keeps the last seconds of a tree of frames and answers for the pose between any two of them.
+    """Keeps the last seconds of a tree of frames and returns the pose between any two of them.
 
     Args:
         cache_s: how much of the past is kept for moving frames.
-        tolerance_s: how far beyond the newest value a look-up may reach; the newest value is given then.
+        tolerance_s: how far beyond the newest value a look-up may reach; it then returns the newest value.
             Drivers stamp data a little later than the last odometry that arrived.
     """
 
@@ -41,7 +41,7 @@ class TransformBuffer:
         self._lock = threading.Lock()
 
     def set(self, parent: str, child: str, stamp_ns: int, parent_from_child: Matrix, static: bool = False) -> None:
-        """Adds one value; a stamp already held is replaced, an older one is sorted in.
+        """Add one value; an existing stamp is replaced, an older one is inserted in order.
 
         Raises:
             TransformError: the matrix is not a finite (4, 4) array, or a frame would be its own ancestor.
@@ -75,15 +75,15 @@ class TransformBuffer:
                 del edge.stamps_ns[:keep], edge.matrices[:keep]
 
     def forget_moving(self) -> None:
-        """Drops the values of moving frames, as when time goes back; fixed ones stay."""
+        """Drop the values of moving frames, for example when time goes back; fixed frames stay."""
         with self._lock:
             self._edges = {child: edge for child, edge in self._edges.items() if edge.static}
 
     def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix:
-        """``target_from_source`` at a time, interpolated; without a time, by each frame's newest value.
+        """``target_from_source`` at a time, interpolated; without a time, from each frame's newest value.
 
         Raises:
-            TransformError: unknown frame, no path, or the time is outside what is held.
+            TransformError: unknown frame, no path, or the time is outside the stored range.
         """
         with self._lock:
             up_source = self._chain(source)
@@ -93,18 +93,18 @@ class TransformBuffer:
                 known = ", ".join(sorted(self._frames())) or "none"
                 raise TransformError(f"no path from {source} to {target} (frames known: {known})")
             common_from_source = self._product(up_source[: up_source.index(common)], stamp_ns)
-            if up_target[0] == common:  # most often: nothing to go down again
+            if up_target[0] == common:  # the usual case: the target is the common ancestor
                 return common_from_source.copy()
             common_from_target = self._product(up_target[: up_target.index(common)], stamp_ns)
         return inverse(common_from_target) @ common_from_source
 
     def frames(self) -> frozenset[str]:
-        """Names of all frames known."""
+        """Names of all known frames."""
         with self._lock:
             return self._frames()
 
     def newest_ns(self, child: str) -> int | None:
-        """Stamp of the newest value of a frame against its parent; None for an unknown frame."""
+        """Stamp of a frame's newest value; None for an unknown frame."""
         with self._lock:
             edge = self._edges.get(child)
             return edge.stamps_ns[-1] if edge else None

@@ -1,4 +1,4 @@
-"""Between messages and arrays: the one place that knows the fields of the ROS types used here."""
+"""Conversions between messages and arrays: the only module that knows the fields of the ROS types used here."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POINT_DTYPE = np.dtype(
         "itemsize": 22,
     }
 )
-"""A point of ``/lidar/points`` in the layout of ros-drivers/velodyne; ``time`` is seconds after the header's stamp."""
+"""A point of ``/lidar/points``, laid out as by ros-drivers/velodyne; ``time`` is seconds after the header's stamp."""
 
 _POINT_FIELD_TYPES = {
     1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 8: "<f8",
@@ -43,15 +43,15 @@ _IMAGE_DTYPES = {
 
 
 def to_time(ns: int) -> Any:
-    """builtin_interfaces/Time of nanoseconds since the epoch."""
+    """builtin_interfaces/Time from nanoseconds since the epoch."""
     return message_type("Time")(sec=int(ns // 1_000_000_000), nanosec=int(ns % 1_000_000_000))
 
 
 def stamp_ns(message: Any) -> int:
-    """Nanoseconds of a message with a header, of a header, or of a Time.
+    """Stamp in nanoseconds of a message with a header, of a header, or of a Time.
 
     Raises:
-        MessageError: the message carries no time.
+        MessageError: the message has no stamp.
     """
     value = getattr(message, "header", message)
     value = getattr(value, "stamp", value)
@@ -66,14 +66,14 @@ def header(frame_id: str, stamp: int) -> Any:
     return message_type("Header")(stamp=to_time(stamp), frame_id=frame_id)
 
 
-# -- pictures ------------------------------------------------------------------------------------
+# -- images --------------------------------------------------------------------------------------
 
 
 def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/Image of an array (H, W) or (H, W, C) without a copy where it is contiguous.
+    """sensor_msgs/Image from an array (H, W) or (H, W, C); a contiguous array is not copied.
 
     Raises:
-        MessageError: unknown encoding, or shape or type do not fit it.
+        MessageError: unknown encoding, or an array whose shape or dtype does not fit it.
     """
     if encoding not in _IMAGE_DTYPES:
         raise MessageError(f"image encoding {encoding!r} is not one of {', '.join(_IMAGE_DTYPES)}")
@@ -95,7 +95,7 @@ def image_message(array: NDArray[Any], encoding: str, frame_id: str, stamp: int)
 
 
 def image_array(message: Any) -> NDArray[Any]:
-    """Array (H, W) or (H, W, C) of a sensor_msgs/Image; a read-only view where rows are not padded.
+    """Array (H, W) or (H, W, C) from a sensor_msgs/Image; a read-only view unless rows are padded.
 
     Raises:
         MessageError: unknown encoding, big-endian data, or too few bytes.
@@ -121,7 +121,7 @@ def image_array(message: Any) -> NDArray[Any]:
 def compressed_image_message(
     data: bytes | bytearray | memoryview | NDArray[np.uint8], frame_id: str, stamp: int, format: str = "jpeg"
 ) -> Any:
-    """sensor_msgs/CompressedImage of encoded bytes as they are."""
+    """sensor_msgs/CompressedImage from encoded bytes."""
     array = data if isinstance(data, np.ndarray) else np.frombuffer(data, np.uint8)
     return message_type("CompressedImage")(header=header(frame_id, stamp), format=format, data=array)
 
@@ -130,7 +130,7 @@ def compressed_image_message(
 
 
 def cloud_message(points: NDArray[Any], frame_id: str, stamp: int) -> Any:
-    """sensor_msgs/PointCloud2 of a structured array (N,), whose layout becomes the message's layout."""
+    """sensor_msgs/PointCloud2 from a structured array (N,), whose layout becomes the message's layout."""
     if points.dtype.fields is None or points.ndim != 1:
         raise MessageError(f"a point cloud needs a structured array (N,), got {points.dtype} {points.shape}")
     field_type = message_type("PointField")
@@ -165,7 +165,7 @@ def _cloud_dtype(fields: tuple[tuple[str, int, int], ...], step: int) -> np.dtyp
 
 
 def cloud_array(message: Any) -> NDArray[Any]:
-    """Structured view (N,) of a PointCloud2, rows joined.
+    """Structured view (N,) of a PointCloud2, its rows concatenated.
 
     Raises:
         MessageError: big-endian data, unknown field type, or too few bytes.
@@ -186,7 +186,7 @@ def cloud_array(message: Any) -> NDArray[Any]:
 
 
 def cloud_xyz(message: Any) -> NDArray[np.float32]:
-    """Coordinates (N, 3) of a PointCloud2 in metres."""
+    """Coordinates (N, 3) of a PointCloud2, in metres."""
     points = cloud_array(message)
     return np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32, copy=False)
 
@@ -202,7 +202,7 @@ def scan_message(
     intensities: ArrayLike | None = None,
     scan_time: float = 0.1,
 ) -> Any:
-    """sensor_msgs/LaserScan; ranges in metres by REP-117 (inf = nothing seen)."""
+    """sensor_msgs/LaserScan; ranges in metres as in REP-117 (inf: no return)."""
     values = np.asarray(ranges, np.float32)
     return message_type("LaserScan")(
         header=header(frame_id, stamp),
@@ -238,7 +238,7 @@ def grid_message(
 
 
 def grid_array(message: Any) -> tuple[NDArray[np.int8], float, tuple[float, float]]:
-    """``(grid (H, W) int8, resolution in m, (x, y) of the grid's corner)`` of an OccupancyGrid.
+    """``(grid (H, W) int8, resolution in m, (x, y) of the grid's corner)`` from an OccupancyGrid.
 
     Raises:
         MessageError: the number of cells is not width × height.
@@ -256,7 +256,7 @@ def grid_array(message: Any) -> tuple[NDArray[np.int8], float, tuple[float, floa
 
 
 def pose_message(matrix: Matrix) -> Any:
-    """geometry_msgs/Pose of a 4×4 matrix."""
+    """geometry_msgs/Pose from a 4×4 matrix."""
     x, y, z = (float(value) for value in matrix[:3, 3])
     qx, qy, qz, qw = (float(value) for value in quaternion_from_matrix(matrix))
     return message_type("Pose")(
@@ -266,7 +266,7 @@ def pose_message(matrix: Matrix) -> Any:
 
 
 def pose_matrix(pose: Any) -> Matrix:
-    """4×4 matrix of a Pose, PoseStamped, PoseWithCovariance(Stamped) or Odometry.
+    """4×4 matrix from a Pose, PoseStamped, PoseWithCovariance(Stamped) or Odometry.
 
     Raises:
         MessageError: the quaternion is zero or not finite.
@@ -297,7 +297,7 @@ def transform_message(parent_from_child: Matrix, parent: str, child: str, stamp:
 
 
 def transform_matrix(message: Any) -> Matrix:
-    """4×4 ``parent_from_child`` of a Transform or TransformStamped.
+    """4×4 ``parent_from_child`` from a Transform or TransformStamped.
 
     Raises:
         MessageError: the quaternion is zero or not finite.
@@ -317,7 +317,7 @@ def twist_message(v: float = 0.0, w: float = 0.0) -> Any:
 
 
 HARD_STOP = "hard_stop"
-"""``frame_id`` of a command that the base reaches at its hard deceleration. Only a zero twist carries it."""
+"""``frame_id`` of a command that the base executes at its hard deceleration; only a zero twist carries it."""
 
 
 def twist_stamped(v: float, w: float, stamp: int, frame_id: str = "base_link") -> Any:
@@ -326,7 +326,7 @@ def twist_stamped(v: float, w: float, stamp: int, frame_id: str = "base_link") -
 
 
 def twist_values(message: Any) -> tuple[float, float]:
-    """``(v in m/s, w in rad/s)`` of a Twist, TwistStamped, TwistWithCovariance or Odometry."""
+    """``(v in m/s, w in rad/s)`` from a Twist, TwistStamped, TwistWithCovariance or Odometry."""
     while hasattr(message, "twist"):
         message = message.twist
     return float(message.linear.x), float(message.angular.z)
@@ -342,7 +342,7 @@ def odometry_message(
     pose_covariance: NDArray[np.float64] | None = None,
     twist_covariance: NDArray[np.float64] | None = None,
 ) -> Any:
-    """nav_msgs/Odometry; covariances (6, 6) in the order x y z rx ry rz (REP-103), zero where not given."""
+    """nav_msgs/Odometry; covariances (6, 6) in the order x y z rx ry rz (REP-103), zero by default."""
     zero = np.zeros((6, 6))
     pose_cov = zero if pose_covariance is None else pose_covariance
     twist_cov = zero if twist_covariance is None else twist_covariance
@@ -360,7 +360,7 @@ def odometry_message(
 
 
 def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
-    """nav_msgs/Path of planar poses (N, 3)."""
+    """nav_msgs/Path from planar poses (N, 3)."""
     array = np.asarray(poses, np.float64).reshape(-1, 3)
     return message_type("Path")(
         header=header(frame_id, stamp),
@@ -369,5 +369,5 @@ def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
 
 
 def path_array(message: Any) -> NDArray[np.float64]:
-    """Planar poses (N, 3) of a nav_msgs/Path."""
+    """Planar poses (N, 3) from a nav_msgs/Path."""
     return np.array([pose2_from_matrix(pose_matrix(p)) for p in message.poses]).reshape(-1, 3)

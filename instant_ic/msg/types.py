@@ -1,4 +1,4 @@
-"""The type store: ROS 2 Jazzy's messages from `rosbags`, and our own from the ``.msg`` files beside this module."""
+"""Type store: ROS 2 Jazzy's messages from `rosbags`, and our own from the ``.msg`` files beside this module."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 DEFINITIONS = Path(__file__).resolve().parent / "definitions"
 
-_LARGE = 1 << 14  # below, clearing all of a message costs less than finding out what need not be cleared
+_LARGE = 1 << 14  # below this size, clearing the whole message is faster than finding out which parts need it
 
-# Short names that several packages of Jazzy share: the one that this stack means.
+# Short names that several packages of Jazzy share, with the type that this stack means.
 _PREFERRED = {
     "GoalStatus": "action_msgs/msg/GoalStatus",
     "GoalStatusArray": "action_msgs/msg/GoalStatusArray",
@@ -25,12 +25,12 @@ _PREFERRED = {
 
 
 class MessageError(ValueError):
-    """An unknown type, or bytes that are not a message of the type they claim to be."""
+    """The type is unknown, or the bytes are not a message of the given type."""
 
 
 @functools.cache
 def typestore() -> Typestore:
-    """Jazzy's types and ours; made once a process (about 0.1 s)."""
+    """Jazzy's types and our own; created once per process (about 0.1 s)."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -42,16 +42,16 @@ def typestore() -> Typestore:
 
 
 def register_type(name: str, definition: str) -> None:
-    """Makes another project's type known to this process, from a definition as bags carry it.
+    """Register another project's type in this process, from a definition as bags carry it.
 
-    Types that are known already, also inside of it, stay as they are.
+    Types that are already known, nested ones included, stay unchanged.
 
     Args:
         name: full name, for example ``rover_msgs/msg/Cells``.
-        definition: text in the ``ros2msg`` form, with those of the types inside.
+        definition: text in the ``ros2msg`` format, with the definitions of nested types.
 
     Raises:
-        MessageError: the text is no definition.
+        MessageError: the text is not a definition.
     """
     if name in typestore().fielddefs:
         return
@@ -84,10 +84,10 @@ def message_type(name: str) -> Any:
 
 
 def type_name(message_or_class: Any) -> str:
-    """Full name, for example ``sensor_msgs/msg/Image``.
+    """Full type name, for example ``sensor_msgs/msg/Image``.
 
     Raises:
-        MessageError: the object is no message.
+        MessageError: the object is not a message.
     """
     name = getattr(message_or_class, "__msgtype__", None)
     if not isinstance(name, str):
@@ -102,7 +102,7 @@ def type_hash(name: str) -> str:
 
 
 def serialize(message: Any) -> memoryview:
-    """CDR bytes, little-endian, with the 4-byte encapsulation header.
+    """Serialize to little-endian CDR bytes with the 4-byte encapsulation header.
 
     Raises:
         MessageError: a field has a value of the wrong type or length.
@@ -116,7 +116,7 @@ def serialize(message: Any) -> memoryview:
 def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
     """Size of a message's CDR bytes, and a function that writes them into memory of that size.
 
-    So a large message can be written once, to where its readers look. What the memory held before does not matter.
+    This allows a large message to be written once, straight into shared memory. Previous contents do not matter.
 
     Raises:
         MessageError: a field has a value of the wrong type or length; the function raises it too.
@@ -126,12 +126,12 @@ def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
     definition = store.get_msgdef(name)
     try:
         size = 4 + definition.getsize_cdr(0, message, store)
-    except Exception as error:  # whatever generated code raises on a wrong value
+    except Exception as error:  # generated code may raise anything on a wrong value
         raise _explained(message, error) from error
 
     def write(target: memoryview) -> None:
-        # Padding must be zero, else the same message would not have the same bytes. It is never inside of an array:
-        # all but the largest array is `rest` bytes, before it or after it.
+        # Padding must be zero, or equal messages would differ in their bytes. Padding is never inside an array:
+        # everything except the largest array is `rest` bytes, before or after it.
         rest = size
         if size >= _LARGE:
             rest -= max((v.nbytes for v in vars(message).values() if isinstance(v, np.ndarray)), default=0)
@@ -140,7 +140,7 @@ def serializer(message: Any) -> tuple[int, Callable[[memoryview], None]]:
         target[1] = 1  # little-endian
         try:
             end = definition.serialize_cdr_le(target[4:], 0, message, store)
-        except Exception as error:  # whatever generated code raises on a wrong value
+        except Exception as error:  # generated code may raise anything on a wrong value
             raise _explained(message, error) from error
         if end + 4 != size:
             raise MessageError(f"{name}: {end + 4} bytes written where {size} were expected")
@@ -153,21 +153,21 @@ def _explained(message: Any, error: Exception) -> MessageError:
 
 
 def deserialize(data: bytes | bytearray | memoryview, name: str) -> Any:
-    """Message of CDR bytes; large arrays are read-only views of ``data``.
+    """Deserialize CDR bytes; large arrays are read-only views of ``data``.
 
     Raises:
-        MessageError: unknown type, or the bytes are cut or of another type.
+        MessageError: unknown type, or the bytes are truncated or of another type.
     """
     full = type_name(message_type(name))
     view = data if isinstance(data, (bytes, memoryview)) else memoryview(data)
     try:
         return typestore().deserialize_cdr(view, full)
-    except Exception as error:  # whatever generated code raises on foreign bytes: struct, index, unicode, value
+    except Exception as error:  # generated code may raise struct, index, unicode or value errors on foreign bytes
         raise MessageError(f"{len(data)} bytes are not a {full}: {type(error).__name__}: {error}") from error
 
 
 def _first_bad_field(message: Any) -> str | None:
-    """Names the field that does not serialize, for the error message."""
+    """Describe the field that cannot be serialized, for the error message."""
     for field in typestore().get_msgdef(type_name(message)).fields:
         value = getattr(message, field[0], None)
         if value is None:
