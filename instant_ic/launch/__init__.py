@@ -1,4 +1,4 @@
-"""Launch files: read, check, start, supervise, stop (docs/launch.md)."""
+"""Read, check, start, supervise and stop launch files (docs/launch.md)."""
 
 from instant_ic.launch.description import (
     LaunchArgument,

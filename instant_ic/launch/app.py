@@ -1,4 +1,4 @@
-"""Runs a launch file in the foreground: what ``ic launch`` and ``make run`` do."""
+"""Run a launch file in the foreground; used by ``ic launch`` and ``make run``."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from instant_ic.pace import Pace
 from instant_ic.pace import write as write_pace
 
 _VIEW_PERIOD_S = 0.5
-_WAITING_LINES = 2000  # lines that a terminal may be behind
+_WAITING_LINES = 2000  # how many lines a terminal may lag behind
 
 
 def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None = None, pace: Pace | None = None) -> int:
-    """Starts everything, shows how it is, stops it.
+    """Start everything, show its state, and stop it at the end.
 
     Args:
         description: what to start.
-        run_dir: run directory; made if missing, with those of the groups in it.
-        live: table of the nodes below the lines; default where standard output is a terminal.
-        pace: of the stack's time; default the machine's.
+        run_dir: run directory; created if missing, with those of the groups inside.
+        live: show a table of the nodes below the lines; default: only if standard output is a terminal.
+        pace: of the stack's time; default: the machine's.
 
     Returns:
         Exit status, see :meth:`Supervisor.run`.
 
     Raises:
         RegistryError: a run directory cannot be used.
-        StackRunningError: another stack has one.
-        EstopStateError: how this run ends could not be kept for the next start.
+        StackRunningError: another stack uses one of them.
+        EstopStateError: the mark of a running stack cannot be written.
     """
     with ExitStack() as locks:
         for folder in description.run_dirs(run_dir):
@@ -71,7 +71,7 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
 
 
 class _Output:
-    """The screen, on a thread of its own so that a terminal that takes nothing does not hold up the stack."""
+    """The screen, on a thread of its own so that a blocked terminal does not hold up the stack."""
 
     def __init__(self, description: LaunchDescription, run_dir: Path, live: bool) -> None:
         self._description, self._run_dir = description, run_dir
@@ -80,34 +80,34 @@ class _Output:
         self._outlet.put(self._screen.start, always=True)
         self._health: HealthMonitor | None = None
         self._ending = False
-        self._left_out = 0  # lines for the terminal
+        self._left_out = 0  # lines not shown on the terminal
         self._next_view_s = 0.0
         self._address: str | None = None
 
     def make_health(self) -> HealthMonitor:
-        """Eyes on the bus; they open after the processes have been started, so that they need not wait."""
+        """Create the health monitor, once the processes have been started, so that they need not wait for it."""
         self._health = HealthMonitor(self._description.nodes, self._run_dir)
         return self._health
 
     def node_line(self, node: str, text: str) -> None:
-        """A line that a node has written."""
+        """Show a line of a node's output."""
         if self._left_out and self._outlet.put(self._screen.event, f"{self._left_out} lines left out: see the logs"):
             self._left_out = 0
         if not self._outlet.put(self._screen.node_line, node, text):
             self._left_out += 1
 
     def event(self, text: str, bad: bool = False) -> None:
-        """Something that the supervisor has done or seen."""
+        """Show an event reported by the supervisor."""
         self._outlet.put(self._screen.event, text, bad, always=True)
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
-        """Looks twice a second."""
+        """Update the view, at most twice a second."""
         if time.monotonic() >= self._next_view_s:
             self._next_view_s = time.monotonic() + _VIEW_PERIOD_S
             self._outlet.put(self._screen.refresh, self._view(processes))
 
     def stopping(self) -> None:
-        """The end begins."""
+        """Mark the beginning of the shutdown."""
         self._ending = True
         self._next_view_s = 0.0
 
@@ -116,7 +116,7 @@ class _Output:
         if health is None:
             return View(tuple(_row(process, None, []) for process in processes), looked=False, ending=self._ending)
         faults = health.topic_faults()
-        # The token goes to a terminal only: what standard output is redirected to may be read by others.
+        # Only a terminal gets the token: others may read the file or pipe that standard output goes to.
         self._address = self._address or health.console_address(with_token=sys.stdout.isatty())
         if not self._ending:
             down = {p.spec.label: p.state.value for p in processes if p.state in (State.FAILED, State.WAITING)}
@@ -131,13 +131,13 @@ class _Output:
         )
 
     def close(self, status: int) -> None:
-        """Shows the rest and takes the table away; where a terminal takes nothing, the process ends with ``status``."""
+        """Show the remaining lines and remove the table; on a blocked terminal the process exits with ``status``."""
         self._outlet.put(self._screen.stop, always=True)
         if not self._outlet.close(timeout_s=3.0):
-            # Its thread holds standard output, and the interpreter would wait for it for ever. The nodes have ended,
-            # the logs are written.
+            # The blocked thread holds standard output, and the interpreter would wait for it forever. The nodes have
+            # ended and the logs are written.
             os._exit(status)
-        if self._outlet.broken is not None:  # ic launch ... | head: what is still in the buffer can go nowhere
+        if self._outlet.broken is not None:  # ic launch ... | head: the rest of the buffer has no destination
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -162,6 +162,6 @@ def _row(process: ManagedProcess, monitor: HealthMonitor | None, faults: Sequenc
         for topic, rate_hz in health.rates_hz.items()
         if rate_hz > 0 and topic.rpartition("/")[2] not in EVERY_NODES
     )
-    # Wrong ones first, then those with a known rate: what does not fit into the line matters least.
+    # Faulty topics first, then those with a nominal rate: the least important ones may not fit into the line.
     order = sorted(sends, key=lambda send: (send[2], nominal_rate(send[0], process.spec.namespace) is None))
     return Row(label, state, health.cpu_percent, health.rss_mb, starts, text, tuple(order))

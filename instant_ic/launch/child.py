@@ -1,8 +1,8 @@
-"""Starts a program that the kernel kills when its launcher is gone; run as a script, never imported.
+"""Start a program that the kernel kills when its launcher dies; run as a script, never imported.
 
-``python -I -S child.py LAUNCHER_PID PROGRAM ARGUMENTS...``. The death signal survives the exec, so the program needs
-to know nothing of it. It is set here and not in the launcher's fork because the launcher has threads. SIGKILL is
-right: who is killed while it holds the crawler leaves its tracks to the base's own command time-out.
+``python -I -S child.py LAUNCHER_PID PROGRAM ARGUMENTS...``. The death signal survives the exec, so the program itself
+needs no support for it. It is set here, not between fork and exec, because the launcher has threads. SIGKILL is safe:
+if the process that holds the crawler is killed, the base's own command time-out stops the tracks.
 """
 
 import ctypes
@@ -18,7 +18,7 @@ def _start() -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0) != 0:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
-    if os.getppid() != launcher:  # it died before the line above
+    if os.getppid() != launcher:  # the launcher died before the line above
         raise SystemExit(1)
     os.execvp(program[0], program)
 

@@ -1,4 +1,4 @@
-"""What a launch file asks for, once it has been read and checked (docs/launch.md lists its keys)."""
+"""Contents of a launch file after reading and checking (docs/launch.md lists its keys)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from instant_ic import paths
 from instant_ic.launch.source import LaunchFileError, Problem
 
 HANG_TIMEOUT_S = 10.0
-"""A node without a heartbeat for longer than this hangs, where its launch file says nothing else."""
+"""Default hang time-out: a node without a heartbeat for longer than this counts as hung."""
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,11 @@ class LaunchArgument:
 
     Attributes:
         name: its name.
-        default: None where a value must be given.
-        description: for people.
+        default: default value; None if a value must be given.
+        description: text for ``--show-args``.
         line: line in the file.
         type: ``str``, ``int``, ``float``, ``bool`` or ``path``.
-        choices: the values that it may have; empty where any will do.
+        choices: allowed values; empty if any value is allowed.
         file: the launch file that declares it.
     """
 
@@ -44,24 +44,24 @@ class NodeSpec:
         name: its name on the bus, unique in its run directory whatever its namespace.
         exec: name of a shipped node, or the path of a program.
         command: the whole command line, without the run directory.
-        namespace: put before its topics.
-        env: environment variables to add; None takes one away.
-        respawn: start it again when it ends.
-        respawn_delay_s: wait before the first new start; doubles with each one within the window.
+        namespace: prefix of its topics.
+        env: environment variables to add; None removes one.
+        respawn: restart it when it ends.
+        respawn_delay_s: wait before the first restart; doubles with each further one within the window.
         required: when it ends, the whole stack ends.
-        file: the launch file that asks for it.
+        file: the launch file that contains it.
         line: line in that file.
-        respawn_max_retries: new starts in all before it is given up; -1: as many as the window allows.
+        respawn_max_retries: total number of restarts before it is given up; -1: limited by the window only.
         run_dir: its run directory; None: the stack's own.
-        group: name of that run directory within the stack's, put before the node's name for people; else empty.
-        heartbeat: whether it is a node that sends heartbeats (an ``executable`` does not).
-        hang_timeout_s: without a heartbeat for longer than this it hangs; 0 never.
+        group: name of that run directory within the stack's, shown before the node's name; else empty.
+        heartbeat: whether the process is a node that sends heartbeats (an ``executable`` does not).
+        hang_timeout_s: without a heartbeat for longer than this it counts as hung; 0: never.
         start_delay_s: wait after the start of the stack (``timer``).
-        sigterm_timeout_s: wait between SIGINT and SIGTERM at the end; None: the stack's.
+        sigterm_timeout_s: wait between SIGINT and SIGTERM at shutdown; None: the stack's.
         sigkill_timeout_s: wait between SIGTERM and SIGKILL; None: the stack's.
-        to_terminal: whether its output goes to the terminal, beside the log file.
+        to_terminal: whether its output goes to the terminal, besides the log file.
         cwd: working directory; None: the launcher's.
-        places: where each ``-p`` word of the command stands, as ``file:line``.
+        places: ``file:line`` of each ``-p`` argument of the command.
     """
 
     name: str
@@ -88,13 +88,13 @@ class NodeSpec:
 
     @property
     def label(self) -> str:
-        """What people call it: ``NODE``, or ``GROUP/NODE`` in a run directory of its own."""
+        """Name shown to users: ``NODE``, or ``GROUP/NODE`` in a run directory of its own."""
         return f"{self.group}/{self.name}" if self.group else self.name
 
 
 @dataclass(frozen=True)
 class Announcement:
-    """Words to say some seconds after the start (``log``)."""
+    """Text to print some seconds after the start (``log``)."""
 
     text: str
     delay_s: float = 0.0
@@ -102,7 +102,7 @@ class Announcement:
 
 @dataclass(frozen=True)
 class Shutdown:
-    """The stack is to end some seconds after its start, all well (``shutdown``)."""
+    """Clean end of the stack some seconds after its start (``shutdown``)."""
 
     reason: str
     delay_s: float = 0.0
@@ -110,15 +110,15 @@ class Shutdown:
 
 @dataclass(frozen=True)
 class LaunchDescription:
-    """What a launch file asks for, once its arguments are known.
+    """Everything that a launch file starts and does, with its arguments applied.
 
     Attributes:
         file: the launch file.
-        arguments: what it declares.
-        values: its variables.
-        nodes: what to start.
-        announcements: what to say.
-        shutdown: when to end by itself; None: never.
+        arguments: arguments that it declares.
+        values: values of its variables.
+        nodes: processes to start.
+        announcements: texts to print.
+        shutdown: when the stack ends by itself; None: never.
     """
 
     file: Path
@@ -129,13 +129,13 @@ class LaunchDescription:
     shutdown: Shutdown | None = None
 
     def run_dirs(self, run_dir: Path) -> list[Path]:
-        """Every run directory of the stack, its own first."""
+        """All run directories of the stack, its own first."""
         others = {node.run_dir for node in self.nodes if node.run_dir is not None}
         return [run_dir, *sorted(others - {run_dir})]
 
 
 def find_launch_file(name: str) -> Path:
-    """A launch file by path, or by the name of a shipped one (``sim`` or ``sim.yaml``).
+    """Find a launch file by path, or by the name of a shipped one (``sim`` or ``sim.yaml``).
 
     Raises:
         FileNotFoundError: neither; the message lists the shipped ones.
@@ -151,15 +151,15 @@ def find_launch_file(name: str) -> Path:
 def read_launch_file(
     file: Path, arguments: Mapping[str, str] | None = None, run_dir: Path | None = None
 ) -> LaunchDescription:
-    """Reads and checks a launch file with everything that it includes.
+    """Read and check a launch file with everything that it includes.
 
     Args:
         file: the launch file.
         arguments: values for its ``arg`` entries.
-        run_dir: run directory that ``$(run-dir)`` stands for; default ``paths.run_dir()``.
+        run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
 
     Raises:
-        LaunchFileError: with every mistake found, in file order.
+        LaunchFileError: all mistakes found, in file order.
     """
     from instant_ic.launch.reader import Reader
 
@@ -189,11 +189,11 @@ def read_launch_file(
 
 
 def read_arguments(file: Path, included: bool = False) -> tuple[LaunchArgument, ...]:
-    """The ``arg`` entries of a launch file, whatever else is in it.
+    """The ``arg`` entries of a launch file, whatever else it contains.
 
     Args:
         file: the launch file.
-        included: instead those of the files that it includes which it leaves at their defaults.
+        included: return those of the included files instead, as far as this file leaves them at their defaults.
 
     Raises:
         LaunchFileError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""What the nodes tell of themselves, as the launcher sees it: heartbeats, topic rates, what is still waited for."""
+"""The launcher's view of the nodes' health: heartbeats, topic rates, and what is still missing at start-up."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ SILENT_AFTER_S = 3.0
 """A node without a heartbeat for longer than this is shown as silent."""
 
 FAULT_HOLDS_S = 3.0
-"""A wrong rate counts once it has been wrong for this long."""
+"""A wrong rate is reported once it has lasted this long."""
 
 EVERY_NODES = ("heartbeat", "diagnostics", "rosout", "parameter_events")
-"""What every node sends, by the last part of the name; a node that no longer does is silent, not slow."""
+"""Topics that every node publishes, by the last part of the name. A node that stops them is silent, not slow."""
 
 _STATES = ("starting", "running", "degraded", "failed", "stopping")
 _UP = ("running", "degraded")
@@ -35,10 +35,10 @@ MILESTONES: tuple[tuple[str, str, str], ...] = (
     ("camera", "theta_camera", "/camera/image/compressed"),
     ("lidar", "vlp16_driver", "/scan"),
     ("base", "crawler_base", "/wheel/odom"),
-    ("map", "grid_slam", "/pose"),  # the map itself is sent only when it changes
+    ("map", "grid_slam", "/pose"),  # the map itself is published only when it changes
     ("depth", "depth_scaler", "/depth/scaled"),
 )
-"""What an operator waits for at the start: word, module of the node, topic whose flow says that it is there."""
+"""What an operator waits for at start-up: label, node, and the topic whose messages show that it works."""
 
 
 @dataclass
@@ -47,13 +47,13 @@ class NodeHealth:
 
     Attributes:
         state: as in NodeStatus.msg, in lower case.
-        message: the worst diagnosis in words.
+        message: text of the worst diagnosis.
         cpu_percent: of one core.
         rss_mb: resident memory.
-        rates_hz: topic → messages a second that it sends.
-        seen_s: monotonic time when it came.
+        rates_hz: published topic → messages per second.
+        seen_s: monotonic time of its arrival.
         pid: process that sent it.
-        ages_s: topic → seconds since the newest message; inf before the first.
+        ages_s: published topic → seconds since the newest message; inf before the first.
     """
 
     state: str
@@ -73,21 +73,21 @@ class NodeHealth:
 
 @dataclass(frozen=True)
 class TopicFault:
-    """A topic that does not flow as it should."""
+    """A topic that has stopped or is too slow."""
 
     label: str
-    """Node that sends it."""
+    """Node that publishes it."""
     topic: str
     words: str
     stopped: bool
 
 
 class HealthMonitor:
-    """Listens to ``/heartbeat`` (and ``/vspace/status`` where a ``nerf`` runs) without a node of its own.
+    """Subscribes to ``/heartbeat`` (and ``/vspace/status`` if the stack has a ``nerf``) without a node of its own.
 
     Args:
         nodes: the nodes of the stack.
-        run_dir: prepared run directory; those of groups lie in it, prepared too.
+        run_dir: prepared run directory; those of groups lie in it, also prepared.
     """
 
     def __init__(self, nodes: Sequence[NodeSpec], run_dir: Path) -> None:
@@ -126,7 +126,7 @@ class HealthMonitor:
             yield group, self._transports[group].subscribe(topic, status, RELIABLE, lambda: None)
 
     def poll(self) -> None:
-        """Takes in what has come; never waits."""
+        """Process the messages that have arrived; never waits."""
         for group, subscription in self._beats:
             for received in subscription.take():
                 self._take(deserialize(received.payload, received.type_name), group)
@@ -156,25 +156,25 @@ class HealthMonitor:
         )
 
     def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
-        """Monotonic time of the newest heartbeat in which this process said that it runs; None before the first."""
+        """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
         health = self.nodes.get(spec.label)
         return health.seen_s if health is not None and health.pid == pid and health.state in _UP else None
 
     def nodes_missing(self) -> list[str]:
-        """Nodes that have not said yet that they run."""
+        """Nodes that have not reported yet that they run."""
         return [s.label for s in self._specs if s.label not in self.nodes or self.nodes[s.label].state not in _UP]
 
     def waiting_for(self) -> list[str]:
-        """What of ``MILESTONES`` (and the v-space) has not been reached, of the nodes in this stack."""
+        """``MILESTONES`` (and the v-space) of this stack's nodes that have not been reached yet."""
         wanted = [
             _labelled(spec, word) for word, program, _ in MILESTONES for spec in self._specs if spec.exec == program
         ]
         return [label for label in [*wanted, *(label for label, _ in self._vspace)] if label not in self._reached]
 
     def topic_faults(self) -> list[TopicFault]:
-        """Topics that have flowed once and now have stopped or are too slow (config/topics.yaml), for a while already.
+        """Topics that have stopped or become too slow (config/topics.yaml), once the fault has lasted a while.
 
-        One that never came is what :meth:`waiting_for` and the node's own diagnoses are for.
+        Topics that never had a message are left to :meth:`waiting_for` and to the node's own diagnoses.
         """
         now_s = time.monotonic()
         faults: list[TopicFault] = []
@@ -196,10 +196,10 @@ class HealthMonitor:
         return faults
 
     def publish(self, down: dict[str, str], faults: Sequence[TopicFault]) -> None:
-        """Sends ``/diagnostics`` once a second.
+        """Publish ``/diagnostics`` once a second.
 
         Args:
-            down: label → words, of the nodes that should run and do not.
+            down: label → text, for nodes that should run and do not.
             faults: see :meth:`topic_faults`.
         """
         now_s = time.monotonic()
@@ -217,10 +217,10 @@ class HealthMonitor:
             publisher.send(serialize(_diagnostic_array(entries)))
 
     def console_address(self, *, with_token: bool) -> str | None:
-        """Address of the operator's page once a node of the console says that it runs.
+        """Address of the operator's page once a console node reports that it runs.
 
         Args:
-            with_token: for a terminal: with the token, where one was made at this start; else the file that holds it.
+            with_token: for a terminal: include the token, if one was created at this start; else name its file.
         """
         for spec in self._specs:
             health = self.nodes.get(spec.label)
@@ -236,7 +236,7 @@ class HealthMonitor:
         return None
 
     def close(self) -> None:
-        """Lets go of the bus."""
+        """Disconnect from the bus."""
         for transport in self._transports.values():
             transport.close()
 
@@ -257,7 +257,7 @@ def _diagnostic_array(entries: Sequence[tuple[int, str, str]]) -> Any:
 
 
 def find_console(infos: Iterable[registry.NodeInfo], names: Iterable[str]) -> str | None:
-    """Address of a console out of the registry, by its parameters ``server.host`` and ``server.port``."""
+    """Address of a console according to the registry, from its parameters ``server.host`` and ``server.port``."""
     wanted = set(names)
     for info in infos:
         server = info.params.get("server", {})

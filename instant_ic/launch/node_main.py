@@ -1,11 +1,10 @@
-"""Runs a node's file as a program and leaves at once when the node is done: ``node_main.py FILE ARGUMENTS``.
+"""Run a node's file as a program, and exit at once when the node ends: ``node_main.py FILE ARGUMENTS``.
 
-Run as a script, never imported, so that nothing of the launcher is loaded into each node.
+Run as a script, never imported, so that no node loads any of the launcher.
 
-An interpreter that has numba's compiler loaded takes 0.7 s of CPU to take itself down, six of them on two cores
-several seconds. A node has closed what matters (motors, bag, sockets, registry) before its ``main`` returns; the rest
-is memory.
-Until the node has signal handlers of its own, a signal ends the process quietly: nothing has been opened yet.
+Interpreter shutdown with numba's compiler loaded takes 0.7 s of CPU; for six nodes on two cores that is several
+seconds. A node has closed what matters (motors, bag, sockets, registry) before its ``main`` returns; the rest is
+memory. Until the node has installed its own signal handlers, a signal ends the process quietly: nothing is open yet.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import os
 import signal
 import sys
 
-for _number in (signal.SIGINT, signal.SIGTERM):  # before the other imports: they take their time
+for _number in (signal.SIGINT, signal.SIGTERM):  # before the other imports, which take long
     signal.signal(_number, lambda *_: os._exit(0))
 
 import logging  # noqa: E402
@@ -23,12 +22,12 @@ import traceback  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 _here = Path(__file__).resolve().parent
-if sys.path and Path(sys.path[0]) == _here:  # beside this file lie modules that no node should find by accident
+if sys.path and Path(sys.path[0]) == _here:  # the modules beside this file must not shadow a node's imports
     sys.path[0] = str(_here.parents[1])
 
 
 def main() -> None:
-    """Runs the file named by the first argument; ends the process with its exit status."""
+    """Run the file named by the first argument, and exit with its status."""
     del sys.argv[0]
     status = 1
     try:
@@ -39,7 +38,7 @@ def main() -> None:
             status = end.code or 0
         else:
             sys.stderr.write(f"{end.code}\n")
-    except BaseException:  # noqa: BLE001 - the process ends here: what the interpreter would print is printed
+    except BaseException:  # noqa: BLE001 - the process ends here, so print what the interpreter would print
         traceback.print_exc()
     logging.shutdown()
     sys.stdout.flush()

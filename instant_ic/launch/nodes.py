@@ -1,4 +1,4 @@
-"""Reads ``node`` and ``executable`` entries of launch files."""
+"""Read ``node`` and ``executable`` entries of launch files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from instant_ic.launch.reader import Scope
 
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-"""What the bus accepts."""
+"""Node names that the bus accepts."""
 
 NODE_MAIN = Path(__file__).with_name("node_main.py")
 _PROCESS_KEYS = (
@@ -43,14 +43,14 @@ _OUTPUTS = ("both", "screen", "log")
 
 
 def join_namespace(namespace: str, name: str) -> str:
-    """A namespace inside another; one that begins with ``/`` stands for itself."""
+    """Resolve a namespace inside another; one that begins with ``/`` is absolute."""
     if name.startswith("/") or not namespace:
         return name
     return f"{namespace.rstrip('/')}/{name}"
 
 
 def read_node(body: Value, scope: Scope) -> NodeSpec | None:
-    """A ``node``; None where it is wrong or its conditions do not hold."""
+    """Read a ``node``; None if it is wrong or its conditions do not hold."""
     context = scope.context
     fields = body.fields(known=(*_NODE_KEYS, *_PROCESS_KEYS), required=("exec",))
     executable = text_of(fields.get("exec"), context)
@@ -72,7 +72,7 @@ def read_node(body: Value, scope: Scope) -> NodeSpec | None:
     for source, target in pairs_of(fields.get("remap"), "from", "to", context):
         options += ["-r", f"{source}:={target}"]
     options += words_of(fields.get("args"), context)
-    # ROS 2 marks its own arguments off from the program's; here all are the node's.
+    # ROS 2 separates its own arguments from the program's; here all of them are the node's.
     options += [word for word in words_of(fields.get("ros_args"), context) if word not in ("--ros-args", "--")]
     hang_timeout_s = seconds_of(fields.get("hang_timeout"), context)
     process = _process(fields, scope, body)
@@ -90,11 +90,11 @@ def read_node(body: Value, scope: Scope) -> NodeSpec | None:
 
 
 def read_executable(body: Value, scope: Scope, taken: set[str]) -> NodeSpec | None:
-    """An ``executable``: any program; None where it is wrong or its conditions do not hold.
+    """Read an ``executable`` (any program); None if it is wrong or its conditions do not hold.
 
     Args:
         body: its keys.
-        scope: where it stands.
+        scope: scope of the entry.
         taken: names of the processes before it.
     """
     context = scope.context
@@ -124,7 +124,7 @@ def read_executable(body: Value, scope: Scope, taken: set[str]) -> NodeSpec | No
 
 
 def _process(fields: Mapping[str, Value], scope: Scope, body: Value) -> dict[str, Any]:
-    """What ``node`` and ``executable`` have in common, as arguments of :class:`NodeSpec`; ``prefix`` besides."""
+    """Common part of ``node`` and ``executable``: arguments of :class:`NodeSpec`, and also ``prefix``."""
     context = scope.context
     output = text_of(fields.get("output"), context) or "both"
     if output not in _OUTPUTS:
@@ -184,7 +184,7 @@ def _parameter(entry: Value, context: Context, places: dict[str, str], prefix: s
             fields["allow_substs"].problem("substitutions inside a parameter file are not done: give name and value")
         return words
     name = plain_text(fields.get("name"))
-    if name and "param" in fields:  # ROS 2's nested parameters
+    if name and "param" in fields:  # nested parameters, as in ROS 2
         inner = [_parameter(part, context, places, f"{prefix}{name}.") for part in fields["param"].items()]
         return [word for words in inner for word in words]
     if not name or "value" not in fields:
@@ -197,7 +197,7 @@ def _parameter(entry: Value, context: Context, places: dict[str, str], prefix: s
 
 
 def parameter_file(value: Value, context: Context) -> list[str]:
-    """The words that hand a parameter file to a node; nothing, with the problem noted, when it is none."""
+    """Command-line arguments that pass a parameter file to a node; empty, with the problem noted, if it is invalid."""
     name = text_of(value, context)
     if name is None:
         return []

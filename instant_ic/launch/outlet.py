@@ -1,7 +1,7 @@
-"""Output that never makes the launcher wait: calls run on a thread of their own, and what is too much is left out.
+"""Output that never blocks the launcher: calls run on a separate thread, and excess output is dropped.
 
-A terminal that somebody has stopped with Ctrl-S, a dead ssh connection, a disk that hangs: none of them may hold up
-the process that empties the nodes' pipes, or the nodes would stand still at their next line.
+A terminal stopped with Ctrl-S, a dead ssh connection or a hanging disk must not hold up the process that reads the
+nodes' pipes, or the nodes would block at their next line.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from instant_ic.private import make_folder, open_file
 
 
 class Outlet:
-    """Runs calls one after another beside the caller.
+    """Runs calls one after another on a thread of its own.
 
     Args:
         name: of the thread.
@@ -32,7 +32,7 @@ class Outlet:
         self.left_out = 0
         """Sum of the sizes that were refused."""
         self.broken: OSError | None = None
-        """Set once a call has failed because what it writes to is gone; nothing is run any more."""
+        """Set once a call fails because its destination is gone; no further call is run."""
         self._limit = limit
         self._calls: deque[tuple[int, Callable[..., None], tuple[Any, ...]]] = deque()
         self._waiting = 0
@@ -42,13 +42,13 @@ class Outlet:
         self._thread.start()
 
     def put(self, function: Callable[..., None], *args: Any, size: int = 1, always: bool = False) -> bool:
-        """Hands over a call; False when too much waits already.
+        """Queue a call; False if too much is waiting already.
 
         Args:
-            function: is run on the outlet's thread.
+            function: runs on the outlet's thread.
             args: its arguments.
-            size: of the call.
-            always: take it even then; for the few words that matter.
+            size: size of the call.
+            always: queue it even then; for the few calls that matter.
         """
         with self._condition:
             if self.broken is not None or (self._waiting + size > self._limit and not always):
@@ -60,7 +60,7 @@ class Outlet:
             return True
 
     def close(self, timeout_s: float = 2.0) -> bool:
-        """Waits until everything has been run, at most ``timeout_s``; whether the thread has ended."""
+        """Wait up to ``timeout_s`` until all calls have run; returns whether the thread has ended."""
         with self._condition:
             self._closed = True
             self._condition.notify()
@@ -77,7 +77,7 @@ class Outlet:
                 size, function, args = self._calls.popleft()
             try:
                 function(*args)
-            except OSError as error:  # the terminal or the reader of a pipe is gone; the nodes go on
+            except OSError as error:  # the terminal or the reader of a pipe is gone; the nodes continue
                 with self._condition:
                     self.broken = error
                     self._calls.clear()
@@ -88,16 +88,16 @@ class Outlet:
 
 
 class LogFile:
-    """A node's log file, mode 0600; the run before is kept beside it. Errors are told once and never raised.
+    """A node's log file, mode 0600; the previous run's file is kept. Errors are reported once and never raised.
 
     Args:
-        path: where; its folder need not be there yet.
-        tell: called with words when writing fails, and when it works again; from the thread that writes.
-        max_bytes: a file that grows beyond this becomes ``.log.1``, and a new one begins.
+        path: of the file; its folder need not exist yet.
+        tell: called with a text when writing fails and when it works again; runs on the writing thread.
+        max_bytes: a larger file is renamed to ``.log.1``, and a new one is started.
     """
 
     RETRY_S = 5.0
-    """After a file could not be opened, this long until the next try."""
+    """Wait after a failed write before the next attempt."""
 
     def __init__(self, path: Path, tell: Callable[[str], None], max_bytes: int = 64 << 20) -> None:
         self.path = path
@@ -110,7 +110,7 @@ class LogFile:
         self._rotate()
 
     def write(self, data: bytes) -> None:
-        """Adds output."""
+        """Append output."""
         try:
             if self._size + len(data) > self._max_bytes:
                 self.close()
@@ -135,10 +135,10 @@ class LogFile:
             self.close()
 
     def close(self) -> None:
-        """Closes the file; a later write opens it again."""
+        """Close the file; a later write opens it again."""
         if self._file is not None:
             file, self._file = self._file, None
-            with suppress(OSError):  # what close() has to say of a full disk, write() has said
+            with suppress(OSError):  # write() has already reported a full disk
                 file.close()
 
     def _put(self, data: bytes) -> None:

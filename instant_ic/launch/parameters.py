@@ -1,8 +1,8 @@
-"""Checks the parameters of a launch description's nodes without starting them.
+"""Check the parameters of a launch description's nodes without starting them.
 
-Checking imports the nodes' modules, two seconds of CPU for the whole stack. So what has been found good is remembered
-by what it depends on (the package's files, the parameter files, the words of the command line), and the rest is
-checked in a process of its own, which takes its memory with it.
+The check imports the nodes' modules, which takes two seconds of CPU for the whole stack. So valid nodes are cached,
+keyed by everything the result depends on (the package's files, the parameter files, the command line). All others are
+checked in a separate process, which frees the memory when it ends.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _MOST_REMEMBERED = 500
 
 
 class ParameterCheckError(RuntimeError):
-    """The check itself did not come to an end; the message says why."""
+    """The check itself did not finish; the message says why."""
 
 
 @dataclass(frozen=True)
 class _Node:
-    """What the check of one node needs."""
+    """Input of the check of one node."""
 
     label: str
     exec: str
@@ -42,31 +42,31 @@ class _Node:
 
     @classmethod
     def of(cls, spec: NodeSpec) -> _Node:
-        """The part of a specification that matters here."""
+        """The part of a specification that the check needs."""
         start = spec.command.index(str(paths.node_file(spec.exec))) + 1
         return cls(spec.label, spec.exec, spec.command[start:], f"{spec.file}:{spec.line}", dict(spec.places))
 
 
 def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
-    """Programs given by path and executables are not looked into."""
+    """The shipped nodes; programs given by path and executables are not checked."""
     return [_Node.of(spec) for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
 
 
 def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
-    """What the nodes would refuse: unknown parameters, wrong types, values out of range; each in words."""
+    """Check all nodes for unknown parameters, wrong types and values out of range; returns one text per problem."""
     return [problem for node in _checkable(nodes) for problem in _problems(node)]
 
 
 def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = None) -> list[str]:
-    """As :func:`check_parameters`, without importing the nodes here, and only those that are not known to be good.
+    """Like :func:`check_parameters`, but in a separate process, and only for nodes not cached as valid.
 
     Args:
         nodes: the nodes.
-        cache: file with what is known to be good; default ``$XDG_CACHE_HOME/instant_ic/launch_check.json``. One that
-            cannot be read or written costs time, nothing else.
+        cache: file of valid nodes; default ``$XDG_CACHE_HOME/instant_ic/launch_check.json``. If it cannot be read or
+            written, the check only takes longer.
 
     Raises:
-        ParameterCheckError: the check did not come to an end.
+        ParameterCheckError: the check did not finish.
     """
     cache = cache or paths.cache_dir() / "launch_check.json"
     package = _package_state()
@@ -91,13 +91,13 @@ def _key(node: str, package: str) -> str:
     words = json.loads(node)["words"]
     for option, word in itertools.pairwise(words):
         if option == "--params-file":
-            with suppress(OSError):  # missing: the check itself tells
+            with suppress(OSError):  # missing: the check itself reports it
                 digest.update(Path(word).read_bytes())
     return digest.hexdigest()
 
 
 def _package_state() -> str:
-    """Changes whenever a module of the package does."""
+    """Text that changes whenever a module of the package does."""
     root = Path(__file__).resolve().parents[1]
     newest, count = 0, 0
     for folder, _, names in os.walk(root):
@@ -124,7 +124,7 @@ def _remember(cache: Path, keys: Sequence[str]) -> None:
 
 
 def _check_apart(nodes: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Label and words of each problem."""
+    """Label and text of each problem."""
     command = [sys.executable, "-m", "instant_ic.launch.parameters"]
     try:
         done = subprocess.run(
@@ -141,7 +141,7 @@ def _check_apart(nodes: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _problems(node: _Node) -> list[str]:
-    """All that is wrong with one node's command line."""
+    """All problems of one node's command line."""
     from instant_ic.bus.node_files import NodeFileError, node_class
     from instant_ic.bus.process import argument_parser, parse_remaps
     from instant_ic.config.params import ParameterError, ProcessParameters
@@ -151,7 +151,7 @@ def _problems(node: _Node) -> list[str]:
         found = node_class(node.exec)
     except NodeFileError as error:
         return [f"{where}: {error}"]
-    except Exception as error:  # noqa: BLE001 - whatever a module raises while it is imported, the node would too
+    except Exception as error:  # noqa: BLE001 - whatever a module raises on import, the node would raise too
         return [f"{where}: cannot be loaded: {type(error).__name__}: {error}"]
     parser = argument_parser(found)
     told: list[str] = []
@@ -190,7 +190,7 @@ def _values(node: _Node, args: Any, problems: list[str], where: str) -> dict[str
 
 
 def _refused(config_class: type[Any], values: dict[str, Any], node: _Node, where: str) -> list[str]:
-    """What a configuration refuses: the value that is to blame is left out, and the rest tried again."""
+    """All values that a configuration refuses: each refused value is removed, and the rest is checked again."""
     from instant_ic.config.params import ParameterError, build
 
     problems: list[str] = []
@@ -212,7 +212,7 @@ def _refused(config_class: type[Any], values: dict[str, Any], node: _Node, where
 
 
 def main() -> None:
-    """The process of its own: nodes on standard input, problems on standard output."""
+    """Entry point of the separate process: nodes on standard input, problems on standard output."""
     nodes = [_Node(**{**entry, "words": tuple(entry["words"])}) for entry in json.load(sys.stdin)]
     report = [(node.label, problem) for node in nodes for problem in _problems(node)]
     json.dump(report, sys.stdout)

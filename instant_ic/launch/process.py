@@ -1,4 +1,4 @@
-"""One supervised process: start, its output, its end, its new starts."""
+"""One supervised process: start, output, end and restarts."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from instant_ic.launch.outlet import LogFile, Outlet
 from instant_ic.launch.reaper import VARIABLE
 
 MAX_LINE_BYTES = 1 << 16
-"""A longer line of output is broken here."""
+"""Longer lines of output are split at this length."""
 
 OUTPUT_BYTES_PER_S = 1 << 20
-"""A node that writes more than this is cut short, after a burst of four seconds' worth."""
+"""Output limit of a node, after a burst of four seconds' worth; the excess is dropped."""
 
 USAGE_STATUS = 2
-"""Exit status of a node whose parameters or arguments are wrong: starting it again cannot help."""
+"""Exit status of a node with wrong parameters or arguments; restarting it cannot help."""
 
 Schedule = Sequence[tuple[signal.Signals, float]]
-"""Signals to end a process, and how long to wait after each."""
+"""Signals that end a process, with the wait after each."""
 
 _CHILD = Path(__file__).with_name("child.py")
 _BURST_BYTES = 4.0 * OUTPUT_BYTES_PER_S
-_PIPE_BYTES = 1 << 20  # a launcher that is held up for a moment must not hold up the nodes
+_PIPE_BYTES = 1 << 20  # a short delay of the launcher must not block the nodes
 
 
 def dies_with_us() -> tuple[str, ...]:
-    """What goes before a command so that the kernel kills its process when this thread is gone, however it went."""
+    """Command prefix that makes the kernel kill the process when this thread dies, for whatever reason."""
     return sys.executable, "-I", "-S", str(_CHILD), str(os.getpid())
 
 
 class State(enum.Enum):
-    """What a supervised process is doing."""
+    """State of a supervised process."""
 
     RUNNING = "running"
     WAITING = "waiting to start"
@@ -51,14 +51,14 @@ class State(enum.Enum):
 
 
 class RespawnLimit:
-    """How often a process may be started again: a wait that doubles, and a number of starts in a window.
+    """Limit on restarts of a process: a delay that doubles, and a number of restarts within a window.
 
     Args:
-        delay_s: wait before the first new start.
-        max_delay_s: the wait grows no longer than this.
-        window_s: only the starts within it count.
-        max_starts: more of them in the window than this, and it is given up.
-        max_retries: more of them in all than this, and it is given up; -1: no limit.
+        delay_s: wait before the first restart.
+        max_delay_s: largest wait.
+        window_s: only restarts within this time count.
+        max_starts: the process is given up after more restarts than this within the window.
+        max_retries: the process is given up after more restarts than this in total; -1: no limit.
     """
 
     def __init__(
@@ -72,16 +72,16 @@ class RespawnLimit:
         self.delay_s, self.max_delay_s = delay_s, max_delay_s
         self.window_s, self.max_starts, self.max_retries = window_s, max_starts, max_retries
         self.retries = 0
-        """New starts in all."""
+        """Total number of restarts."""
         self._starts: deque[float] = deque()
 
     @property
     def used(self) -> int:
-        """New starts within the window, up to the last question."""
+        """Restarts within the window, as of the last call of :meth:`next_delay_s`."""
         return len(self._starts)
 
     def next_delay_s(self, now_s: float) -> float | None:
-        """Counts one more start; seconds to wait before it, or None when there were too many."""
+        """Count one more restart; returns the seconds to wait before it, or None if there were too many."""
         while self._starts and now_s - self._starts[0] > self.window_s:
             self._starts.popleft()
         if len(self._starts) >= self.max_starts or 0 <= self.max_retries <= self.retries:
@@ -92,7 +92,7 @@ class RespawnLimit:
         return delay_s
 
     def __str__(self) -> str:
-        """The limit that was reached, in words."""
+        """Text for the limit that was reached."""
         if 0 <= self.max_retries <= self.retries:
             return f"{self.max_retries} new starts"
         return f"{self.max_starts} new starts within {self.window_s:.0f} s"
@@ -104,10 +104,10 @@ class ManagedProcess:
     Args:
         spec: what to start.
         run_dir: run directory of the stack.
-        mark: what the process and all that it starts carry in their environment.
-        disk: where the log is written from.
-        tell: for words about the log.
-        limit: of its new starts.
+        mark: text that the process and everything it starts carry in their environment.
+        disk: outlet that writes the log.
+        tell: called with texts about the log.
+        limit: on its restarts.
     """
 
     def __init__(
@@ -121,13 +121,13 @@ class ManagedProcess:
     ) -> None:
         self.spec = spec
         self.limit = limit or RespawnLimit(spec.respawn_delay_s, max_retries=spec.respawn_max_retries)
-        self.mark = f"{mark}/{spec.label}."  # the point, so that no name is the beginning of another
+        self.mark = f"{mark}/{spec.label}."  # ends with a dot, so that no mark is a prefix of another
         self.state = State.WAITING
         self.exit_status: int | None = None
         self.reason = ""
-        """Why the launcher ends it, in words; empty when it ends by itself or with the stack."""
+        """Why the launcher ends it; empty when it ends by itself or with the stack."""
         self.start_s = 0.0
-        """Monotonic time from which on it is to run."""
+        """Monotonic time from which it should run."""
         self.started_s = 0.0
         """Monotonic time of its last start."""
         self.output_closed = False
@@ -145,37 +145,37 @@ class ManagedProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id, also its process group's, while it runs."""
+        """Process id, which is also the id of its process group, while it runs."""
         return self._popen.pid if self._popen is not None else None
 
     @property
     def output(self) -> IO[bytes] | None:
-        """The pipe with its output, non-blocking, while it runs."""
+        """Non-blocking pipe with its output, while it runs."""
         return self._popen.stdout if self._popen is not None else None
 
     @property
     def flooding(self) -> bool:
-        """Whether it has been cut short for now."""
+        """Whether some of its output is being dropped."""
         return self._left_out > 0
 
     @property
     def ending(self) -> bool:
-        """Whether signals to end it are on their way."""
+        """Whether its end has begun."""
         return self._ending is not None
 
     def start(self) -> None:
-        """Starts the process.
+        """Start the process.
 
         Raises:
-            OSError: the kernel does not let it.
+            OSError: the kernel refuses it.
         """
         guard = dies_with_us()
-        # A stack inside a node of another stack carries both marks, so that it goes with the outer one.
+        # A stack started by a node of another stack carries both marks, so that it ends with the outer one.
         marks = [mark for mark in (os.environ.get(VARIABLE), self.mark) if mark]
         environment: dict[str, str | None] = {
             **os.environ,
             "PYTHONUNBUFFERED": "1",
-            "PYTHONFAULTHANDLER": "1",  # a crash, and the SIGABRT to one that hangs, leave the stack of every thread
+            "PYTHONFAULTHANDLER": "1",  # a crash, or the SIGABRT sent to a hung node, prints the stack of every thread
             **self.spec.env,
             "INSTANT_IC_RUN_DIR": str(self._run_dir),
             VARIABLE: ":".join(marks),
@@ -192,30 +192,30 @@ class ManagedProcess:
         )
         assert self._popen.stdout is not None
         os.set_blocking(self._popen.stdout.fileno(), False)
-        with suppress(OSError):  # the user's share of pipe memory is used up: the usual 64 kB then
+        with suppress(OSError):  # the user's pipe memory is used up: keep the usual 64 kB
             fcntl.fcntl(self._popen.stdout.fileno(), fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         self.state, self.output_closed = State.RUNNING, False
         self.started_s = time.monotonic()
 
     def send(self, signum: signal.Signals) -> None:
-        """Sends a signal to the whole process group; SIGABRT to the process alone, whose stack it is to show."""
+        """Send a signal to the whole process group; SIGABRT only to the process itself, which then prints its stack."""
         if self._popen is not None:
             with suppress(ProcessLookupError):
                 if signum is signal.SIGABRT:
                     os.kill(self._popen.pid, signum)
                 else:
                     os.killpg(self._popen.pid, signum)
-                # Who has been stopped sees nothing but SIGKILL before he goes on.
+                # A stopped process handles no signal except SIGKILL until it continues.
                 os.killpg(self._popen.pid, signal.SIGCONT)
 
     def begin_end(self, schedule: Schedule, reason: str = "") -> None:
-        """From now on :meth:`press_on` sends these signals."""
+        """Begin to end the process; :meth:`press_on` then sends these signals."""
         self._ending = deque(schedule)
         self._next_signal_s = 0.0
         self.reason = self.reason or reason
 
     def press_on(self, now_s: float) -> signal.Signals | None:
-        """Sends the next signal of its end when it is due; the signal that was sent."""
+        """Send the next ending signal when it is due; returns the signal sent."""
         if self._ending is None or now_s < self._next_signal_s or not self._ending:
             return None
         signum, wait_s = self._ending.popleft()
@@ -224,14 +224,14 @@ class ManagedProcess:
         return signum
 
     def out_of_means(self, now_s: float) -> bool:
-        """Whether all signals have been sent, and their waits are over."""
+        """Whether all signals have been sent and their waits are over."""
         return self._ending is not None and not self._ending and now_s >= self._next_signal_s
 
     def read_lines(self, now_s: float) -> Iterator[str]:
-        """What it has written since, line by line; all of it goes into the log file.
+        """New lines of its output; all of it goes into the log file.
 
-        At most four pieces a call, so that one that writes without end cannot keep the launcher from the others; and
-        no more than ``OUTPUT_BYTES_PER_S``.
+        Reads at most four chunks per call, so that endless output cannot keep the launcher from the other processes,
+        and at most ``OUTPUT_BYTES_PER_S``.
         """
         self._budget = min(self._budget + (now_s - self._budget_s) * OUTPUT_BYTES_PER_S, _BURST_BYTES)
         self._budget_s = now_s
@@ -245,7 +245,7 @@ class ManagedProcess:
             if not data:
                 self.output_closed = True
                 return
-            # Once cut short, it has to save up a second's worth: one note a second, not one a piece.
+            # Once output is dropped, the budget must first recover a second's worth: one note per second, not per chunk.
             if self._budget < (OUTPUT_BYTES_PER_S if self._left_out else 0):
                 self._left_out += len(data)
                 continue
@@ -253,7 +253,7 @@ class ManagedProcess:
             if self._left_out:
                 data, self._left_out = self._note() + data, 0
             if not self._disk.put(self._log.write, data, size=len(data)):
-                self._left_out += len(data)  # the disk does not keep up
+                self._left_out += len(data)  # the disk is too slow
             *lines, self._partial = (self._partial + data).split(b"\n")
             if len(self._partial) >= MAX_LINE_BYTES:
                 lines, self._partial = [*lines, self._partial], b""
@@ -263,13 +263,13 @@ class ManagedProcess:
         return f"\n[launch: {self._left_out} bytes left out: more than {OUTPUT_BYTES_PER_S} a second]\n".encode()
 
     def has_ended(self) -> bool:
-        """Whether its own process has ended; it stays unreaped, so that its group's number cannot be taken."""
+        """Whether its own process has ended. It stays unreaped, so that its group id cannot be reused."""
         if self._popen is None:
             return False
         return os.waitid(os.P_PID, self._popen.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
 
     def reap(self) -> Iterator[str]:
-        """After ``has_ended``: kills what is left of its group, sets ``exit_status``, gives the last lines."""
+        """After ``has_ended``: kill the rest of its group, set ``exit_status`` and yield the last lines."""
         assert self._popen is not None
         self.send(signal.SIGKILL)
         now_s = time.monotonic()
@@ -288,7 +288,7 @@ class ManagedProcess:
         self.state = State.ENDED if self.exit_status == 0 and not self.reason else State.FAILED
 
     def close(self) -> None:
-        """Closes the log file, after what waits to be written."""
+        """Close the log file once everything waiting has been written."""
         self._disk.put(self._log.close, always=True)
 
 

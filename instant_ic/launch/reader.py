@@ -1,7 +1,7 @@
-"""Reads the actions of launch files: arguments, variables, conditions, includes, groups, environment, timers.
+"""Read the actions of launch files: arguments, variables, conditions, includes, groups, environment, timers.
 
-The keys are those of ROS 2's YAML launch files; docs/launch.md lists them. What ROS 2 has and we have not is refused
-with the reason.
+The keys are those of ROS 2's YAML launch files; docs/launch.md lists them. Unsupported ROS 2 keys are refused with
+the reason.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ _TYPES: dict[str, Callable[[str], object]] = {"str": str, "int": int, "float": f
 
 @dataclass
 class Scope:
-    """What holds for the actions of one group or file.
+    """Settings that apply to the actions of one group or file.
 
     Attributes:
         context: variables, environment, files.
-        namespace: before the topics of its nodes.
+        namespace: prefix of its nodes' topics.
         group: name of its run directory within the stack's; empty: the stack's own.
-        env: what ``set_env`` and ``unset_env`` (None) ask for.
-        options: ``-p``, ``--params-file`` and ``-r`` words for each node.
+        env: variables from ``set_env`` and ``unset_env`` (None).
+        options: ``-p``, ``--params-file`` and ``-r`` arguments for each node.
         delay_s: wait after the start of the stack.
     """
 
@@ -67,7 +67,7 @@ class Scope:
     delay_s: float = 0.0
 
     def child(self) -> Scope:
-        """A copy that can change without changing this one."""
+        """A copy that can change independently."""
         return dataclasses.replace(self, context=self.context.child(), env=dict(self.env), options=list(self.options))
 
     @property
@@ -77,12 +77,12 @@ class Scope:
 
 
 class Reader:
-    """Collects what a launch file and all that it includes ask for.
+    """Collects the contents of a launch file and all its includes.
 
     Args:
         run_dir: run directory of the stack.
         given: arguments of the command line.
-        conditions: false takes every include and group as if its conditions held, to see which arguments there are.
+        conditions: if false, read every include and group as if its conditions held, to list all arguments.
     """
 
     def __init__(self, run_dir: Path, given: Mapping[str, str], conditions: bool = True) -> None:
@@ -95,7 +95,7 @@ class Reader:
         self._run_dir, self._given, self._conditions = run_dir, given, conditions
 
     def read_top(self, file: Path) -> dict[str, str] | None:
-        """Reads the launch file itself; the values of its variables, or None when it cannot be read."""
+        """Read the top launch file; returns the values of its variables, or None if it cannot be read."""
         scope = Scope(Context(file.resolve(), self._run_dir))
         declared = self._file(file.resolve(), scope, dict(self._given), depth=0)
         if declared is None:
@@ -114,22 +114,22 @@ class Reader:
         return declared
 
     def include(self, file: Path, scope: Scope, given: dict[str, str], place: Value, depth: int) -> None:
-        """Reads an included file.
+        """Read an included file.
 
         Args:
             file: the file.
-            scope: as it is where the include stands.
+            scope: scope of the include.
             given: the arguments that the include sets.
-            place: where the include stands.
-            depth: how deep the includes are.
+            place: place of the include.
+            depth: nesting depth of the includes.
         """
         if depth >= _MAX_INCLUDE_DEPTH:
             place.problem(f"files include each other more than {_MAX_INCLUDE_DEPTH} deep")
             return
         inner = scope.child()
         inner.context = Context(file, scope.context.run_dir, {}, dict(scope.context.environment))
-        # It sees only the arguments that it is given: what a file hides (a switch that is no good for driving) stays
-        # hidden, whatever the command line says.
+        # It sees only the arguments that it is given: an argument that a file hides (a switch that is unsafe for
+        # driving) stays hidden, whatever the command line says.
         declared = self._file(file, inner, given, depth + 1)
         known = {(argument.file, argument.name) for argument in self.included}
         self.included += [
@@ -179,11 +179,11 @@ class _Actions:
 
     @property
     def context(self) -> Context:
-        """Of the scope."""
+        """Context of the scope."""
         return self.scope.context
 
     def read(self, body: Value) -> None:
-        """All of a list."""
+        """Read all actions of a list."""
         for entry in body.items():
             fields = entry.fields()
             if entry.is_mapping and len(fields) != 1:
@@ -233,7 +233,7 @@ class _Actions:
         self.declared.append(argument)
         if name in self.given:
             value = self.given[name]
-            if kind == "path" and value and self.depth == 0:  # from the command line: as the shell completes it
+            if kind == "path" and value and self.depth == 0:  # relative to the shell's folder
                 value = str(Path(value).expanduser().absolute())
         elif argument.default is not None:
             value = argument.default
@@ -253,7 +253,7 @@ class _Actions:
 
     @staticmethod
     def _checked(value: str, argument: LaunchArgument, body: Value) -> str:
-        """The value, if the argument may have it; else one that it may have, so that the mistake is told once."""
+        """The value if the argument allows it; else an allowed one, so that the mistake is reported only once."""
         if value == "" == argument.default:
             return value
         if argument.choices and value not in argument.choices:
@@ -342,7 +342,7 @@ class _Actions:
     def _start(self, spec: NodeSpec | None) -> None:
         self.reader.nodes += [spec] if spec is not None else []
 
-    # -- what holds for the processes that follow ------------------------------------------------
+    # -- settings for the processes that follow ------------------------------------------------------
 
     def _set_env(self, body: Value) -> None:
         if fields := self._fields(body, ("name", "value"), ("name", "value")):
@@ -393,7 +393,7 @@ class _Actions:
         if fields := self._fields(body, ("value",), ("value",)):
             self.scope.options += ["-p", f"use_sim_time:={str(flag_of(fields['value'], self.context)).lower()}"]
 
-    # -- what the launcher itself does -----------------------------------------------------------
+    # -- actions of the launcher itself --------------------------------------------------------------
 
     def _log(self, body: Value) -> None:
         if (fields := self._fields(body, ("message", "level"), ("message",))) and (

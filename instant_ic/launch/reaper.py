@@ -1,9 +1,9 @@
-"""Outlives a launcher by a moment and kills what its nodes have left behind; run as a script, never imported.
+"""Outlives the launcher briefly and kills what its nodes have left behind; run as a script, never imported.
 
-``python -I -S reaper.py``, with the launcher at the other end of its standard input, who writes MARK first. When the
-launcher is gone, however it went, every process that carries MARK in its environment is killed: the nodes, their
-children, and those that have left the node's process group for a session of their own, which no signal to a group and
-no parent-death signal reaches. It writes ``PID COMMAND`` for each, and ends.
+``python -I -S reaper.py``. The launcher holds the other end of its standard input and writes MARK first. When the
+launcher has ended, for whatever reason, the reaper kills every process that carries MARK in its environment: the nodes,
+their children, and processes that left the node's process group for a session of their own, which neither group signals
+nor parent-death signals reach. It writes ``PID COMMAND`` for each, and exits.
 """
 
 import os
@@ -18,7 +18,7 @@ _LONGEST_S = 3.0
 
 
 def marked(mark: str) -> "list[int]":
-    """Processes that carry a mark; those of other users cannot be looked into and cannot be ours."""
+    """Processes that carry a mark. Other users' processes are not readable, and cannot belong to this stack."""
     wanted = mark.encode()
     found = []
     for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would stat each of them
@@ -30,14 +30,14 @@ def marked(mark: str) -> "list[int]":
 def _marks(pid: int) -> bytes:
     try:
         environment = Path(f"/proc/{pid}/environ").read_bytes()
-    except OSError:  # ended, or another user's
+    except OSError:  # it has ended, or belongs to another user
         return b""
     start = (b"\0" + environment).find(b"\0" + VARIABLE.encode() + b"=")
     return environment[start:].split(b"\0", 1)[0] if start >= 0 else b""
 
 
 def kill_marked(mark: str) -> "dict[int, str]":
-    """Kills every process that carries a mark, until none is left; process id → command line."""
+    """Kill every process that carries a mark, until none is left; returns process id → command line."""
     killed: dict[int, str] = {}
     deadline = time.monotonic() + _LONGEST_S
     while time.monotonic() < deadline:
@@ -50,7 +50,7 @@ def kill_marked(mark: str) -> "dict[int, str]":
             except OSError:
                 continue
             try:
-                if mark.encode() in _marks(pid):  # still the same: its number has not been given to another
+                if mark.encode() in _marks(pid):  # still the same process: its id has not been reused
                     command = Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
                     signal.pidfd_send_signal(descriptor, signal.SIGKILL)
                     killed.setdefault(pid, command.strip())
@@ -63,9 +63,9 @@ def kill_marked(mark: str) -> "dict[int, str]":
 
 
 def main() -> None:
-    """Waits for the launcher's end."""
+    """Wait for the launcher's end."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it goes when the launcher has gone
+        signal.signal(number, signal.SIG_IGN)  # the reaper must outlive the launcher
     told = b""
     while piece := os.read(0, 4096):
         told += piece
@@ -74,7 +74,7 @@ def main() -> None:
     try:
         for pid, command in killed.items():
             os.write(1, f"{pid} {command}\n".encode())
-    except OSError:  # nobody listens any more
+    except OSError:  # the reader is gone
         pass
 
 

@@ -1,4 +1,4 @@
-"""A run directory is locked against a second stack."""
+"""Lock that reserves a run directory for one stack."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from instant_ic.bus.registry import open_lock
 
 
 class StackRunningError(RuntimeError):
-    """Another stack has the run directory; the message says which and what to do."""
+    """Another stack uses the run directory; the message says which one and what to do."""
 
 
 class StackLock:
-    """Held while a stack runs; the kernel lets go of it when the launcher dies, however it dies.
+    """Lock held while a stack runs; the kernel releases it when the launcher dies, however it dies.
 
     Args:
         run_dir: prepared run directory.
-        label: told to whoever comes second.
+        label: shown to a second stack that tries to start.
     """
 
     def __init__(self, run_dir: Path, label: str) -> None:
@@ -28,11 +28,11 @@ class StackLock:
         self._descriptor = -1
 
     def __enter__(self) -> StackLock:
-        """Takes the lock.
+        """Take the lock.
 
         Raises:
-            StackRunningError: another stack has it.
-            RegistryError: it is no file of this user.
+            StackRunningError: another stack holds it.
+            RegistryError: the lock file does not belong to this user.
         """
         descriptor = open_lock(self.path, create=True)
         try:
@@ -51,6 +51,6 @@ class StackLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Lets go of the lock."""
+        """Release the lock."""
         os.ftruncate(self._descriptor, 0)
         os.close(self._descriptor)

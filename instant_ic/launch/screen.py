@@ -1,4 +1,4 @@
-"""The launcher's words: plain lines for logs and CI, a live table of the nodes in a terminal."""
+"""The launcher's output: plain lines for logs and CI, a live table of the nodes in a terminal."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Row:
     Attributes:
         label: its name.
         state: in one or two words.
-        cpu_percent: of one core; None where nothing is known.
-        rss_mb: resident memory; None likewise.
-        starts: how often it has been started again.
-        text: its worst diagnosis, or what is wrong with its topics; empty when all is well.
-        sends: topic and rate for each topic that flows, with whether the rate is right.
+        cpu_percent: of one core; None if unknown.
+        rss_mb: resident memory; None if unknown.
+        starts: number of restarts.
+        text: its worst diagnosis, or the fault of its topics; empty when all is well.
+        sends: topic, rate, and whether the rate is right, for each active topic.
     """
 
     label: str
@@ -51,16 +51,16 @@ class Row:
 
 @dataclass(frozen=True)
 class View:
-    """How a stack is at one time.
+    """State of a stack at one time.
 
     Attributes:
         rows: its processes, in the order of the launch file.
-        missing: nodes that have not said yet that they run.
+        missing: nodes that have not reported yet that they run.
         waiting: what an operator still waits for (camera, map, ...).
-        address: of the operator's page; None until it is there.
-        faults: topics that do not flow as they should, in words.
-        looked: whether the nodes' heartbeats are heard already.
-        ending: whether the stack is being stopped; then nothing is waited for any more.
+        address: of the operator's page; None until it is available.
+        faults: topics that have stopped or are too slow, as text.
+        looked: whether the launcher receives heartbeats already.
+        ending: whether the stack is shutting down, so that nothing is waited for.
     """
 
     rows: tuple[Row, ...] = ()
@@ -73,13 +73,13 @@ class View:
 
 
 class Screen:
-    """Prints lines and events, tells what the stack waits for, and the console's address.
+    """Prints lines and events, what the stack waits for, and the console's address.
 
     Args:
         nodes: names, in the order of the launch file.
         live: keep a table of the nodes below the lines.
-        progress_period_s: without the table, how often to tell what is still waited for.
-        console: where to; for tests.
+        progress_period_s: without the table, how often to print what the stack still waits for.
+        console: destination; for tests.
     """
 
     def __init__(
@@ -101,36 +101,36 @@ class Screen:
         self._told_faults: tuple[str, ...] = ()
 
     def __enter__(self) -> Screen:
-        """Shows the table."""
+        """Show the table."""
         self.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Takes the table away."""
+        """Remove the table."""
         self.stop()
 
     def start(self) -> None:
-        """Shows the table."""
+        """Show the table."""
         if self._live is not None:
             self._live.start()
 
     def stop(self) -> None:
-        """Takes the table away."""
+        """Remove the table."""
         if self._live is not None:
             self._live.stop()
 
     def node_line(self, node: str, text: str) -> None:
-        """A line that a node has written."""
+        """Print a line of a node's output."""
         prefix = (f"{node:>{self._width}} │ ", self._colours.get(node, "white"))
         style = next((style for word, style in _LINE_STYLES.items() if word in text), "")
         self._console.print(Text.assemble(prefix, Text.from_ansi(text, style=style)))
 
     def event(self, text: str, bad: bool = False) -> None:
-        """Something that the supervisor has done or seen."""
+        """Print an event reported by the supervisor."""
         self._console.print(Text(f"{'launch':>{self._width}} │ {text}", style="bold red" if bad else "bold"))
 
     def refresh(self, view: View) -> None:
-        """Tells what is new since the last view, and draws the table again."""
+        """Print what has changed since the last view, and render the table again."""
         now = time.monotonic()
         if view.looked and not view.ending:
             self._tell_progress(view, now)
@@ -159,7 +159,7 @@ class Screen:
             self._tell_faults(view.faults)
 
     def _tell_faults(self, faults: tuple[str, ...]) -> None:
-        """A topic is told when it becomes wrong and when it is right again; the numbers in between change nothing."""
+        """Report a topic when it becomes faulty and when it recovers; changing numbers are not reported again."""
         before = {fault.partition(":")[0] for fault in self._told_faults}
         now = {fault.partition(":")[0] for fault in faults}
         if new := [fault for fault in faults if fault.partition(":")[0] not in before]:
@@ -169,9 +169,9 @@ class Screen:
         self._told_faults = faults
 
     def table(self, view: View) -> RenderableType:
-        """The nodes, and a line below them."""
+        """The table of nodes with a status line below."""
         table = Table(box=None, pad_edge=False, expand=False, header_style="dim")
-        # Least widths, or a long message in the last column would squeeze the others away.
+        # Minimum widths, or a long message in the last column would squeeze the others.
         for name, justify, width in (
             ("node", "left", self._width),
             ("state", "left", 10),

@@ -1,4 +1,4 @@
-"""YAML with line numbers, and the list of everything that is wrong with it."""
+"""YAML with line numbers, and a list of everything that is wrong with it."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ _NO_VALUE = "tag:yaml.org,2002:null"
 
 @dataclass(frozen=True)
 class Problem:
-    """One mistake: file, line (from 1) and plain words."""
+    """One mistake: file, line (from 1) and text."""
 
     file: Path
     line: int
     text: str
 
     def __str__(self) -> str:
-        """``file:line: words``, as editors and terminals understand it."""
+        """``file:line: text``, the format that editors and terminals understand."""
         return f"{_shorten(self.file)}:{self.line}: {self.text}"
 
 
 class LaunchFileError(ValueError):
-    """Everything that is wrong with a launch file and what it includes, in ``problems``."""
+    """A launch file or its includes have mistakes; ``problems`` lists all of them."""
 
     def __init__(self, problems: list[Problem]) -> None:
         super().__init__("\n".join(str(problem) for problem in problems))
@@ -34,12 +34,12 @@ class LaunchFileError(ValueError):
 
 @dataclass
 class Value:
-    """A place in a YAML file: scalar, mapping or list, with accessors that note problems instead of raising.
+    """A place in a YAML file (scalar, mapping or list), with accessors that note problems instead of raising.
 
     Attributes:
         file: the file.
-        node: PyYAML's node of it.
-        problems: where mistakes are noted; shared by the whole launch description.
+        node: PyYAML's node.
+        problems: list where mistakes are noted; shared by the whole launch description.
     """
 
     file: Path
@@ -57,12 +57,12 @@ class Value:
         return f"{_shorten(self.file)}:{self.line}"
 
     def problem(self, text: str) -> None:
-        """Notes a mistake at this line."""
+        """Note a mistake at this line."""
         self.problems.append(Problem(self.file, self.line, text))
 
     @property
     def is_null(self) -> bool:
-        """Whether nothing is written here."""
+        """Whether the value is empty."""
         return isinstance(self.node, yaml.ScalarNode) and self.node.tag == _NO_VALUE
 
     @property
@@ -77,11 +77,11 @@ class Value:
 
     @property
     def is_quoted(self) -> bool:
-        """Whether it is text in quotes (or a block), so never a number or a truth value."""
+        """Whether it is quoted (or block) text, and so never a number or a boolean."""
         return isinstance(self.node, yaml.ScalarNode) and self.node.style is not None
 
     def text(self) -> str | None:
-        """The scalar as it is written; None, with a problem noted, for lists and mappings."""
+        """The scalar as written; None, with a problem noted, for lists and mappings."""
         if isinstance(self.node, yaml.ScalarNode):
             return "" if self.is_null else str(self.node.value)
         self.problem(f"expected a single value, got a {_kind(self.node)}")
@@ -95,7 +95,7 @@ class Value:
         return []
 
     def fields(self, known: Collection[str] = (), required: Collection[str] = ()) -> dict[str, Value]:
-        """The entries of a mapping; unknown (when ``known`` is given), double and missing keys are problems."""
+        """Entries of a mapping; unknown (if ``known`` is given), duplicate and missing keys are noted as problems."""
         if not isinstance(self.node, yaml.MappingNode):
             self.problem(f"expected keys and values, got a {_kind(self.node)}")
             return {}
@@ -126,11 +126,11 @@ class Value:
 
 
 def load(file: Path, problems: list[Problem]) -> Value | None:
-    """Reads a YAML file; None, with the problem noted, when it cannot be read.
+    """Read a YAML file; None, with the problem noted, if it cannot be read.
 
     Args:
-        file: path of it.
-        problems: where mistakes are noted.
+        file: its path.
+        problems: list where mistakes are noted.
     """
     try:
         text = file.read_text(encoding="utf-8")

@@ -1,7 +1,7 @@
-"""``$(var x)``, ``$(env X default)``, ``$(config file.yaml)`` and the like in launch files.
+"""Substitutions of launch files: ``$(var x)``, ``$(env X default)``, ``$(config file.yaml)`` and others.
 
-Nothing is ever executed: ``$(eval ...)`` knows comparisons, ``and``, ``or``, ``not`` and parentheses, and a nested
-substitution is one operand of it, whatever its value looks like.
+Nothing is ever executed. ``$(eval ...)`` knows comparisons, ``and``, ``or``, ``not`` and parentheses; a nested
+substitution is always one operand, whatever its value looks like.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _anonymous = itertools.count(1)
 
 
 class SubstitutionError(ValueError):
-    """A substitution that cannot be worked out; the message says which and why."""
+    """A substitution cannot be evaluated; the message says which and why."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Context:
     """What substitutions refer to.
 
     Attributes:
-        launch_file: the file that the text stands in.
+        launch_file: the file that contains the text.
         run_dir: run directory of the stack.
         variables: launch arguments and ``let`` values in scope.
         environment: environment variables.
@@ -62,7 +62,7 @@ class Context:
     environment: dict[str, str] = field(default_factory=lambda: dict(os.environ))
 
     def child(self) -> Context:
-        """A copy whose variables and environment can change without changing these (a group's scope)."""
+        """A copy whose variables and environment can change independently (a group's scope)."""
         return Context(self.launch_file, self.run_dir, dict(self.variables), dict(self.environment))
 
 
@@ -94,7 +94,7 @@ def has_substitution(text: str) -> bool:
 
 
 def truth(text: str) -> bool:
-    """The truth value of a condition's text.
+    """Boolean value of a condition's text.
 
     Raises:
         SubstitutionError: neither true/1 nor false/0/empty.
@@ -191,7 +191,7 @@ def _word(value: bool) -> str:
 
 
 def _arguments(text: str, context: Context) -> list[str]:
-    """The words of a substitution; quotes hold one together, and a nested substitution is never split."""
+    """Arguments of a substitution; quotes group words, and a nested substitution is never split."""
     words: list[str] = []
     current: str | None = None
     quote = ""
@@ -221,11 +221,11 @@ def _arguments(text: str, context: Context) -> list[str]:
 
 
 def _unwrapped(text: str) -> str:
-    """ROS 2 puts the whole expression of an ``eval`` into quotes: what is inside; other text as it is."""
+    """The text without enclosing quotes: ROS 2 puts the whole expression of an ``eval`` into quotes."""
     for quote in "'\"":
         inside = text[1:-1]
         if len(text) > 1 and text[0] == text[-1] == quote and quote not in inside.replace(f"\\{quote}", ""):
-            # A single word in quotes is an operand here too, so nothing is lost by looking inside.
+            # A single quoted word is an operand without its quotes too, so removing them changes nothing.
             return inside.replace(f"\\{quote}", quote)
     return text
 
@@ -270,7 +270,7 @@ class _Expression:
                 tokens.append(("symbol", symbol))
             elif word is None:
                 quoted = single if single is not None else double
-                # A quoted operand may hold substitutions; their value is text, never operators.
+                # A quoted operand may contain substitutions; their value is text, never an operator.
                 tokens.append(("operand", substitute(quoted, context)))
             elif word in ("and", "or", "not"):
                 tokens.append(("symbol", word))

@@ -1,4 +1,4 @@
-"""Starts the nodes of a launch description, watches them, stops them."""
+"""Start the nodes of a launch description, watch them, stop them."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ STOP_SCHEDULE: Schedule = (
     (signal.SIGTERM, 1.2),
     (signal.SIGKILL, 1.0),
 )
-"""What is sent to the process groups at the end, and the longest wait after each; under 5 s in all."""
+"""Signals to the process groups at shutdown, with the longest wait after each; under 5 s in total."""
 
 HANG_SCHEDULE: Schedule = ((signal.SIGABRT, 2.0), (signal.SIGKILL, 1.0))
-"""What a node that hangs is sent: first what makes it write the stack of every thread, then what ends it."""
+"""Signals to a hung node: the first makes it write the stack of every thread, the second ends it."""
 
 BUSY_FACTOR = 6.0
-"""A node without heartbeat that computes (a compiler at its first picture) is given this many times longer."""
+"""Factor on the hang time-out for a node that computes (a compiler at its first image)."""
 
 _BUSY_SHARE = 0.5
-_LOG_BYTES = 32 << 20  # what may wait for the disk
+_LOG_BYTES = 32 << 20  # how much may wait for the disk
 _REAPER = Path(__file__).with_name("reaper.py")
 
 
 class Output(Protocol):
-    """Where the supervisor's words go."""
+    """Destination of the supervisor's output."""
 
     def node_line(self, node: str, text: str) -> None:
-        """A line that a node has written."""
+        """Show a line of a node's output."""
 
     def event(self, text: str, bad: bool = False) -> None:
-        """Something that the supervisor has done or seen."""
+        """Show an event reported by the supervisor."""
 
     def refresh(self, processes: Sequence[ManagedProcess]) -> None:
         """Called several times a second."""
@@ -56,20 +56,20 @@ class Output(Protocol):
 
 
 class Health(Protocol):
-    """What the nodes tell of themselves."""
+    """The nodes' heartbeats."""
 
     def poll(self) -> None:
-        """Takes in what has come; never waits."""
+        """Process the messages that have arrived; never waits."""
 
     def beat_s(self, spec: NodeSpec, pid: int) -> float | None:
-        """Monotonic time of the newest heartbeat in which this process said that it runs; None before the first."""
+        """Monotonic time of the newest heartbeat in which this process reported that it runs; None before the first."""
 
     def close(self) -> None:
-        """Lets go of the bus."""
+        """Disconnect from the bus."""
 
 
 class _Silence:
-    """How long a process has gone without a heartbeat, by the time that the launcher has looked."""
+    """Time that a process has gone without a heartbeat, as observed by the launcher."""
 
     def __init__(self) -> None:
         self.beat_s: float | None = None
@@ -78,36 +78,36 @@ class _Silence:
         self._active_s = 0.0
 
     def look(self, beat_s: float | None, pid: int, since_last_look_s: float) -> None:
-        """Takes note of the newest heartbeat."""
+        """Record the newest heartbeat."""
         if beat_s is None or beat_s != self.beat_s:
             self.beat_s, self.lasts_s, self.told = beat_s, 0.0, False
             self._active_s = 0.0
             return
         if self.lasts_s == 0.0:
             self._active_s = _active_s(pid)
-        # A launcher that was held up itself (stopped, swapped out) must not blame the nodes for it.
+        # If the launcher itself was held up (stopped, swapped out), the nodes are not to blame.
         self.lasts_s += min(since_last_look_s, 0.5)
 
     def busy(self, pid: int) -> bool:
-        """Whether it has computed, or waited for its turn to, for most of the silence."""
+        """Whether the process has computed, or waited for a CPU, for most of the silence."""
         return _active_s(pid) - self._active_s > _BUSY_SHARE * self.lasts_s
 
 
 class Supervisor:
-    """Brings the processes from what they are to what they should be, again and again, until the end.
+    """Brings every process from its actual to its wanted state, again and again, until the end.
 
-    Each round compares for every process whether it is wanted with whether it runs, and does the one next thing:
-    start it, send it the next signal of its end, find out that it hangs, or leave it alone. The order of starts does
-    not matter to the nodes.
+    Each round compares whether a process is wanted with whether it runs, and does the one next thing: start it, send
+    it the next signal of its end, detect that it hangs, or leave it alone. The order of starts does not matter to the
+    nodes.
 
     Args:
         nodes: what to start.
         run_dir: prepared run directory.
-        output: where lines and events go.
-        make_limit: the respawn limit of a node; for tests.
-        stop_schedule: signals of the end and the wait after each.
-        make_health: called once all are started; None: nobody looks at heartbeats.
-        announcements: words to say at their time.
+        output: destination of lines and events.
+        make_limit: creates the respawn limit of a node; for tests.
+        stop_schedule: signals at shutdown, with the wait after each.
+        make_health: called once all processes are started; None: heartbeats are not watched.
+        announcements: texts to print at their time.
         shutdown: when to end by itself.
     """
 
@@ -127,7 +127,7 @@ class Supervisor:
         self._mark = uuid.uuid4().hex
         self._disk = Outlet("log files", _LOG_BYTES)
         self._told: deque[str] = deque()
-        """Words from the thread that writes the logs."""
+        """Texts from the thread that writes the logs."""
         self.processes = [
             ManagedProcess(
                 node, run_dir, self._mark, self._disk, self._told.append, make_limit(node) if make_limit else None
@@ -147,16 +147,16 @@ class Supervisor:
         self._last_look_s = 0.0
 
     def request_stop(self, hurry: bool = False) -> None:
-        """Asks for the end, from a signal handler or another thread; ``hurry`` goes straight to SIGKILL."""
+        """Request the end, from a signal handler or another thread; ``hurry`` goes straight to SIGKILL."""
         self._hurry = self._hurry or hurry
         self._stop = True
 
     def run(self) -> int:
-        """Starts everything, watches it to the end and stops what is left.
+        """Start everything, watch it until the end, and stop what is left.
 
         Returns:
-            0 when a stop was asked for or every node ended well; 1 when a required node failed, or when all have
-            ended and one of them badly.
+            0 when a stop was requested or every node ended normally; 1 when a required node failed, or when all have
+            ended and at least one of them failed.
         """
         try:
             with self._reaper(), self._signals():
@@ -185,7 +185,7 @@ class Supervisor:
 
     @contextmanager
     def _reaper(self) -> Iterator[None]:
-        """Somebody who kills what is left when this process is gone, even by SIGKILL."""
+        """Run a helper process that kills what is left when this process dies, even by SIGKILL."""
         process = subprocess.Popen(
             (sys.executable, "-I", "-S", str(_REAPER)),
             stdin=subprocess.PIPE,
@@ -209,7 +209,7 @@ class Supervisor:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """SIGINT, SIGTERM and SIGHUP ask for the end; a second one hurries it."""
+        """Let SIGINT, SIGTERM and SIGHUP request the end; a second signal hurries it."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -228,7 +228,7 @@ class Supervisor:
     # -- one round -------------------------------------------------------------------------------
 
     def _step(self, wait_s: float) -> None:
-        """Passes on what the nodes write, then brings every process nearer to what it should be."""
+        """Forward the nodes' output, then move every process towards its wanted state."""
         flooded = False
         if self._selector.get_map():
             ready = self._selector.select(wait_s)
@@ -245,7 +245,7 @@ class Supervisor:
         self._tell()
         self._output.refresh(self.processes)
         if flooded:
-            time.sleep(0.005)  # somebody writes without end: the CPU is for the others
+            time.sleep(0.005)  # a process writes without end: leave the CPU to the others
 
     def _reconcile(self, now_s: float) -> None:
         since_s, self._last_look_s = now_s - self._last_look_s, now_s
@@ -269,7 +269,7 @@ class Supervisor:
         self._keep_time(now_s - self._start_s)
 
     def _keep_time(self, since_start_s: float) -> None:
-        """What the launch file wants to be said, or the end that it wants."""
+        """Print the launch file's texts when they are due, or end the stack at its ``shutdown``."""
         while self._announcements and self._announcements[0].delay_s <= since_start_s:
             self._output.event(self._announcements.pop(0).text)
         if self._shutdown is not None and since_start_s >= self._shutdown.delay_s and not self._stop:
@@ -283,7 +283,7 @@ class Supervisor:
         return [(signum, wait_s if (w := own.get(signum)) is None else w) for signum, wait_s in self._stop_schedule]
 
     def _judge(self, process: ManagedProcess, since_s: float) -> None:
-        """Ends a process that has stopped sending heartbeats."""
+        """End a process that has stopped sending heartbeats."""
         if self._health is None or process.pid is None or not process.spec.heartbeat:
             return
         limit_s, silence = process.spec.hang_timeout_s, self._silences[process]
@@ -306,7 +306,7 @@ class Supervisor:
         self._silences[process] = _Silence()
         try:
             process.start()
-        except (OSError, ValueError) as error:  # ValueError: a zero byte in a word
+        except (OSError, ValueError) as error:  # ValueError: an argument contains a zero byte
             process.state, process.exit_status = State.FAILED, 127
             self._output.event(f"{process.spec.label} cannot be started: {error}", bad=True)
             self._after_end(process)
@@ -319,7 +319,7 @@ class Supervisor:
             self._output.event(self._told.popleft(), bad=True)
 
     def _pass_on(self, process: ManagedProcess) -> bool:
-        """Hands on what a process has written; whether it was so much that the most was left out."""
+        """Forward a process's output; returns whether most of it was dropped."""
         for line in process.read_lines(time.monotonic()):
             if process.spec.to_terminal:
                 self._output.node_line(process.spec.label, line)
@@ -339,13 +339,13 @@ class Supervisor:
                 self._output.node_line(process.spec.label, line)
         if self._stop:
             return
-        # Children that have left the process group for a session of their own would hold its devices and ports.
+        # Children in a session of their own, outside the process group, would keep its devices and ports open.
         for pid, command in kill_marked(process.mark).items():
             self._output.event(f"killed what {process.spec.label} had left behind: {pid} {command}", bad=True)
         self._after_end(process)
 
     def _after_end(self, process: ManagedProcess) -> None:
-        """Starts a process again, ends the stack, or only says that it has ended."""
+        """Restart a process, end the stack, or only report that the process has ended."""
         spec, status = process.spec, process.exit_status or 0
         what = f"{spec.label} ended ({process.reason or describe_exit(status)})"
         status = status or (1 if process.reason else 0)
@@ -393,7 +393,7 @@ class Supervisor:
 
 
 def _active_s(pid: int) -> float:
-    """How long a process's first thread, the node's own, has computed or waited for a CPU; 0 when it is gone."""
+    """Seconds that a process's first thread (the node's own) has computed or waited for a CPU; 0 if it is gone."""
     try:
         computed, waited, _ = Path(f"/proc/{pid}/schedstat").read_text().split()
     except OSError:
@@ -402,7 +402,7 @@ def _active_s(pid: int) -> float:
 
 
 def _is_traced(pid: int) -> bool:
-    """Whether a debugger holds a process."""
+    """Whether a debugger is attached to a process."""
     try:
         status = Path(f"/proc/{pid}/status").read_text()
     except OSError:

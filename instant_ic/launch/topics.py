@@ -1,4 +1,4 @@
-"""Nominal rates of topics (``config/topics.yaml``), and what follows from them: alive, right rate."""
+"""Nominal rates of topics (``config/topics.yaml``), and checks against them: alive, right rate."""
 
 from __future__ import annotations
 
@@ -13,42 +13,42 @@ ALIVE_PERIODS = 10.0
 """A topic whose newest message is older than this many periods has stopped."""
 
 FREQ_OK_SHARE = 0.9
-"""Share of the nominal rate from which on a rate is right."""
+"""Share of the nominal rate above which a rate is right."""
 
 
 class TopicTableError(ValueError):
-    """The table of rates cannot be used; the message says where and why."""
+    """The table of rates is invalid; the message says where and why."""
 
 
 @dataclass(frozen=True)
 class TopicRate:
-    """What is expected of a topic.
+    """Expected rate of a topic.
 
     Attributes:
-        rate_hz: nominal rate, messages a second.
-        when: it flows only then (words); empty where it flows all the time.
+        rate_hz: nominal rate, messages per second.
+        when: condition under which it is published, as text; empty if it always is.
     """
 
     rate_hz: float
     when: str = ""
 
     def alive(self, age_s: float) -> bool:
-        """Whether a newest message of this age is young enough (inf: there was none)."""
+        """Whether the newest message is recent enough; age inf: there was none."""
         return age_s * self.rate_hz < ALIVE_PERIODS
 
     def freq_ok(self, rate_hz: float) -> bool:
-        """Whether a measured rate comes near enough to the nominal one."""
+        """Whether a measured rate is close enough to the nominal one."""
         return rate_hz > FREQ_OK_SHARE * self.rate_hz
 
     def fault(self, rate_hz: float, age_s: float) -> str:
-        """What is wrong in words, with the numbers; empty where nothing is.
+        """Description of the fault, with the numbers; empty if there is none.
 
         Args:
             rate_hz: measured rate.
-            age_s: of the newest message; inf before the first.
+            age_s: age of the newest message; inf before the first.
         """
         if not self.alive(age_s):
-            if self.when:  # its absence means nothing
+            if self.when:  # a pause is normal
                 return ""
             return "has not come yet" if math.isinf(age_s) else f"stopped {age_s:.1f} s ago"
         if not self.freq_ok(rate_hz):
@@ -57,10 +57,10 @@ class TopicRate:
 
 
 def read_topic_rates(file: Path) -> dict[str, TopicRate]:
-    """Topic → what is expected of it.
+    """Read a table of rates: topic → expected rate.
 
     Raises:
-        TopicTableError: the file cannot be read, a key is unknown, a rate is no number > 0; with every mistake.
+        TopicTableError: all mistakes: an unreadable file, an unknown key, or a rate that is not a number > 0.
     """
     from instant_ic.launch.source import Problem, load
 
@@ -93,11 +93,11 @@ def topic_rates() -> dict[str, TopicRate]:
 
 
 def nominal_rate(topic: str, namespace: str = "") -> TopicRate | None:
-    """What is expected of a topic, or None where nothing is known.
+    """Expected rate of a topic, or None if the table does not have it.
 
     Args:
         topic: full name, ``/left/scan``.
-        namespace: of the node that sends it, ``left``; the table knows topics without it.
+        namespace: namespace of the publishing node, ``left``; the table lists topics without it.
     """
     rates = topic_rates()
     prefix = f"/{namespace.strip('/')}/" if namespace.strip("/") else ""

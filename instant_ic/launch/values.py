@@ -1,4 +1,4 @@
-"""Values of a launch file with their substitutions done; what is wrong is noted at its line, never raised."""
+"""Values of a launch file after substitution; mistakes are noted at their line, never raised."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ CONDITION = ("if", "unless")
 
 
 def text_of(value: Value | None, context: Context) -> str | None:
-    """The text; None where there is none or it is wrong."""
+    """The text after substitution; None if it is missing or wrong."""
     text = value.text() if value is not None else None
     return replaced(text, value, context) if value is not None and text is not None else None
 
 
 def plain_text(value: Value | None) -> str | None:
-    """The text as it is written."""
+    """The text as written."""
     return value.text() if value is not None else None
 
 
 def replaced(text: str, value: Value, context: Context) -> str | None:
-    """A text of this place with its substitutions done."""
+    """A text from this place, after substitution."""
     try:
         return substitute(text, context)
     except SubstitutionError as error:
@@ -36,7 +36,7 @@ def replaced(text: str, value: Value, context: Context) -> str | None:
 
 
 def flag_of(value: Value | None, context: Context, default: bool = False) -> bool:
-    """A truth value."""
+    """A boolean."""
     text = text_of(value, context)
     if value is None or text is None:
         return default
@@ -48,12 +48,12 @@ def flag_of(value: Value | None, context: Context, default: bool = False) -> boo
 
 
 def holds(fields: Mapping[str, Value], context: Context) -> bool:
-    """Whether ``if`` and ``unless`` let an action through."""
+    """Whether ``if`` and ``unless`` let the action run."""
     return flag_of(fields.get("if"), context, default=True) and not flag_of(fields.get("unless"), context)
 
 
 def seconds_of(value: Value | None, context: Context) -> float | None:
-    """A number of seconds >= 0; None where there is none or it is wrong."""
+    """A number of seconds >= 0; None if it is missing or wrong."""
     text = text_of(value, context)
     if value is None or text is None:
         return None
@@ -69,7 +69,7 @@ def seconds_of(value: Value | None, context: Context) -> float | None:
 
 
 def integer_of(value: Value | None, context: Context, default: int) -> int:
-    """A whole number."""
+    """An integer."""
     text = text_of(value, context)
     if value is None or text is None:
         return default
@@ -81,7 +81,7 @@ def integer_of(value: Value | None, context: Context, default: int) -> int:
 
 
 def words_of(value: Value | None, context: Context) -> list[str]:
-    """The words of a command line."""
+    """The arguments of a command line."""
     text = text_of(value, context)
     if value is None or not text:
         return []
@@ -93,20 +93,20 @@ def words_of(value: Value | None, context: Context) -> list[str]:
 
 
 def pair_of(entry: Value, first: str, second: str, context: Context) -> tuple[str, str] | None:
-    """Two keys that belong together; None where either is missing."""
+    """Two keys that belong together; None if either is missing."""
     fields = entry.fields(known=(first, second, *CONDITION), required=(first, second))
     one, two = text_of(fields.get(first), context), text_of(fields.get(second), context)
     return (one, two) if one and two is not None and holds(fields, context) else None
 
 
 def pairs_of(value: Value | None, first: str, second: str, context: Context) -> list[tuple[str, str]]:
-    """The pairs of a list of them."""
+    """All pairs of a list."""
     found = [pair_of(entry, first, second, context) for entry in value.items()] if value is not None else []
     return [pair for pair in found if pair is not None]
 
 
 def parameter_value(value: Value, kind: str, context: Context) -> object:
-    """The value of a parameter, of the type that it is said to have or else as YAML reads it."""
+    """The value of a parameter, of the given type, or as YAML reads it."""
     if value.is_list or value.is_mapping:
         return _substituted(value.plain(), value, context)
     text = text_of(value, context)
@@ -122,7 +122,7 @@ def parameter_value(value: Value, kind: str, context: Context) -> object:
     if kind not in readers:
         value.problem(f"unknown type {kind!r} (types: str, int, float, bool)")
         return None
-    # Quoted text, and nothing at all, stay text; the rest is read as YAML reads it.
+    # Quoted and empty text stays text; everything else is read as YAML.
     if kind == "" and ((value.is_quoted and not has_substitution(value.text() or "")) or not text):
         return text
     try:
