@@ -245,7 +245,7 @@ class ManagedProcess:
             if not data:
                 self.output_closed = True
                 return
-            # Once output is dropped, the budget must first recover a second's worth: one note per second, not per chunk.
+            # Once output is dropped, the budget must first recover by one second: one note per second, not per chunk.
             if self._budget < (OUTPUT_BYTES_PER_S if self._left_out else 0):
                 self._left_out += len(data)
                 continue
