@@ -199,7 +199,7 @@ class ControlServer:
                 return
             try:
                 future.set_result(function())
-            except Exception as error:  # noqa: BLE001 - it belongs to the one who asks
+            except Exception as error:  # noqa: BLE001 - the client gets the exception
                 future.set_exception(error)
 
         self._node.call_soon(run)
