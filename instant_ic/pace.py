@@ -120,7 +120,7 @@ def read(run_dir: Path) -> Pace:
         fields = json.loads(text)
         pace = Pace(float(fields["factor"]), int(fields["epoch_ns"]), int(fields["monotonic_ns"]))
     except (ValueError, KeyError, TypeError) as error:
-        raise PaceError(f"{file}: no pace ({error}); delete it, or start the stack again") from error
+        raise PaceError(f"{file}: not a valid pace ({error}); delete the file, or restart the stack") from error
     if not (math.isfinite(pace.factor) and SLOWEST <= pace.factor <= FASTEST):
         raise PaceError(f"{file}: pace must lie in {SLOWEST}..{FASTEST:g} (got {pace.factor:g})")
     return pace

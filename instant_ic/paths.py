@@ -17,7 +17,7 @@ def share_dir(name: str) -> Path:
     for candidate in (_PACKAGE / "share" / name, _PACKAGE.parent / name):
         if candidate.is_dir():
             return candidate
-    raise FileNotFoundError(f"{name}/ is missing beside the package at {_PACKAGE}: install instant-ic again")
+    raise FileNotFoundError(f"{name}/ is missing beside the package at {_PACKAGE}: reinstall instant-ic")
 
 
 def shipped_file(folder: str, name: str) -> Path:

@@ -125,7 +125,7 @@ class ControlServer:
             operation = self._operations().get(str(request.get("op")))
             if operation is None:
                 known = ", ".join(self._operations())
-                raise _RequestError(f"unknown op {request.get('op')!r} (there are: {known})")
+                raise _RequestError(f"unknown op {request.get('op')!r} (known: {known})")
             return {"ok": True, **operation(request)}
         except _RequestError as error:
             return _refusal(str(error), "request")
@@ -175,10 +175,10 @@ class ControlServer:
         name, arguments = str(request.get("command")), request.get("arguments", {})
         command = self._node.commands.get(name)
         if command is None and self._node.starting:
-            raise NodeBusyError(f"{self._node.node_name} is just starting")
+            raise NodeBusyError(f"{self._node.node_name} is still starting; try again")
         if command is None:
             known = ", ".join(self._node.commands) or "none"
-            raise _RequestError(f"{self._node.node_name} has no command {name!r} (there are: {known})")
+            raise _RequestError(f"{self._node.node_name} has no command {name!r} (known: {known})")
         if not isinstance(arguments, dict):
             raise _RequestError('call needs "arguments": {name: value}')
         try:
@@ -209,7 +209,7 @@ class ControlServer:
             if not future.cancel():  # it has just started
                 return future.result(_CHANGE_S)
             what, busy_s = self._node.activity()
-            doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop does not turn"
+            doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop is not running"
             raise NodeBusyError(f"{self._node.node_name} is busy ({doing}); nothing was changed") from None
 
 
@@ -303,7 +303,7 @@ class NodeControl:
             except OSError as error:
                 raise ControlError(f"node {self.node}: {path}: {error}") from error
         if line is None:
-            raise ControlError(f"node {self.node} ended while it was asked")
+            raise ControlError(f"node {self.node} ended before it answered")
         answer = _parse(line)
         if answer.get("ok"):
             return answer
@@ -313,9 +313,7 @@ class NodeControl:
     def _not_there(self) -> str:
         running = [node.name for node in registry.list_nodes(self.run_dir)]
         if self.node in running:
-            return (
-                f"node {self.node} runs but takes no requests: it is just starting or ending, or is of an old version"
-            )
+            return f"node {self.node} is running but accepts no requests: it is starting up, shutting down or outdated"
         close = difflib.get_close_matches(self.node, running, n=1)
         hint = f"did you mean {close[0]!r}?" if close else f"running: {', '.join(running) or 'none'}"
         return f"node {self.node!r} does not run in {self.run_dir} ({hint})"
@@ -333,7 +331,7 @@ class _LineReader:
         """The next line without its line end; None when the other side has closed."""
         while (end := self._buffer.find(b"\n")) < 0:
             if len(self._buffer) > self._max_bytes:
-                raise _RequestError(f"a line of more than {self._max_bytes} bytes")
+                raise _RequestError(f"line longer than {self._max_bytes} bytes")
             part = self._connection.recv(65536)
             if not part:
                 return None

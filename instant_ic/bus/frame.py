@@ -75,9 +75,9 @@ class Hello:
             values = json.loads(body)
             hello = cls(**values)
         except (ValueError, TypeError, RecursionError) as error:
-            raise FrameError(f"a greeting that cannot be read: {error}") from None
+            raise FrameError(f"unreadable greeting: {error}") from None
         if not all(isinstance(value, str) for value in values.values()):
-            raise FrameError("a greeting whose fields are not text")
+            raise FrameError("greeting with fields that are not text")
         return hello
 
 

@@ -113,7 +113,7 @@ class _Reader:
             return False
         magic, version, self.shared, depth = GREETING.unpack_from(self._incoming)
         if magic != MAGIC or version != VERSION or not depth:
-            raise ValueError(f"a reader that does not speak version {VERSION} of the bus (it sent {magic!r} {version})")
+            raise ValueError(f"a reader of another bus version (expected {VERSION}, it sent {magic!r} {version})")
         self._incoming = self._incoming[GREETING.size :]
         self.depth = depth
         self.prompt = True
@@ -461,9 +461,7 @@ class LocalPublisher:
         with self._lock:
             untaken = sum(reader.untaken for reader in self._readers.values())
             if untaken:  # no later message will reveal this gap to the readers
-                log.warning(
-                    "%s ends with %d messages that its readers were too slow to take: lost", self.topic, untaken
-                )
+                log.warning("%s closed: %d messages lost, its readers were too slow to take them", self.topic, untaken)
             for reader in list(self._readers.values()):
                 self._drop(reader)
             self._pool.close()
@@ -553,7 +551,7 @@ class LocalPublisher:
                     return
                 except OSError as error:  # too many open files: the reader waits for a connection until there are fewer
                     if not self._told_full:
-                        log.error("%s: a reader cannot be let in: %s", self.topic, error)
+                        log.error("%s: cannot accept a reader: %s", self.topic, error)
                     self._told_full = True
                     time.sleep(_DOOR_S)
                     return

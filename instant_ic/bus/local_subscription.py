@@ -173,18 +173,18 @@ class Inlet:
     def _shared(self, body: bytes, sequence: int) -> memoryview | None:
         """The message in shared memory; None when the buffer does not hold the announced message."""
         if len(body) != SHARED_BODY.size:
-            raise FrameError(f"a place in shared memory of {len(body)} bytes")
+            raise FrameError(f"shared-memory frame with a body of {len(body)} bytes")
         number, new, size = SHARED_BODY.unpack(body)
         if new:
             if not self._fds:
-                raise FrameError("a buffer without its file descriptor")
+                raise FrameError("new buffer without its file descriptor")
             try:
                 self._mappings[number] = SharedMapping(self._fds.popleft())
             except OSError as error:
                 self._without_shared_memory(error.strerror or str(error))
         mapping = self._mappings.get(number)
         if mapping is None or not mapping.fits(size):
-            raise FrameError(f"a message of {size} bytes in buffer {number}, which is not known or smaller")
+            raise FrameError(f"a message of {size} bytes in buffer {number}, which is unknown or too small")
         if mapping.sequence != sequence:
             self._give_back(number)
             return None  # the publisher has overwritten a buffer that it lent
@@ -200,7 +200,7 @@ class Inlet:
 
     def _without_shared_memory(self, why: str) -> NoReturn:
         self.subscription.shared = False
-        raise FrameError(f"shared memory cannot be used ({why}); connecting again without it, slower")
+        raise FrameError(f"shared memory cannot be used ({why}); reconnecting without it, which is slower")
 
     def _done(self, number: int, sequence: int, mapping: SharedMapping, _: object) -> None:
         """Return a buffer when its last view is gone; may run in any thread."""
@@ -309,7 +309,7 @@ class LocalSubscription:
         hello = inlet.hello
         assert hello is not None
         if hello.topic != self.topic:
-            raise FrameError(f"a publisher of {hello.topic}")
+            raise FrameError(f"connected to a publisher of {hello.topic}")
         inlet.refused = self._digest is not None and hello.digest != self._digest
         inlet.node, inlet.type_name = hello.node, self.type_name or hello.type_name
         inlet.expected = self._expected.get(hello.publisher, 0)
@@ -322,7 +322,7 @@ class LocalSubscription:
         if sequence != inlet.expected + skipped:
             if not inlet.expected:
                 if inlet.hello is None:
-                    raise FrameError("a message before the publisher's greeting")
+                    raise FrameError("message before the publisher's greeting")
             elif sequence < inlet.expected:  # a latched value, sent again over a new connection
                 return
             else:
@@ -354,7 +354,7 @@ class LocalSubscription:
         """Count and log that a publisher overwrote a buffer it had lent, which is a fault of the publisher."""
         self.stats.torn += 1
         node = inlet.hello.node if inlet.hello else "?"
-        log.error("%s: %s wrote over a message that was still being read", self.topic, node)
+        log.error("%s: %s overwrote a message that was still in use", self.topic, node)
 
     def _refuse(self, inlet: Inlet) -> None:
         hello = inlet.hello

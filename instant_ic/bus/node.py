@@ -546,7 +546,10 @@ class Node(Generic[ConfigT]):
         self.clock.set(now_ns)
         went_back = now_ns < before_ns - _WENT_BACK_NS
         if went_back:
-            self.log.warning("time went back %.1f s: timers and transforms begin anew", (before_ns - now_ns) / 1e9)
+            self.log.warning(
+                "simulated time went back %.1f s: timers restart, moving transforms are dropped",
+                (before_ns - now_ns) / 1e9,
+            )
         if went_back or before_ns == 0:
             for entry in self._timers:
                 entry[2].due_ns = now_ns + entry[2].period_ns
@@ -559,7 +562,7 @@ class Node(Generic[ConfigT]):
         """Subscriptions to read now; before simulated time has started, only ``/clock``."""
         if not self.use_sim_time or self._clock_in is None or self.clock.now_ns() > 0:
             if self._diagnoses.get("simulated time", (OK,))[0] != OK:
-                self.diagnose("simulated time", OK, "comes")
+                self.diagnose("simulated time", OK, "running")
             return list(self.subscriptions)
         if time.monotonic() > self._began_s + _NO_CLOCK_S:
             self.diagnose("simulated time", WARN, f"use_sim_time is set, waiting for {self._clock_in.raw.topic}")
@@ -577,7 +580,9 @@ class Node(Generic[ConfigT]):
                 next_beat = now + _HEARTBEAT_S
                 self._beat()
                 if (jump_s := system_clock.jump_s()) and not self.use_sim_time:
-                    self.log.warning("the machine's clock was set by %+.1f s: stamps jump, timers go on", jump_s)
+                    self.log.warning(
+                        "the machine's clock was set by %+.1f s: stamps jump, timers are not affected", jump_s
+                    )
             if now >= next_diagnostics:
                 next_diagnostics = now + _DIAGNOSTICS_S
                 self._publish_diagnostics()

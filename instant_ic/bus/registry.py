@@ -197,7 +197,7 @@ class Claim:
             except BlockingIOError:
                 if time.monotonic() > deadline:
                     os.close(self._fd)
-                    raise RegistryError(f"{what} is already there: another process holds {lock_path}") from None
+                    raise RegistryError(f"{what} already exists: another process holds {lock_path}") from None
                 time.sleep(0.02)
 
     def write(self, content: dict[str, Any]) -> None:
@@ -213,7 +213,7 @@ class Claim:
             scratch.replace(self.json_path)
         except OSError as error:
             scratch.unlink(missing_ok=True)
-            raise RegistryError(f"{self._what} cannot be told to others: {error}") from error
+            raise RegistryError(f"{self._what} cannot be registered: {error}") from error
 
     def release(self) -> None:
         """Remove the JSON file and release the lock; a second call does nothing."""

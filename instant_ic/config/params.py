@@ -80,7 +80,7 @@ def load_file(path: Path, node: str) -> Values:
         where = f"{path}:{mark.line + 1}" if mark else str(path)
         raise ParameterError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
     except RecursionError:
-        raise ParameterError(f"{path}: nested without end: an anchor inside itself?") from None
+        raise ParameterError(f"{path}: nested endlessly: does an anchor contain itself?") from None
 
 
 def _sections(root: yaml.Node, path: Path, node: str) -> Values:
@@ -108,7 +108,7 @@ def _items(node: yaml.Node, path: Path) -> list[tuple[str, yaml.Node]]:
     keys = [key for key, _ in items]
     for (key, value), at in zip(items, range(len(keys)), strict=True):
         if key in keys[:at]:
-            raise ParameterError(f"{_where(path, value)}: {key!r} stands twice")
+            raise ParameterError(f"{_where(path, value)}: {key!r} is given twice")
     return items
 
 
@@ -153,7 +153,7 @@ def yaml_value(text: str, what: str) -> Any:
     except _YAML_FAULTS as error:
         raise ParameterError(f"{what}: the value is not YAML: {_one_line(error)}") from error
     except RecursionError:
-        raise ParameterError(f"{what}: the value is nested too deep") from None
+        raise ParameterError(f"{what}: the value is nested too deeply") from None
 
 
 def parse_override(word: str) -> tuple[str, Value]:

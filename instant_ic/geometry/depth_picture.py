@@ -64,7 +64,7 @@ def encode_depth(depth_m: NDArray[np.floating], fov_rad: float, width: int = WID
         return b"", 0.0
     ok, png = cv2.imencode(".png", np.rint(small * (255 / most)).astype(np.uint8))
     if not ok:
-        raise ValueError(f"PNG encoder refused a picture of shape {small.shape}")
+        raise ValueError(f"PNG encoder refused an image of shape {small.shape}")
     return bytes(png.tobytes()), 1 / most
 
 
@@ -78,7 +78,7 @@ def decode_depth(png: bytes, near_m: float) -> NDArray[np.float32]:
 
     grey = decode_image(png, cv2.IMREAD_UNCHANGED)
     if grey is None or grey.ndim != 2 or grey.dtype != np.uint8:
-        raise ValueError(f"a depth picture of {len(png)} bytes is no grey PNG of 8 bits")
+        raise ValueError(f"a depth image of {len(png)} bytes is not an 8-bit grey PNG")
     return grey.astype(np.float32) * np.float32(1 / (255 * near_m))
 
 

@@ -56,7 +56,7 @@ def run_stack(description: LaunchDescription, run_dir: Path, live: bool | None =
             count = f"{len(description.nodes)} node{'' if len(description.nodes) == 1 else 's'}"
             output.event(f"{count} of {description.file}, run directory {run_dir}")
             if pace is not None and not pace.real:
-                output.event(f"time goes at {pace.factor:g} of the machine's: for simulated devices only")
+                output.event(f"time runs at {pace.factor:g} of real time: for simulated devices only")
             status = Supervisor(
                 description.nodes,
                 run_dir,
@@ -91,7 +91,7 @@ class _Output:
 
     def node_line(self, node: str, text: str) -> None:
         """Show a line of a node's output."""
-        if self._left_out and self._outlet.put(self._screen.event, f"{self._left_out} lines left out: see the logs"):
+        if self._left_out and self._outlet.put(self._screen.event, f"{self._left_out} lines dropped: see the logs"):
             self._left_out = 0
         if not self._outlet.put(self._screen.node_line, node, text):
             self._left_out += 1

@@ -181,7 +181,7 @@ def _parameter(entry: Value, context: Context, places: dict[str, str], prefix: s
     if "from" in fields:
         words = parameter_file(fields["from"], context)
         if words and flag_of(fields.get("allow_substs"), context) and "$(" in Path(words[1]).read_text():
-            fields["allow_substs"].problem("substitutions inside a parameter file are not done: give name and value")
+            fields["allow_substs"].problem("a parameter file cannot contain substitutions: give name and value")
         return words
     name = plain_text(fields.get("name"))
     if name and "param" in fields:  # nested parameters, as in ROS 2

@@ -121,15 +121,13 @@ class LogFile:
                     return
                 self._open()
             if self._lost:
-                self._put(f"[launch: {self._lost} bytes are missing here: they could not be written]\n".encode())
-                self._tell(f"{self.path} is written again; {self._lost} bytes are missing in it")
+                self._put(f"[launch: {self._lost} bytes are missing here: writing failed]\n".encode())
+                self._tell(f"{self.path} can be written again; {self._lost} bytes are missing in it")
                 self._lost = 0
             self._put(data)
         except OSError as error:
             if not self._lost:
-                self._tell(
-                    f"{self.path} cannot be written ({error.strerror}): make room, until then its lines are lost"
-                )
+                self._tell(f"{self.path} cannot be written ({error.strerror}); its lines are lost until there is space")
             self._lost += len(data)
             self._next_try_s = time.monotonic() + self.RETRY_S
             self.close()
@@ -160,4 +158,4 @@ class LogFile:
         except FileNotFoundError:
             pass
         except OSError as error:
-            self._tell(f"{self.path} cannot be put aside ({error.strerror}): it is written on")
+            self._tell(f"{self.path} cannot be renamed ({error.strerror}); new output is appended to it")

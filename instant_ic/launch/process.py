@@ -94,8 +94,8 @@ class RespawnLimit:
     def __str__(self) -> str:
         """Text for the limit that was reached."""
         if 0 <= self.max_retries <= self.retries:
-            return f"{self.max_retries} new starts"
-        return f"{self.max_starts} new starts within {self.window_s:.0f} s"
+            return f"{self.max_retries} restarts"
+        return f"{self.max_starts} restarts within {self.window_s:.0f} s"
 
 
 class ManagedProcess:
@@ -260,7 +260,7 @@ class ManagedProcess:
             yield from (line.decode(errors="replace").rstrip("\r") for line in lines)
 
     def _note(self) -> bytes:
-        return f"\n[launch: {self._left_out} bytes left out: more than {OUTPUT_BYTES_PER_S} a second]\n".encode()
+        return f"\n[launch: {self._left_out} bytes dropped: more than {OUTPUT_BYTES_PER_S} a second]\n".encode()
 
     def has_ended(self) -> bool:
         """Whether its own process has ended. It stays unreaped, so that its group id cannot be reused."""

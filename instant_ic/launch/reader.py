@@ -193,7 +193,7 @@ class _Actions:
                 if kind in self.handlers:
                     self.handlers[kind](value)
                 elif kind in _NOT_HERE:
-                    value.problem(f"{kind!r} is ROS 2's, but not here: {_NOT_HERE[kind]}")
+                    value.problem(f"{kind!r} is not supported here: {_NOT_HERE[kind]}")
                 else:
                     value.problem(f"unknown key {kind!r} (known: {', '.join(sorted(self.handlers))})")
 
@@ -215,7 +215,7 @@ class _Actions:
         if not name:
             return
         if any(argument.name == name for argument in self.declared):
-            body.problem(f"argument {name!r} is declared a second time")
+            body.problem(f"argument {name!r} is declared twice")
             return
         kind = plain_text(fields.get("type")) or "str"
         if kind not in _TYPES:
@@ -418,6 +418,6 @@ class _Actions:
         fields = {} if body.is_null else self._fields(body, ("reason",))
         if fields is None:
             return
-        reason = text_of(fields.get("reason"), self.context) or "the launch file says so"
+        reason = text_of(fields.get("reason"), self.context) or "requested by the launch file"
         if self.reader.shutdown is None or self.scope.delay_s < self.reader.shutdown.delay_s:
             self.reader.shutdown = Shutdown(reason, self.scope.delay_s)

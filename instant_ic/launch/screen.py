@@ -165,7 +165,7 @@ class Screen:
         if new := [fault for fault in faults if fault.partition(":")[0] not in before]:
             self.event(f"too slow: {', '.join(new)}", bad=True)
         if over := sorted(before - now):
-            self.event(f"at the right rate again: {', '.join(over)}")
+            self.event(f"back to the right rate: {', '.join(over)}")
         self._told_faults = faults
 
     def table(self, view: View) -> RenderableType:
@@ -217,7 +217,7 @@ class Screen:
             words.append("ready", style="bold green")
         if self._address:
             words.append(" · ").append(self._address, style="bold underline")
-        words.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C ends everything", style="dim")
+        words.append(f" · {_duration(time.monotonic() - self._started_s)} · Ctrl-C stops the stack", style="dim")
         return words
 
 

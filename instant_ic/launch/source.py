@@ -106,7 +106,7 @@ class Value:
             if name is None:
                 continue
             if name in found:
-                key.problem(f"{name!r} stands here a second time (first in line {found[name].line})")
+                key.problem(f"{name!r} is given twice (first in line {found[name].line})")
             elif known and name not in known:
                 key.problem(f"unknown key {name!r} (known: {', '.join(sorted(known))})")
             else:

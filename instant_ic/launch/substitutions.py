@@ -182,8 +182,8 @@ def _evaluate(body: str, context: Context) -> str:
                 raise SubstitutionError(f"$(if CONDITION THEN ELSE) takes two or three values, got {rest.strip()!r}")
             return words[1] if truth(words[0]) else "".join(words[2:])
     if name in _NOT_HERE:
-        raise SubstitutionError(f"$({name} ...) is ROS 2's, but not here: {_NOT_HERE[name]}")
-    raise SubstitutionError(f"unknown substitution $({name} ...); there are {_KNOWN}")
+        raise SubstitutionError(f"$({name} ...) is not supported here: {_NOT_HERE[name]}")
+    raise SubstitutionError(f"unknown substitution $({name} ...); known: {_KNOWN}")
 
 
 def _word(value: bool) -> str:

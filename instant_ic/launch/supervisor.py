@@ -177,7 +177,7 @@ class Supervisor:
             for process in self.processes:
                 process.close()
             if not self._disk.close():
-                self._output.event("the disk does not take the rest of the logs", bad=True)
+                self._output.event("the rest of the logs could not be written", bad=True)
             self._tell()
             if self._health is not None:
                 self._health.close()
@@ -203,9 +203,9 @@ class Supervisor:
             except subprocess.TimeoutExpired:
                 process.kill()
                 left, _ = process.communicate()
-                self._output.event("what the nodes have started could not be killed in 5 s", bad=True)
+                self._output.event("processes that the nodes left behind could not be killed within 5 s", bad=True)
             for line in left.decode(errors="replace").splitlines():
-                self._output.event(f"killed what a node had left behind: {line}", bad=True)
+                self._output.event(f"killed a process that a node left behind: {line}", bad=True)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
@@ -273,7 +273,7 @@ class Supervisor:
         while self._announcements and self._announcements[0].delay_s <= since_start_s:
             self._output.event(self._announcements.pop(0).text)
         if self._shutdown is not None and since_start_s >= self._shutdown.delay_s and not self._stop:
-            self._output.event(f"the stack ends: {self._shutdown.reason}")
+            self._output.event(f"stopping the stack: {self._shutdown.reason}")
             self._stop = True
 
     def _schedule(self, process: ManagedProcess) -> Schedule:
@@ -295,11 +295,13 @@ class Supervisor:
         if silence.lasts_s < BUSY_FACTOR * limit_s and silence.busy(process.pid):
             if not silence.told:
                 silence.told = True
-                words = f"no heartbeat for {silence.lasts_s:.0f} s, but it computes"
-                self._output.event(f"{process.spec.label}: {words}: ends at {BUSY_FACTOR * limit_s:.0f} s", bad=True)
+                words = f"no heartbeat for {silence.lasts_s:.0f} s, but it is computing"
+                self._output.event(
+                    f"{process.spec.label}: {words}; it will be killed after {BUSY_FACTOR * limit_s:.0f} s", bad=True
+                )
             return
         reason = f"hangs: no heartbeat for {silence.lasts_s:.0f} s"
-        self._output.event(f"{process.spec.label} {reason}; its stack goes to {process.log_path}", bad=True)
+        self._output.event(f"{process.spec.label} {reason}; its stack is in {process.log_path}", bad=True)
         process.begin_end(HANG_SCHEDULE, reason)
 
     def _start(self, process: ManagedProcess) -> None:
@@ -341,7 +343,7 @@ class Supervisor:
             return
         # Children in a session of their own, outside the process group, would keep its devices and ports open.
         for pid, command in kill_marked(process.mark).items():
-            self._output.event(f"killed what {process.spec.label} had left behind: {pid} {command}", bad=True)
+            self._output.event(f"killed a process that {process.spec.label} left behind: {pid} {command}", bad=True)
         self._after_end(process)
 
     def _after_end(self, process: ManagedProcess) -> None:
@@ -360,10 +362,10 @@ class Supervisor:
             if delay_s is not None:
                 process.state, process.start_s = State.WAITING, time.monotonic() + delay_s
                 used, most = process.limit.used, process.limit.max_starts
-                self._output.event(f"{what}; starts again in {delay_s:.1f} s ({used} of {most})", bad=True)
+                self._output.event(f"{what}; restarts in {delay_s:.1f} s ({used} of {most})", bad=True)
                 return
             process.state = State.FAILED
-            self._output.event(f"{what}, {process.limit} did not help: given up{hint}", bad=True)
+            self._output.event(f"{what}; given up after {process.limit}{hint}", bad=True)
             status = status or 1
         if spec.required:
             self._status = 1 if status else 0
@@ -388,7 +390,7 @@ class Supervisor:
             if all(process.state is not State.RUNNING or process.out_of_means(time.monotonic()) for process in left):
                 stuck = [f"{p.spec.label} (pid {p.pid})" for p in left if p.state is State.RUNNING]
                 if stuck:
-                    self._output.event(f"not even SIGKILL ends {', '.join(stuck)}: it waits in the kernel", bad=True)
+                    self._output.event(f"{', '.join(stuck)} cannot be killed: blocked in the kernel", bad=True)
                 return
 
 

@@ -50,7 +50,7 @@ class TopicRate:
         if not self.alive(age_s):
             if self.when:  # a pause is normal
                 return ""
-            return "has not come yet" if math.isinf(age_s) else f"stopped {age_s:.1f} s ago"
+            return "no message yet" if math.isinf(age_s) else f"stopped {age_s:.1f} s ago"
         if not self.freq_ok(rate_hz):
             return f"{rate_hz:.1f} of {self.rate_hz:g} Hz"
         return ""

@@ -238,7 +238,7 @@ def test_bad_log_line_ends_no_callback(tuned, capsys):
         (b"\xff\xfe", "not JSON"),
         (b"[1]", "expected a JSON object"),
         (b"[" * 100_000, "not JSON"),
-        (b'{"op": "explode"}', "unknown op 'explode' (there are: describe, get, set, log_level, status, call)"),
+        (b'{"op": "explode"}', "unknown op 'explode' (known: describe, get, set, log_level, status, call)"),
         (b"{}", "unknown op None"),
         (b'{"op": "set"}', 'set needs "values"'),
         (b'{"op": "set", "values": [1]}', 'set needs "values"'),

@@ -123,7 +123,7 @@ def test_second_node_of_a_name_is_refused(talker, run_dir):
     wait_for(lambda: registry.list_nodes(run_dir))
     second = talker()
     assert second.wait(30) == 1
-    assert "node talker is already there" in second.stderr.read()
+    assert "node talker already exists" in second.stderr.read()
 
 
 def test_wrong_parameter_names_the_place(talker, tmp_path):

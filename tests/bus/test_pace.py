@@ -73,7 +73,7 @@ def test_pace_comes_back_from_its_file(tmp_path_factory, factor, epoch_ns, monot
 @pytest.mark.parametrize("text", ["", "[1]", '{"factor": 0.5}', '{"factor": "x", "epoch_ns": 1, "monotonic_ns": 1}'])
 def test_damaged_file_is_named(tmp_path, text):
     (tmp_path / pace.FILE).write_text(text)
-    with pytest.raises(PaceError, match=r"pace\.json.*start the stack again"):
+    with pytest.raises(PaceError, match=r"pace\.json.*restart the stack"):
         pace.read(tmp_path)
 
 

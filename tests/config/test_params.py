@@ -74,7 +74,7 @@ other:
         ("    beams: 3\n    matcher:\n      window_m: -0.1", r"p\.yaml:5: window_m must be > 0 \(got -0\.1\)"),
         ("    matcher: 3", r"p\.yaml:3: parameter 'matcher' is a group"),
         ("    rate.x: 3", r"p\.yaml:3: parameter 'rate' has no part 'x'"),
-        ("    rate: 1\n    rate: 2", r"p\.yaml:4: 'rate' stands twice"),
+        ("    rate: 1\n    rate: 2", r"p\.yaml:4: 'rate' is given twice"),
         ("    rate: [1", r"p\.yaml:\d+: not YAML"),
         ("    - 3", r"p\.yaml:3: expected a mapping"),
     ],
@@ -100,7 +100,7 @@ def test_other_mistakes(tmp_path):
     [
         ("    rate: 2001-13-45", r"p\.yaml:3: rate: the value is not YAML: month must be in 1\.\.12"),
         ("    rate: !!timestamp x", r"p\.yaml:3: rate: the value is not YAML"),
-        ("    rate: " + "[" * 3000 + "]" * 3000, r"p\.yaml: nested without end"),
+        ("    rate: " + "[" * 3000 + "]" * 3000, r"p\.yaml: nested endlessly"),
         ("    matcher: &a {window_m: *a}", r"p\.yaml(:3)?: "),
         ("    ? [1]\n    : 2", r"unknown parameter"),
     ],

@@ -58,7 +58,7 @@ def test_where_nothing_is_met_the_picture_is_empty():
 
 @pytest.mark.parametrize("png", [b"", b"\x89PNG\r\n\x1a\n", cv2.imencode(".png", np.zeros((4, 4, 3)))[1].tobytes()])
 def test_what_is_no_depth_picture_is_refused(png):
-    with pytest.raises(ValueError, match="no grey PNG"):
+    with pytest.raises(ValueError, match="not an 8-bit grey PNG"):
         decode_depth(png, 1.0)
     with pytest.raises(ValueError, match="shape"):
         encode_depth(np.zeros((2, 2, 2)), FOV)

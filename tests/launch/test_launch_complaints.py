@@ -150,7 +150,7 @@ def test_a_node_that_forks_leaves_nothing_at_the_end_of_the_stack(run_dir: Path)
     assert supervise(run_dir, [program("forker", FORKING)], output) == 0
     pids = [int(word) for word in output.lines[0][1].split()[1:]]
     assert all(gone(pid) for pid in pids)
-    assert any(f"killed what a node had left behind: {pids[2]}" in event for event in output.events)
+    assert any(f"killed a process that a node left behind: {pids[2]}" in event for event in output.events)
 
 
 def test_children_of_a_node_that_crashed_are_gone_before_it_starts_again(run_dir: Path) -> None:
@@ -163,7 +163,7 @@ def test_children_of_a_node_that_crashed_are_gone_before_it_starts_again(run_dir
     output = Recorder(second_start)
     supervise(run_dir, [program("forker", code, respawn=True, respawn_delay_s=0.1)], output)
     first = [int(word) for word in next(text for _, text in output.lines if text.startswith("pids")).split()[1:]]
-    assert any(f"killed what forker had left behind: {first[2]}" in event for event in output.events)
+    assert any(f"killed a process that forker left behind: {first[2]}" in event for event in output.events)
     assert all(gone(pid, 0.5) for pid in first)
 
 
@@ -216,7 +216,7 @@ def test_a_node_that_hangs_is_told_killed_and_started_again_with_its_stack_in_th
     assert supervise(run_dir, [node, program("other", SLEEPER)], output, make_health=lambda: beats) == 0
     assert any(event.startswith("stuck hangs: no heartbeat for ") for event in output.events)
     assert "SIGABRT to stuck" in output.events and "SIGKILL to stuck" not in output.events
-    assert any("stuck ended (hangs: no heartbeat for" in e and "starts again in 0.1 s" in e for e in output.events)
+    assert any("stuck ended (hangs: no heartbeat for" in e and "restarts in 0.1 s" in e for e in output.events)
     log = (run_dir / "log" / "stuck.log").read_text()
     assert "Fatal Python error: Aborted" in log and "in stuck_here" in log
 
@@ -266,7 +266,7 @@ def test_a_node_that_computes_is_given_more_time(run_dir: Path) -> None:
     node = program("compiler", code, required=True, hang_timeout_s=0.5)
     started_s = time.monotonic()
     assert supervise(run_dir, [node], output, make_health=lambda: beats) == 1
-    assert "but it computes: ends at 3 s" in output.events[0]
+    assert "but it is computing; it will be killed after 3 s" in output.events[0]
     assert "hangs: no heartbeat for 3 s" in output.events[1] and time.monotonic() - started_s > 3.0
 
 
@@ -282,7 +282,7 @@ def test_a_launcher_that_was_held_up_itself_does_not_blame_the_nodes() -> None:
 def test_respawn_max_retries_counts_in_all() -> None:
     limit = RespawnLimit(0.0, window_s=1.0, max_starts=5, max_retries=2)
     assert [limit.next_delay_s(now) for now in (0.0, 100.0, 200.0)] == [0.0, 0.0, None]
-    assert str(limit) == "2 new starts"
+    assert str(limit) == "2 restarts"
 
 
 # -- output --------------------------------------------------------------------------------------
@@ -299,7 +299,7 @@ def test_a_node_that_floods_its_output_holds_up_nobody(run_dir: Path, monkeypatc
     assert [text for name, text in output.lines if name == "talker"] == [*(f"word {i}" for i in range(20)), "done"]
     written = (run_dir / "log" / "flood.log").stat().st_size
     assert written < 3_000_000
-    assert "bytes left out: more than 65536 a second]" in (run_dir / "log" / "flood.log").read_text()
+    assert "bytes dropped: more than 65536 a second]" in (run_dir / "log" / "flood.log").read_text()
 
 
 def test_a_terminal_that_takes_nothing_does_not_hold_up_the_launcher() -> None:
@@ -387,12 +387,12 @@ def test_full_disk_for_a_log_is_told_once_and_what_is_missing_is_noted(
         full_disk.setattr(outlet, "open_file", lambda path, flags: os.open("/dev/full", os.O_WRONLY))
         for _ in range(3):
             log.write(b"lost line\n")
-    assert told == [f"{path} cannot be written (No space left on device): make room, until then its lines are lost"]
+    assert told == [f"{path} cannot be written (No space left on device); its lines are lost until there is space"]
     log._next_try_s = 0.0
     log.write(b"kept line\n")
-    assert told[1] == f"{path} is written again; 30 bytes are missing in it"
+    assert told[1] == f"{path} can be written again; 30 bytes are missing in it"
     log.close()
-    assert path.read_text() == "[launch: 30 bytes are missing here: they could not be written]\nkept line\n"
+    assert path.read_text() == "[launch: 30 bytes are missing here: writing failed]\nkept line\n"
 
 
 def test_a_log_folder_that_cannot_be_written_does_not_keep_the_node_from_running(run_dir: Path) -> None:
@@ -463,7 +463,7 @@ def test_timer_log_shutdown_and_executables(tmp_path: Path, capfd: pytest.Captur
     )
     assert main(["launch", file, "--run-dir", str(tmp_path / "r")]) == 0
     lines = [line.strip() for line in capfd.readouterr().out.splitlines()]
-    order = ["launch │ begins", "second │ later", "launch │ the stack ends: enough"]
+    order = ["launch │ begins", "second │ later", "launch │ stopping the stack: enough"]
     assert [line for line in lines if line in order] == order and "first │ red" in lines
     assert (tmp_path / "r" / "log" / "second.log").read_text() == "later\n"
 

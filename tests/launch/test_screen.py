@@ -57,8 +57,8 @@ def test_plain_lines_tell_a_degraded_topic_once_and_its_recovery(out: io.StringI
         screen.refresh(View())
     assert out.getvalue().splitlines()[2:] == [
         "launch │ too slow: /pose of slam: 7.2 of 10 Hz, /scan of lidar: stopped 3.0 s ago",
-        "launch │ at the right rate again: /scan of lidar",
-        "launch │ at the right rate again: /pose of slam",
+        "launch │ back to the right rate: /scan of lidar",
+        "launch │ back to the right rate: /pose of slam",
     ]
 
 

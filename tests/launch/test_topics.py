@@ -27,7 +27,7 @@ def test_rate_is_right_above_nine_tenths() -> None:
         (TopicRate(10.0), 10.0, 0.1, ""),
         (TopicRate(10.0), 7.25, 0.1, "7.2 of 10 Hz"),
         (TopicRate(10.0), 3.0, 2.5, "stopped 2.5 s ago"),
-        (TopicRate(10.0), 0.0, math.inf, "has not come yet"),
+        (TopicRate(10.0), 0.0, math.inf, "no message yet"),
         (TopicRate(10.0, "driving"), 0.0, math.inf, ""),
         (TopicRate(10.0, "driving"), 0.0, 60.0, ""),
         (TopicRate(10.0, "driving"), 5.0, 0.2, "5.0 of 10 Hz"),
