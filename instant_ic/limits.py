@@ -103,4 +103,4 @@ def check_arrays(path: str | Path) -> None:
     except zipfile.BadZipFile as error:
         raise ValueError(str(error)) from None
     if size > MOST_ARRAY_BYTES:
-        raise ValueError(f"its arrays unpack to {size >> 20} MB (limit: {MOST_ARRAY_BYTES >> 20} MB)")
+        raise ValueError(f"its arrays unpack to {size >> 20} MB; at most {MOST_ARRAY_BYTES >> 20} MB are read")

@@ -48,7 +48,7 @@ def test_image_of_a_message_is_refused_by_its_declared_size(data: bytes) -> None
     assert decode_image(data, cv2.IMREAD_COLOR) is None
     with pytest.raises(JpegError, match="at most"):
         decode_rgb(data, 64, 32)
-    with pytest.raises(ValueError, match="depth picture"):
+    with pytest.raises(ValueError, match="depth image"):
         decode_depth(data, 0.3)
 
 
@@ -92,7 +92,7 @@ def bomb_npz(path: Path) -> Path:
 
 def test_arrays_are_refused_by_what_they_unpack_to(tmp_path: Path) -> None:
     path = bomb_npz(tmp_path / "depth.npz")
-    with pytest.raises(ValueError, match=f"{MOST_ARRAY_BYTES >> 20} at most"):
+    with pytest.raises(ValueError, match=f"at most {MOST_ARRAY_BYTES >> 20} MB"):
         check_arrays(path)
     with pytest.raises(DepthFileError, match="at most"):
         load_depth(path)

@@ -98,7 +98,7 @@ def test_hang_respawn_groups_and_the_end_by_a_required_node(launched: Launched) 
     assert "left/stuck hangs: no heartbeat for 2 s" in launched.text()
     assert "left/stuck ended (hangs: no heartbeat for 2 s); restarts in 2.0 s (1 of 5)" in launched.text()
     assert "Fatal Python error: Aborted" in (launched.run_dir / "left" / "log" / "stuck.log").read_text()
-    launched.wait_for(lambda: "running" in launched.text().rpartition("starts again")[2], "second start's first words")
+    launched.wait_for(lambda: "running" in launched.text().rpartition("restarts in")[2], "second start's first words")
     os.kill(vital, signal.SIGKILL)
     assert launched.process.wait(30) == 1
     assert "vital ended (killed by SIGKILL); it is required, so the stack ends" in launched.text()
