@@ -68,7 +68,7 @@ LARGE_TOPICS = "[/lidar/points, /lidar/packets, /camera/*, /depth/*, /keyframe, 
 WARM_S, JUDGED_S = 120.0, 300.0
 """A process's memory is judged from 120 s after its start, and only if that leaves 300 s."""
 LEAK_MB, LEAK_FDS = 24.0, 4.0
-"""Growth by the fitted line over the time judged."""
+"""Growth over the time judged."""
 
 NEEDED = ("arbiter", "crawler_base", "console", "grid_slam", "vlp16_driver")
 OTHERS = ("theta_camera", "virtual_robot", "navigator", "depth_estimator", "depth_scaler", "nerf")
@@ -135,14 +135,20 @@ class Levels:
                     self._rows[name, process.pid].append(row)
 
     def judge(self) -> dict[str, dict[str, Any]]:
-        """Growth by a fitted line of each process's longest life: ``rss_mb``, ``fds``, ``seconds``, ``leak``."""
+        """Growth in each process's longest life: ``rss_mb``, ``fds``, ``seconds``, ``leak``.
+
+        Memory grows by the fitted line. Descriptors come and go with every process that connects, and shared buffers
+        are held while a reader is frozen: theirs is the difference of the lowest counts in the first and last third.
+        """
         result: dict[str, dict[str, Any]] = {}
         for (name, _), rows in self._rows.items():
             late = np.array([row for row in rows if row[0] > rows[0][0] + WARM_S])
             span = float(late[-1, 0] - late[0, 0]) if len(late) > 10 else 0.0
             if span < JUDGED_S or span < result.get(name, {}).get("seconds", 0.0):
                 continue
-            rss, fds = (float(np.polyfit(late[:, 0], late[:, k], 1)[0]) * span for k in (1, 2))
+            rss = float(np.polyfit(late[:, 0], late[:, 1], 1)[0]) * span
+            third = len(late) // 3
+            fds = float(late[-third:, 2].min() - late[:third, 2].min())
             result[name] = {
                 "seconds": round(span),
                 "rss_mb": round(rss, 1),
