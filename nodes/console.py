@@ -1,4 +1,4 @@
-"""Serves the operator's page: pictures, state and map to it; commands, emergency stop and look direction from it."""
+"""Serves the operator's page: sends it images, state and map; takes its commands, emergency stop and look direction."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ MAX_FAULTS = 4
 
 @dataclass(frozen=True)
 class ConsoleConfig:
-    """Parameters; config/console.yaml says what each does."""
+    """Parameters. config/console.yaml describes each one."""
 
     server: ServerConfig = field(default_factory=ServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
@@ -90,7 +90,7 @@ class ConsoleConfig:
 
 
 class ConsoleNode(Node[ConsoleConfig]):
-    """Joins the topics to a :class:`ConsoleServer`, whose backend it is."""
+    """Backend of a :class:`ConsoleServer`: connects the page to the topics."""
 
     name = "console"
     live_parameters = ("view",)
@@ -122,19 +122,19 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.mode = self.shown = "none"
         self._picture_ns: int | None = None
         self._picture_stamp = 0
-        self._view = (0, 0, 0.0)  # the driver's newest: request, when it came, its delay in s
-        self._drawn: tuple[Matrix, bool] | None = None  # its pose, and whether its depth came along
-        self._displayed = pose_message(np.eye(4))  # its pose as the page shows it
+        self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
+        self._drawn: tuple[Matrix, bool] | None = None  # that view's camera pose, and whether it carries depth
+        self._displayed = pose_message(np.eye(4))  # pose from which the page shows that view
         self.lead = Lead(config.lead)
         self._told_ns = 0
-        self._lost_ns: int | None = None  # when the driver was lost last
-        self._wanted: tuple[Matrix, Look] | None = None  # what the last view was asked for
-        self._asked: dict[int, int] = {}  # the last requests: number -> when it went out
+        self._lost_ns: int | None = None  # when the driver was last lost
+        self._wanted: tuple[Matrix, Look] | None = None  # pose and look of the last request
+        self._asked: dict[int, int] = {}  # recent requests: id -> send time (steady ns)
         self._grids: dict[FrameKind, Any] = {}
         self._grid_digests: dict[FrameKind, int] = {}
         self._diagnoses_seen: dict[str, tuple[int, str, float]] = {}
         self._heartbeats: dict[str, tuple[float, bool]] = {}
-        self.tf  # noqa: B018 - subscribes to /tf now, not at the first picture
+        self.tf  # noqa: B018 - subscribes to /tf now, not at the first image
         page = {
             "dissolve_ms": config.dissolve_ms,
             "ease_ms": config.ease_ms,
@@ -165,11 +165,14 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.timer(1.0 / config.map_rate_hz, self.send_grids)
 
     def offer_sign_in(self) -> None:
-        """Shows the address with the token to this machine's user alone: the log goes to ``/rosout`` and into bags."""
+        """Write the address with the token to a private file, and to the terminal.
+
+        The token is never logged, because the log goes to ``/rosout`` and into bags.
+        """
         assert self.run_dir is not None
         file = sign_in_file(self.run_dir, self.node_name)
         try:
-            file.unlink(missing_ok=True)  # of a console that was killed
+            file.unlink(missing_ok=True)  # left by a console that was killed
             if not self.server.access.made_token:
                 return
             with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
@@ -177,7 +180,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         except OSError as error:
             raise NodeError(f"cannot write the address with the token to {file}: {error.strerror}") from error
         self.log.info("the address with the token is in %s", file)
-        if sys.stdout.isatty():  # `ic run console`; the launcher shows it by itself
+        if sys.stdout.isatty():  # `ic run console`; the launcher shows the address itself
             sys.stdout.write(f"sign in at {self.server.sign_in_url}\n")
             sys.stdout.flush()
 
@@ -187,46 +190,46 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def teardown(self) -> None:
         if hasattr(self, "server"):
-            self.server.stop()  # first: it stops the robot
+            self.server.stop()  # first, because it stops the robot
             if self.run_dir is not None:
                 sign_in_file(self.run_dir, self.node_name).unlink(missing_ok=True)
             self.recording.stop()
 
-    # ---- from the operator, on the server's thread ----------------------------------------------
+    # ---- operator actions, called on the server's thread ----------------------------------------
 
     def on_drive(self, linear: float, angular: float) -> None:
-        """Gives a command on at once: a round by the node's thread would cost latency."""
+        """Publish a command at once: a detour through the node's thread would add latency."""
         self.command_out.publish(twist_stamped(linear, angular, self.clock.now_ns()))
 
     def on_operator(self, there: bool) -> None:
-        """Tells the arbiter at once that the driver is gone; that he is back it sees by his commands."""
+        """Report a lost driver to the arbiter at once. His return shows in his commands."""
         if not there:
             self._lost_ns = self.clock.steady_ns()
             self.tell_shown()
 
     def on_estop(self, stop: bool) -> None:
-        """Sets or releases the emergency stop."""
+        """Publish the emergency stop: set or released."""
         self.estop_out.publish(Bool(data=stop))
 
     def on_look(self, look: Look) -> None:
-        """Takes the look direction for the next view."""
+        """Store the look direction for the next view."""
         self.look = look
 
     def on_record(self, on: bool) -> None:
-        """Has the recorder begin or end a recording."""
+        """Start or stop a recording."""
         self.recording.record(on)
 
     def on_snapshot(self) -> None:
-        """Has the recorder keep the last minute."""
+        """Save the last minute as a snapshot."""
         self.recording.snapshot()
 
     def on_bookmark(self, name: str) -> None:
-        """Gives the present moment a name, on a topic, so that it is in every recording and snapshot."""
+        """Publish a bookmark for the present moment; the topic puts it into every recording and snapshot."""
         self.bookmark_out.publish(String(data=name))
         self.recording.bookmark(name)
 
     def ask_recorder(self, command: str, **arguments: Any) -> Any:
-        """Has the recorder do something; on the desk's thread. Raises RecorderError with words for the operator."""
+        """Call the recorder node, on the desk's thread; raise RecorderError with a message for the operator."""
         name = self.config.recorder
         if self.run_dir is None:
             raise RecorderError("no recorder can be asked here")
@@ -238,20 +241,20 @@ class ConsoleNode(Node[ConsoleConfig]):
             raise RecorderError(f"recorder: {error}") from None
 
     def export_map(self) -> dict[str, bytes]:
-        """The newest map as map_server reads it; on a thread of the server."""
-        from instant_ic.slam.map_files import ros_map  # brings numba along
+        """Return the newest map in map_server's file format. Runs on a thread of the server."""
+        from instant_ic.slam.map_files import ros_map  # imports numba
 
         message = self._map
         if message is None or message.info.width * message.info.height == 0:
             return {}
         grid, resolution, origin = grid_array(message)
-        picture, text = ros_map(grid, round(resolution, 6), origin, "map.png")  # the message has it as float32
+        picture, text = ros_map(grid, round(resolution, 6), origin, "map.png")  # float32 in the message
         return {"map.png": grey_png(picture), "map.yaml": text.encode()}
 
-    # ---- pictures -------------------------------------------------------------------------------
+    # ---- images ---------------------------------------------------------------------------------
 
     def on_panorama(self, message: CompressedImage) -> None:
-        """Passes a panorama on as it came, with the camera's pose when it was taken."""
+        """Forward a panorama unchanged, with the camera's rotation at its stamp."""
         self._picture_ns = self.clock.steady_ns()
         self._picture_stamp = stamp = stamp_ns(message)
         self.tell_shown()
@@ -266,7 +269,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         )
 
     def on_view(self, message: RenderedView) -> None:
-        """Passes a rendered view on, and asks for the next."""
+        """Forward a rendered view, then request the next one."""
         camera = pose_matrix(message.pose)
         if not (0 < message.fov_rad < math.pi):
             self.diagnose("view", ERROR, f"rendered view with a field of view of {message.fov_rad:.3g} rad: dropped")
@@ -279,7 +282,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.views.answered(int(message.request_id), came_ns / 1e9)
         page = self.views.page_of(int(message.request_id))
         if page is None:
-            # A slow renderer answers a request that has timed out: that is when its delay matters most.
+            # A slow renderer answers after the time-out, which is when its delay matters most.
             delay_s = (came_ns - self._asked.get(int(message.request_id), came_ns)) / 1e9
             self._view = int(message.request_id), came_ns, delay_s
             self._drawn = camera, knows and len(message.depth_png) > 0
@@ -306,7 +309,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.request_view()
 
     def request_view(self) -> None:
-        """Asks the virtual space for the picture where the operator looks, if one is due; else where others do."""
+        """Request a view in the driver's look direction if one is due, else one for a watching page."""
         steady_s = self.clock.steady_ns() / 1e9
         virtual = self.with_vbot()
         if not (virtual or self.vspace_alive()):
@@ -330,8 +333,8 @@ class ConsoleNode(Node[ConsoleConfig]):
                 self.ask_for_view(map_from_base, looks[page], page)
 
     def ask_for_view(self, map_from_base: Matrix, look: Look, page: int | None) -> None:
-        """Asks for one view, of the driver's look or of a watching page's."""
-        # The look direction is relative to the robot's heading, so of the mount only the place counts.
+        """Request one view for ``look``: the driver's (``page`` None) or that of a watching page."""
+        # The look direction is relative to the robot's heading, so only the position of the mount counts.
         map_from_camera = map_from_base @ self.camera_place() @ look.rotation()
         shape = view_shape(look, self.config.view)
         steady_ns = self.clock.steady_ns()
@@ -352,7 +355,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         )
 
     def tell_shown(self) -> None:
-        """Tells the arbiter what there is to be shown, how old it is, and when the driver was lost. On any thread."""
+        """Report the available images, their age and the loss of the driver to the arbiter. Called on any thread."""
         now_ns, stamp, lost_ns = self.clock.steady_ns(), self.clock.now_ns(), self._lost_ns
         view_id, came_ns, delay_s = self._view
         self.shown_out.publish(
@@ -364,13 +367,13 @@ class ConsoleNode(Node[ConsoleConfig]):
                 view_pose=self._displayed,
                 view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
                 view_delay_s=delay_s,
-                # By the steady clock: after the machine's was set back, no command must look older than the loss.
+                # Steady clock: if the system clock is set back, new commands must not look older than the loss.
                 operator_lost=to_time(0 if lost_ns is None else stamp - (now_ns - lost_ns)),
             )
         )
 
     def displayed(self) -> Any:
-        """Pose, as a message, that the page shows the newest view from: on its way to where the v-bot is now."""
+        """Return the pose message from which the page shows the newest view, moved towards the v-bot's present pose."""
         if self._drawn is None:
             return self._displayed
         camera, knows_depth = self._drawn
@@ -381,39 +384,39 @@ class ConsoleNode(Node[ConsoleConfig]):
         return pose_message(shown)
 
     def with_vbot(self) -> bool:
-        """Whether the v-bot's view is shown, or about to be."""
+        """Whether the v-bot's view is shown or soon will be."""
         return self.mode in ("entering", "virtual", "returning")
 
     def vspace_alive(self) -> bool:
-        """Whether the virtual space has anything to draw."""
+        """Whether the virtual space can render."""
         status = self.vspace.message
         return status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
 
     # ---- state ----------------------------------------------------------------------------------
 
     def on_control(self, message: ControlState) -> None:
-        """Shows the other picture at once where it is to be shown: both go on moving."""
+        """Send a change of mode at once, because both robots keep moving."""
         if self.mode not in ("none", MODES.get(int(message.mode))):
             self.send_state()
 
     def on_vbot(self, message: Odometry) -> None:
-        """Shows a step of the v-bot at once: the next timer would be half a period off."""
+        """Send each step of the v-bot at once: the timer would add half a period on average."""
         if self.with_vbot():
             self.send_state()
 
     def tell_state(self) -> None:
-        """Tells the state in time where the v-bot has not done so already."""
+        """Send the state on the timer, unless the v-bot has just triggered it."""
         if self.clock.steady_ns() - self._told_ns > 0.6e9 / self.config.state_rate_hz:
             self.send_state()
 
     def send_state(self) -> None:
-        """Tells the page mode, poses and commands; asks for views at the rate of the mode."""
+        """Send mode, poses and commands to the page; request views at the rate of the mode."""
         self._told_ns = self.clock.steady_ns()
         control = self.control.message
         self.mode = "none" if control is None else MODES.get(int(control.mode), "none")
         virtual = control is not None and int(control.shown) == ControlState.SHOWN_VIRTUAL
         self.shown = "none" if control is None else "virtual" if virtual else "real"
-        if self.mode in ("entering", "returning"):  # the other picture is wanted at any moment
+        if self.mode in ("entering", "returning"):  # the switch may come at any moment
             self.server.show(FrameKind.VIEW, FrameKind.PANORAMA)
         else:
             self.server.show(FrameKind.VIEW if virtual else FrameKind.PANORAMA)
@@ -445,13 +448,13 @@ class ConsoleNode(Node[ConsoleConfig]):
         self.request_view()
 
     def shown_twist(self) -> tuple[float, float]:
-        """Velocity (m/s, rad/s) of the robot that is shown, as it is measured."""
+        """Measured velocity (m/s, rad/s) of the shown robot."""
         if self.shown == "virtual" and self.vbot.message is not None:
             return twist_values(self.vbot.message)
         return (0.0, 0.0) if self.control.message is None else twist_values(self.control.message.robot_twist)
 
     def send_plan(self) -> None:
-        """Tells the page trajectory, path and subgoal, all in the map's frame."""
+        """Send trajectory, path and subgoal to the page, all in the map frame."""
         virtual = self.mode == "virtual"
         subgoal = self.subgoal.message if virtual else None
         self.server.publish(
@@ -464,12 +467,12 @@ class ConsoleNode(Node[ConsoleConfig]):
         )
 
     def send_health(self) -> None:
-        """Tells the page what is wrong, in the words of whoever found it."""
+        """Send virtual space, battery and faults to the page; faults carry the text of the node that found them."""
         age_s = math.inf if self._picture_ns is None else (self.clock.steady_ns() - self._picture_ns) / 1e9
         self.check("camera", age_s <= PICTURE_TIMEOUT_S, "no picture from the camera", age_s=age_s)
         self.check("controller", self.control.message is not None, "no state from the arbiter")
         self.check("pose", self.robot_pose() is not None, "the robot's pose is unknown")
-        # Of the page alone, not a diagnosis: the node itself is well.
+        # Shown on the page only, not as a diagnosis: the node itself works.
         plain = [{"level": "warn", "name": "network", "text": PLAIN_HTTP}] if self.server.plain_http else []
         self.server.publish(
             "health",
@@ -482,11 +485,11 @@ class ConsoleNode(Node[ConsoleConfig]):
         )
 
     def check(self, name: str, fine: bool, fault: str, **values: Any) -> None:
-        """Sets a diagnosis: OK, or a warning in the words of ``fault``."""
+        """Set a diagnosis: OK, or a warning with the text ``fault``."""
         self.diagnose(name, OK if fine else WARN, "" if fine else fault, **values)
 
     def faults(self) -> list[dict[str, str]]:
-        """Present faults, the worst of each node, the worst first: ``level`` (warn, error), ``name``, ``text``."""
+        """Return the worst present fault of each node, worst first: ``level`` (warn, error), ``name``, ``text``."""
         now = self.clock.steady_ns() / 1e9
         found = [
             (level, name.partition(":")[0], text)
@@ -507,28 +510,28 @@ class ConsoleNode(Node[ConsoleConfig]):
         ]
 
     def on_diagnostics(self, message: DiagnosticArray) -> None:
-        """Keeps the newest diagnosis of each name."""
+        """Store the newest diagnosis of each name."""
         now = self.clock.steady_ns() / 1e9
         for status in message.status:
             self._diagnoses_seen[status.name] = (int(status.level), status.message, now)
 
     def on_heartbeat(self, message: NodeStatus) -> None:
-        """Notes that a node lives; one that says it stops is not missed."""
+        """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
         self._heartbeats[message.node] = (self.clock.steady_ns() / 1e9, int(message.state) == NodeStatus.STOPPING)
 
     # ---- map ------------------------------------------------------------------------------------
 
     def on_map(self, message: OccupancyGrid) -> None:
-        """Keeps the newest map."""
+        """Store the newest map."""
         self._map = message
         self._grids[FrameKind.MAP] = message
 
     def on_costmap(self, message: OccupancyGrid) -> None:
-        """Keeps the newest costmap."""
+        """Store the newest costmap."""
         self._grids[FrameKind.COSTMAP] = message
 
     def send_grids(self) -> None:
-        """Sends map and costmap where they have changed."""
+        """Send map and costmap if they have changed."""
         while self._grids:
             kind, message = self._grids.popitem()
             image = grid_image(*grid_array(message))
@@ -539,7 +542,7 @@ class ConsoleNode(Node[ConsoleConfig]):
     # ---- poses ----------------------------------------------------------------------------------
 
     def lookup(self, target: str, source: str, stamp: int | None = None) -> Matrix | None:
-        """``target_from_source`` at ``stamp``, else the newest; None when the tree has a gap."""
+        """Return ``target_from_source`` at ``stamp``, else the newest one; None if the tree has a gap."""
         for when in (stamp, None):
             try:
                 return self.tf.lookup(target, source, when)
@@ -548,27 +551,27 @@ class ConsoleNode(Node[ConsoleConfig]):
         return None
 
     def robot_pose(self) -> Matrix | None:
-        """map_from_base of the r-bot; of the arbiter where the tree has a gap."""
+        """Return map_from_base of the r-bot; the arbiter's estimate if the tree has a gap."""
         pose = self.lookup("map", "base_link")
         if pose is None and self.control.message is not None:
             return pose_matrix(self.control.message.robot_pose)
         return pose
 
     def vbot_pose(self) -> Matrix | None:
-        """map_from_base of the v-bot; of the arbiter until the v-bot tells its own."""
+        """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its own."""
         if self.vbot.message is not None:
             return pose_matrix(self.vbot.message)
         return None if self.control.message is None else pose_matrix(self.control.message.vbot_pose)
 
     def camera_place(self) -> Matrix:
-        """Translation from base to camera."""
+        """Return base_from_camera with the identity as rotation."""
         place = np.eye(4)
         base_from_camera = self.lookup("base_link", "camera")
         place[:3, 3] = (0, 0, self.config.camera_height_m) if base_from_camera is None else base_from_camera[:3, 3]
         return place
 
     def points(self, path: Path | None) -> list[list[float]]:
-        """Points [x, y] of a path in the map's frame, centimetres exact; empty when there is none."""
+        """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty without a path."""
         if path is None or not path.poses:
             return []
         xyz = np.pad(path_array(path)[:, :2], ((0, 0), (0, 1)))
@@ -581,7 +584,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         return points
 
     def captured_ms(self, stamp: int) -> float:
-        """A stamp on the server's clock for the page; a stamp from the future counts as now."""
+        """Convert a stamp to the server's clock in ms; a stamp in the future counts as now."""
         age_ms = (self.clock.now_ns() - stamp) / 1e6
         return self.server.now_ms() - max(age_ms, 0.0)
 

@@ -1,7 +1,7 @@
-"""The operator's console: a web page, its server, and a client for tests.
+"""Operator's console: a web page, its server and a Python client.
 
-The folder knows neither the bus nor the messages: :class:`ConsoleServer` takes a :class:`Backend` and
-plain values; :mod:`nodes.console` joins it to the topics.
+The package depends on neither the bus nor the messages. :class:`ConsoleServer` takes a :class:`Backend` and
+plain values; :mod:`nodes.console` connects it to the topics.
 """
 
 from instant_ic.console.client import ConsoleClient

@@ -1,6 +1,6 @@
-"""Who may use the page: sign-in by token, cookies of those who have signed in, TLS. Knows HTTP's words, not its server.
+"""Access control of the page: sign-in by token, session cookies, TLS. Independent of the HTTP server.
 
-Times are seconds of one monotonic clock, given by the caller, so that tests need not wait.
+The caller passes the time, in seconds of one monotonic clock, so that tests need not wait.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from instant_ic.config.ranges import Positive, Range, check_ranges
 COOKIE = "instant_ic_session"
 SIGN_IN = ("auto", "always", "never")
 MIN_TOKEN = 16
-FIRST_WAIT_S = 0.25  # before a token is looked at, once an address has sent too many wrong ones
-MAX_WAIT_S = 4.0  # whoever shares the address with a guesser waits so long at most
+FIRST_WAIT_S = 0.25  # before a token is checked, once its address has sent too many wrong ones
+MAX_WAIT_S = 4.0  # bounds the wait of a user who shares his address with an attacker
 _MOST_SESSIONS = 256
 _MOST_ADDRESSES = 1024
 _MOST_DOUBLINGS = 8
 
 
 class AccessError(ValueError):
-    """A token or certificate cannot be used; says which and what to do."""
+    """A token or certificate cannot be used; the text says which and what to do."""
 
 
 class Role(Enum):
-    """What a signed-in page may do. An emergency stop may come from either."""
+    """Rights of a signed-in page. Both roles may set the emergency stop."""
 
     DRIVE = "drive"
     WATCH = "watch"
@@ -46,13 +46,13 @@ class AccessConfig:
     """Sign-in and TLS.
 
     Attributes:
-        sign_in: ``auto``: needed where the page is open to the network or a token file is given; ``always``; ``never``.
-        token_file: file with the token of whoever may drive, readable by its owner alone; empty: one is made at each
-            start; it stands on the terminal and in a file for its owner alone, never in the log.
-        watch_token_file: likewise of those who may only watch (and stop the robot); empty: there are none.
-        session_hours: a page stays signed in for so long.
-        tries_per_minute: wrong tokens of one address without a wait; each further one doubles the wait of the address's
-            next try, right or wrong, up to ``MAX_WAIT_S``. A right token is never refused.
+        sign_in: ``auto`` (required on a network address or with a token file), ``always`` or ``never``.
+        token_file: file with the token to drive, readable by its owner only. Empty: each start makes a token and
+            shows it on the terminal and in a file readable by its owner only, never in the log.
+        watch_token_file: file with the token to watch and stop the robot only; empty: there is no such token.
+        session_hours: lifetime of a sign-in.
+        tries_per_minute: wrong tokens that one address may send without a wait. Each further one doubles the wait of
+            its next try, right or wrong, up to ``MAX_WAIT_S``. A right token is never refused.
         tls_certificate, tls_key: PEM files; both empty: plain HTTP.
     """
 
@@ -73,10 +73,10 @@ class AccessConfig:
 
 
 def read_token(file: str) -> str:
-    """The token in a file.
+    """Read the token from a file.
 
     Raises:
-        AccessError: no such file, others may read it, or no token that would be hard to guess.
+        AccessError: the file is missing, others may read it, or its token is too easy to guess.
     """
     path = Path(file).expanduser()
     try:
@@ -95,7 +95,7 @@ def read_token(file: str) -> str:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a server bound to ``host`` is reached from this machine alone."""
+    """Whether a server bound to ``host`` is reachable from this machine only."""
     if host == "localhost":
         return True
     try:
@@ -105,7 +105,7 @@ def is_loopback(host: str) -> bool:
 
 
 def tls_context(config: AccessConfig) -> ssl.SSLContext | None:
-    """For the server; None for plain HTTP.
+    """Return the server's TLS context; None for plain HTTP.
 
     Raises:
         AccessError: certificate or key cannot be used.
@@ -114,7 +114,7 @@ def tls_context(config: AccessConfig) -> ssl.SSLContext | None:
         return None
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.options |= ssl.OP_NO_RENEGOTIATION  # costs the server a handshake for a few bytes
+    context.options |= ssl.OP_NO_RENEGOTIATION  # a client could force handshakes with a few bytes
     files = [str(Path(file).expanduser()) for file in (config.tls_certificate, config.tls_key)]
     try:
         context.load_cert_chain(*files)
@@ -124,11 +124,11 @@ def tls_context(config: AccessConfig) -> ssl.SSLContext | None:
 
 
 class Access:
-    """Decides who may come in.
+    """Tokens, sessions and wrong tries.
 
     Args:
         config: parameters.
-        host: address that the server is bound to.
+        host: address to which the server is bound.
 
     Raises:
         AccessError: a token file cannot be used.
@@ -157,15 +157,15 @@ class Access:
             self._digests[Role.WATCH] = _digest(watch)
 
     def role_of_token(self, token: str, address: str, now_s: float) -> Role | None:
-        """What a token allows; None for a wrong one, which is counted against the address.
+        """Return the role of a token; None for a wrong one, which counts against the address.
 
-        The caller waits :meth:`wait_s` before it asks: guesses are slow, and a right token is slow at worst.
+        The caller first waits :meth:`wait_s`. So guessing is slow, and a right token is slow at worst.
         """
         digest = _digest(token)
-        # Every token is compared, each in constant time: how long it takes tells nothing.
+        # Compare every token, each in constant time, so that the duration reveals nothing.
         roles = [role for role, known in self._digests.items() if hmac.compare_digest(known, digest)]
         if roles:
-            return roles[0]  # earlier failures still count: they may be somebody else's behind the same address
+            return roles[0]  # earlier failures still count: another user of the same address may have caused them
         failures = self._failures.setdefault(address, deque(maxlen=self.config.tries_per_minute + _MOST_DOUBLINGS))
         self._failures.move_to_end(address)
         failures.append(now_s)
@@ -174,13 +174,13 @@ class Access:
         return None
 
     def wait_s(self, address: str, now_s: float) -> float:
-        """Seconds that a token of this address has to wait before it is compared, at most ``MAX_WAIT_S``."""
+        """Seconds to wait before comparing a token of this address, at most ``MAX_WAIT_S``."""
         recent = sum(now_s - at < 60.0 for at in self._failures.get(address, ()))
         too_many = recent - self.config.tries_per_minute
         return min(MAX_WAIT_S, FIRST_WAIT_S * 2.0**too_many) if too_many >= 0 else 0.0
 
     def open_session(self, role: Role, now_s: float) -> str:
-        """A new cookie's value."""
+        """Open a session and return the value of its cookie."""
         value = secrets.token_urlsafe(32)
         self._sessions[_digest(value)] = (role, now_s + self.config.session_hours * 3600.0)
         while len(self._sessions) > _MOST_SESSIONS:
@@ -188,17 +188,17 @@ class Access:
         return value
 
     def role_of_session(self, cookie: str, now_s: float) -> Role | None:
-        """What a cookie allows; None for one that is not known or too old."""
+        """Return the role of a cookie; None if it is unknown or expired."""
         found = self._sessions.get(_digest(cookie))
         return found[0] if found is not None and now_s < found[1] else None
 
     def end_of_session_s(self, cookie: str) -> float:
-        """When a cookie's sign-in ends; minus infinity where there is none."""
+        """Return the time at which a cookie's sign-in expires; minus infinity if there is none."""
         found = self._sessions.get(_digest(cookie))
         return -math.inf if found is None else found[1]
 
     def close_session(self, cookie: str) -> None:
-        """Signs a page out."""
+        """Sign a page out."""
         self._sessions.pop(_digest(cookie), None)
 
 

@@ -1,4 +1,4 @@
-"""A console client in Python: drives through the page's own WebSocket, for system tests and scripts."""
+"""Console client in Python: drives through the page's WebSocket, for system tests and scripts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from instant_ic.console.protocol import Frame, FrameKind, decode_frame, parse_te
 
 
 class ConsoleClient:
-    """One operator without a browser.
+    """Operator without a browser.
 
     Example::
 
@@ -27,7 +27,7 @@ class ConsoleClient:
             await console.wait_for(lambda c: c.mode == "virtual", timeout_s=60)
 
     ``state``, ``plan``, ``health``, ``session`` and ``hello`` hold the newest message of that type;
-    ``frames[FrameKind.PANORAMA]`` the newest frame.
+    ``frames[FrameKind.PANORAMA]`` holds the newest panorama.
     """
 
     def __init__(
@@ -38,13 +38,13 @@ class ConsoleClient:
         token: str = "",
         ca_file: str | Path | None = None,
     ) -> None:
-        """Not connected yet.
+        """Create the client; :meth:`connect` connects it.
 
         Args:
-            url: the page's address; ``?token=`` in it serves as ``token``.
-            acknowledge: whether frames are acknowledged, so that the next comes.
-            token: of the sign-in, where one is needed.
-            ca_file: PEM file of the authority, or of the server's own certificate, for ``https``.
+            url: the page's address; its ``?token=`` is used if ``token`` is empty.
+            acknowledge: whether to acknowledge frames; the server sends the next one only then.
+            token: sign-in token, if the server requires one.
+            ca_file: for ``https``: PEM file of the authority or of the server's own certificate.
         """
         parts = urlsplit(url)
         self.url = parts._replace(query="").geturl()
@@ -73,11 +73,11 @@ class ConsoleClient:
         await self.close()
 
     async def connect(self, timeout_s: float = 10.0) -> None:
-        """Connects and waits until the clock offset to the server is known.
+        """Connect, and wait until the clock offset to the server is known.
 
         Raises:
-            aiohttp.WSServerHandshakeError: the server refuses; 401 where the token is missing or wrong.
-            TimeoutError: it does not answer.
+            aiohttp.WSServerHandshakeError: the server refuses; 401 if the token is missing or wrong.
+            TimeoutError: the server does not answer.
         """
         self._http = aiohttp.ClientSession()
         parts = urlsplit(self.url)
@@ -101,7 +101,7 @@ class ConsoleClient:
         await self.wait_for(lambda c: c._offset_ms is not None and "hello" in c.messages, timeout_s)
 
     async def close(self) -> None:
-        """Stops and disconnects."""
+        """Stop and disconnect."""
         for task in self._tasks:
             task.cancel()
         for task in self._tasks:
@@ -124,7 +124,7 @@ class ConsoleClient:
 
     @property
     def mode(self) -> str | None:
-        """Mode of the newest state: real, virtual, stopped or none; None before the first."""
+        """Mode of the newest ``state`` message; None before the first."""
         return self.state.get("mode")
 
     @property
@@ -133,33 +133,33 @@ class ConsoleClient:
         return self._socket is None or self._socket.closed
 
     async def acquire(self, *, take: bool = False, timeout_s: float = 5.0) -> None:
-        """Becomes the driver; TimeoutError when another client keeps the lease."""
+        """Become the driver; raise TimeoutError if another client keeps the lease."""
         await self.send({"type": "lease", "take": take})
         await self.wait_for(lambda c: c.session.get("driver") == "you", timeout_s)
 
     def drive(self, linear: float, angular: float) -> None:
-        """From now on sends this command (m/s, rad/s) at 20 Hz, until :meth:`stop`."""
+        """Send this command (m/s, rad/s) at 20 Hz until :meth:`stop`."""
         self._command = (linear, angular)
 
     async def stop(self) -> None:
-        """Sends a zero command at once, and none after it."""
+        """Send one zero command at once, and none after it."""
         self._command = (0.0, 0.0)
         await self.send_drive(0.0, 0.0)
 
     async def estop(self) -> None:
-        """Sets the emergency stop."""
+        """Set the emergency stop."""
         await self.send({"type": "estop"})
 
     async def release_estop(self) -> None:
-        """Releases the emergency stop (drivers only)."""
+        """Release the emergency stop (driver only)."""
         await self.send({"type": "estop_release"})
 
     async def look(self, yaw: float, pitch: float = 0.0, hfov: float = 1.57, vfov: float = 1.02) -> None:
-        """Turns the look direction (rad, left and up positive, relative to the robot's heading)."""
+        """Set the look direction (rad; left and up positive; relative to the robot's heading)."""
         await self.send({"type": "look", "yaw": yaw, "pitch": pitch, "hfov": hfov, "vfov": vfov})
 
     async def send_drive(self, linear: float, angular: float, *, age_s: float = 0.0) -> None:
-        """Sends one drive command, stamped ``age_s`` ago."""
+        """Send one drive command with a stamp ``age_s`` in the past."""
         if self._offset_ms is None:
             raise RuntimeError("console client: connect() first")
         self._sequence += 1
@@ -169,13 +169,13 @@ class ConsoleClient:
         )
 
     async def send(self, message: dict[str, Any]) -> None:
-        """Sends any text message."""
+        """Send a text message."""
         if self._socket is None:
             raise RuntimeError("console client: connect() first")
         await self._socket.send_json(message)
 
     async def wait_for(self, predicate: Callable[[ConsoleClient], object], timeout_s: float = 10.0) -> None:
-        """Waits until ``predicate(self)`` is true after some message.
+        """Wait until ``predicate(self)`` is true; it is checked after each message.
 
         Raises:
             TimeoutError: with the newest state in its text.
@@ -229,7 +229,7 @@ class ConsoleClient:
     async def _beat(self) -> None:
         assert self._socket is not None
         while not self._socket.closed:
-            # Well within the server's drive.beat_timeout_s.
+            # Well below the server's drive.beat_timeout_s.
             await self.send({"type": "ping", "client_ms": time.monotonic() * 1000})
             if self._command != (0.0, 0.0) and self._offset_ms is not None:
                 await self.send_drive(*self._command)

@@ -1,6 +1,6 @@
-"""Connections to the operator's page: how many, how fast and for how long. Knows HTTP's server, not the page.
+"""Limits on the number, rate and duration of connections to the operator's page.
 
-Times are seconds of the monotonic clock.
+The module depends on the HTTP server, not on the page. Times are seconds of the monotonic clock.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from typing import Any
 
 from aiohttp import web
 
-HEADERS_S = 5.0  # for a TLS handshake, for a request's headers, and for its body
-STALL_S = 30.0  # a client that takes no data for this long is cut off
-LINGER_S = 1.0  # for the rest of a body that nobody wants
-CLOSE_S = 1.0  # for a closing handshake
-RETRY_S = 0.2  # between two tries to accept, after one failed
-BYTES_PER_S = 48 * 1024  # of one connection, to the server: a page that drives by touch sends about a third
+HEADERS_S = 5.0  # time for a TLS handshake, for a request's headers, and for its body
+STALL_S = 30.0  # a client that takes no data for this time is disconnected
+LINGER_S = 1.0  # time to read the rest of a refused body
+CLOSE_S = 1.0  # time for a closing handshake
+RETRY_S = 0.2  # pause after a failed accept
+BYTES_PER_S = 48 * 1024  # received on one connection; a page that drives by touch sends about a third
 BURST_BYTES = 48 * 1024
-CONNECTIONS_PER_S = 20.0  # of one address: a page opens about six
+CONNECTIONS_PER_S = 20.0  # of one address; a page opens about six
 BURST_CONNECTIONS = 64.0
 _MOST_ADDRESSES = 1024
 logger = logging.getLogger("instant_ic.console")
 
 
 class TokenBucket:
-    """Lets ``rate`` through each second on average, and ``burst`` at once. Times are given by the caller.
+    """Token bucket: ``rate`` tokens a second on average, ``burst`` at once. The caller passes the time.
 
     Args:
-        rate: a second.
-        burst: at most at once.
-        first: at once at the start; default ``burst``.
+        rate: tokens added each second.
+        burst: capacity.
+        first: tokens at the start; default ``burst``.
     """
 
     __slots__ = ("_at", "_tokens", "burst", "rate")
@@ -48,7 +48,7 @@ class TokenBucket:
         self._tokens, self._at = burst if first is None else first, -math.inf
 
     def take(self, now: float, amount: float = 1.0) -> bool:
-        """Takes ``amount`` if it is there; False, and nothing taken, otherwise."""
+        """Take ``amount`` tokens if available, else none; return whether they were taken."""
         if self._at > -math.inf:
             self._tokens = min(self.burst, self._tokens + (now - self._at) * self.rate)
         self._at = now
@@ -58,23 +58,23 @@ class TokenBucket:
         return True
 
     def give_back(self) -> None:
-        """Takes one :meth:`take` back."""
+        """Return one token to the bucket."""
         self._tokens = min(self.burst, self._tokens + 1.0)
 
     def wait_s(self) -> float:
-        """Seconds from the last :meth:`take` until one token is there."""
+        """Seconds from the last :meth:`take` until one token is available."""
         return max(0.0, 1.0 - self._tokens) / self.rate
 
 
 class AddressBuckets:
-    """A token bucket for each address; the address unused for longest is forgotten first."""
+    """Token bucket for each address; the least recently used address is dropped first."""
 
     def __init__(self, rate: float, burst: float) -> None:
         self._rate, self._burst = rate, burst
         self._buckets: OrderedDict[str, TokenBucket] = OrderedDict()
 
     def of(self, address: str) -> TokenBucket:
-        """The bucket of an address."""
+        """Return the bucket of an address."""
         bucket = self._buckets.setdefault(address, TokenBucket(self._rate, self._burst))
         self._buckets.move_to_end(address)
         while len(self._buckets) > _MOST_ADDRESSES:
@@ -83,7 +83,7 @@ class AddressBuckets:
 
 
 def network_of(host: str) -> str:
-    """The key by which an address is limited: IPv4 in full, of IPv6 the /64, which one subscriber has whole."""
+    """Return the key by which an address is limited: IPv4 in full, IPv6 by its /64, which belongs to one subscriber."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
@@ -96,7 +96,7 @@ def network_of(host: str) -> str:
 
 
 class Connection(web.RequestHandler):
-    """One client's connection: HTTP, then perhaps a WebSocket. Cut off where it floods or takes no data."""
+    """One client's connection: HTTP, possibly upgraded to a WebSocket. Cut if it floods or takes no data."""
 
     __slots__ = ("_bucket", "_headers", "_on_flood", "_on_gone", "_stall", "kept", "muted", "network", "task")
 
@@ -110,15 +110,15 @@ class Connection(web.RequestHandler):
         super().__init__(
             server,
             loop=asyncio.get_running_loop(),
-            keepalive_timeout=HEADERS_S,  # counts from the start of the connection, then from each answer
+            keepalive_timeout=HEADERS_S,  # from the start of the connection, then from each answer
             lingering_time=LINGER_S,
             access_log=None,  # type: ignore[arg-type]
         )
         self.network = network
         self.kept = False
-        """Whether it is a WebSocket, which no newer connection displaces."""
+        """Whether it is a WebSocket; no newer connection displaces one."""
         self.muted = False
-        """Whether what the client sends is thrown away unread."""
+        """Whether data from the client is discarded unread."""
         self.task: asyncio.Task[None] | None = None
         self._headers = headers
         self._on_gone = on_gone
@@ -127,17 +127,17 @@ class Connection(web.RequestHandler):
         self._stall: asyncio.TimerHandle | None = None
 
     def keep(self, on_flood: Callable[[], None]) -> None:
-        """The connection is a WebSocket from now on; ``on_flood`` is called once where its client sends too much."""
+        """Mark the connection as a WebSocket; ``on_flood`` is called once if its client sends too much."""
         self.kept, self._on_flood = True, on_flood
 
     def mute(self) -> None:
-        """Reads nothing more: what waits for the client still goes out, what it sends costs nothing."""
+        """Stop reading. Pending data still goes to the client, and what the client sends costs nothing."""
         self.muted = True
         if self.transport is not None and not self.transport.is_closing():
             self.transport.pause_reading()
 
     def abort(self) -> None:
-        """Cuts the connection now, also during its TLS handshake."""
+        """Cut the connection at once, even during its TLS handshake."""
         if self.transport is not None:
             self.transport.abort()
         elif self.task is not None:
@@ -146,7 +146,7 @@ class Connection(web.RequestHandler):
     def data_received(self, data: bytes) -> None:
         if self.muted:
             return
-        # Bytes, not messages: frames without end make no message, and cost as much.
+        # Bytes, not messages: an endless frame is never a message, yet costs as much.
         if self._bucket.take(time.monotonic(), len(data)):
             super().data_received(data)
             return
@@ -181,7 +181,7 @@ class Connection(web.RequestHandler):
 
 @dataclass(frozen=True)
 class Limits:
-    """Connections at a time, in all and of one address."""
+    """Largest number of simultaneous connections, in total and of one address."""
 
     total: int
     per_address: int
@@ -190,29 +190,29 @@ class Limits:
 class Listener:
     """Accepts connections within limits.
 
-    Where an address has all that it may have, its oldest connection that is no WebSocket makes room; where all are
-    taken, the oldest one of the address that holds the most. So whoever holds idle connections displaces himself.
+    At the limit of an address, its oldest connection that is not a WebSocket makes room. At the total limit, the
+    oldest one of the address with the most such connections does. So a client with idle connections displaces itself.
 
     Args:
         server: answers the requests.
-        limits: how many connections.
-        tls: for https; None: http.
-        headers: of every error that is answered below the server.
+        limits: numbers of connections.
+        tls: context for https; None: http.
+        headers: added to error responses that are created below the application.
     """
 
     def __init__(self, server: web.Server, limits: Limits, tls: ssl.SSLContext | None, headers: dict[str, str]) -> None:
         self._server, self._limits, self._tls, self._headers = server, limits, tls, headers
-        self._connections: dict[Connection, None] = {}  # the oldest first
+        self._connections: dict[Connection, None] = {}  # oldest first
         self._rates = AddressBuckets(CONNECTIONS_PER_S, BURST_CONNECTIONS)
         self._sockets: list[socket.socket] = []
         self._tasks: list[asyncio.Task[None]] = []
         self.refused = 0
 
     async def open(self, host: str, port: int) -> int:
-        """Listens on every address of ``host``, and returns the port.
+        """Listen on every address of ``host`` and return the port.
 
         Raises:
-            OSError: host unknown, port in use or not allowed.
+            OSError: the host is unknown, or the port is in use or not permitted.
         """
         loop = asyncio.get_running_loop()
         found = await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
@@ -230,7 +230,7 @@ class Listener:
         return int(self._sockets[0].getsockname()[1])
 
     async def close(self) -> None:
-        """Accepts nothing more; the connections stay."""
+        """Stop accepting; existing connections stay open."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -246,15 +246,15 @@ class Listener:
         while True:
             try:
                 accepted, peer = await loop.sock_accept(listener)
-            except ConnectionAbortedError:  # gone before its turn
+            except ConnectionAbortedError:  # the client left before it was accepted
                 continue
-            except OSError as error:  # no more file descriptors, or no memory
+            except OSError as error:  # out of file descriptors or memory
                 logger.error("cannot accept a connection: %s; an idle one is closed to make room", error.strerror)
                 self._displace(self._connections)
                 await asyncio.sleep(RETRY_S)
                 continue
             self._admit(accepted, network_of(peer[0]))
-            await asyncio.sleep(0)  # what is connected already comes first
+            await asyncio.sleep(0)  # existing connections come first
 
     def _admit(self, accepted: socket.socket, network: str) -> None:
         own = [connection for connection in self._connections if connection.network == network]
@@ -274,7 +274,7 @@ class Listener:
         logger.warning("refused a connection from %s: %s", network, reason)
 
     def _displace(self, connections: Iterable[Connection]) -> bool:
-        """Cuts the oldest connection, of the address that has the most of these, that is no WebSocket."""
+        """Cut the oldest non-WebSocket of the address that has the most of them; return False if there is none."""
         idle = [connection for connection in connections if not connection.kept]
         if not idle:
             return False
@@ -292,10 +292,10 @@ class Listener:
             await asyncio.get_running_loop().connect_accepted_socket(
                 lambda: connection, accepted, ssl=self._tls, ssl_handshake_timeout=HEADERS_S if self._tls else None
             )
-        except OSError as error:  # also what a TLS handshake fails by
+        except OSError as error:  # includes failed TLS handshakes
             logger.debug("no connection with %s: %s", connection.network, error)
         finally:
-            if connection.transport is None:  # cut off, or failed, before it began
+            if connection.transport is None:  # cut or failed before it was set up
                 accepted.close()
                 self._forget(connection)
 

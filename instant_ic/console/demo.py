@@ -1,7 +1,7 @@
-"""The page with made-up data, for work on the page: ``python -m instant_ic.console.demo``.
+"""Demo of the page with synthetic data, for work on the page: ``python -m instant_ic.console.demo``.
 
-A robot in a room, driven from the page, with an obstacle ahead. What it does at the obstacle is a
-sketch of the method that lets the page be tried; the real thing is instant_ic.control.
+The operator drives a robot in a room with an obstacle ahead. Its behaviour at the obstacle is only a sketch of the
+method, enough to try the page; instant_ic.control implements it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Pose = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Sizes and rates of the made-up pictures."""
+    """Sizes and rates of the synthetic images."""
 
     panorama_width: int = 640
     panorama_hz: float = 5.0
@@ -43,7 +43,7 @@ class DemoConfig:
 
 
 class DemoRecorder:
-    """Says what a recorder would say, and writes nothing."""
+    """Answers as a recorder would, and writes nothing."""
 
     def __init__(self) -> None:
         self.missing = False
@@ -73,7 +73,7 @@ class DemoRecorder:
 
 
 class Demo:
-    """A backend with a robot of its own. ``start`` and ``stop`` run it beside a server."""
+    """Backend with a simulated robot, and its server."""
 
     def __init__(
         self,
@@ -87,13 +87,13 @@ class Demo:
         self.commands: list[tuple[float, float]] = []
         self.look = Look()
         self.estop = False
-        self.button = False  # on the robot
+        self.button = False  # e-stop button on the robot
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
         self.pictures = True
-        self.depth: bytes | None = None  # sent in place of the views' own depth
-        self.tint = (1.0, 1.0, 1.0)  # of the rendered view, blue, green, red
-        self.keyframe: Pose | None = None  # where the virtual space was learnt: what could not be seen there is noise
+        self.depth: bytes | None = None  # sent instead of the views' own depth
+        self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
+        self.keyframe: Pose | None = None  # trained pose of the virtual space; what it did not see is noise
         self.mode = "real"
         self.reason = ""
         self.robot: Pose = np.zeros(3)
@@ -108,7 +108,7 @@ class Demo:
         self._slow_due = 0.0
         self._noise = np.random.default_rng(0)
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
-        self._drawn, self._drawn_from = b"", np.zeros((4, 4))  # the last panorama, and where the camera was
+        self._drawn, self._drawn_from = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
         self._desk = RecordingDesk(self.recorder.ask, lambda told: self.server.publish("recording", told), 0.2)
         self._stop = threading.Event()
@@ -150,7 +150,7 @@ class Demo:
         return {"map.png": grey_png(demo_world.occupancy()[0].view(np.uint8)), "map.yaml": b"image: map.png\n"}
 
     def start(self) -> None:
-        """Starts the server and the robot."""
+        """Start the server and the robot."""
         self.server.start()
         self._desk.start()
         grid, origin = demo_world.occupancy()
@@ -162,7 +162,7 @@ class Demo:
             thread.start()
 
     def stop(self) -> None:
-        """Ends both."""
+        """Stop the server and the robot."""
         self._stop.set()
         self._desk.stop()
         for thread in self._threads:
@@ -189,19 +189,19 @@ class Demo:
                 self._send_view(self._views.asked(now))
 
     def place(self, x: float, y: float, yaw: float) -> None:
-        """Puts both robots there (m, rad)."""
+        """Place both robots at this pose (m, rad)."""
         with self._placing:
             self.robot, self.vbot = np.array([x, y, yaw]), np.array([x, y, yaw])
 
     def reset(self) -> None:
-        """As at the start, but that the robot stays in the mode REAL; for tests that share a demo."""
+        """Restore the initial state, with the mode forced to REAL; for tests that share a demo."""
         self.forced_mode, self.faults, self.pictures = "real", [], True
         self.recorder.missing, self.recorder.error, self.recorder.state = False, "", "idle"
         self.place(0.0, 0.0, 0.0)
         self.commands.clear()
 
     def step(self, seconds: float) -> None:
-        """Moves both robots on."""
+        """Advance both robots."""
         with self._placing:
             self._step(seconds)
 
@@ -237,7 +237,7 @@ class Demo:
         return bool(gap < 0.12 and abs(wrap_angle(self.vbot[2] - self.robot[2])) < 0.1)
 
     def _follow(self, seconds: float) -> None:
-        """Goes to the v-bot, round the obstacle's left side where the straight way is blocked."""
+        """Follow the v-bot, round the obstacle's left side if the straight line is blocked."""
         box = demo_world.OBSTACLE
         goal = self.vbot[:2].copy()
         if _hits(goal[None]):
@@ -292,7 +292,7 @@ class Demo:
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()
         camera = _camera(self.robot)
-        if not np.array_equal(self._drawn_from, camera):  # a robot that stands sees the same
+        if not np.array_equal(self._drawn_from, camera):  # a standing robot sees the same image
             self._drawn = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
             self._drawn_from = camera
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist()}
@@ -374,7 +374,7 @@ def _moved(pose: Pose, v: float, w: float, seconds: float) -> Pose:
 
 
 def _ahead(pose: Pose, v: float, w: float, metres: float) -> Pose:
-    """Where a command leads, (N, 2), up to ``metres`` of way."""
+    """Return the path of a command, (N, 2), ``metres`` long."""
     points = []
     for _ in range(40):
         points.append(pose[:2])
@@ -389,7 +389,7 @@ def _hits(points: Pose) -> bool:
 
 
 def main() -> None:
-    """Serves the demo until Ctrl-C."""
+    """Serve the demo until Ctrl-C."""
     parser = argparse.ArgumentParser(
         prog="python -m instant_ic.console.demo", description=(__doc__ or "").partition("\n")[0]
     )

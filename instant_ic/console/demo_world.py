@@ -1,4 +1,4 @@
-"""A room to try the page with: shaded boxes, seen along any directions, and its map as a grid."""
+"""Room of the demo: shaded boxes, cast along any directions, and its map as a grid."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FLOOR, CEILING, WALL, WHITE, CRATE = range(5)
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box, metres; ``inside`` boxes are rooms, whose inner faces are seen."""
+    """Axis-aligned box, metres; ``inside`` boxes are rooms, visible from inside."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
@@ -34,7 +34,7 @@ BOXES = (
 
 
 def shade(origin: tuple[float, float, float], directions: Array) -> NDArray[np.uint8]:
-    """BGR colours (..., 3) uint8 seen from ``origin`` along ``directions`` (..., 3)."""
+    """Return the BGR colours (..., 3) uint8 seen from ``origin`` along ``directions`` (..., 3)."""
     eye = np.asarray(origin, np.float32)
     shape = directions.shape[:-1]
     rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
@@ -46,7 +46,7 @@ def shade(origin: tuple[float, float, float], directions: Array) -> NDArray[np.u
 
 
 def seen(keyframe: tuple[float, float, float], origin: tuple[float, float, float], directions: Array) -> Array:
-    """1 where what stands along ``directions`` (..., 3) from ``origin`` can be seen from ``keyframe`` too, else 0."""
+    """Return 1 where the surface along ``directions`` (..., 3) from ``origin`` is visible from ``keyframe``, else 0."""
     eye, other = np.asarray(origin, np.float32), np.asarray(keyframe, np.float32)
     rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
     way = eye + rays * _cast(eye, rays)[0][:, None] - other
@@ -56,13 +56,13 @@ def seen(keyframe: tuple[float, float, float], origin: tuple[float, float, float
 
 
 def distances(origin: tuple[float, float, float], directions: Array) -> Array:
-    """Metres along ``directions`` (..., 3) from ``origin`` to what stands there."""
+    """Return the distances (m) from ``origin`` along ``directions`` (..., 3) to the nearest surface."""
     rays = directions.reshape(-1, 3) / np.linalg.norm(directions.reshape(-1, 3), axis=1, keepdims=True)
     return _cast(np.asarray(origin, np.float32), rays)[0].reshape(directions.shape[:-1])
 
 
 def _cast(eye: Array, rays: Array) -> tuple[Array, NDArray[np.int8], NDArray[np.int8]]:
-    """Distance, axis of the face and material of what unit ``rays`` (N, 3) meet first."""
+    """Return distance, face axis and material at the first hit of unit ``rays`` (N, 3)."""
     inverse = 1.0 / np.where(np.abs(rays) < 1e-6, np.float32(1e-6), rays)
     nearest = np.full(len(rays), np.inf, np.float32)
     axis = np.zeros(len(rays), np.int8)
@@ -116,7 +116,7 @@ def _colours(points: Array, axis: NDArray[np.int8], material: NDArray[np.int8]) 
 
 
 def occupancy(resolution: float = 0.05) -> tuple[NDArray[np.int8], tuple[float, float]]:
-    """Grid (H, W) int8 of the room, row 0 = lowest y, and its lower left corner (m)."""
+    """Return the room's grid (H, W) int8, row 0 = lowest y, and its lower left corner (m)."""
     margin = 0.5
     origin = (ROOM.low[0] - margin, ROOM.low[1] - margin)
     width = round((ROOM.high[0] - ROOM.low[0] + 2 * margin) / resolution)
@@ -133,7 +133,7 @@ def occupancy(resolution: float = 0.05) -> tuple[NDArray[np.int8], tuple[float, 
 
 
 def inflate(grid: NDArray[np.int8], resolution: float, radius_m: float = 0.5) -> NDArray[np.int8]:
-    """Costs (H, W) int8, 0..100, that fall off with the distance from what is occupied."""
+    """Return costs (H, W) int8, 0..100, that fall linearly with the distance from occupied cells."""
     import cv2
 
     distance = cv2.distanceTransform((grid < 50).astype(np.uint8), cv2.DIST_L2, 5) * resolution

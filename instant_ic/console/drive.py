@@ -1,6 +1,6 @@
-"""Who drives, and which command holds: the lease, the watchdog and the emergency stop, without a socket.
+"""Arbitration of drive commands without a socket: lease, watchdog and emergency stop.
 
-Times are seconds of one monotonic clock, given by the caller, so that tests need not wait.
+The caller passes the time, in seconds of one monotonic clock, so that tests need not wait.
 """
 
 from __future__ import annotations
@@ -10,22 +10,22 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
-RATE_COMMANDS = 200  # of which the rate is counted
+RATE_COMMANDS = 200  # newest commands kept to measure the rate
 
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """What may be driven, and when a command no longer holds."""
+    """Speed limits, and the time-outs after which a command expires."""
 
     max_linear_mps: float = 0.4
     max_angular_rps: float = 0.8
-    rate_hz: float = 20.0  # commands given on while driving
-    watchdog_s: float = 0.25  # no command from the driver for this long: stop
+    rate_hz: float = 20.0  # commands published while driving
+    watchdog_s: float = 0.25  # time without a command from the driver after which the robot stops
     max_command_age_s: float = 0.3  # older commands (by the client's stamp) are dropped
-    stop_repeat_s: float = 0.3  # zeros are given on at rate_hz for this long after a stop
-    keep_alive_hz: float = 10.0  # zeros of an idle driver whose page lives: the operator is there
-    beat_timeout_s: float = 0.25  # nothing heard from the driver's page for this long: he is lost, and the arbiter told
-    lease_timeout_s: float = 2.0  # a driver who is silent for this long loses the lease
+    stop_repeat_s: float = 0.3  # time after a stop in which zeros are published at rate_hz
+    keep_alive_hz: float = 10.0  # zeros of an idle driver whose page is heard: the operator is present
+    beat_timeout_s: float = 0.25  # silence of the driver's page after which the arbiter is told that he is lost
+    lease_timeout_s: float = 2.0  # silence of the driver's page after which he loses the lease
 
     def __post_init__(self) -> None:
         for key in ("max_linear_mps", "max_angular_rps", "rate_hz", "watchdog_s", "max_command_age_s"):
@@ -39,7 +39,7 @@ class DriveConfig:
 
 
 class Verdict(Enum):
-    """What became of a drive command."""
+    """Result of a drive command."""
 
     ACCEPTED = "accepted"
     NOT_DRIVER = "another client drives"
@@ -49,11 +49,11 @@ class Verdict(Enum):
 
 
 class DriveGate:
-    """One driver by lease; the newest command that still holds; zero whenever in doubt.
+    """Lease of one driver, and the newest command that is still valid; zero whenever in doubt.
 
-    Zeros mean "the operator is there and wants nothing"; silence means that nobody is there. So an idle driver's zeros
-    are given on only while the page is heard, and after its loss one zero goes out, then nothing. :meth:`driver_alive`
-    tells of the loss itself.
+    Zeros mean that the operator is present and commands nothing; silence means that nobody is present. So an idle
+    driver's zeros are published only while his page is heard. After its loss one zero is published, then nothing.
+    :meth:`driver_alive` reports the loss itself.
     """
 
     def __init__(self, config: DriveConfig) -> None:
@@ -75,16 +75,16 @@ class DriveGate:
 
     @property
     def command(self) -> tuple[float, float]:
-        """Newest command that holds, (m/s, rad/s)."""
+        """Newest valid command, (m/s, rad/s)."""
         return self._command
 
     @property
     def moving(self) -> bool:
-        """Whether the command is other than zero."""
+        """Whether the command is not zero."""
         return self._command != (0.0, 0.0)
 
     def request(self, client: int, now: float, *, take: bool = False) -> bool:
-        """Gives the lease to ``client`` if it is free or ``take`` is set; True when it drives."""
+        """Give the lease to ``client`` if it is free or ``take`` is set; return whether the client drives."""
         if self.driver == client:
             return True
         if self.driver is not None and not take:
@@ -95,34 +95,34 @@ class DriveGate:
         return True
 
     def leave(self, client: int, now: float) -> None:
-        """Gives the lease back (hand-over, closed socket); stops if ``client`` drove."""
+        """Release the lease of ``client`` (hand-over, closed socket), and stop if it drove."""
         if self.driver == client:
             self.stop(now)
             self.driver = None
 
     def forget(self, client: int, now: float) -> None:
-        """Drops what is known of a client that has gone."""
+        """Drop the state of a client that has disconnected."""
         self.leave(client, now)
         self._sequence.pop(client, None)
 
     def touch(self, client: int, now: float, *, away: bool = False) -> bool:
-        """Any sign of life of ``client``; True when by it the driver has come back, or gone.
+        """Note a message of ``client``; return True if it changes whether the driver is present.
 
-        ``away``: its page is not looked at. It keeps the lease, but the operator does not count as there.
+        ``away``: the page is hidden or its operator types. It keeps the lease, but the operator counts as absent.
         """
         if self.driver != client:
             return False
         was_there = self.driver_alive(now)
         self._driver_seen = now
-        self._driver_beat = -math.inf if away else now  # a page that says so need not be missed first
+        self._driver_beat = -math.inf if away else now  # absent at once, without the time-out
         return was_there == away
 
     def driver_alive(self, now: float) -> bool:
-        """Whether somebody drives whose page was heard, and looked at, within ``beat_timeout_s``."""
+        """Whether there is a driver whose page reported him present within ``beat_timeout_s``."""
         return self.driver is not None and now - self._driver_beat < self.config.beat_timeout_s
 
     def receive(self, client: int, sequence: int, age_s: float, linear: float, angular: float, now: float) -> Verdict:
-        """Takes a drive command (m/s, rad/s; clamped to the limits) and says what became of it."""
+        """Handle a drive command (m/s, rad/s; clamped to the limits) and return the result."""
         verdict = self._judge(client, sequence, age_s)
         self.counts[verdict] += 1
         if verdict is not Verdict.ACCEPTED:
@@ -148,47 +148,47 @@ class DriveGate:
             return Verdict.NOT_DRIVER
         if sequence <= self._sequence.get(client, -1):
             return Verdict.OUT_OF_ORDER
-        # A stamp from the future tells as little about freshness as an old one.
+        # A stamp in the future proves no freshness either.
         if abs(age_s) > self.config.max_command_age_s:
             return Verdict.OLD
         return Verdict.STOPPED if self.estop else Verdict.ACCEPTED
 
     def rate_hz(self, now: float) -> float:
-        """Commands accepted a second, over the last second; 0 while none come."""
+        """Commands accepted within the last second."""
         return float(sum(now - at <= 1.0 for at in self._accepted))
 
     def stop(self, now: float) -> None:
-        """Command zero from now on."""
+        """Set the command to zero."""
         if self.moving:
             self._stopped_at = now
         self._command = (0.0, 0.0)
 
     def set_estop(self, now: float) -> None:
-        """Latches the emergency stop."""
+        """Latch the emergency stop."""
         self.estop = True
         self.stop(now)
 
     def release_estop(self, client: int) -> bool:
-        """Releases the emergency stop; only the driver may. True when released."""
+        """Release the emergency stop if ``client`` is the driver; return whether it was released."""
         if client != self.driver:
             return False
         self.estop = False
         return True
 
     def take_due(self, now: float) -> tuple[float, float] | None:
-        """Command to give on now, or None when none is due. Runs the watchdog and the lease time-out."""
+        """Return the command to publish now, or None if none is due. Runs the watchdog and the lease time-out."""
         if self.moving and now - self._received >= self.config.watchdog_s:
             self.watchdog_trips += 1
             self.stop(now)
-            self._driver_beat = -math.inf  # a loss, no wish to stop: the arbiter is informed, and the base brakes hard
+            self._driver_beat = -math.inf  # a lost driver, not a commanded stop: report it, and the base brakes hard
         if self.driver is not None and now - self._driver_seen >= self.config.lease_timeout_s:
             self.leave(self.driver, now)
-        # The one zero after a stop goes out even when nobody is there any more.
+        # The one zero after a stop is published even if the driver has gone.
         if not self.moving and not self.driver_alive(now) and self._emitted_command in (None, (0.0, 0.0)):
             self._emitted_command = None
             return None
         changed = self._command != self._emitted_command
-        # 1 ms of slack: a timer that wakes a little early must not skip a whole period.
+        # 1 ms of slack, so that a timer that fires slightly early does not skip a period.
         if not changed and now - self._emitted < self._period_s(now) - 0.001:
             return None
         self._emitted = now
@@ -196,7 +196,7 @@ class DriveGate:
         return self._command
 
     def next_deadline(self, now: float) -> float | None:
-        """When :meth:`take_due` should be called next; None when nothing is going on."""
+        """Return the time at which to call :meth:`take_due` next; None if nothing is pending."""
         deadlines = []
         if self.moving:
             deadlines += [self._received + self.config.watchdog_s, self._emitted + self._period_s(now)]
@@ -209,13 +209,13 @@ class DriveGate:
         return max(now, min(deadlines)) if deadlines else None
 
     def _period_s(self, now: float) -> float:
-        """Time between two commands given on."""
+        """Time between two published commands."""
         repeating = now - self._stopped_at <= self.config.stop_repeat_s
         return 1.0 / (self.config.rate_hz if self.moving or repeating else self.config.keep_alive_hz)
 
 
 def _clamp(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value)) + 0.0  # + 0.0 makes -0.0 a plain zero
+    return max(-limit, min(limit, value)) + 0.0  # + 0.0 turns -0.0 into 0.0
 
 
 def _positive(key: str, value: float) -> None:

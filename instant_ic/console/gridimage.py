@@ -13,10 +13,10 @@ UNKNOWN = 255
 
 @dataclass(frozen=True)
 class GridImage:
-    """A grid as a grey PNG.
+    """Grid as a grey PNG; row 0 is the highest y.
 
-    ``header``: resolution (m), width and height (cells), x and y (m): the lower left corner of the
-    picture in the grid's frame. Row 0 of the PNG is the highest y.
+    ``header``: resolution (m), width and height (cells), and x and y (m) of the lower left corner of the
+    image in the grid's frame.
     """
 
     header: dict[str, float]
@@ -27,16 +27,16 @@ class GridImage:
 def grid_image(
     grid: NDArray[np.int8], resolution: float, origin_xy: tuple[float, float], *, crop: bool = True
 ) -> GridImage | None:
-    """PNG of ``grid`` (H, W) int8, row 0 = lowest y, -1 unknown, 0..100.
+    """Encode a grid as a PNG.
 
     Args:
-        grid: cells.
-        resolution: metres a cell.
+        grid: cells (H, W) int8, -1 unknown, else 0..100; row 0 is the lowest y.
+        resolution: cell size, m.
         origin_xy: lower left corner of the grid, m.
-        crop: cut to what is known, with a margin of 2 cells.
+        crop: crop to the known cells with a margin of 2 cells.
 
     Returns:
-        None when nothing is known.
+        The image; None if no cell is known.
     """
     known_rows = np.flatnonzero((grid >= 0).any(axis=1))
     known_columns = np.flatnonzero((grid >= 0).any(axis=0))
@@ -60,7 +60,7 @@ def grid_image(
 
 
 def grey_png(grey: NDArray[np.uint8]) -> bytes:
-    """PNG of a picture (H, W)."""
+    """Encode a grey image (H, W) as PNG."""
     import cv2
 
     ok, png = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])

@@ -1,4 +1,4 @@
-"""Keeps what strangers can cause in the log to one line a second for each place in the code."""
+"""Rate limit for log messages that network clients can cause: one a second for each place in the code."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ PERIOD_S = 1.0
 
 
 class LogRate(logging.Filter):
-    """Passes one record of each place in the code every ``PERIOD_S``; the next one says how many were left out.
+    """Passes one record of each place in the code every ``PERIOD_S``; the next one states how many were dropped.
 
     Args:
-        clock: seconds that only grow; for tests.
+        clock: monotonic time in seconds; tests pass their own.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -40,6 +40,6 @@ _FILTER = LogRate()
 
 
 def limit_logs() -> None:
-    """Limits the loggers of the console, of asyncio and of aiohttp's server; calling it again changes nothing."""
+    """Limit the loggers of the console, asyncio and aiohttp's server. Further calls change nothing."""
     for name in NOISY:
         logging.getLogger(name).addFilter(_FILTER)

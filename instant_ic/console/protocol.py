@@ -1,16 +1,16 @@
-"""The console's WebSocket protocol: JSON text messages, and binary frames for pictures and maps.
+"""WebSocket protocol of the console: JSON text messages, and binary frames for images and maps.
 
 Binary frame, little endian::
 
     offset 0   uint8   version (1)
     offset 1   uint8   kind (FrameKind)
     offset 2   uint16  0
-    offset 4   uint32  sequence number, grows by one a kind and client
+    offset 4   uint32  sequence number, counted for each kind and client
     offset 8   uint32  length of the header, bytes
     offset 12          header: JSON, UTF-8
     then               payload: JPEG or PNG
 
-docs/console.md lists the fields of each message and header.
+docs/console.md lists the fields of every message and header.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ PREFIX = struct.Struct("<BBHII")
 
 
 class ProtocolError(ValueError):
-    """A message that does not follow the protocol; says which field and what it held."""
+    """A message violates the protocol; the text names the field and its value."""
 
 
 class FrameKind(IntEnum):
-    """What a binary frame holds."""
+    """Content of a binary frame."""
 
     PANORAMA = 1  # equirect JPEG as the camera sent it
     VIEW = 2  # perspective JPEG of the virtual space
@@ -50,16 +50,16 @@ class Frame:
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """Bytes of ``frame`` for one binary WebSocket message."""
+    """Encode ``frame`` as one binary WebSocket message."""
     header = json.dumps(frame.header, separators=(",", ":"), allow_nan=False).encode()
     return PREFIX.pack(VERSION, frame.kind, 0, frame.sequence, len(header)) + header + frame.payload
 
 
 def decode_frame(data: bytes) -> Frame:
-    """Frame from the bytes of one binary WebSocket message.
+    """Decode one binary WebSocket message.
 
     Raises:
-        ProtocolError: too short, unknown version or kind, or a header that is no JSON object.
+        ProtocolError: too short, unknown version or kind, or the header is not a JSON object.
     """
     if len(data) < PREFIX.size:
         raise ProtocolError(f"binary frame of {len(data)} bytes: the prefix alone has {PREFIX.size}")
@@ -80,7 +80,7 @@ def decode_frame(data: bytes) -> Frame:
 
 
 def parse_text(text: str) -> dict[str, Any]:
-    """JSON object with a string ``type``; anything else raises ProtocolError."""
+    """Parse a JSON object with a string ``type``; raise ProtocolError for anything else."""
     try:
         message = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -91,9 +91,9 @@ def parse_text(text: str) -> dict[str, Any]:
 
 
 def number(message: dict[str, Any], key: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """Finite number ``message[key]`` within [low, high]; ProtocolError otherwise."""
+    """Return ``message[key]`` as a finite number in [low, high]; raise ProtocolError otherwise."""
     value = message.get(key)
-    # json.loads takes NaN, Infinity and integers of any length, none of which may reach a motor.
+    # json.loads accepts NaN, Infinity and integers of any length; none of them may reach a motor.
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(_as_float(value)):
         raise ProtocolError(f"{message['type']}.{key} must be a finite number (got {value!r:.40})")
     if not low <= value <= high:
@@ -102,7 +102,7 @@ def number(message: dict[str, Any], key: str, low: float = -math.inf, high: floa
 
 
 def whole(message: dict[str, Any], key: str) -> int:
-    """Integer ``message[key]`` in [0, 2**53]; ProtocolError otherwise."""
+    """Return ``message[key]`` as an integer in [0, 2**53]; raise ProtocolError otherwise."""
     value = message.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**53:
         raise ProtocolError(f"{message['type']}.{key} must be a whole number (got {value!r:.40})")
@@ -110,7 +110,7 @@ def whole(message: dict[str, Any], key: str) -> int:
 
 
 def words(message: dict[str, Any], key: str, max_length: int) -> str:
-    """Text ``message[key]`` of 1 to ``max_length`` printable characters; ProtocolError otherwise."""
+    """Return ``message[key]``, a text of 1 to ``max_length`` printable characters; raise ProtocolError otherwise."""
     value = message.get(key)
     if not isinstance(value, str) or not 1 <= len(value.strip()) <= max_length or not value.isprintable():
         raise ProtocolError(
@@ -120,7 +120,7 @@ def words(message: dict[str, Any], key: str, max_length: int) -> str:
 
 
 def flag(message: dict[str, Any], key: str, default: bool | None = None) -> bool:
-    """Truth value ``message[key]``; ProtocolError otherwise, or where it is missing and has no default."""
+    """Return ``message[key]`` as a bool; raise ProtocolError for another type or a missing key without default."""
     value = message.get(key, default)
     if not isinstance(value, bool):
         raise ProtocolError(f"{message['type']}.{key} must be true or false (got {value!r:.40})")

@@ -1,4 +1,4 @@
-"""The page's record, snapshot and bookmark buttons: asks a recorder, and tells the page what has become of it."""
+"""Recording, snapshots and bookmarks of the page: calls a recorder and reports its state to the page."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ logger = logging.getLogger("instant_ic.console")
 
 
 class RecorderError(RuntimeError):
-    """The recorder did not do what it was asked; says why, in words for the operator."""
+    """The recorder refused or did not answer; the text is for the operator."""
 
 
 class Ask(Protocol):
-    """Has the recorder do one of its commands (``record``, ``stop``, ``snapshot``, ``status``) and gives its answer."""
+    """Calls a command of the recorder: ``record``, ``stop``, ``snapshot`` or ``status``."""
 
     def __call__(self, command: str, **arguments: Any) -> Any:
-        """Waits for the answer; raises RecorderError where there is none or it is a refusal."""
+        """Return the answer; raise RecorderError if there is none or the recorder refuses."""
 
 
 class RecordingDesk:
-    """Asks the recorder from a thread of its own: an answer may take seconds, and the page must not wait.
+    """Calls the recorder in its own thread, because an answer may take seconds and the page must not wait.
 
     Args:
         ask: see :class:`Ask`.
-        tell: gets the page's ``recording`` message, each ``poll_s`` and at once after something was done.
-        poll_s: how often the recorder is asked how it is, s.
+        tell: called with the page's ``recording`` message every ``poll_s`` and after each command.
+        poll_s: period of the recorder's status, s.
     """
 
     def __init__(self, ask: Ask, tell: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
@@ -50,11 +50,11 @@ class RecordingDesk:
         self._thread = threading.Thread(target=self._run, name="recording desk", daemon=True)
 
     def start(self) -> None:
-        """Begins to ask."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends; what was asked for and is not done yet is left."""
+        """Stop the thread; drop pending commands."""
         if self._thread.is_alive():
             self._wish(None)
             self._thread.join(_END_S)
@@ -62,15 +62,15 @@ class RecordingDesk:
     # ---- any thread ----------------------------------------------------------------------------------
 
     def record(self, on: bool) -> None:
-        """Begins a recording, or ends it."""
+        """Start or stop a recording."""
         self._wish(self._begin if on else self._end)
 
     def snapshot(self) -> None:
-        """Has the last minute written."""
+        """Save the last minute."""
         self._wish(self._snap)
 
     def bookmark(self, name: str) -> None:
-        """Notes a bookmark that has been published, for the list."""
+        """Add a published bookmark to the list."""
         recording = self._recording
         seconds: float | None = None
         if recording.get("state") == "recording":

@@ -1,6 +1,6 @@
 """HTTP and WebSocket server of the operator's page, in its own thread.
 
-It knows no bus: what the operator does goes to a :class:`Backend`, what the operator sees comes by
+It does not depend on the bus. The operator's actions go to a :class:`Backend`. Data for the page comes through
 :meth:`ConsoleServer.publish` and :meth:`ConsoleServer.send_frame`, which any thread may call.
 """
 
@@ -47,14 +47,14 @@ STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096
 MAX_BODY = 4096
 MAX_BAD_MESSAGES = 20
-BURST_S = 2.0  # of messages that may come at once: what a radio link held back
-WATCHER_SHARE = 0.4  # of max_messages_per_s, for a page that does not drive
-FIRST_S = 0.25  # likewise, of a new page
+BURST_S = 2.0  # seconds' worth of messages that may arrive at once, after a radio link has stalled
+WATCHER_SHARE = 0.4  # share of max_messages_per_s for a page that does not drive
+FIRST_S = 0.25  # as BURST_S, for a new page
 REQUESTS_PER_S = 40.0  # of one address; a page with its modules takes about 25
 BURST_REQUESTS = 150.0
-SOCKETS_PER_S = 5.0  # WebSockets that one address may open; a new one gets all that is shown
+SOCKETS_PER_S = 5.0  # WebSockets opened by one address; a new one is sent everything that is shown
 BURST_SOCKETS = 20.0
-RESERVED_FOR_DRIVERS = 2  # of max_clients: pages that may only watch cannot take all places
+RESERVED_FOR_DRIVERS = 2  # share of max_clients that pages that may only watch cannot take
 MAX_BOOKMARK = 60  # characters
 SILENT_CLIENT_S = 15.0
 OWN_S = 1.5
@@ -65,7 +65,7 @@ SECURITY_HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Cache-Control": "no-cache",  # a new version of the page must not meet an old module
+    "Cache-Control": "no-cache",  # a new page must not load old modules from the cache
 }
 PLAIN_HTTP = "Plain HTTP: whoever listens in on the network can take over. Set server.access.tls_certificate."
 logger = logging.getLogger("instant_ic.console")
@@ -74,49 +74,49 @@ _ROLE: web.RequestKey[Role | None] = web.RequestKey("role", Role | None)  # type
 
 
 class ConsoleError(RuntimeError):
-    """The server cannot start; says why and what to do."""
+    """The server cannot start or stop; the text says why and what to do."""
 
 
 class Backend(Protocol):
-    """What the operator's actions do. Called on the server's thread: return at once."""
+    """Handler of the operator's actions. Called on the server's thread; every method must return at once."""
 
     def on_drive(self, linear: float, angular: float) -> None:
-        """Command to give on now, m/s and rad/s: 20 Hz while driving; zeros while the driver is there and idle."""
+        """Publish a command, m/s and rad/s: at 20 Hz while driving, zeros while the driver is present and idle."""
 
     def on_operator(self, there: bool) -> None:
-        """A driver is there now, or not any more: his page is silent, hidden or closed, or he gave the lease back."""
+        """A driver is present, or lost: his page is silent, hidden or closed, or he gave the lease back."""
 
     def on_estop(self, stop: bool) -> None:
-        """Emergency stop set (any client) or released (the driver)."""
+        """Emergency stop set (by any client) or released (by the driver)."""
 
     def on_look(self, look: Look) -> None:
-        """Look direction and field of view of the driver."""
+        """New look direction and field of view of the driver."""
 
     def on_record(self, on: bool) -> None:
-        """Recording asked for, or to be ended."""
+        """Start or stop a recording."""
 
     def on_snapshot(self) -> None:
-        """The last minute is to be kept."""
+        """Save the last minute."""
 
     def on_bookmark(self, name: str) -> None:
-        """The present moment gets a name."""
+        """Give the present moment a name."""
 
     def export_map(self) -> dict[str, bytes]:
-        """Files of the map, name → content; empty while there is none. Called on a thread of its own; may take time."""
+        """Return the map's files, name → content; empty without a map. Called on its own thread; may take time."""
 
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """Where the page is served, and to whom."""
+    """Address, limits and access of the server."""
 
     host: str = "127.0.0.1"
     port: Annotated[int, Range(0, 65535)] = 8080  # 0 = any free port
-    allowed_hosts: tuple[str, ...] = ()  # names by which browsers may reach the page besides localhost
+    allowed_hosts: tuple[str, ...] = ()  # host names by which browsers may reach the page besides localhost
     max_clients: PositiveInt = 16
     max_connections: PositiveInt = 128
     max_connections_per_address: PositiveInt = 32
-    max_messages_per_s: Positive = 300.0  # of one page; it closes beyond, see BURST_S
-    background_picture_hz: Positive = 2.0  # pictures that are not shown (camera in the v-space)
+    max_messages_per_s: Positive = 300.0  # of one page; above, its WebSocket is closed; see BURST_S
+    background_picture_hz: Positive = 2.0  # images that are not shown (camera in the v-space)
     access: AccessConfig = field(default_factory=AccessConfig)
     drive: DriveConfig = field(default_factory=DriveConfig)
 
@@ -128,7 +128,7 @@ class ConsoleServer:
     """Serves the page and its WebSocket at ``/ws``.
 
     Args:
-        backend: gets what the operator does.
+        backend: handles the operator's actions.
         config: address and limits.
         page: values for the page (dissolve time, footprint, ...), sent in ``hello``.
     """
@@ -153,11 +153,11 @@ class ConsoleServer:
         self._texts: dict[str, str] = {}
         self._frames: dict[FrameKind, PendingFrame] = {}
         self._looks: dict[int, Look] = {}
-        self._own: dict[tuple[int, FrameKind], float] = {}  # when a client last got a frame of its own
+        self._own: dict[tuple[int, FrameKind], float] = {}  # (client, kind) -> time of its last own frame
         self._foreground = frozenset({FrameKind.PANORAMA})
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
-        self._operator = False  # whether the backend has been told that a driver is there
+        self._operator = False  # whether the backend knows that a driver is present
         self._gate_wake = asyncio.Event()
         self._finish = asyncio.Event()
         self._exporting = asyncio.Lock()
@@ -167,7 +167,7 @@ class ConsoleServer:
     # ---- any thread -------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Binds the port and serves; ConsoleError when that fails."""
+        """Bind the port and serve; raise ConsoleError if that fails."""
         self._thread = threading.Thread(target=self._run, name="console-server", daemon=True)
         self._thread.start()
         if not self._started.wait(START_TIMEOUT_S):
@@ -179,11 +179,11 @@ class ConsoleServer:
             ) from self._start_error
 
     def stop(self) -> None:
-        """Stops the robot's command, closes every client and ends the thread."""
+        """Command zero, close every client and end the thread."""
         if self._thread is None:
             return
         if self._loop is not None and self._thread.is_alive():
-            # The loop may end between the test and the call.
+            # The loop may end between the check and the call.
             with contextlib.suppress(RuntimeError):
                 self._loop.call_soon_threadsafe(self._finish.set)
         self._thread.join(timeout=5.0)
@@ -205,46 +205,46 @@ class ConsoleServer:
 
     @property
     def sign_in_url(self) -> str:
-        """Address of the page, with the token where one was made at this start: opens it without more ado."""
+        """Address of the page, with the token if this start made one; opening it signs in."""
         token = self.access.made_token
         return f"{self.url}?token={quote(token)}" if token else self.url
 
     @staticmethod
     def now_ms() -> float:
-        """The server's clock for the page: monotonic milliseconds."""
+        """Server's clock for the page: monotonic milliseconds."""
         return time.monotonic() * 1000.0
 
     def publish(self, kind: str, message: dict[str, Any]) -> None:
-        """Sends a text message of type ``kind`` to every client; only the newest of a kind waits."""
+        """Send a text message of type ``kind`` to every client; it replaces a pending one of this kind."""
         text = json.dumps({"type": kind, **message}, separators=(",", ":"), allow_nan=False)
         self._call(self._publish, kind, text)
 
     def send_frame(self, kind: FrameKind, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
-        """Sends a picture or map to every client; only the newest of a kind waits.
+        """Send an image or map to every client; it replaces a pending one of this kind.
 
         Args:
-            kind: what it is.
-            header: of the frame, JSON.
-            payload: the picture.
-            client: send it to this one alone, which for ``OWN_S`` then gets none of the others' of this kind.
+            kind: content of the frame.
+            header: JSON header of the frame.
+            payload: JPEG or PNG.
+            client: only recipient; for ``OWN_S`` it gets no frames of this kind that are meant for all.
         """
         self._call(self._send_frame, kind, PendingFrame(header, payload), client)
 
     def watching(self) -> dict[int, Look]:
-        """Where those look who do not drive, by client; empty while nobody drives."""
+        """Looks of the clients that do not drive, by client; empty while nobody drives."""
         driver = self.gate.driver
         return (
             {} if driver is None else {number: look for number, look in self._looks.copy().items() if number != driver}
         )
 
     def show(self, *kinds: FrameKind) -> None:
-        """Says which of PANORAMA and VIEW the page shows, or soon will; what is not named is sent rarely."""
+        """Set which of PANORAMA and VIEW the page shows or soon will; the other is sent at a low rate."""
         self._call(self._show, frozenset(kinds))
 
     def _call(self, function: Callable[..., None], *args: Any) -> None:
         if self._loop is None:
             return
-        # After stop() there is nobody left to tell.
+        # After stop() the loop is closed and nobody listens.
         with contextlib.suppress(RuntimeError):
             self._loop.call_soon_threadsafe(function, *args)
 
@@ -310,13 +310,13 @@ class ConsoleServer:
 
     @staticmethod
     async def _pace(request: web.Request, buckets: AddressBuckets) -> None:
-        """Makes an address wait that asks too often; how many wait, its number of connections bounds."""
+        """Delay requests of an address above its rate; its connection limit bounds how many wait."""
         bucket = buckets.of(network_of(request.remote or ""))
         while not bucket.take(time.monotonic()):
             await asyncio.sleep(bucket.wait_s())
 
     async def _role(self, request: web.Request) -> Role | None:
-        """What whoever asks may do; programs bring their token in the header, pages the cookie of their sign-in."""
+        """Return the role of a request: programs send a token in the header, pages the cookie of their sign-in."""
         if not self.access.required:
             return Role.DRIVE
         scheme, _, token = request.headers.get("Authorization", "").partition(" ")
@@ -334,7 +334,7 @@ class ConsoleServer:
         return role
 
     async def _turn_away(self, request: web.Request) -> web.StreamResponse:
-        """Without a sign-in: the form for browsers that open the page, words for everything else."""
+        """Answer a request without sign-in: the form for browsers that open the page, 401 for everything else."""
         if request.path == "/" and request.method == "GET":
             if token := request.query.get("token", ""):
                 return await self._enter(request, token)
@@ -345,7 +345,7 @@ class ConsoleServer:
         )  # fmt: skip
 
     async def _enter(self, request: web.Request, token: str) -> web.Response:
-        """Signs a browser in: a cookie in place of the token, which goes out of the address and the history."""
+        """Sign a browser in: set a cookie and redirect, so that the token leaves address and history."""
         role = await self._role_of_token(request, token)
         if role is None:
             return self._sign_in_page("This token is wrong.")
@@ -355,7 +355,7 @@ class ConsoleServer:
             COOKIE, self.access.open_session(role, now), httponly=True, samesite="Strict",
             secure=self._tls is not None, max_age=round(self.config.access.session_hours * 3600),
         )  # fmt: skip
-        self._end_signed_out()  # those whose sign-in the new one displaced
+        self._end_signed_out()  # pages whose sign-in the new one displaced
         logger.info("%s has signed in to %s", request.remote, role.value)
         return response
 
@@ -384,7 +384,7 @@ class ConsoleServer:
         raise response
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
-        if "token" in request.query:  # signed in already: out of the address
+        if "token" in request.query:  # already signed in: remove the token from the address
             raise web.HTTPSeeOther("/")
         return web.FileResponse(STATIC / "index.html")
 
@@ -406,7 +406,7 @@ class ConsoleServer:
         return _download(frame.payload, "panorama", "jpg", "image/jpeg")
 
     async def _export_map(self, request: web.Request) -> web.StreamResponse:
-        # One at a time, and not on this thread: packing takes long beside a driver's commands.
+        # One at a time, and not on this thread: packing would delay the driver's commands.
         async with self._exporting:
             files = await asyncio.to_thread(self.backend.export_map)
             if not files:
@@ -415,7 +415,7 @@ class ConsoleServer:
         return _download(packed, "map", "zip", "application/zip")
 
     async def _estop(self, request: web.Request) -> web.StreamResponse:
-        """Emergency stop by a connection of its own: the page's WebSocket may be stuck. Only that releases the stop."""
+        """Set the emergency stop without the page's WebSocket, which may be stuck but alone can release it."""
         self._check_origin(request)
         self._stop_robot(request.remote or "")
         return web.Response(status=204)
@@ -438,24 +438,24 @@ class ConsoleServer:
             raise web.HTTPServiceUnavailable(text=f"{len(self._sessions)} clients already\n")
         connection = request.protocol
         assert isinstance(connection, Connection)
-        # Pings of the protocol itself come to the reader too, or they would pass by its limit.
+        # Without autoping the reader sees the protocol's pings too, so that the message limit covers them.
         socket = web.WebSocketResponse(max_msg_size=MAX_CLIENT_MESSAGE, compress=False, timeout=CLOSE_S, autoping=False)
         limit = self.config.max_messages_per_s
-        # A new one has had nothing held back: whoever is cut off and comes again brings no new burst.
+        # A new connection has no delayed messages: a client must not gain a new burst by reconnecting.
         bucket = TokenBucket(limit, limit * BURST_S, limit * FIRST_S)
         session = Session(self._next_number, socket, connection, bucket, may_drive, request[_COOKIE])
         self._next_number += 1
-        self._sessions[session.number] = session  # before anything is awaited: the place is taken
+        self._sessions[session.number] = session  # before the first await, so that the place is taken
         loop = asyncio.get_running_loop()
         sender: asyncio.Task[None] | None = None
         expiry: asyncio.TimerHandle | None = None
         try:
-            await socket.prepare(request)  # raises where the request is no WebSocket's
+            await socket.prepare(request)  # raises if the request is no WebSocket upgrade
             connection.keep(lambda: self._flooded(session))
             self._greet(session)
             sender = asyncio.create_task(session.send_forever())
             if self.access.required and session.cookie:
-                # A little later than the end itself, which a timer may otherwise find not yet there.
+                # 10 ms late: a timer that fires early would find the sign-in still valid.
                 expiry = loop.call_at(self.access.end_of_session_s(session.cookie) + 0.01, self._end_signed_out)
             await self._read_forever(session)
         finally:
@@ -471,7 +471,7 @@ class ConsoleServer:
         return socket
 
     def _drop(self, session: Session) -> None:
-        """Takes all rights from a session: it drives no more, and nothing more is sent to it."""
+        """Remove a session: it loses the lease and receives nothing more."""
         if self._sessions.pop(session.number, None) is None:
             return
         self.gate.forget(session.number, time.monotonic())
@@ -481,7 +481,7 @@ class ConsoleServer:
         self._tell_session()
 
     def _end(self, session: Session, code: WSCloseCode, reason: str) -> None:
-        """Drops a session at once, and then closes its socket, whatever its client does."""
+        """Drop a session at once, then close its socket whatever the client does."""
         self._drop(session)
         if session.closing is None:
             session.closing = asyncio.create_task(self._close(session, code, reason))
@@ -491,13 +491,13 @@ class ConsoleServer:
         try:
             async with asyncio.timeout(2 * CLOSE_S):
                 await session.socket.close(code=code, message=reason.encode())
-        except (TimeoutError, ConnectionError, RuntimeError) as error:  # does not read, or has gone
+        except (TimeoutError, ConnectionError, RuntimeError) as error:  # the client does not read or has gone
             logger.debug("client %d took no closing frame: %s", session.number, error)
         finally:
             session.connection.abort()
 
     def _end_signed_out(self) -> None:
-        """Ends the sessions whose sign-in has ended: signed out, expired, or displaced by newer ones."""
+        """End the sessions whose sign-in has ended: signed out, expired or displaced by newer ones."""
         now = time.monotonic()
         for session in list(self._sessions.values()):
             if self.access.required and session.cookie and self.access.role_of_session(session.cookie, now) is None:
@@ -505,7 +505,7 @@ class ConsoleServer:
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "signed out")
 
     def _flooded(self, session: Session) -> None:
-        """Ends a session that sends more than any page does."""
+        """End a session that sends more than a page ever does."""
         logger.warning("client %d sends too much: closed", session.number)
         session.connection.mute()
         self._end(session, WSCloseCode.POLICY_VIOLATION, "too many messages")
@@ -539,10 +539,10 @@ class ConsoleServer:
             except TimeoutError:
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "silent")
                 return
-            if session.number not in self._sessions:  # ended while it waited
+            if session.number not in self._sessions:  # ended meanwhile
                 return
             now = time.monotonic()
-            # Whoever watches sends no commands, only beats and looks.
+            # A watcher sends no commands, only pings and looks.
             session.bucket.rate = limit if session.number == self.gate.driver else limit * WATCHER_SHARE
             within = session.bucket.take(now)
             if message.type is WSMsgType.TEXT:
@@ -559,10 +559,10 @@ class ConsoleServer:
             elif session.chokes:
                 session.connection.mute()
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "does not read its answers")
-            await asyncio.sleep(0)  # one message a turn: nobody's queue is worked off before another's message
+            await asyncio.sleep(0)  # one message a turn, so that clients take turns
 
     def _take(self, session: Session, text: str, now: float, *, only_a_stop: bool) -> None:
-        """Handles one message; an emergency stop counts even where it is the one too many."""
+        """Handle one message; an emergency stop is handled even above the message limit."""
         try:
             message = parse_text(text)
             if not only_a_stop or message["type"] == "estop":
@@ -594,7 +594,7 @@ class ConsoleServer:
             raise ProtocolError(f"unknown message type {kind!r:.40}")
         if kind == "ping":
             session.away = flag(message, "away", False)
-        # A page that is not looked at goes on acknowledging pictures: no sign of an operator either.
+        # A hidden page keeps acknowledging images; that is no sign of an operator either.
         if self.gate.touch(session.number, now, away=session.away):
             self._emit_due()
         handler(session, message, now)
@@ -615,7 +615,7 @@ class ConsoleServer:
         age_s = (self.now_ms() - number(message, "time_ms")) / 1000.0
         linear, angular = number(message, "linear"), number(message, "angular")
         verdict = self.gate.receive(session.number, whole(message, "seq"), age_s, linear, angular, time.monotonic())
-        # A zero needs no permission, and out-of-order ones are harmless: only refused motion is told.
+        # A zero needs no permission and is harmless out of order, so only refused motion is reported.
         if verdict is not Verdict.ACCEPTED and (linear, angular) != (0.0, 0.0):
             session.reply({"type": "refused", "reason": verdict.name.lower(), "text": verdict.value})
         self._emit_due()
@@ -639,7 +639,7 @@ class ConsoleServer:
         self._stop_robot(f"client {session.number}")
 
     def _stop_robot(self, who: str) -> None:
-        """Emergency stop, on the topic before this returns."""
+        """Set the emergency stop; it is published before this returns."""
         news = not self.gate.estop
         self.gate.set_estop(time.monotonic())
         self.backend.on_estop(True)
@@ -664,13 +664,13 @@ class ConsoleServer:
             vfov=number(message, "vfov", 0.01, MAX_FOV_RAD),
         )
         self._looks[session.number] = look
-        # The renderer looks where the driver looks, or the only one who watches; elsewhere where it has time.
+        # The main view follows the driver, or any page while nobody drives; watchers get views in spare time.
         if self.gate.driver in (session.number, None):
             self.backend.on_look(look)
 
     @staticmethod
     def _may_drive(session: Session) -> bool:
-        """Whether this sign-in may do more than watch and stop; tells it where it may not."""
+        """Whether the sign-in may do more than watch and stop; if not, send a refusal."""
         if not session.may_drive:
             session.reply({"type": "refused", "reason": "watch_only", "text": "this sign-in may watch only"})
         return session.may_drive
@@ -695,7 +695,7 @@ class ConsoleServer:
         except ValueError as error:
             raise ProtocolError(f"ack.kind: {error}") from None
         if session.acknowledge(kind, whole(message, "seq")):
-            session.bucket.give_back()  # these the server's own frames limit
+            session.bucket.give_back()  # acknowledgements are limited by the server's own frames
 
     async def _drive_forever(self) -> None:
         while True:
@@ -705,7 +705,7 @@ class ConsoleServer:
             with contextlib.suppress(TimeoutError):
                 delay = None if deadline is None else max(deadline - time.monotonic(), 0.001)
                 await asyncio.wait_for(self._gate_wake.wait(), delay)
-                continue  # woken: what is due may have changed
+                continue  # woken: the deadline may have changed
             self._emit_due(wake=False)
             if self.gate.watchdog_trips != trips:
                 logger.warning("no command for %.2f s: stopped", self.config.drive.watchdog_s)
@@ -724,7 +724,7 @@ class ConsoleServer:
             self._gate_wake.set()
 
     def _tell_session(self, only: Session | None = None) -> None:
-        """Sends all who are connected, or one alone, how the lease stands."""
+        """Send the state of the lease to all clients, or to one."""
         for session in list(self._sessions.values()) if only is None else [only]:
             driver = self.gate.driver
             role = "none" if driver is None else "you" if driver == session.number else "other"
@@ -763,7 +763,7 @@ class ConsoleServer:
 
 
 def zip_of(files: dict[str, bytes]) -> bytes:
-    """A ZIP archive of ``files``, name → content."""
+    """Return a ZIP archive of ``files``, name → content."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
@@ -778,7 +778,7 @@ def _download(content: bytes, stem: str, ending: str, content_type: str) -> web.
 
 
 async def _secure_headers(request: web.Request, response: web.StreamResponse) -> None:
-    """Headers of every answer, errors among them."""
+    """Add the security headers to every response, errors included."""
     for name, value in SECURITY_HEADERS.items():
         response.headers.setdefault(name, value)
 
@@ -786,8 +786,8 @@ async def _secure_headers(request: web.Request, response: web.StreamResponse) ->
 def host_allowed(host: str, allowed: tuple[str, ...]) -> bool:
     """Whether a Host header names this machine.
 
-    A page of a foreign site can point its own name at 127.0.0.1 (DNS rebinding), and then its Origin
-    equals its Host; but it cannot make a browser send an IP literal or "localhost".
+    A foreign site can point its own name at 127.0.0.1 (DNS rebinding); then its Origin equals its Host.
+    But it cannot make a browser send an IP literal or "localhost".
     """
     try:
         name = urlsplit(f"//{host}").hostname
@@ -805,7 +805,7 @@ def host_allowed(host: str, allowed: tuple[str, ...]) -> bool:
 
 
 def origin_allowed(origin: str | None, host: str) -> bool:
-    """Whether a WebSocket comes from the page itself; programs send no Origin and are let in."""
+    """Whether a request comes from the page itself; programs send no Origin and are accepted."""
     if origin is None:
         return True
     try:

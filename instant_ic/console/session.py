@@ -1,4 +1,4 @@
-"""One connected page: what waits to be sent to it, newest only, so that a slow one holds up nobody."""
+"""Send queue of one connected page. It keeps only the newest of each kind, so a slow page delays no other."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from aiohttp import web
 from instant_ic.console.connections import Connection, TokenBucket
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
 
-# Small things first: a picture must not delay the state, nor the map a picture.
-MAX_REPLIES = 256  # that wait: about a second's worth of a page; whoever has more does not read
+MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
+# Smallest first: an image must not delay the state, nor a map an image.
 FRAME_ORDER = (FrameKind.VIEW, FrameKind.PANORAMA, FrameKind.MAP, FrameKind.COSTMAP)
 
 
 @dataclass(frozen=True)
 class PendingFrame:
-    """A frame before it has a sequence number."""
+    """Frame that has no sequence number yet."""
 
     header: dict[str, Any]
     payload: bytes
 
 
 class Session:
-    """Outbox of one client. Used on the server's loop only.
+    """Send queue of one client. Used on the server's loop only.
 
-    Replies go out in order; a text of a key and a frame of a kind replace an older one that still
-    waits; the next frame of a kind goes when the last was acknowledged.
+    Replies are sent in order. A text replaces a pending text of the same key, and a frame a pending frame of the
+    same kind. The next frame of a kind is sent once the client has acknowledged the last one.
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class Session:
         self.socket = socket
         self.connection = connection
         self.bucket = bucket
-        """Of its messages."""
+        """Limits the client's messages."""
         self.may_drive = may_drive
         self.cookie = cookie
-        """Of its sign-in, with which it ends; empty where it came without or by a token."""
+        """Cookie of the sign-in; the session ends with it. Empty without a sign-in, or for one by token."""
         self.closing: asyncio.Task[None] | None = None
-        """The closing handshake, once the session has ended."""
+        """Closing handshake, once the session has ended."""
         self.bad_messages = 0
         self.chokes = False
-        """Whether more replies wait than a client that reads leaves there."""
+        """Whether too many replies are pending, which means that the client does not read."""
         self.away = False
         self._replies: deque[str] = deque()
         self._texts: dict[str, str] = {}
@@ -68,7 +68,7 @@ class Session:
         self._wake = asyncio.Event()
 
     def reply(self, message: dict[str, Any]) -> None:
-        """Queues an answer that must not be lost; one too many sets ``chokes``, and the session must end."""
+        """Queue an answer that must not be lost. If the queue is full, set ``chokes``; the session must then end."""
         if len(self._replies) >= MAX_REPLIES:
             self.chokes = True
             return
@@ -76,23 +76,23 @@ class Session:
         self._wake.set()
 
     def put_text(self, key: str, text: str) -> None:
-        """Queues ``text``; replaces one of the same key that still waits."""
+        """Queue ``text``, replacing a pending one of the same key."""
         self._texts[key] = text
         self._wake.set()
 
     def put_frame(self, kind: FrameKind, frame: PendingFrame) -> None:
-        """Queues a frame; replaces one of the same kind that still waits."""
+        """Queue a frame, replacing a pending one of the same kind."""
         self._frames[kind] = frame
         self._wake.set()
 
     def set_foreground(self, kinds: frozenset[FrameKind], background_period_s: float) -> None:
-        """Pictures of another kind go out once in ``background_period_s`` only."""
+        """Limit images of all other kinds to one every ``background_period_s``."""
         self._foreground = kinds
         self._background_period_s = background_period_s
         self._wake.set()
 
     def acknowledge(self, kind: FrameKind, sequence: int) -> bool:
-        """The client has shown frame ``sequence``; False where it was not sent, or acknowledged before."""
+        """Note that the client has shown frame ``sequence``; False if it was not sent or already acknowledged."""
         if self._unacknowledged.get(kind) != sequence:
             return False
         del self._unacknowledged[kind]
@@ -100,7 +100,7 @@ class Session:
         return True
 
     async def send_forever(self) -> None:
-        """Sends what waits until the socket closes."""
+        """Send pending messages until the socket closes."""
         while not self.socket.closed:
             await self._wake.wait()
             self._wake.clear()

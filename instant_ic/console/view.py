@@ -1,4 +1,4 @@
-"""Where the operator looks, and which rendered view to ask for next."""
+"""Look direction of the operator, and scheduling of requests for rendered views."""
 
 from __future__ import annotations
 
@@ -14,25 +14,23 @@ from instant_ic.geometry.poses import pose_matrix
 
 MAX_FOV_RAD = math.radians(150)
 WATCHER_APART_RAD = math.radians(15)
-"""Who looks elsewhere than the driver by less has enough of the driver's view."""
+"""Smallest angle from the driver's look at which a watcher gets views of his own."""
 ELSEWHERE_M = 1.0
-"""A view from farther off is no earlier look at the same place: it is shown as it was drawn."""
+"""A view rendered farther away shows another place; the page does not move it to the v-bot."""
 
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """Rendered views that the console asks for."""
+    """Requests for rendered views."""
 
-    width: Annotated[int, Range(16, 4096)] = 320  # with height: number of pixels; the shape is the window's
+    width: Annotated[int, Range(16, 4096)] = 320  # times height: pixels of a view; its shape is the window's
     height: Annotated[int, Range(16, 4096)] = 180
-    fov_margin: Annotated[float, Range(1, 2)] = 1.15  # asked field of view over the shown one, to be re-aimed
+    fov_margin: Annotated[float, Range(1, 2)] = 1.15  # requested over shown field of view: room to re-aim
     virtual_rate_hz: Positive = 10.0  # while the virtual space is shown
-    still_rate_hz: Positive = 5.0  # likewise, while nothing moves: the renderer is then free when it does
-    watcher_rate_hz: NotNegative = (
-        2.0  # for a page that looks elsewhere than the driver's, where there is time; 0 = none
-    )
+    still_rate_hz: Positive = 5.0  # while nothing moves there, so that the renderer is free when motion starts
+    watcher_rate_hz: NotNegative = 2.0  # for a page that looks elsewhere than the driver's, if time is left; 0 = none
     real_rate_hz: NotNegative = 1.0  # while the camera is shown, to keep the renderer warm; 0 = none
-    response_timeout_s: Positive = 0.5  # a request without an answer counts as lost after this
+    response_timeout_s: Positive = 0.5  # an unanswered request counts as lost after this time
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -40,10 +38,10 @@ class ViewConfig:
 
 @dataclass(frozen=True)
 class LeadConfig:
-    """Rendered views shown from where the v-bot is now (``geometry.depth_picture``)."""
+    """Showing rendered views from the v-bot's present position (``geometry.depth_picture``)."""
 
-    max_m: NotNegative = 0.3  # at most so far from where a view was drawn for; 0: each as it was drawn
-    seconds: NotNegative = 0.8  # after the switch until the v-bot's place is shown, and before the return back
+    max_m: NotNegative = 0.3  # largest distance from the rendered position; 0: views are not moved
+    seconds: NotNegative = 0.8  # time of the transition after a switch, and back before the return
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -51,9 +49,9 @@ class LeadConfig:
 
 @dataclass(frozen=True)
 class Look:
-    """Look direction relative to the robot's heading, and the shown field of view.
+    """Look direction relative to the robot's heading, and the shown field of view, in radians.
 
-    Yaw is counter-clockwise (left positive), pitch is up positive; radians.
+    Yaw is positive to the left (counter-clockwise), pitch is positive upwards.
     """
 
     yaw: float = 0.0
@@ -62,19 +60,19 @@ class Look:
     vfov: float = math.radians(58.7)
 
     def rotation(self) -> NDArray[np.float64]:
-        """camera_from_look as a 4x4 pose: x along the line of sight, y left, z up."""
+        """Return camera_from_look (4, 4): x along the line of sight, y left, z up."""
         # In x-forward, y-left axes a positive turn about y lowers the line of sight.
         return pose_matrix(0.0, 0.0, 0.0, 0.0, -self.pitch, self.yaw)
 
     def apart(self, other: Look) -> float:
-        """Angle (rad) between the two lines of sight."""
+        """Return the angle between the two lines of sight, rad."""
         cosine = float(self.rotation()[:3, 0] @ other.rotation()[:3, 0])
         return math.acos(min(max(cosine, -1.0), 1.0))
 
 
 @dataclass(frozen=True)
 class ViewShape:
-    """Horizontal field of view (rad) and size (pixels) of a view to be asked for."""
+    """Horizontal field of view (rad) and size (pixels) of a requested view."""
 
     fov_rad: float
     width: int
@@ -82,10 +80,10 @@ class ViewShape:
 
 
 def view_shape(look: Look, config: ViewConfig) -> ViewShape:
-    """Shape of the view that covers ``look`` with the margin, in the operator's aspect ratio.
+    """Return the shape of a view that covers ``look`` with the margin, in the window's aspect ratio.
 
-    The number of pixels stays that of the configuration, whatever the window's shape, because it
-    sets the renderer's time. Sizes are multiples of 8.
+    The number of pixels follows the configuration for any window shape, because it determines the render time.
+    Width and height are multiples of 8.
     """
     half_width = math.tan(min(look.hfov * config.fov_margin, MAX_FOV_RAD) / 2)
     half_height = math.tan(min(look.vfov * config.fov_margin, MAX_FOV_RAD) / 2)
@@ -93,15 +91,15 @@ def view_shape(look: Look, config: ViewConfig) -> ViewShape:
     pixels = config.width * config.height
     width = max(16, 8 * round(math.sqrt(pixels * aspect) / 8))
     height = max(16, 8 * round(math.sqrt(pixels / aspect) / 8))
-    # Where the aspect was clamped or rounded, the wider need decides.
+    # If the aspect ratio was clamped or rounded, the larger field of view wins.
     fov = 2 * math.atan(max(half_width, half_height * width / height))
     return ViewShape(fov, width, height)
 
 
 class Lead:
-    """How far a rendered view is shown on its way from the place that it was drawn for to the v-bot's place now.
+    """Share of the way from a view's rendered position to the v-bot's present position at which the page shows it.
 
-    0 at a switch, where every picture is shown from where it was made, so that nothing jumps; 1 while the v-bot drives.
+    0 at a switch: every image is shown from where it was made, so that nothing jumps. 1 while the v-bot drives.
     """
 
     def __init__(self, config: LeadConfig) -> None:
@@ -110,7 +108,7 @@ class Lead:
         self._at_s: float | None = None
 
     def step(self, now_s: float, driven: bool) -> float:
-        """The share now, on the steady clock; ``driven``: the operator drives the v-bot."""
+        """Advance to ``now_s`` (steady clock) and return the share; ``driven``: the operator drives the v-bot."""
         passed_s = 0.0 if self._at_s is None else now_s - self._at_s
         self._at_s = now_s
         step = passed_s / self.config.seconds if self.config.seconds > 0 else 1.0
@@ -118,7 +116,12 @@ class Lead:
         return self.share
 
     def displayed(self, place: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the page shows a view from that was drawn for ``place``, with the v-bot's camera at ``now``, (N,) m."""
+        """Return the position from which the page shows a view, (N,) m.
+
+        Args:
+            place: camera position for which the view was rendered, (N,) m.
+            now: present position of the v-bot's camera, (N,) m.
+        """
         way = now - place
         far = float(np.linalg.norm(way))
         if far > ELSEWHERE_M or far == 0.0:
@@ -128,10 +131,10 @@ class Lead:
 
 
 class ViewScheduler:
-    """One request outstanding; the next after the answer or the time-out, at the rate of the mode.
+    """Schedules view requests: one outstanding at a time, the next after the answer or time-out, at the mode's rate.
 
-    What moves after a rest is asked for at once: the operator waits for it. Between the driver's views those come in
-    that look elsewhere, as long as the driver's next does not have to wait for them.
+    The first motion after a rest is requested at once, because the operator waits for it. Watchers' views are
+    requested between the driver's views, if they do not delay his next one.
     """
 
     def __init__(self, config: ViewConfig) -> None:
@@ -139,16 +142,16 @@ class ViewScheduler:
         self.lost = 0
         self._next_id = 1
         self._outstanding: int | None = None
-        self._asked_s = -math.inf  # of any request
-        self._due_s = -math.inf  # the driver's last request
-        self._takes_s = 0.0  # from a request to its answer, the last time
+        self._asked_s = -math.inf  # time of the last request
+        self._due_s = -math.inf  # time of the driver's last request
+        self._takes_s = 0.0  # duration of the last request
         self._still = False
         self._rate_hz = 0.0
-        self._watchers: dict[int, int] = {}  # request -> page, the newest few
-        self._served_s: dict[int, float] = {}  # page -> when its last request went out
+        self._watchers: dict[int, int] = {}  # recent requests: id -> page
+        self._served_s: dict[int, float] = {}  # page -> time of its last request
 
     def due(self, now_s: float, *, virtual: bool, moves: bool = True) -> bool:
-        """Whether a request should go out now. ``moves``: the view would be another than the last."""
+        """Whether to send a request now. ``moves``: the view would differ from the last one."""
         if self._waits(now_s):
             return False
         still, before = virtual and not moves, self._still
@@ -161,12 +164,12 @@ class ViewScheduler:
         return fits
 
     def watcher(self, now_s: float, driver: Look, watchers: dict[int, Look]) -> int | None:
-        """The page whose own view should be asked for now: of those that look elsewhere, the longest unserved."""
+        """Return the page whose own view is due: the one unserved for longest among those that look elsewhere."""
         rate, config = self._rate_hz, self.config
         if not (rate > 0 and config.watcher_rate_hz > 0) or self._waits(now_s):
             return None
         if now_s + self._takes_s > self._due_s + 1.0 / rate:
-            return None  # the driver's next would wait
+            return None  # it would delay the driver's next view
         self._served_s = {page: at for page, at in self._served_s.items() if page in watchers}
         last = {page: self._served_s.get(page, -math.inf) for page in watchers}
         waiting = [
@@ -177,7 +180,7 @@ class ViewScheduler:
         return min(waiting, key=lambda page: last[page], default=None)
 
     def asked(self, now_s: float, watcher: int | None = None) -> int:
-        """Notes a request made now, for the driver or a watching page; returns its id."""
+        """Record a request for the driver or a watching page, and return its id."""
         number = self._outstanding = self._next_id
         self._next_id = self._next_id % (2**32 - 1) + 1  # uint32 in ViewRequest; 0 stays unused
         self._asked_s = now_s
@@ -191,7 +194,7 @@ class ViewScheduler:
         return number
 
     def answered(self, request_id: int, now_s: float | None = None) -> bool:
-        """Notes an answer; True when it is the one that was waited for."""
+        """Record an answer; return whether it answers the outstanding request."""
         if request_id != self._outstanding:
             return False
         self._outstanding = None
@@ -200,7 +203,7 @@ class ViewScheduler:
         return True
 
     def page_of(self, request_id: int) -> int | None:
-        """The watching page that a request was for; None: for the driver, and so for all."""
+        """Return the watching page of a request; None if it was for the driver, whose view goes to all pages."""
         return self._watchers.get(request_id)
 
     def _waits(self, now_s: float) -> bool:
