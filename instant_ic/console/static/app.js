@@ -1,4 +1,4 @@
-// The operator's page: joins link, drive, look, pictures, map and overlay.
+// The operator's page: connects link, drive, look, images, map and overlay.
 
 import { attachStick, Drive, isDriveKey, isTyping } from "./drive.js";
 import { Gamepads } from "./gamepad.js";
@@ -14,8 +14,8 @@ import { Recording } from "./record.js";
 import { saveFile, savePicture } from "./save.js";
 import { GlViewer } from "./viewer.js";
 
-const LOOK_MS = 100; // look direction sent at most this often
-const SLOW_FRAME_MS = 45; // without a graphics card: at most this often, and with fewer pixels
+const LOOK_MS = 100; // shortest interval between two look messages
+const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
 const SLOW_PIXELS = 0.5;
 const SLOW_MAP_MS = 200;
 const byId = (id) => document.getElementById(id);
@@ -39,7 +39,7 @@ let state = null, session = { driver: "none", clients: 0, estop: false };
 let plan = { trajectory: [], path: [], subgoal: null };
 let everConnected = false;
 let sentLook = "", sentLookAt = 0;
-let yielded = false; // the operator handed the lease over
+let yielded = false; // the operator gave the lease back
 let mayDrive = true; // false: signed in to watch
 let mapChanged = true, lastFrame = performance.now(), lastHud = 0, lastMap = 0;
 let lastPicture = "", lastGuide = "", lastMapKey = "";
@@ -55,7 +55,7 @@ function makeViewer() {
   return new FlatViewer(picture);
 }
 
-// ---- what comes --------------------------------------------------------------------------------
+// ---- incoming messages -------------------------------------------------------------------------
 
 link.addEventListener("open", () => {
   everConnected = true;
@@ -68,7 +68,7 @@ link.addEventListener("lost", () => {
   drive.setEnabled(false);
   showBanner();
 });
-link.addEventListener("signed-out", () => location.reload()); // to the form
+link.addEventListener("signed-out", () => location.reload()); // shows the sign-in form
 link.addEventListener("message", ({ detail: message }) => {
   switch (message.type) {
     case "hello":
@@ -96,7 +96,7 @@ link.addEventListener("message", ({ detail: message }) => {
       hud.showHealth(message);
       break;
     case "session":
-      // Lost by silence, not given away: ask for it again. The keys must be pressed anew.
+      // The lease timed out and was not given back: request it again. Keys must be pressed again.
       if (session.driver === "you" && message.driver === "none" && !yielded) link.send({ type: "lease", take: false });
       session = message;
       drive.setEnabled(session.driver === "you" && !session.estop);
@@ -124,18 +124,18 @@ link.addEventListener("frame", async ({ detail: frame }) => {
   }
 });
 
-// ---- what the operator does ----------------------------------------------------------------------
+// ---- operator actions ----------------------------------------------------------------------------
 
 function stopNow() {
   drive.stop();
   link.send({ type: "estop" });
-  // By a connection of its own as well: the WebSocket may be stuck, and a second stop changes nothing.
+  // Also by a separate connection: the WebSocket may be stuck, and a second stop changes nothing.
   fetch("/estop", { method: "POST", keepalive: true }).then(({ ok }) => ok).catch(() => false).then((sent) => {
     if (!sent && !link.connected) hud.toast("No link: the stop could not be sent");
   });
 }
 
-/** Whoever wants to drive while nobody does, may. */
+/** Requests the lease if nobody drives; otherwise says why not. */
 function askForTheLease() {
   if (!mayDrive) hud.toast("This sign-in may watch and stop the robot, not drive it.");
   else if (session.driver === "none") link.send({ type: "lease", take: false });
@@ -184,9 +184,9 @@ SHORTCUTS.NumpadSubtract = SHORTCUTS.Minus;
 SHORTCUTS.NumpadAdd = SHORTCUTS.Equal;
 
 window.addEventListener("keydown", (event) => {
-  if (isTyping(event)) return; // a name is typed in a dialog; the robot is held as long as that is open
+  if (isTyping(event)) return; // typing a name in a dialog; the robot is stopped while it is open
   if (event.code === "Space") {
-    // Before any focused button gets it: the space bar always stops.
+    // The space bar always stops, so no focused button may receive it.
     event.preventDefault();
     event.stopPropagation();
     if (!event.repeat) stopNow();
@@ -235,10 +235,10 @@ pads.addEventListener("tell", ({ detail: words }) => hud.toast(words));
 drive.addEventListener("stop", ({ detail: why }) => hud.toast(`Stopped: ${why}`));
 document.addEventListener("visibilitychange", () => { lastFrame = performance.now(); });
 
-// ---- what is shown -------------------------------------------------------------------------------
+// ---- display -------------------------------------------------------------------------------------
 
 function showBanner() {
-  // A stopped robot starts only with hands off; whoever still holds a key must be told.
+  // A stopped robot starts only once the controls are released, so tell an operator who still holds a key.
   const held = state?.mode === "stopped" && (state.command ?? []).some((value) => value !== 0);
   hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), held, session.driver, state?.reason ?? "");
 }
@@ -304,12 +304,12 @@ function frame(now) {
     hud.showLatency(link, pictures);
     hud.mark("picture", pictures.shown ? (pictures.stale ? "stale" : "live") : "none");
   }
-  // For tests and for whoever debugs: what the page shows.
+  // For tests and debugging.
   hud.mark("blend", scene.blend.toFixed(2));
   hud.mark("map", minimap.hasMap ? "drawn" : "none");
 }
 
-/** Draws where a picture came, the direction changed by half a pixel, or the window by any. */
+/** Renders if a new image arrived, the direction changed by half a pixel, or the window size changed. */
 function drawPicture(scene) {
   const moved = scene.blend > 0 ? rounded(scene.moved, 3) : "";
   const key = rounded([...scene.mapFromLook, look.yaw, look.vfov], 4) + moved;
@@ -318,7 +318,7 @@ function drawPicture(scene) {
   lastPicture = key;
   pictures.changed = false;
   viewer.draw(scene);
-  // For whoever measures: which picture was drawn, and from where.
+  // For measurements: the rendered image and its position.
   const { motion, view, panorama, place } = pictures, shown = shows(state);
   const detail = { shown, pose: motion.pose, blend: scene.blend, view, panorama, place };
   dispatchEvent(new CustomEvent("drawn", { detail }));
@@ -327,7 +327,7 @@ function drawPicture(scene) {
 function drawOverlay(scene, tanHalf) {
   const position = cameraPosition(), colour = COLOURS[state?.mode] ?? COLOURS.none;
   const trajectory = position && link.connected ? plan.trajectory : [];
-  // With no trajectory there is nothing that could move.
+  // Without a trajectory nothing in the overlay can move.
   const place = trajectory.length ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
   const key = [place, colour, rounded([look.yaw, look.vfov], 3)].join();
   const resized = fit(guide, viewer.slow ? SLOW_PIXELS : 1) | fit(compass);

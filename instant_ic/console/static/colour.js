@@ -1,19 +1,19 @@
-// Colours of one picture made like another's: a gain and an offset a channel, fitted where both show the same place.
+// Colour matching of two images: gain and offset for each channel, fitted where both show the same place.
 
 import { clamp } from "./math.js";
 
 export const plain = { gain: [1, 1, 1], offset: [0, 0, 0] };
 
-const ROUNDS = 6; // of fitting with less weight to what does not fit
-const OUTLIER = 1.5; // median deviations
-const LEAST_WEIGHT = 0.05; // of the cells; with less in common nothing is matched
-const STIFFNESS = 0.02; // a flat picture tells gain and offset apart badly: then it is the gain
+const ROUNDS = 6; // of the reweighted fit
+const OUTLIER = 1.5; // in median deviations
+const LEAST_WEIGHT = 0.05; // share of the cells; with less overlap colours are not matched
+const STIFFNESS = 0.02; // a flat image cannot separate gain from offset; this favours gain
 const MOST_GAIN = 1.8, MOST_OFFSET = 0.2;
 
 /**
- * The colour {gain, offset} with which `from` looks most like `to`.
- * `from`, `to`: 3 values a cell, 0..1; `weights`: one a cell, 0..1. Cells that differ by more than colour
- * (something moved, an edge is not quite in place) count little.
+ * Returns the colour {gain, offset} that makes `from` look most like `to`.
+ * `from`, `to`: 3 values per cell, 0..1; `weights`: one per cell, 0..1. Cells that differ by more than colour
+ * (something moved, an edge is slightly off) get little weight.
  */
 export function fitColour(from, to, weights) {
   const total = weights.reduce((sum, weight) => sum + weight, 0);
@@ -40,7 +40,7 @@ function pick(values, channel) {
   return one;
 }
 
-/** Weighted least squares of y = gain x + offset, the offset held towards 0. */
+/** Weighted least squares of y = gain x + offset; returns [gain, offset]. The offset is regularised towards 0. */
 function line(x, y, weights) {
   let n = 0, sx = 0, sy = 0, sxx = 0, sxy = 0;
   for (let i = 0; i < x.length; i++) {
@@ -62,7 +62,7 @@ function median(values) {
   return sorted[sorted.length >> 1] ?? 0;
 }
 
-/** A share of `colour`: 0 none, 1 all of it. */
+/** Scales `colour` by `share`: 0 none, 1 all of it. */
 export function part(colour, share) {
   return {
     gain: colour.gain.map((gain) => 1 + (gain - 1) * share),
@@ -70,12 +70,12 @@ export function part(colour, share) {
   };
 }
 
-/** `values` (3 a cell) in that colour. */
+/** Applies a colour to `values` (3 per cell). */
 export function coloured(values, { gain, offset }) {
   return values.map((value, i) => clamp(value * gain[i % 3] + offset[i % 3], 0, 1));
 }
 
-/** A colour that is let go slowly: all of it at first, nothing after `releaseMs`. */
+/** Colour that fades out: all of it at first, none after `releaseMs`. */
 export class Releasing {
   constructor() {
     this._colour = plain;

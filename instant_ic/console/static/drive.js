@@ -1,4 +1,4 @@
-// Hold to drive: keyboard, touch stick and gamepad. Whatever may hide a release counts as one.
+// Hold to drive: keyboard, touch stick and gamepad. Any event that may hide a release counts as a release.
 
 import { clamp } from "./math.js";
 
@@ -10,7 +10,7 @@ const KEYS = {
   KeyD: [0, -1], ArrowRight: [0, -1],
 };
 
-/** Whether a key event belongs to a text that is being typed. */
+/** Whether a key event goes to a text field. */
 export function isTyping(event) {
   return event.target instanceof HTMLInputElement && event.target.type === "text";
 }
@@ -22,7 +22,7 @@ export function isDriveKey(event) {
   return event.code in KEYS && !slider;
 }
 
-/** Event "stop" (detail: why) when something other than a released key or stick ended a drive. */
+/** Event "stop" (detail: reason) when anything but a released key or stick ends a drive. */
 export class Drive extends EventTarget {
   constructor(link) {
     super();
@@ -45,7 +45,7 @@ export class Drive extends EventTarget {
     link.addEventListener("lost", () => this.stop("the link was lost"));
   }
 
-  /** Forgets every held key and the stick, and sends zero at once. */
+  /** Releases all keys and the stick, and sends zero at once. */
   stop(why) {
     const moving = this.command[0] !== 0 || this.command[1] !== 0;
     this._held.clear();
@@ -78,7 +78,7 @@ export class Drive extends EventTarget {
 
   _keyDown(event) {
     if (!isDriveKey(event)) return;
-    // With a system key held the browser may swallow the key-up.
+    // While a system key is held, the browser may suppress the key-up event.
     if (event.ctrlKey || event.metaKey || event.altKey) return this.stop("a system key was pressed");
     event.preventDefault();
     if (event.repeat || !this.enabled) return;
@@ -160,7 +160,7 @@ export function attachStick(element, drive) {
   });
 }
 
-/** A stick's axis, [-1, 1], without the play round its middle. */
+/** Axis of a stick, [-1, 1], with a dead zone around its centre. */
 export function deadZone(value) {
   const size = Math.abs(value);
   return size < 0.12 ? 0 : (Math.sign(value) * (size - 0.12)) / 0.88;

@@ -1,12 +1,11 @@
-// The feedback picture without WebGL: a crop of the panorama (cylinder in place of a plane, so lines bend
-// a little), and the rendered view moved and scaled, as a whole where the camera has moved on. Aims right in the middle
-// of the picture.
+// The view without WebGL: a crop of the panorama (a cylinder instead of a plane, so lines bend slightly), and the
+// rendered view, shifted and scaled as a whole when the camera has moved. The direction is exact at the centre.
 
 import { plain } from "./colour.js";
 import { rotate } from "./math.js";
 import { cells, MOST_PARALLAX, SAMPLE, SAMPLE_FINE } from "./viewer.js";
 
-const SOFT_PIXELS = 16; // of the view, to one of its blurred copy
+const SOFT_PIXELS = 16; // of the view per pixel of its blurred copy
 
 export class FlatViewer {
   constructor(canvas) {
@@ -14,18 +13,18 @@ export class FlatViewer {
     this.context = canvas.getContext("2d", { alpha: false });
     this.name = "canvas";
     this.slow = true;
-    this.busy = false; // it draws at once
+    this.busy = false; // renders synchronously
     this.lost = false;
     this._panorama = null; // {bitmap, mask, finished, colour}
     this._view = null;
-    this._inverse = 0; // mean of the view's depth, 1/m; 0: not known
+    this._inverse = 0; // mean inverse depth of the view, 1/m; 0: unknown
   }
 
   setPanorama(bitmap) {
     this._panorama = renewed(this._panorama, bitmap, null);
   }
 
-  /** See GlViewer.setView; of the depth picture the mean counts. */
+  /** See GlViewer.setView; only the mean of the depth image is used. */
   setView(bitmap, mask = null, depth = null) {
     this._view = renewed(this._view, bitmap, mask);
     this._inverse = depth ? meanLevel(depth.picture) / depth.near_m : 0;
@@ -36,7 +35,7 @@ export class FlatViewer {
     this._draw(this.context, width, height, scene, scene.blend);
   }
 
-  /** See GlViewer.sample; here the weights are 0 outside of the view, else 1. */
+  /** See GlViewer.sample; the weights are 0 outside the view, else 1. */
   sample(scene) {
     this._sampled ??= new OffscreenCanvas(SAMPLE[0] * SAMPLE_FINE, SAMPLE[1] * SAMPLE_FINE);
     const { width, height } = this._sampled;
@@ -71,7 +70,7 @@ export class FlatViewer {
     const centreV = 0.5 - Math.asin(z) / Math.PI;
     const spanU = Math.atan(scene.tanHalf[0]) / Math.PI;
     const spanV = (2 * Math.atan(scene.tanHalf[1])) / Math.PI;
-    // The whole turn, repeated on both sides, so that the seam needs no special case.
+    // The full panorama, repeated on both sides, so that the seam needs no special case.
     const turn = width / spanU, sheet = height / spanV;
     const top = height / 2 - centreV * sheet;
     for (const shift of [-1, 0, 1])
@@ -79,7 +78,7 @@ export class FlatViewer {
   }
 
   _drawView(context, width, height, scene) {
-    // Where the rendered view's axis stands in the look frame (viewFromLook's first row).
+    // Axis of the rendered view in the look frame (first row of viewFromLook).
     const axis = scene.viewFromLook.slice(0, 3);
     if (axis[0] <= 0.1) return;
     const [forward, left, up] = scene.moved ?? [0, 0, 0];
@@ -94,7 +93,7 @@ export class FlatViewer {
   }
 }
 
-/** Mean level of a grey picture, 0..1. */
+/** Mean level of a grey image, 0..1. */
 function meanLevel(picture) {
   const context = new OffscreenCanvas(picture.width, picture.height).getContext("2d", { willReadFrequently: true });
   context.drawImage(picture, 0, 0);
@@ -109,7 +108,7 @@ function renewed(old, bitmap, mask) {
   return { bitmap, mask, finished: null, colour: plain };
 }
 
-/** The picture in its colour, soft where the mask tells that nobody has seen; made once a picture and colour. */
+/** Returns the image in its colour, blurred where the mask marks unseen places; cached for each image and colour. */
 function finished(picture, colour) {
   if (!picture.mask && colour === plain) return picture.bitmap;
   if (picture.finished && sameColour(picture.colour, colour)) return picture.finished;
@@ -125,7 +124,7 @@ function finished(picture, colour) {
   if (picture.mask) soften(data, pixels(blurred(picture.bitmap)).data, pixels(picture.mask).data);
   for (let i = 0; i < data.length; i += 4)
     for (let channel = 0; channel < 3; channel++)
-      data[i + channel] = data[i + channel] * colour.gain[channel] + 255 * colour.offset[channel]; // clamped by its type
+      data[i + channel] = data[i + channel] * colour.gain[channel] + 255 * colour.offset[channel]; // Uint8ClampedArray clamps
   context.putImageData(image, 0, 0);
   picture.finished = canvas;
   picture.colour = colour;
@@ -144,7 +143,7 @@ function blurred(bitmap) {
   return small;
 }
 
-/** Mixes the blurred, paler picture in where the mask is dark. */
+/** Blends in the blurred, paler image where the mask is dark. */
 function soften(data, soft, mask) {
   for (let i = 0; i < data.length; i += 4) {
     const seen = mask[i] / 255;

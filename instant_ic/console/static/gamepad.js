@@ -1,23 +1,23 @@
-// Gamepad of the browser's standard layout: hold a shoulder button and drive by the left stick, look by the right one.
+// Gamepad with the browser's standard layout: hold a shoulder button and drive with the left stick, look with the right.
 
 import { deadZone } from "./drive.js";
 import { radians } from "./math.js";
 
 const POLL_MS = 20;
-const STOP = 1, CENTRE = 3, SHOULDERS = [4, 5], FASTER = 12, SLOWER = 13; // B, Y, LB and RB, cross up and down
-const LOOK_RATE = radians(110); // a second, at the stick's end
+const STOP = 1, CENTRE = 3, SHOULDERS = [4, 5], FASTER = 12, SLOWER = 13; // B, Y, LB and RB, D-pad up and down
+const LOOK_RATE = radians(110); // per second, at full deflection
 const STEP = 10; // percent of the speed limit
 
 /**
  * Events: "drive" (the shoulder button was pressed), "stop", "centre", "scale" (detail: percent to add),
- * "tell" (detail: words). Nothing is driven unless the window has the focus and the button was pressed since.
+ * "tell" (detail: text). It drives only if the window has focus and the button was pressed after it gained focus.
  */
 export class Gamepads extends EventTarget {
   constructor(drive, look) {
     super();
     this.drive = drive;
     this.look = look;
-    this._index = null; // of the pad that is used
+    this._index = null; // of the active pad
     this._held = new Set();
     this._driving = false;
     this._last = performance.now();
@@ -25,7 +25,7 @@ export class Gamepads extends EventTarget {
     window.addEventListener("gamepaddisconnected", ({ gamepad }) => {
       if (gamepad.index === this._index) this._lose();
     });
-    // What stopped the drive stops the pad too: the button must be let go and pressed anew.
+    // Any stop also stops the pad: the button must be released and pressed again.
     drive.addEventListener("stop", () => { this._driving = false; });
     setInterval(() => this._poll(), POLL_MS);
   }
@@ -37,7 +37,7 @@ export class Gamepads extends EventTarget {
     }
     if (this._index !== null) return;
     this._index = pad.index;
-    this._held = pressed(pad); // what is held already was not pressed for us
+    this._held = pressed(pad); // a button held already was not pressed for driving
     this._state("ready");
     this._tell("Gamepad: hold a shoulder button and drive by the left stick");
   }
@@ -58,7 +58,7 @@ export class Gamepads extends EventTarget {
     const held = pressed(pad), fresh = [...held].filter((button) => !this._held.has(button));
     this._held = held;
     const focused = document.hasFocus() && !document.hidden;
-    if (fresh.includes(STOP)) this._say("stop"); // also without the focus
+    if (fresh.includes(STOP)) this._say("stop"); // also without focus
     if (!focused) return this._letGo();
     if (!this.drive.enabled) this._letGo(); // not the driver, or an emergency stop
     if (fresh.includes(CENTRE)) this._say("centre");

@@ -1,12 +1,12 @@
-// The predicted trajectory as a ribbon on the floor of the picture, and the compass tape.
+// The predicted trajectory as a ribbon on the floor, and the compass tape.
 
 import { degrees, rotate, wrapAngle } from "./math.js";
 
 const NEAREST_M = 0.25;
-const REACH_M = 4; // the floor close by is out of sight, so the arc is drawn on to here
+const REACH_M = 4; // the nearby floor is out of view, so the arc is extended to here
 const STEP_M = 0.1;
 
-/** `points` and, from their end on, the arc of their last bend, up to REACH_M from the start. */
+/** `points`, extended along the arc of their last bend to REACH_M from the start. */
 function extended(points) {
   let length = 0;
   for (let i = 1; i < points.length; i++)

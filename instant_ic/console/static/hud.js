@@ -11,14 +11,14 @@ const MODES = {
   stopped: ["STOPPED", "The robot is held"],
   none: ["WAITING", "No controller is running"],
 };
-// Said to whoever cannot see the mode; what lasts a moment only is not.
+// Announced by screen readers; transitional modes are not.
 const SAID = {
   real: "Real view: you see through the robot's camera",
   virtual: "Virtual view: you drive the virtual robot, the robot follows",
   stopped: "Stopped: the robot is held",
 };
 const ANNOUNCE_MS = 400;
-// What an operator calls the nodes whose faults are told.
+// Node names for the operator's list of faults.
 const NODES = {
   theta_camera: "Camera", vlp16_driver: "LiDAR", crawler_base: "Base", grid_slam: "Map and pose", arbiter: "Control",
   virtual_robot: "Virtual robot", navigator: "Path planner", depth_estimator: "Depth", depth_scaler: "Depth",
@@ -30,7 +30,7 @@ const TOAST_MS = 2600;
 const byId = (id) => document.getElementById(id);
 
 function write(element, text) {
-  // Setting the same text again would make screen readers say it again.
+  // Setting the same text again would make screen readers repeat it.
   if (element.textContent !== text) element.textContent = text;
 }
 
@@ -77,7 +77,7 @@ export function showHealth(health) {
   list.replaceChildren(...faults.map(({ level, name, text }) => {
     const item = document.createElement("li");
     item.className = level;
-    item.title = `${name}: ${text}`; // whole, and with the node's name for `ic log`
+    item.title = `${name}: ${text}`; // full text, with the node's name for `ic log`
     const bold = document.createElement("b");
     bold.textContent = NODES[name] ?? name;
     item.append(bold, ` ${text}`);
@@ -85,7 +85,7 @@ export function showHealth(health) {
   }));
 }
 
-/** How good the virtual space is: sharpness of what was learnt, of the view asked for, how much of it was seen, how far. */
+/** Quality of the virtual space: PSNR of the training or of the requested view, share of it that was seen, valid range. */
 function readiness({ psnr_db, expected_psnr_db, unseen_share, radius_m }) {
   const words = [];
   if (expected_psnr_db > 0) words.push(`${expected_psnr_db.toFixed(0)} dB here`, `${Math.round(100 * (1 - unseen_share))} % seen`);
@@ -135,7 +135,7 @@ export function showSession(session) {
 
 const sentence = (words) => (words ? words[0].toUpperCase() + words.slice(1) : "");
 
-/** One banner at a time: a lost link first, then the emergency stop, then a key held through a stop. */
+/** One banner at a time, by priority: lost link, emergency stop, key held through a stop. */
 export function showBanner(connected, everConnected, estop, held, driver, reason) {
   document.body.dataset.link = connected ? "up" : everConnected ? "lost" : "connecting";
   document.body.dataset.estop = estop ? "set" : "free";
@@ -147,18 +147,18 @@ export function showBanner(connected, everConnected, estop, held, driver, reason
   write(byId("banner-text"), lost
     ? "The robot was told to stop. Connecting again…"
     : !estop ? "Let go of the controls to go on."
-    : reason ? sentence(reason) // who or what holds it, and what to do
+    : reason ? sentence(reason) // says what holds the robot and what to do
     : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
   byId("release").hidden = lost || !estop || driver !== "you";
 }
 
-/** Sets a data attribute of the page, where styles and tests look; writes only what has changed. */
+/** Sets a data attribute of the page, for styles and tests, if it has changed. */
 export function mark(name, value) {
   if (document.body.dataset[name] !== value) document.body.dataset[name] = value;
 }
 
 let announceTimer = null;
-/** Has a screen reader say a text, if it still holds in a moment: what flickers is not said. */
+/** Announces a text to screen readers after ANNOUNCE_MS, unless another one replaces it: short changes stay silent. */
 export function announce(text) {
   clearTimeout(announceTimer);
   announceTimer = setTimeout(() => write(byId("announce"), text), ANNOUNCE_MS);

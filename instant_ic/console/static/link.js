@@ -1,15 +1,15 @@
 // The WebSocket: reconnects, measures round trip and clock offset, decodes binary frames.
 
-const PING_MS = 50; // the server takes a driver who is silent for beat_timeout_s (0.25 s) as gone
-const SILENCE_MS = 1000; // nothing heard for this long: the link counts as lost
+const PING_MS = 50; // the server counts a driver as lost after beat_timeout_s (0.25 s)
+const SILENCE_MS = 1000; // the link counts as lost after this silence
 const PREFIX_BYTES = 12;
 const VERSION = 1;
 
 export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4;
 
 /**
- * Events: "open", "lost" (once a loss), "signed-out" (the server wants a token), "message" (detail: object), "frame" (detail: frame).
- * A frame is {kind, sequence, header, payload: Blob}; whoever takes it calls acknowledge(frame).
+ * Events: "open", "lost" (once for each loss), "signed-out" (the server requires a token), "message" (detail: object), "frame"
+ * (detail: frame). A frame is {kind, sequence, header, payload: Blob}; its consumer must call acknowledge(frame).
  */
 export class Link extends EventTarget {
   constructor(url) {
@@ -17,8 +17,8 @@ export class Link extends EventTarget {
     this.url = url;
     this.roundTripMs = null;
     this.commandAgeMs = null;
-    this.commandHz = 0; // drive commands that the server took in the last second
-    this.away = false; // the operator is at something else than the robot
+    this.commandHz = 0; // drive commands accepted in the last second
+    this.away = false; // the operator does something else, such as typing
     this.connected = false;
     this._offsetMs = null;
     this._samples = [];
@@ -27,17 +27,17 @@ export class Link extends EventTarget {
     this._sequence = 0;
     this._connect();
     setInterval(() => this._beat(), PING_MS);
-    // At once: hidden pages beat once a second or not at all.
+    // At once, because timers of hidden pages run once a second or not at all.
     document.addEventListener("visibilitychange", () => this._ping());
     window.addEventListener("pagehide", () => this._ping(true));
   }
 
-  /** The server's clock now, ms; null before the first answer. */
+  /** Present time of the server's clock, ms; null before the first answer. */
   serverNow() {
     return this._offsetMs === null ? null : performance.now() + this._offsetMs;
   }
 
-  /** How good the link is: "good", "fair", "poor"; null while it is not known. By its round trips, the usual and the slow. */
+  /** Quality of the link by median and 90th percentile of the round trip: "good", "fair", "poor"; null if unknown. */
   get quality() {
     if (!this.connected || this._samples.length < 10) return null;
     const sorted = this._samples.slice(-60).map((sample) => sample.roundTrip).sort((a, b) => a - b);
@@ -50,7 +50,7 @@ export class Link extends EventTarget {
     if (this._socket?.readyState === WebSocket.OPEN) this._socket.send(JSON.stringify(message));
   }
 
-  /** Sends a drive command (m/s, rad/s); false when there is no link to send it by. */
+  /** Sends a drive command (m/s, rad/s); returns false without a link. */
   drive(linear, angular) {
     const time_ms = this.serverNow();
     if (!this.connected || time_ms === null) return false;
@@ -91,13 +91,13 @@ export class Link extends EventTarget {
     this._retryMs = Math.min(this._retryMs * 2, 2000);
   }
 
-  /** A refused WebSocket tells a page no reason; an ordinary request does. */
+  /** Asks by an ordinary request why the WebSocket was refused; a WebSocket gives a page no reason. */
   async _askWhy() {
     try {
       const answer = await fetch("/health", { cache: "no-store" });
       if (answer.status === 401) this.dispatchEvent(new Event("signed-out"));
     } catch {
-      // No server there: the next try tells.
+      // No server; the next attempt will show.
     }
   }
 
@@ -110,7 +110,7 @@ export class Link extends EventTarget {
   _beat() {
     if (this._socket?.readyState !== WebSocket.OPEN) return;
     if (performance.now() - this._heard > SILENCE_MS && !document.hidden) {
-      // A dead path closes no socket for minutes, so we do.
+      // A dead path leaves the socket open for minutes, so close it here.
       const dead = this._socket;
       this._socket = null;
       dead.close();
@@ -141,7 +141,7 @@ export class Link extends EventTarget {
     const roundTrip = now - message.client_ms;
     this._samples.push({ roundTrip, offset: message.server_ms + roundTrip / 2 - now });
     if (this._samples.length > 100) this._samples.shift();
-    // The quickest answer was delayed least, so its offset is the truest.
+    // The fastest answer was delayed least, so its offset is the most accurate.
     this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
     const recent = this._samples.slice(-40).map((s) => s.roundTrip).sort((a, b) => a - b);
     this.roundTripMs = recent[recent.length >> 1];

@@ -1,17 +1,17 @@
-// Where the operator looks, relative to the robot's heading: mouse or finger drag, wheel, keys.
+// Look direction relative to the robot's heading: mouse or finger drag, wheel, keys.
 
 import { isTyping } from "./drive.js";
 import { clamp, radians, wrapAngle } from "./math.js";
 
 const MAX_PITCH = radians(80);
 const MIN_VFOV = radians(25), MAX_VFOV = radians(85);
-const KEY_RATE = radians(70); // a second
+const KEY_RATE = radians(70); // per second
 const KEYS = { KeyJ: [1, 0], KeyL: [-1, 0], KeyI: [0, 1], KeyK: [0, -1] };
 const REST_PITCH = radians(-10); // a little floor in front of the robot
 const CENTRE_MS = 350;
 
 export class Look {
-  /** `element` takes the drags. */
+  /** `element` receives the drags. */
   constructor(element) {
     this.yaw = 0;
     this.pitch = REST_PITCH;
@@ -45,7 +45,7 @@ export class Look {
     window.addEventListener("blur", () => this._held.clear());
   }
 
-  /** Turns back to straight ahead. */
+  /** Turns to straight ahead. */
   centre() {
     this._centring = { yaw: this.yaw, pitch: this.pitch, start: performance.now() };
   }
@@ -60,7 +60,7 @@ export class Look {
     this.vfov = clamp(this.vfov * factor, MIN_VFOV, MAX_VFOV);
   }
 
-  /** Moves on by `seconds`. */
+  /** Advances by `seconds`. */
   step(seconds) {
     for (const code of this._held) {
       this.turn(KEYS[code][0] * KEY_RATE * seconds, KEYS[code][1] * KEY_RATE * seconds);
@@ -91,7 +91,7 @@ export class Look {
       if (before > 10 && after > 10) this.zoom(before / after);
       return;
     }
-    // The picture follows the pointer: a drag to the right turns the line of sight to the left.
+    // The image follows the pointer: a drag to the right turns the line of sight to the left.
     const perPixel = this.vfov / element.clientHeight;
     this._turn((event.clientX - last[0]) * perPixel, (event.clientY - last[1]) * perPixel);
     this._pointers.set(event.pointerId, [event.clientX, event.clientY]);

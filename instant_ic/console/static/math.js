@@ -7,7 +7,7 @@ export function rotationZ(angle) {
   return [c, -s, 0, s, c, 0, 0, 0, 1];
 }
 
-/** Line of sight turned left by `yaw` and up by `pitch`. */
+/** Rotation of the line of sight: left by `yaw`, up by `pitch`. */
 export function lookRotation(yaw, pitch) {
   const c = Math.cos(pitch), s = Math.sin(pitch);
   return multiply(rotationZ(yaw), [c, 0, -s, 0, 1, 0, s, 0, c]);

@@ -1,4 +1,4 @@
-// The map in a corner: walls, costs, both robots, path, subgoal and predicted trajectory.
+// Map in the corner: walls, costs, both robots, path, subgoal and predicted trajectory.
 
 const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", path: "#8fb8ff", goal: "#ffffff" };
 const RADIUS_M = 3.5; // half the width shown in the small map
@@ -11,7 +11,7 @@ export class MiniMap {
     this._layers = { floor: null, costs: null, walls: null };
   }
 
-  /** `bitmap` holds grey cells (gridimage.py), `header` where they lie. */
+  /** `bitmap` holds grey cells (gridimage.py), `header` their resolution and position. */
   setLayer(name, bitmap, header) {
     const paints = name === "map" ? { floor: paintFloor, walls: paintWalls } : { costs: paintCosts };
     for (const [layer, paint] of Object.entries(paints)) this._layers[layer] = { image: painted(bitmap, paint), header };
@@ -40,7 +40,7 @@ export class MiniMap {
     if (scene.vbot && scene.mode === "virtual") this._robot(scene.vbot, scene.footprint, COLOURS.virtual, pixel, false);
   }
 
-  /** Sets metres as units: heading up when small, north up with the whole map when large. */
+  /** Scales the canvas to metres and returns pixels per metre. Small: heading up; large: north up with the whole map. */
   _place([x, y, yaw], width, height) {
     const context = this.context;
     if (this.large && this._layers.walls) {
@@ -123,7 +123,7 @@ export class MiniMap {
     context.fill();
     context.stroke();
     context.setLineDash([]);
-    // The nose tells where it heads.
+    // The triangle shows the heading.
     context.fillStyle = solid ? "#0b0e12" : colour;
     context.beginPath();
     context.moveTo(length * 0.36, 0);

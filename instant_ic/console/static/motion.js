@@ -1,18 +1,18 @@
-// Where the shown robot is at the moment of drawing, between and beyond the state messages.
+// Pose of the shown robot at render time, between and beyond the state messages.
 
 import { clamp, wrapAngle } from "./math.js";
 
 const EXTRAPOLATION_MS = 200;
 export const SMOOTHING_MS = 50;
 const SNAP_RAD = 0.6, SNAP_M = 0.5; // a larger jump is a new pose, not a motion
-const EASED_RAD = 0.2, EASED_M = 0.3; // likewise from one robot to the other
+const EASED_RAD = 0.2, EASED_M = 0.3; // the same between the two robots
 
 export class Motion {
   constructor() {
-    this.pose = null; // [x, y, yaw] in the map; null: not known
+    this.pose = null; // [x, y, yaw] in the map frame; null: unknown
     this.easeMs = 400;
     this._followed = null;
-    this._residual = [0, 0, 0]; // what the other robot's pose had more, and is still left of it
+    this._residual = [0, 0, 0]; // remaining offset of the other robot's pose
     this._easedMs = 0;
     this._robot = null;
   }
@@ -21,14 +21,14 @@ export class Motion {
     return this.pose?.[2] ?? null;
   }
 
-  /** The shown robot's own pose, without what is left of the other's. */
+  /** Pose of the shown robot without the remaining offset of the other one. */
   get own() {
     return this._followed;
   }
 
   /**
-   * Goes on by `elapsedMs`. `robot`: name of the robot that is shown; at another name the difference of the two poses
-   * is eased out. `pose` was true `ageMs` ago, `twist` [m/s, rad/s] its velocity then.
+   * Advances by `elapsedMs`. `robot`: name of the shown robot; when it changes, the difference between the two poses is
+   * eased out. `pose` and `twist` [m/s, rad/s] are `ageMs` old.
    */
   follow(robot, pose, twist, ageMs, elapsedMs) {
     if (!pose) return;
@@ -40,12 +40,12 @@ export class Motion {
       this._followed = target;
     }
     this._robot = robot;
-    // It goes on at its velocity, and only what that misses is smoothed: so a steady motion is shown without a lag.
+    // Move on at the velocity and smooth only the remaining error, so that steady motion is shown without lag.
     const went = this._followed && moved(this._followed, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
     const left = went ? difference(target, went) : null;
     if (left === null || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
     else this._followed = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
-    this._easedMs += elapsedMs; // not the time itself: a page that hangs for a moment goes on from where it was
+    this._easedMs += elapsedMs; // elapsed, not absolute: after a short hang the page continues where it was
     const t = this.easeMs > 0 ? clamp(this._easedMs / this.easeMs, 0, 1) : 1;
     this.pose = sum(this._followed, this._residual, 1 - t * t * (3 - 2 * t));
   }

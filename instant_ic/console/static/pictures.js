@@ -1,4 +1,4 @@
-// The newest panorama and rendered view, and what to show of them now.
+// The newest panorama and rendered view, and the scene composed of them.
 
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
 import { PANORAMA, VIEW } from "./link.js";
@@ -6,29 +6,29 @@ import { fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, tr
 import { Motion, SMOOTHING_MS } from "./motion.js";
 
 const STALE_MS = 2000;
-// For a picture made after the change of mode; then the best there is.
+// Longest wait for an image made after the change of mode; afterwards the best available is shown.
 const WAIT_MS = { [PANORAMA]: 300, [VIEW]: 500 };
-const RELEASE_STEP_MS = 100; // the colour is let go in steps too small to be seen
-const LEAST_M = 0.0005; // of a view's motion, to be drawn
-const ELSEWHERE_M = 1; // a view from farther off is no earlier look at the same place
+const RELEASE_STEP_MS = 100; // the matched colour fades in steps too small to be seen
+const LEAST_M = 0.0005; // smallest motion of a view that is rendered
+const ELSEWHERE_M = 1; // a view rendered farther away shows another place
 
 export class Pictures {
   constructor(viewer, link) {
     this.viewer = viewer;
     this.link = link;
-    this.panorama = null; // header of the shown one
+    this.panorama = null; // header of the newest one
     this.view = null;
     this.blend = 0;
     this.dissolveMs = 250;
     this.decodeErrors = 0;
     this.changed = true;
     this.motion = new Motion();
-    this.leadMaxM = 0; // a view is shown as from up to this far from where it was drawn for; 0: never moved
-    this.place = null; // [x, y] in the map of the camera that the view is shown from
-    this._now = null; // of the v-bot's camera
-    this._lead = 0; // 0: from where it was drawn for, 1: from where the v-bot is now
+    this.leadMaxM = 0; // largest distance by which a view is moved from its rendered position; 0: never moved
+    this.place = null; // position [x, y] in the map frame from which the view is shown
+    this._now = null; // position of the v-bot's camera
+    this._lead = 0; // 0: rendered position, 1: present position of the v-bot
     this._virtual = false;
-    // Since when pictures of each kind have been made where the shown robot is; by the server's clock.
+    // Time since which images of each kind are made at the shown robot; server's clock.
     this._since = { [PANORAMA]: 0, [VIEW]: 0 };
     this._nearVbot = false;
     this._nearRobot = true;
@@ -39,12 +39,12 @@ export class Pictures {
     this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
   }
 
-  /** Time in which a colour that was matched at a switch is let go; 0: colours are not matched. */
+  /** Time in which a colour matched at a switch fades out; 0: colours are not matched. */
   set colourReleaseMs(value) {
     for (const colour of Object.values(this._colours)) colour.releaseMs = value;
   }
 
-  /** Decodes a picture frame, puts it into the viewer, then acknowledges it. */
+  /** Decodes an image frame, passes it to the viewer, then acknowledges it. */
   async take(frame) {
     try {
       const { mask: maskText, depth: depthText, ...header } = frame.header;
@@ -71,7 +71,7 @@ export class Pictures {
     }
   }
 
-  /** Pictures of a kind that came in the last 3 s, a second. */
+  /** Images of a kind per second, over the last 3 s. */
   rate(kind) {
     const now = performance.now();
     const recent = this._arrivals[kind].filter((t) => now - t < 3000);
@@ -79,12 +79,12 @@ export class Pictures {
     return (1000 * (recent.length - 1)) / (now - recent[0]);
   }
 
-  /** Header of the picture that the operator sees. */
+  /** Header of the shown image. */
   get shown() {
     return this.blend > 0.5 ? this.view : this.panorama;
   }
 
-  /** Age of the shown picture, ms; null when there is none. */
+  /** Age of the shown image, ms; null if there is none. */
   ageMs() {
     const now = this.link.serverNow();
     return this.shown && now !== null ? now - this.shown.captured_ms : null;
@@ -95,7 +95,7 @@ export class Pictures {
     return age !== null && age > STALE_MS;
   }
 
-  /** Scene for the viewer after `elapsedMs` more. `state` is the newest state message. */
+  /** Advances by `elapsedMs` and returns the scene for the viewer. `state` is the newest state message. */
   scene(state, look, tanHalf, elapsedMs) {
     const now = performance.now();
     const starts = this._step(state, elapsedMs);
@@ -124,8 +124,8 @@ export class Pictures {
   }
 
   /**
-   * How the camera has moved since the view was drawn, in the view's frame; null: not to be seen. `state.lead` says how
-   * much of the way to the v-bot's place of now is shown: at a switch none, as then each picture is where it was made.
+   * Motion of the camera since the view was rendered, in the view's frame; null: too small to be seen. `state.lead` is the
+   * share of the way to the v-bot's present position; at a switch it is 0, so that each image is where it was made.
    */
   _moved(state, elapsedMs) {
     const { p, q, mount, hasDepth } = this.view, own = this.motion.own;
@@ -143,20 +143,20 @@ export class Pictures {
     return rotate(transpose(fromQuaternion(q)), [share * way[0], share * way[1], 0]);
   }
 
-  /** Goes on with the dissolve; true when one starts from a picture that was shown alone. */
+  /** Advances the dissolve; returns true when one starts from an image that was shown alone. */
   _step(state, elapsedMs) {
     const virtual = shows(state) === "virtual";
     const at = state?.at_ms ?? 0;
     if (virtual !== this._virtual) this._changedAt = at;
     this._virtual = virtual;
-    // While the virtual space is entered, views are made at the v-bot's pose already; while it is left, the camera is
-    // there already, and the switch is made when its newest picture is of the same place as the view.
+    // In ENTERING, views are already rendered at the v-bot's pose. In RETURNING, the camera is already there, and the
+    // switch comes when its newest image shows the same place as the view.
     const nearVbot = virtual || state?.mode === "entering", nearRobot = !virtual || state?.mode === "returning";
     if (nearVbot && !this._nearVbot) this._since[VIEW] = at;
     if (nearRobot && !this._nearRobot) this._since[PANORAMA] = at;
     this._nearVbot = nearVbot;
     this._nearRobot = nearRobot;
-    // A stop shows the real view, however old; so does the loss of the controller.
+    // A stop shows the real view, however old; so does a lost controller.
     const waits = virtual || state?.mode === "real";
     const kind = virtual ? VIEW : PANORAMA, wanted = virtual ? 1 : 0;
     const toward = this.blend === wanted || this._toward === wanted || !waits || this._fits(kind) ? wanted : 1 - wanted;
@@ -170,14 +170,14 @@ export class Pictures {
     return starts;
   }
 
-  /** Whether the newest picture of a kind may be shown: made since the switch, or the best there is after a wait. */
+  /** Whether the newest image of a kind may be shown: it was made since the switch, or the wait is over. */
   _fits(kind) {
     const header = kind === VIEW ? this.view : this.panorama;
     if (!header) return kind === PANORAMA;
     return header.captured_ms >= this._since[kind] || this.link.serverNow() - this._changedAt > WAIT_MS[kind];
   }
 
-  /** Gives the picture that comes the colours of the one that goes, as both show the same place. */
+  /** Matches the colours of the new image to the old one; both show the same place. */
   _match(scene, now) {
     if (this._colours[VIEW].releaseMs <= 0) return;
     const seen = this.viewer.sample(scene);
@@ -193,7 +193,7 @@ export class Pictures {
     this.changed = true;
   }
 
-  /** Follows the shown robot between the state messages. */
+  /** Updates the pose of the shown robot between the state messages. */
   _follow(state, elapsedMs) {
     const robot = shows(state) === "virtual" ? "virtual" : "real";
     const pose = robot === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
@@ -210,7 +210,7 @@ const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none"
 const decodedPng = (text) =>
   decoded(new Blob([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], { type: "image/png" }));
 
-/** The depth picture of a view, base64 of a PNG; null where there is none, or none that can be used. */
+/** Decodes the depth image of a view (base64 PNG); null if it is missing or unusable. */
 async function decodedDepth(text, near_m) {
   if (!text || !(near_m > 0)) return null;
   try {
@@ -222,8 +222,8 @@ async function decodedDepth(text, near_m) {
 }
 
 /**
- * The mask of a view, base64 of a PNG; null where all of it was seen. It is much coarser than the view: a place
- * counts as what the least seen place beside it is, so that none that was not seen shows at the edges.
+ * Decodes the mask of a view (base64 PNG); null if all of it was seen. The mask is much coarser than the view, so each
+ * pixel takes the minimum of its neighbourhood: then no unseen place shows at the edges.
  */
 async function decodedMask(text) {
   if (!text) return null;

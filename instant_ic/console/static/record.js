@@ -1,4 +1,4 @@
-// Record button, snapshot of the last minute, bookmarks: wishes to the server, and what it says has become of them.
+// Record button, snapshot of the last minute and bookmarks: commands to the server, and their results.
 
 import { announce, toast } from "./hud.js";
 
@@ -6,7 +6,7 @@ const byId = (id) => document.getElementById(id);
 const BUSY = { ending: "Saving…", "disk full": "Disk full", failed: "Failed", paused: "Paused" };
 
 export class Recording {
-  /** `drive` is stopped, and the link says "away", while a bookmark's name is typed: the robot is held meanwhile. */
+  /** While a bookmark's name is typed, `drive` is stopped and the link reports "away", which keeps the robot stopped. */
   constructor(link, drive) {
     this.link = link;
     this.drive = drive;
@@ -34,12 +34,12 @@ export class Recording {
     else this._wish({ type: "record", on: !this.running });
   }
 
-  /** Gives this moment a name; without one it gets a number. */
+  /** Sets a bookmark; without a name it gets a number. */
   mark(name) {
     this._wish({ type: "bookmark", name: name || `Mark ${this._told.bookmarks.length + 1}` });
   }
 
-  /** Takes a "recording" message. */
+  /** Shows a "recording" message. */
   take(message) {
     this._told = { bookmarks: [], snapshots: [], ...message };
     const { number, text } = message.notice;

@@ -1,13 +1,13 @@
-// Saves the picture, the panorama and the map as files of the operator's machine.
+// Saves the view, the panorama and the map as files on the operator's machine.
 
 import { toast } from "./hud.js";
 
-/** The picture as it is shown, without the overlay, in the window's full resolution. `draw` draws it into the canvas. */
+/** Saves the shown view without the overlay, at the window's full resolution. `draw` renders it into the canvas. */
 export function savePicture(canvas, draw) {
   const { width, height } = canvas;
   canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
   canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
-  draw(); // WebGL keeps no picture beyond the task in which it was drawn
+  draw(); // WebGL discards the image after the task that rendered it
   canvas.toBlob((blob) => {
     if (blob) hand(blob, `picture_${stamp()}.png`);
     else toast("The browser could not make a file of the picture.");
@@ -17,7 +17,7 @@ export function savePicture(canvas, draw) {
   draw();
 }
 
-/** A file of the server: `path` under /export/. */
+/** Saves a file of the server: `path` under /export/. */
 export async function saveFile(path) {
   try {
     const answer = await fetch(`/export/${path}`, { cache: "no-store" });

@@ -1,4 +1,4 @@
-// The feedback picture in WebGL 2: panorama and rendered view through one projection, one pass.
+// The view in WebGL 2: panorama and rendered view in one projection and one pass.
 
 const VERTEX = `#version 300 es
 out vec2 screen;
@@ -20,18 +20,18 @@ uniform vec2 viewTanHalf;  // of the rendered view
 uniform vec2 viewSize;     // pixels
 uniform float blend;       // 0 camera, 1 virtual space
 uniform bool hasMask;
-uniform bool slow;         // the CPU draws
-uniform bool moved;        // the camera has moved since the view was drawn
-uniform vec2 aside;        // how far, right and up, over viewTanHalf, m
-uniform float along;       // and forward
-uniform float perInverse;  // inverse depth along the axis that 1 stands for in the depth picture, 1/m
-uniform float mostInverse; // nearest that counts: nearer things would be torn apart
-uniform int only;          // 0 the picture; for samples: 1 the panorama, 2 the view with its confidence as alpha
+uniform bool slow;         // the CPU renders
+uniform bool moved;        // the camera has moved since the view was rendered
+uniform vec2 aside;        // motion to the right and up, divided by viewTanHalf, m
+uniform float along;       // motion forward, m
+uniform float perInverse;  // inverse depth along the axis of value 1 in the depth image, 1/m
+uniform float mostInverse; // upper limit: nearer surfaces would tear
+uniform int only;          // 0 the result; for samples: 1 the panorama, 2 the view with its confidence as alpha
 uniform vec3 panoramaGain, panoramaOffset, viewGain, viewOffset;
 const float PI = 3.14159265358979;
 const vec3 NIGHT = vec3(0.035, 0.043, 0.055);
 const vec3 GREY = vec3(0.30, 0.59, 0.11);
-const float SOFT_LEVEL = 4.0; // of the view's pyramid, for what nobody has seen
+const float SOFT_LEVEL = 4.0; // mipmap level of the view for unseen places
 
 vec3 fromPanorama(vec3 direction) {
   if (!hasPanorama) return NIGHT;
@@ -41,9 +41,9 @@ vec3 fromPanorama(vec3 direction) {
   return textureLod(panorama, vec2(u, v), 0.0).rgb;
 }
 
-// Cubic B-spline by four bilinear look-ups: a small view enlarged stays soft, without squares.
+// Cubic B-spline by four bilinear look-ups: an enlarged small view stays smooth, without visible pixels.
 vec3 smoothView(vec2 uv, float level) {
-  if (slow && level == 0.0) return textureLod(view, uv, 0.0).rgb; // four would be a third of the CPU's work
+  if (slow && level == 0.0) return textureLod(view, uv, 0.0).rgb; // four look-ups would be a third of the CPU's work
   vec2 viewSize = max(floor(viewSize / exp2(level)), 1.0);
   vec2 p = uv * viewSize - 0.5;
   vec2 i = floor(p), f = p - i;
@@ -59,9 +59,9 @@ vec3 smoothView(vec2 uv, float level) {
     mix(textureLod(view, vec2(a.x, b.y), level), textureLod(view, vec2(b.x, b.y), level), high.x), high.y).rgb;
 }
 
-// Where the view shows what is seen at this place of it now that the camera has moved: by steps against the depth,
-// from the nearest on, so that near things cover far ones. An even number: where the steps swing to and fro between
-// near and far, something opens up behind an edge, and the far side goes on. (geometry/depth_picture.py in Python.)
+// Position in the rendered view of what the moved camera sees at `at`. Fixed-point iteration on the depth, from the
+// nearest depth on, so that near surfaces cover far ones. The number of steps is even: where the iteration alternates
+// between near and far, a gap opens behind an edge, and the far surface fills it. (Python: geometry/depth_picture.py.)
 vec2 before(vec2 at) {
   vec2 perInverseDepth = aside - along * at;
   float inverse = mostInverse;
@@ -72,7 +72,7 @@ vec2 before(vec2 at) {
   return at + inverse * perInverseDepth;
 }
 
-// What was seen is sharp; the rest is guessed from around it, so it is shown blurred and paler.
+// Seen places are sharp; the rest is a guess from its surroundings, so it is shown blurred and paler.
 vec3 fromView(vec2 uv) {
   float seen = hasMask ? smoothstep(0.0, 1.0, textureLod(mask, uv, 0.0).r) : 1.0;
   vec3 result = seen > 0.004 ? smoothView(uv, 0.0) : vec3(0.0);
@@ -91,7 +91,7 @@ void main() {
   }
   vec3 d = viewFromLook * direction;
   vec2 uv = vec2(0.0);
-  float inside = 0.0; // of the rendered view, with a soft edge
+  float inside = 0.0; // inside the rendered view, with a soft edge
   if (blend > 0.0 && d.x > 0.0) {
     vec2 at = vec2(-d.y, d.z) / (d.x * viewTanHalf);
     if (moved) at = before(at);
@@ -106,16 +106,16 @@ void main() {
   vec3 real = vec3(0.0), rendered = vec3(0.0);
   if (blend < 1.0 || inside < 1.0) real = fromPanorama(direction) * panoramaGain + panoramaOffset;
   if (inside > 0.0) rendered = fromView(uv) * viewGain + viewOffset;
-  // Beyond the rendered view's edge the camera's picture goes on, dim and grey.
+  // Beyond the rendered view's edge the camera's image continues, dim and grey.
   vec3 around = mix(NIGHT, vec3(dot(real, GREY)), 0.35);
   colour = vec4(mix(real, mix(around, rendered, inside), blend), 1.0);
 }`;
 
 /** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
 export const SAMPLE = [40, 24], SAMPLE_FINE = 4;
-/** Motion over depth: what is nearer is taken to be so far that it moves by no more. */
+/** Largest motion over depth; nearer surfaces are moved by no more than this. */
 export const MOST_PARALLAX = 0.5;
-const MOST_REST_MS = 100; // between two pictures that the CPU draws
+const MOST_REST_MS = 100; // longest pause between two frames that the CPU renders
 
 /** Throws when WebGL 2 is missing. */
 export class GlViewer {
@@ -127,7 +127,7 @@ export class GlViewer {
     this.name = "webgl";
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     const renderer = String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-    // Drawn by the CPU: the page then does with fewer pixels and no blur.
+    // Software rendering: the page then uses fewer pixels and no blur.
     this.slow = /swiftshader|llvmpipe|software|basic render/i.test(renderer);
     this.lost = false;
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
@@ -146,9 +146,9 @@ export class GlViewer {
     gl.generateMipmap(gl.TEXTURE_2D);
     this._hasPanorama = false;
     this._hasMask = false;
-    this._perInverse = 0; // 1/m; 0: the depth is not known
+    this._perInverse = 0; // 1/m; 0: depth unknown
     this._viewSize = [1, 1];
-    this._fence = null; // signalled when the CPU has drawn the last picture
+    this._fence = null; // signalled when the CPU has rendered the last frame
     this._drawnAt = 0;
     this._restUntil = 0;
     gl.useProgram(this._program);
@@ -164,13 +164,13 @@ export class GlViewer {
   }
 
   /**
-   * `mask`: small grey picture of where the view is sure; null: everywhere.
-   * `depth`: {picture, near_m}: small grey picture, whose v is the depth near_m * 255 / v along the axis; null: not known.
+   * `mask`: small grey image, bright where the view was seen; null: everywhere.
+   * `depth`: {picture, near_m}: small grey image; value v is the depth near_m * 255 / v along the axis; null: unknown.
    */
   setView(bitmap, mask = null, depth = null) {
     this._upload(1, this._view, bitmap);
     this._viewSize = [bitmap.width, bitmap.height];
-    this.gl.generateMipmap(this.gl.TEXTURE_2D); // to blur it where nobody has seen
+    this.gl.generateMipmap(this.gl.TEXTURE_2D); // to blur unseen places
     this._hasMask = mask !== null;
     if (mask) this._upload(2, this._mask, mask);
     this._perInverse = depth ? 1 / depth.near_m : 0;
@@ -178,8 +178,8 @@ export class GlViewer {
   }
 
   /**
-   * `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend, panoramaColour, viewColour; `moved`: of the
-   * camera since the view was drawn [forward, left, up] in the view's frame, m; null: not at all.
+   * `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend, panoramaColour, viewColour; `moved`: motion of
+   * the camera since the view was rendered [forward, left, up] in the view's frame, m; null: none.
    */
   draw(scene) {
     const gl = this.gl;
@@ -192,8 +192,8 @@ export class GlViewer {
   }
 
   /**
-   * Whether the CPU still draws the last picture, or has not been left alone for as long as that took: what waits
-   * behind such drawings is late, a new view of the virtual space as much as a message.
+   * Whether the CPU still renders the last frame, or has not yet paused for as long as that took (at most MOST_REST_MS).
+   * Without the pause, rendering would delay messages and new views.
    */
   get busy() {
     const gl = this.gl;
@@ -208,8 +208,8 @@ export class GlViewer {
   }
 
   /**
-   * Panorama and view as they came, small and in the same projection: {1: panorama, 2: view} with 3 values a cell,
-   * 0..1, and `weights`, 0 where the view shows nothing that was seen.
+   * Returns panorama and view without colour matching, small and in the same projection: {1: panorama, 2: view} with
+   * 3 values per cell, 0..1, and `weights`, which are 0 where the view shows no seen place.
    */
   sample(scene) {
     const gl = this.gl, width = SAMPLE[0] * SAMPLE_FINE, height = SAMPLE[1] * SAMPLE_FINE;
@@ -285,7 +285,7 @@ export class GlViewer {
   }
 }
 
-/** Means over the cells of RGBA pixels: {colours: 3 a cell, alpha: 1 a cell}, 0..1. */
+/** Averages RGBA pixels over the cells: {colours: 3 per cell, alpha: 1 per cell}, 0..1. */
 export function cells(pixels) {
   const [columns, rows] = SAMPLE, fine = SAMPLE_FINE, share = 1 / (255 * fine * fine);
   const colours = new Array(3 * columns * rows).fill(0), alpha = new Array(columns * rows).fill(0);
