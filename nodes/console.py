@@ -158,7 +158,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         if self.server.plain_http:
             self.log.warning(PLAIN_HTTP)
         if self.server.access.unguarded:
-            self.log.warning("everybody on the network may drive: server.access.sign_in is never")
+            self.log.warning("anyone on the network may drive, because server.access.sign_in is never")
         self.timer(1.0 / config.state_rate_hz, self.tell_state)
         self.timer(0.2, self.send_plan)
         self.timer(1.0, self.send_health)
@@ -232,11 +232,13 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Call the recorder node, on the desk's thread; raise RecorderError with a message for the operator."""
         name = self.config.recorder
         if self.run_dir is None:
-            raise RecorderError("no recorder can be asked here")
+            raise RecorderError("The recorder is not available: this node has no run directory.")
         try:
             return NodeControl(self.run_dir, name, RECORDER_TIMEOUT_S).call(command, **arguments)
         except NodeMissingError:
-            raise RecorderError(f"no recorder runs: launch the station with recorder:=true (node {name})") from None
+            raise RecorderError(
+                f"No recorder is running. Launch the station with recorder:=true (node {name})."
+            ) from None
         except ControlError as error:
             raise RecorderError(f"recorder: {error}") from None
 
@@ -272,11 +274,11 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Forward a rendered view, then request the next one."""
         camera = pose_matrix(message.pose)
         if not (0 < message.fov_rad < math.pi):
-            self.diagnose("view", ERROR, f"rendered view with a field of view of {message.fov_rad:.3g} rad: dropped")
+            self.diagnose("view", ERROR, f"rendered view dropped: its field of view is {message.fov_rad:.3g} rad")
             return
         near_m = float(message.depth_near_m)
         knows = math.isfinite(near_m) and near_m > 0
-        words = f"views whose depth picture has a range of {near_m:.3g} m: each is shown from where it was drawn"
+        words = f"depth images with an invalid range of {near_m:.3g} m: views stay at their rendered position"
         self.check("depth", knows or not len(message.depth_png), words)
         came_ns = self.clock.steady_ns()
         self.views.answered(int(message.request_id), came_ns / 1e9)
@@ -469,7 +471,7 @@ class ConsoleNode(Node[ConsoleConfig]):
     def send_health(self) -> None:
         """Send virtual space, battery and faults to the page; faults carry the text of the node that found them."""
         age_s = math.inf if self._picture_ns is None else (self.clock.steady_ns() - self._picture_ns) / 1e9
-        self.check("camera", age_s <= PICTURE_TIMEOUT_S, "no picture from the camera", age_s=age_s)
+        self.check("camera", age_s <= PICTURE_TIMEOUT_S, "no image from the camera", age_s=age_s)
         self.check("controller", self.control.message is not None, "no state from the arbiter")
         self.check("pose", self.robot_pose() is not None, "the robot's pose is unknown")
         # Shown on the page only, not as a diagnosis: the node itself works.

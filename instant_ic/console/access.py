@@ -85,10 +85,10 @@ def read_token(file: str) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise AccessError(f"token file {path}: {getattr(error, 'strerror', None) or error}") from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise AccessError(f"token file {path} may be read by others: chmod 600 {path}")
+        raise AccessError(f"token file {path} is readable by others: run `chmod 600 {path}`")
     if len(text) < MIN_TOKEN or not text.isascii() or any(c.isspace() for c in text):
         raise AccessError(
-            f"token file {path}: a token has at least {MIN_TOKEN} ASCII characters and no spaces; make one by "
+            f"token file {path}: a token must have at least {MIN_TOKEN} ASCII characters and no spaces; make one with "
             f"`python3 -c 'import secrets; print(secrets.token_urlsafe())' > {path}`"
         )
     return text
@@ -153,7 +153,9 @@ class Access:
         if config.watch_token_file:
             watch = read_token(config.watch_token_file)
             if hmac.compare_digest(watch, drive):
-                raise AccessError("token_file and watch_token_file hold the same token: whoever watches could drive")
+                raise AccessError(
+                    "token_file and watch_token_file hold the same token, so watchers could drive; use two tokens"
+                )
             self._digests[Role.WATCH] = _digest(watch)
 
     def role_of_token(self, token: str, address: str, now_s: float) -> Role | None:

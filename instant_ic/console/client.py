@@ -190,7 +190,7 @@ class ConsoleClient:
                         await self._news.wait()
         except TimeoutError:
             raise TimeoutError(
-                f"console client: not true within {timeout_s:g} s; state {self.state}, session {self.session}"
+                f"console client: condition not met within {timeout_s:g} s; state {self.state}, session {self.session}"
             ) from None
 
     async def _read(self) -> None:

@@ -54,7 +54,7 @@ class DemoRecorder:
     def ask(self, command: str, **arguments: Any) -> Any:
         """See :class:`instant_ic.console.recording.Ask`."""
         if self.missing:
-            raise RecorderError("no recorder runs: launch the station with recorder:=true")
+            raise RecorderError("No recorder is running. Launch the station with recorder:=true.")
         path = f"recordings/rec_{time.strftime('%Y%m%d_%H%M%S')}"
         if command == "record":
             self.state, self._began_s = "recording", time.monotonic()
@@ -210,8 +210,8 @@ class Demo:
         v, w = (0.0, 0.0) if stopped else self._command
         before = self.mode
         if stopped:
-            words = "emergency stop button: let it out, then release the stop here"
-            self.mode, self.reason = "stopped", words if self.button else "emergency stop: release it to go on"
+            words = "emergency stop button is pressed: release it, then release the stop here"
+            self.mode, self.reason = "stopped", words if self.button else "emergency stop: release it to continue"
         elif self.forced_mode is not None:
             self.mode, self.reason = self.forced_mode, ""
         elif self.mode == "stopped":
@@ -350,7 +350,7 @@ def _jpeg(picture: NDArray[np.uint8]) -> bytes:
 
     ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
     if not ok:
-        raise ValueError(f"JPEG encoder refused a picture of shape {picture.shape}")
+        raise ValueError(f"JPEG encoder failed on an image of shape {picture.shape}")
     return bytes(data.tobytes())
 
 
@@ -361,7 +361,7 @@ def _mask(seen: NDArray[np.float32]) -> bytes:
     small = cv2.resize(seen, (64, max(1, round(64 * height / width))), interpolation=cv2.INTER_AREA)
     ok, data = cv2.imencode(".png", np.rint(255 * small).astype(np.uint8))
     if not ok:
-        raise ValueError(f"PNG encoder refused a mask of shape {small.shape}")
+        raise ValueError(f"PNG encoder failed on a mask of shape {small.shape}")
     return bytes(data.tobytes())
 
 
@@ -398,7 +398,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO)
     demo = Demo(ServerConfig(port=arguments.port))
     demo.start()
-    logging.getLogger("instant_ic.console.demo").info("open %s (Ctrl-C ends)", demo.server.url)
+    logging.getLogger("instant_ic.console.demo").info("open %s (Ctrl-C stops)", demo.server.url)
     try:
         threading.Event().wait()
     except KeyboardInterrupt:

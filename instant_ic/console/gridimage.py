@@ -65,5 +65,5 @@ def grey_png(grey: NDArray[np.uint8]) -> bytes:
 
     ok, png = cv2.imencode(".png", grey, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not ok:
-        raise ValueError(f"PNG encoder refused a picture of {grey.shape[1]}x{grey.shape[0]} pixels")
+        raise ValueError(f"PNG encoder failed on an image of {grey.shape[1]}x{grey.shape[0]} pixels")
     return bytes(png.tobytes())

@@ -32,7 +32,7 @@ class LogRate(logging.Filter):
             return False
         self._last[place] = now
         if left_out := self._left_out.pop(place, 0):
-            record.msg, record.args = f"{record.getMessage()} ({left_out} more like it are left out)", ()
+            record.msg, record.args = f"{record.getMessage()} ({left_out} similar messages dropped)", ()
         return True
 
 

@@ -62,10 +62,10 @@ def decode_frame(data: bytes) -> Frame:
         ProtocolError: too short, unknown version or kind, or the header is not a JSON object.
     """
     if len(data) < PREFIX.size:
-        raise ProtocolError(f"binary frame of {len(data)} bytes: the prefix alone has {PREFIX.size}")
+        raise ProtocolError(f"binary frame of {len(data)} bytes is shorter than its prefix of {PREFIX.size} bytes")
     version, kind, _, sequence, header_length = PREFIX.unpack_from(data)
     if version != VERSION:
-        raise ProtocolError(f"binary frame of version {version}: this side speaks {VERSION}")
+        raise ProtocolError(f"binary frame of version {version}: expected {VERSION}")
     end = PREFIX.size + header_length
     if end > len(data):
         raise ProtocolError(f"binary frame of {len(data)} bytes: its header should end at {end}")
@@ -84,7 +84,7 @@ def parse_text(text: str) -> dict[str, Any]:
     try:
         message = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ProtocolError(f"text message is no JSON: {error}") from None
+        raise ProtocolError(f"text message is not valid JSON: {error}") from None
     if not isinstance(message, dict) or not isinstance(message.get("type"), str):
         raise ProtocolError("text message must be an object with a string 'type'")
     return message
@@ -105,7 +105,7 @@ def whole(message: dict[str, Any], key: str) -> int:
     """Return ``message[key]`` as an integer in [0, 2**53]; raise ProtocolError otherwise."""
     value = message.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= 2**53:
-        raise ProtocolError(f"{message['type']}.{key} must be a whole number (got {value!r:.40})")
+        raise ProtocolError(f"{message['type']}.{key} must be an integer from 0 to 2**53 (got {value!r:.40})")
     return value
 
 

@@ -78,13 +78,13 @@ class RecordingDesk:
         path = recording.get("path", "") if seconds is not None else ""
         at = f"{datetime.now():%H:%M:%S}"
         self._bookmarks.append({"name": name, "at": at, "seconds": seconds, "recording": _name(path)})
-        self._wish(lambda: f"Marked: {name}" + ("" if path else " (nothing is being recorded)"))
+        self._wish(lambda: f"Bookmark set: {name}" + ("" if path else " (not recording)"))
 
     def _wish(self, wish: Callable[[], str] | None) -> None:
         try:
             self._wishes.put_nowait(wish)
         except queue.Full:
-            logger.warning("recorder: %d wishes wait already, this one is left out", self._wishes.maxsize)
+            logger.warning("recorder: %d commands are pending; this one is dropped", self._wishes.maxsize)
 
     # ---- the desk's thread ---------------------------------------------------------------------------
 
@@ -111,13 +111,13 @@ class RecordingDesk:
         self._notice = {"number": self._notice["number"] + 1, "text": text, "level": level}
 
     def _begin(self) -> str:
-        return f"Recording into {_name(self._ask('record')['path'])}"
+        return f"Recording to {_name(self._ask('record')['path'])}"
 
     def _end(self) -> str:
-        return f"Recorded: {_name(self._ask('stop')['path'])}"
+        return f"Recording saved: {_name(self._ask('stop')['path'])}"
 
     def _snap(self) -> str:
-        return f"The last minute is being kept: {_name(self._ask('snapshot', reason='operator')['path'])}"
+        return f"Saving the last minute: {_name(self._ask('snapshot', reason='operator')['path'])}"
 
     def _told(self) -> dict[str, Any]:
         told: dict[str, Any] = {"notice": self._notice, "bookmarks": list(self._bookmarks)}
@@ -128,9 +128,7 @@ class RecordingDesk:
             return told | {"recorder": "missing", "text": str(error), "state": "none"}
         recording = status.get("recording")
         if recording is None:
-            text = (
-                f"the recorder writes {_name(status.get('path', ''))} all the time: there is nothing to begin or to end"
-            )
+            text = f"The recorder writes {_name(status.get('path', ''))} continuously. It cannot be started or stopped."
             return told | {"recorder": "missing", "text": text, "state": "none"}
         self._recording, self._asked_s = recording, time.monotonic()
         found = [

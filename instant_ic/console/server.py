@@ -67,7 +67,7 @@ SECURITY_HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-cache",  # a new page must not load old modules from the cache
 }
-PLAIN_HTTP = "Plain HTTP: whoever listens in on the network can take over. Set server.access.tls_certificate."
+PLAIN_HTTP = "Plain HTTP: anyone on the network can read the traffic and take over. Set server.access.tls_certificate."
 logger = logging.getLogger("instant_ic.console")
 _COOKIE: web.RequestKey[str] = web.RequestKey("cookie", str)
 _ROLE: web.RequestKey[Role | None] = web.RequestKey("role", Role | None)  # type: ignore[arg-type]
@@ -175,7 +175,7 @@ class ConsoleServer:
         if self._start_error is not None:
             raise ConsoleError(
                 f"console: cannot listen on {self.config.host}:{self.config.port}: {self._start_error}; "
-                "stop what uses the port or set server.port"
+                "stop the other program or set server.port"
             ) from self._start_error
 
     def stop(self) -> None:
@@ -288,7 +288,7 @@ class ConsoleServer:
             await listener.close()
             sessions = list(self._sessions.values())
             for session in sessions:
-                self._end(session, WSCloseCode.GOING_AWAY, "console ends")
+                self._end(session, WSCloseCode.GOING_AWAY, "console shuts down")
             await asyncio.gather(*(session.closing for session in sessions if session.closing is not None))
         finally:
             await listener.close()
@@ -303,7 +303,7 @@ class ConsoleServer:
         if not (signed_in and request.path == "/estop"):
             await self._pace(request, self._requests)
         if not host_allowed(request.headers.get("Host", ""), self.config.allowed_hosts):
-            raise web.HTTPForbidden(text="unknown Host; name it in server.allowed_hosts\n")
+            raise web.HTTPForbidden(text="Host not allowed; add it to server.allowed_hosts\n")
         request[_ROLE] = role = await self._role(request)
         open_to_all = request.path == "/sign-in" or request.path.startswith("/static/")
         return await (self._turn_away(request) if role is None and not open_to_all else handler(request))
@@ -348,7 +348,7 @@ class ConsoleServer:
         """Sign a browser in: set a cookie and redirect, so that the token leaves address and history."""
         role = await self._role_of_token(request, token)
         if role is None:
-            return self._sign_in_page("This token is wrong.")
+            return self._sign_in_page("Wrong token.")
         now = time.monotonic()
         response = web.Response(status=303, headers={"Location": "/"})
         response.set_cookie(
@@ -372,7 +372,7 @@ class ConsoleServer:
             async with asyncio.timeout(HEADERS_S):
                 token = (await request.post()).get("token", "")
         except TimeoutError:
-            raise web.HTTPRequestTimeout(text=f"the token did not come within {HEADERS_S:g} s\n") from None
+            raise web.HTTPRequestTimeout(text=f"no token received within {HEADERS_S:g} s\n") from None
         return await self._enter(request, token.strip() if isinstance(token, str) else "")
 
     async def _sign_out(self, request: web.Request) -> web.StreamResponse:
@@ -402,7 +402,7 @@ class ConsoleServer:
     async def _export_panorama(self, request: web.Request) -> web.StreamResponse:
         frame = self._frames.get(FrameKind.PANORAMA)
         if frame is None:
-            raise web.HTTPNotFound(text="no picture has come from the camera yet\n")
+            raise web.HTTPNotFound(text="there is no camera image yet\n")
         return _download(frame.payload, "panorama", "jpg", "image/jpeg")
 
     async def _export_map(self, request: web.Request) -> web.StreamResponse:
@@ -435,7 +435,7 @@ class ConsoleServer:
         may_drive = request[_ROLE] is Role.DRIVE
         places = self.config.max_clients if may_drive else max(1, self.config.max_clients - RESERVED_FOR_DRIVERS)
         if len(self._sessions) >= places:
-            raise web.HTTPServiceUnavailable(text=f"{len(self._sessions)} clients already\n")
+            raise web.HTTPServiceUnavailable(text=f"too many pages: {len(self._sessions)} are connected\n")
         connection = request.protocol
         assert isinstance(connection, Connection)
         # Without autoping the reader sees the protocol's pings too, so that the message limit covers them.
@@ -501,12 +501,12 @@ class ConsoleServer:
         now = time.monotonic()
         for session in list(self._sessions.values()):
             if self.access.required and session.cookie and self.access.role_of_session(session.cookie, now) is None:
-                logger.info("client %d: its sign-in has ended", session.number)
+                logger.info("client %d closed: its sign-in has ended", session.number)
                 self._end(session, WSCloseCode.POLICY_VIOLATION, "signed out")
 
     def _flooded(self, session: Session) -> None:
         """End a session that sends more than a page ever does."""
-        logger.warning("client %d sends too much: closed", session.number)
+        logger.warning("client %d closed: it sends too many messages", session.number)
         session.connection.mute()
         self._end(session, WSCloseCode.POLICY_VIOLATION, "too many messages")
 
@@ -650,7 +650,9 @@ class ConsoleServer:
 
     def _on_estop_release(self, session: Session, message: dict[str, Any], now: float) -> None:
         if not self.gate.release_estop(session.number):
-            session.reply({"type": "refused", "reason": "not_driver", "text": "only the driver may release"})
+            session.reply(
+                {"type": "refused", "reason": "not_driver", "text": "only the driver may release the emergency stop"}
+            )
             return
         self.backend.on_estop(False)
         self._tell_session()
@@ -672,7 +674,7 @@ class ConsoleServer:
     def _may_drive(session: Session) -> bool:
         """Whether the sign-in may do more than watch and stop; if not, send a refusal."""
         if not session.may_drive:
-            session.reply({"type": "refused", "reason": "watch_only", "text": "this sign-in may watch only"})
+            session.reply({"type": "refused", "reason": "watch_only", "text": "this sign-in may only watch"})
         return session.may_drive
 
     def _on_record(self, session: Session, message: dict[str, Any], now: float) -> None:
@@ -708,7 +710,7 @@ class ConsoleServer:
                 continue  # woken: the deadline may have changed
             self._emit_due(wake=False)
             if self.gate.watchdog_trips != trips:
-                logger.warning("no command for %.2f s: stopped", self.config.drive.watchdog_s)
+                logger.warning("no drive command for %.2f s: published zero", self.config.drive.watchdog_s)
             if (self.gate.driver, self.gate.watchdog_trips) != (driver, trips):
                 self._tell_session()
 

@@ -127,10 +127,10 @@ def test_guessing_is_slowed_down_for_each_address_and_a_right_token_never_refuse
 def test_bad_token_files_are_named(tmp_path):
     with pytest.raises(AccessError, match=r"missing: No such file"):
         read_token(str(tmp_path / "missing"))
-    with pytest.raises(AccessError, match=r"open may be read by others: chmod 600"):
+    with pytest.raises(AccessError, match=r"open is readable by others: run `chmod 600"):
         read_token(token_file(tmp_path, "open", DRIVE, 0o640))
     for name, token in (("short", "abc"), ("spaced", "a token with some spaces"), ("accents", "jétonjétonjétonjéton")):
-        with pytest.raises(AccessError, match=rf"{name}: a token has at least 16 ASCII characters"):
+        with pytest.raises(AccessError, match=rf"{name}: a token must have at least 16 ASCII characters"):
             read_token(token_file(tmp_path, name, token))
     same = token_file(tmp_path, "a", DRIVE), token_file(tmp_path, "b", DRIVE)
     with pytest.raises(ConsoleError, match="the same token"):
@@ -189,7 +189,7 @@ def test_a_browser_signs_in_by_address_or_form_and_out_again(serve, files):
             async with http.get(server.url) as response:
                 assert response.status == 401
             async with http.post(server.url + "sign-in", data={"token": "wrong"}) as response:
-                assert response.status == 401 and "This token is wrong." in await response.text()
+                assert response.status == 401 and "Wrong token." in await response.text()
             async with http.post(server.url + "sign-in", data={"token": f" {WATCH} "}) as response:
                 assert response.status == 200 and "app.js" in await response.text()
             # A signed-out cookie does not come back to life.
@@ -211,7 +211,7 @@ def test_fault_wrong_tokens_lock_out_the_right_one_of_the_same_address(serve, fi
             for _ in range(3):
                 async with http.post(server.url + "sign-in", data={"token": "wrong"}) as response:
                     assert response.status == 401
-                    assert "This token is wrong." in await response.text()
+                    assert "Wrong token." in await response.text()
             assert server.access.wait_s("127.0.0.1", time.monotonic()) > 0  # slowed down
             async with http.get(f"{server.url}?token={DRIVE}", allow_redirects=False) as response:
                 assert response.status == 303

@@ -115,7 +115,7 @@ def test_fault_dead_man_release_sends_no_zero_by_gamepad(pad, shared_demo):
 
 def test_gamepads_right_stick_looks_and_an_unknown_layout_is_told(pad, shared_demo):
     pad.evaluate("plug('')")
-    pad.get_by_text("the browser does not know this gamepad's layout").wait_for()
+    pad.get_by_text("the browser does not know its layout").wait_for()
     pad.evaluate("plug('standard'); pad.axes = [0, 0, 1, 0]")
     wait_until(lambda: shared_demo.look.yaw < -0.2, pad, "the look turns right")
     assert not moving(shared_demo)
@@ -133,7 +133,7 @@ def test_fault_any_client_drives_and_idle_zeros_fight_the_drivers_commands(drive
     start_driving(driver, shared_demo)
     since = len(shared_demo.commands)
     watcher.keyboard.down("s")
-    watcher.get_by_text("Another operator drives. Take over to drive.").wait_for()
+    watcher.get_by_text("Another operator is driving. Press Take over to drive.").wait_for()
     watcher.keyboard.up("s")  # sends its zero
     watcher.wait_for_timeout(SETTLE_MS)
     given = shared_demo.commands[since:]
@@ -236,7 +236,7 @@ def test_the_button_on_the_robot_is_told_with_where_to_let_it_out(driver, shared
     shared_demo.button = True
     expect_body(driver, "estop", "set")
     assert driver.locator("#banner-title").inner_text() == "EMERGENCY STOP"
-    words = "Emergency stop button: let it out, then release the stop here"
+    words = "Emergency stop button is pressed: release it, then release the stop here"
     assert driver.locator("#banner-text").inner_text() == driver.locator("#mode-reason").inner_text() == words
     shared_demo.button = False
     expect_body(driver, "estop", "free")
@@ -247,7 +247,7 @@ def test_controls_held_through_a_stop_are_told_to_be_let_go(driver, shared_demo)
     start_driving(driver, shared_demo)
     assert driver.locator("#banner").is_hidden()
     shared_demo.forced_mode = "stopped"
-    driver.get_by_text("Let go of the controls to go on.").wait_for()
+    driver.get_by_text("Release the controls to continue.").wait_for()
     assert driver.locator("#banner-title").inner_text() == "STOPPED"
     assert driver.locator("#release").is_hidden()  # nothing was latched
     driver.keyboard.up("w")

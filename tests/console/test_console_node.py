@@ -330,7 +330,7 @@ def test_the_depth_of_a_view_goes_to_the_page_where_it_can_be_used(setup, near_m
     assert payload == b"VIEW"
     level, words = node.diagnoses()["depth"][:2]
     assert (level > 0) == (not sent)
-    assert ("depth picture" in words) == (not sent)
+    assert ("invalid range" in words) == (not sent)
 
 
 def test_the_page_leads_with_the_vbot_and_the_arbiter_hears_what_is_displayed(setup):

@@ -53,13 +53,13 @@ def test_a_full_disk_and_a_missing_recorder_are_told_in_plain_words(driver, shar
     recorder.missing = True
     driver.locator('#record[aria-disabled="true"]').wait_for()
     driver.locator("#record").click(force=True)  # "disabled" to whoever asks, but it says why
-    driver.get_by_text("no recorder runs: launch the station with recorder:=true").first.wait_for()
+    driver.get_by_text("No recorder is running. Launch the station with recorder:=true.").first.wait_for()
     assert recorder.state == "disk full"  # it was asked for nothing
 
 
 def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(driver, shared_demo):
     driver.keyboard.press("b")
-    driver.get_by_text("Marked: Mark 1 (nothing is being recorded)").wait_for()
+    driver.get_by_text("Bookmark set: Mark 1 (not recording)").wait_for()
     start_driving(driver, shared_demo)
     driver.locator("#more-open").focus()
     driver.keyboard.press("Enter")
@@ -90,9 +90,9 @@ def test_bookmarks_by_key_and_by_name_and_the_robot_is_held_while_one_is_typed(d
 
 def test_the_last_minute_is_kept(driver, shared_demo):
     driver.locator("#more-open").click()
-    driver.get_by_role("button", name="Keep the last minute").click()
+    driver.get_by_role("button", name="Save the last minute").click()
     wait_until(lambda: shared_demo.recorder.snapshots, driver, "the snapshot")
-    driver.get_by_text("The last minute is being kept").wait_for()
+    driver.get_by_text("Saving the last minute").wait_for()
     assert driver.locator("#more").is_hidden()
 
 
@@ -130,7 +130,7 @@ def test_what_cannot_be_saved_is_told(driver, shared_demo, monkeypatch):
     monkeypatch.setattr(shared_demo, "export_map", dict)
     driver.locator("#more-open").click()
     driver.get_by_role("button", name="Save the map").click()
-    driver.get_by_text("Nothing saved: there is no map yet").wait_for()
+    driver.get_by_text("Not saved: there is no map yet").wait_for()
     assert any("404" in fault for fault in driver.faults)
     driver.faults.clear()  # the browser reports the answer
 
@@ -195,8 +195,8 @@ def test_a_change_of_mode_is_said_once_and_shown_by_word_and_shape(driver, share
     said = driver.locator("#announce[role=status][aria-live=polite]")
     marks = {}
     for mode, words in (
-        ("virtual", "Virtual view: you drive the virtual robot, the robot follows"),
-        ("stopped", "Stopped: the robot is held"),
+        ("virtual", "Virtual view: you drive the virtual robot, and the robot follows"),
+        ("stopped", "Stopped: the robot stands still"),
         ("real", "Real view: you see through the robot's camera"),
     ):
         shared_demo.forced_mode = mode
@@ -289,7 +289,7 @@ def test_a_phone_shows_everything_and_its_stick_drives_until_it_is_let_go(
     shared_demo.faults = [{"level": "error", "name": "vlp16_driver", "text": "no packets"}]
     page.locator("#faults li").wait_for()
     shared_demo.button = True  # the longest words that the mode comes with
-    page.get_by_text("Emergency stop button: let it out").first.wait_for()
+    page.get_by_text("Emergency stop button is pressed").first.wait_for()
     names = ["#mode", "#vspace", "#link", "#record", "#more-open", "#faults", "#map", "#panel", "#stick", "#estop"]
     boxes = {}
     for name in names:

@@ -68,18 +68,18 @@ def test_a_recording_is_begun_told_and_ended(desk):
     made.record(True)
     told = wait_for(lambda m: m["state"] == "recording")
     assert (told["name"], told["seconds"], told["bytes"], told["free_bytes"]) == ("rec_1", 12.5, 3_000_000, 10**9)
-    assert told["notice"] == {"number": 1, "text": "Recording into rec_1", "level": "ok"}
+    assert told["notice"] == {"number": 1, "text": "Recording to rec_1", "level": "ok"}
     made.record(False)
     made.snapshot()
     told = wait_for(lambda m: m["notice"]["number"] == 3)
     assert recorder.asked == [("record", {}), ("stop", {}), ("snapshot", {"reason": "operator"})]
-    assert told["notice"]["text"] == "The last minute is being kept: rec_1"
+    assert told["notice"]["text"] == "Saving the last minute: rec_1"
     assert [made["name"] for made in told["snapshots"]] == ["s2", "s3", "s4", "s5", "s6"]  # the newest five
 
 
 def test_a_missing_recorder_and_a_refusal_are_told_in_words_and_the_next_wish_counts(desk):
     made, recorder, wait_for = desk
-    recorder.refusal = "no recorder runs: launch the station with recorder:=true"
+    recorder.refusal = "No recorder is running. Launch the station with recorder:=true."
     made.record(True)
     told = wait_for(lambda m: m["notice"]["number"] == 1)
     assert told["notice"] == {"number": 1, "text": recorder.refusal, "level": "error"}
@@ -99,7 +99,7 @@ def test_bookmarks_are_listed_with_their_place_in_the_recording(desk):
     made, recorder, wait_for = desk
     made.bookmark("before")
     told = wait_for(lambda m: m["bookmarks"])
-    assert told["bookmarks"][0]["seconds"] is None and "nothing is being recorded" in told["notice"]["text"]
+    assert told["bookmarks"][0]["seconds"] is None and "not recording" in told["notice"]["text"]
     recorder.state = "recording"
     wait_for(lambda m: m["state"] == "recording")
     for n in range(MAX_BOOKMARKS):
@@ -114,7 +114,7 @@ def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
     told = []
     made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, told.append)
     told.append(made._told())
-    assert told[0]["recorder"] == "missing" and "drive all the time" in told[0]["text"]
+    assert told[0]["recorder"] == "missing" and "drive continuously" in told[0]["text"]
 
 
 # ---- the node --------------------------------------------------------------------------------------
@@ -134,11 +134,11 @@ def test_a_bookmark_goes_to_the_bus_so_that_every_bag_has_it(node):
 
 def test_the_recorder_is_asked_over_its_control_channel(node, tmp_path, monkeypatch):
     _, console = node
-    with pytest.raises(RecorderError, match="no recorder can be asked here"):
+    with pytest.raises(RecorderError, match="recorder is not available"):
         console.ask_recorder("status")
     monkeypatch.setattr(ConsoleNode, "run_dir", tmp_path)
     (tmp_path / "nodes").mkdir()
-    with pytest.raises(RecorderError, match=r"no recorder runs: .* recorder:=true \(node operator_recorder\)"):
+    with pytest.raises(RecorderError, match=r"No recorder is running\. .* recorder:=true \(node operator_recorder\)"):
         console.ask_recorder("status")
 
     class Recorder:

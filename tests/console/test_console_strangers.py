@@ -481,7 +481,7 @@ def test_log_lines_of_one_place_come_once_a_second_with_a_count():
     assert rate.filter(record(2))
     now[0] = 1.0
     after = record(1)
-    assert rate.filter(after) and after.getMessage() == "from a (999 more like it are left out)"
+    assert rate.filter(after) and after.getMessage() == "from a (999 similar messages dropped)"
     now[0] = 2.0
     after = record(1)
     assert rate.filter(after) and after.getMessage() == "from a"

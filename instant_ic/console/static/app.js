@@ -49,7 +49,7 @@ function makeViewer() {
     try {
       return new GlViewer(picture);
     } catch (error) {
-      console.info(`${error.message}: the picture is drawn without it`);
+      console.info(`${error.message}: falling back to the 2D canvas`);
     }
   }
   return new FlatViewer(picture);
@@ -104,7 +104,7 @@ link.addEventListener("message", ({ detail: message }) => {
       showBanner();
       break;
     case "refused":
-      if (message.reason === "not_driver") hud.toast("Another operator drives. Take over to drive.");
+      if (message.reason === "not_driver") hud.toast("Another operator is driving. Press Take over to drive.");
       break;
     case "error":
       console.error(`server: ${message.text}`);
@@ -131,15 +131,15 @@ function stopNow() {
   link.send({ type: "estop" });
   // Also by a separate connection: the WebSocket may be stuck, and a second stop changes nothing.
   fetch("/estop", { method: "POST", keepalive: true }).then(({ ok }) => ok).catch(() => false).then((sent) => {
-    if (!sent && !link.connected) hud.toast("No link: the stop could not be sent");
+    if (!sent && !link.connected) hud.toast("Emergency stop not sent: no connection to the server.");
   });
 }
 
 /** Requests the lease if nobody drives; otherwise says why not. */
 function askForTheLease() {
-  if (!mayDrive) hud.toast("This sign-in may watch and stop the robot, not drive it.");
+  if (!mayDrive) hud.toast("This sign-in can watch and stop the robot, but not drive it.");
   else if (session.driver === "none") link.send({ type: "lease", take: false });
-  else if (session.driver === "other") hud.toast("Another operator drives. Take over to drive.");
+  else if (session.driver === "other") hud.toast("Another operator is driving. Press Take over to drive.");
 }
 
 function setScale(percent) {
@@ -157,7 +157,7 @@ function enlargeMap() {
 
 function fullScreen() {
   if (document.fullscreenElement) document.exitFullscreen();
-  else document.documentElement.requestFullscreen().catch((error) => hud.toast(`No full screen: ${error.message}`));
+  else document.documentElement.requestFullscreen().catch((error) => hud.toast(`Full screen failed: ${error.message}`));
 }
 
 function saveShownPicture() {

@@ -36,8 +36,8 @@ export class Drive extends EventTarget {
     this._timer = null;
     window.addEventListener("keydown", (event) => this._keyDown(event));
     window.addEventListener("keyup", (event) => this._keyUp(event));
-    window.addEventListener("blur", () => this.stop("the window lost the focus"));
-    window.addEventListener("pagehide", () => this.stop("the page was left"));
+    window.addEventListener("blur", () => this.stop("the window lost focus"));
+    window.addEventListener("pagehide", () => this.stop("the page was closed"));
     window.addEventListener("contextmenu", () => this.stop("a menu was opened"));
     document.addEventListener("visibilitychange", () => {
       if (document.hidden) this.stop("the page was hidden");

@@ -32,14 +32,14 @@ export class Gamepads extends EventTarget {
 
   _connect(pad) {
     if (pad.mapping !== "standard") {
-      this._tell(`${pad.id}: the browser does not know this gamepad's layout, so it does not drive`);
+      this._tell(`Gamepad ${pad.id} cannot drive: the browser does not know its layout.`);
       return;
     }
     if (this._index !== null) return;
     this._index = pad.index;
     this._held = pressed(pad); // a button held already was not pressed for driving
     this._state("ready");
-    this._tell("Gamepad: hold a shoulder button and drive by the left stick");
+    this._tell("Gamepad connected: hold a shoulder button and drive with the left stick.");
   }
 
   _lose() {

@@ -6,16 +6,16 @@ import { PANORAMA, VIEW } from "./link.js";
 const MODES = {
   real: ["REAL", "The robot obeys the operator"],
   virtual: ["VIRTUAL", "The robot follows you round the obstacle"],
-  entering: ["ENTERING", "The virtual space is about to be shown"],
-  returning: ["RETURNING", "The real view is about to come back"],
-  stopped: ["STOPPED", "The robot is held"],
+  entering: ["ENTERING", "Switching to the virtual space"],
+  returning: ["RETURNING", "Switching back to the camera"],
+  stopped: ["STOPPED", "The robot stands still"],
   none: ["WAITING", "No controller is running"],
 };
 // Announced by screen readers; transitional modes are not.
 const SAID = {
   real: "Real view: you see through the robot's camera",
-  virtual: "Virtual view: you drive the virtual robot, the robot follows",
-  stopped: "Stopped: the robot is held",
+  virtual: "Virtual view: you drive the virtual robot, and the robot follows",
+  stopped: "Stopped: the robot stands still",
 };
 const ANNOUNCE_MS = 400;
 // Node names for the operator's list of faults.
@@ -98,7 +98,7 @@ function vspaceText(vspace) {
   if (!vspace) return "No virtual space yet";
   switch (vspace.state) {
     case "ready": return "Virtual space ready";
-    case "training": return `Virtual space learning, ${vspace.train_seconds.toFixed(0)} s`;
+    case "training": return `Virtual space training, ${vspace.train_seconds.toFixed(0)} s`;
     case "failed": return `Virtual space failed: ${vspace.message}`;
     default: return vspace.message || "No virtual space yet";
   }
@@ -123,9 +123,9 @@ export function showSession(session) {
   document.body.dataset.driver = session.driver;
   const watchers = session.clients - 1;
   const text = {
-    you: watchers > 0 ? `You drive · ${watchers} watching` : "You drive",
-    other: "Another operator drives",
-    none: "Nobody drives",
+    you: watchers > 0 ? `You are driving · ${watchers} watching` : "You are driving",
+    other: "Another operator is driving",
+    none: "Nobody is driving",
   }[session.driver];
   write(byId("lease-text"), text);
   write(byId("take"), session.driver === "none" ? "Drive" : "Take over");
@@ -145,10 +145,10 @@ export function showBanner(connected, everConnected, estop, held, driver, reason
   if (banner.hidden) return;
   write(byId("banner-title"), lost ? "LINK LOST" : estop ? "EMERGENCY STOP" : "STOPPED");
   write(byId("banner-text"), lost
-    ? "The robot was told to stop. Connecting again…"
-    : !estop ? "Let go of the controls to go on."
+    ? "The server stops the robot. Reconnecting…"
+    : !estop ? "Release the controls to continue."
     : reason ? sentence(reason) // says what holds the robot and what to do
-    : driver === "you" ? "The robot is held until you release it." : "The robot is held until the driver releases it.");
+    : driver === "you" ? "Release the emergency stop to continue." : "Only the driver can release the emergency stop.");
   byId("release").hidden = lost || !estop || driver !== "you";
 }
 

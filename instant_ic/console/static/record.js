@@ -11,7 +11,7 @@ export class Recording {
     this.link = link;
     this.drive = drive;
     this.mayRecord = true;
-    this._told = { recorder: "missing", state: "none", text: "No recorder has answered yet.", bookmarks: [], snapshots: [] };
+    this._told = { recorder: "missing", state: "none", text: "The recorder has not answered yet.", bookmarks: [], snapshots: [] };
     this._notice = null;
     byId("record").addEventListener("click", () => this.toggle());
     byId("snapshot").addEventListener("click", () => this._wish({ type: "snapshot" }));
@@ -50,13 +50,13 @@ export class Recording {
   }
 
   _wish(message) {
-    if (!this.mayRecord) toast("This sign-in may watch and save pictures, not record.");
-    else if (!this.link.connected) toast("No link: nothing was recorded or marked.");
+    if (!this.mayRecord) toast("This sign-in can watch and save images, but not record.");
+    else if (!this.link.connected) toast("No connection to the server. Nothing was recorded or bookmarked.");
     else this.link.send(message);
   }
 
   _openMarks() {
-    this.drive.stop("the bookmarks were opened");
+    this.drive.stop("the bookmark dialog is open");
     this.link.away = true;
     byId("marks").showModal();
   }
@@ -72,7 +72,7 @@ export class Recording {
     button.setAttribute("aria-pressed", this.running);
     button.setAttribute("aria-disabled", !usable);
     button.setAttribute("aria-label", this.running ? `Stop recording (${shown})` : shown);
-    button.title = text || (this.running ? this._told.path : "Record what the robot and the page send (R)");
+    button.title = text || (this.running ? this._told.path : "Record the drive (R)");
   }
 
   _showLists() {
@@ -81,8 +81,8 @@ export class Recording {
       `${at}  ${name}` + (recording ? `  (${clock(seconds)} in ${recording})` : ""));
     list(byId("marks-list"), marks.reverse(), "None yet.");
     list(byId("snapshots-list"), snapshots.map(({ name, state, words }) => `${name}: ${words || state}`).reverse(), "None yet.");
-    const room = free_bytes == null ? "" : ` · ${megabytes(free_bytes)} free on the disk`;
-    write(byId("record-more"), cached_s === undefined ? this._told.text : `The last ${Math.round(cached_s)} s are at hand${room}`);
+    const room = free_bytes == null ? "" : ` · ${megabytes(free_bytes)} free on disk`;
+    write(byId("record-more"), cached_s === undefined ? this._told.text : `The last ${Math.round(cached_s)} s are in memory${room}`);
   }
 }
 

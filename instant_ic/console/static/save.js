@@ -10,7 +10,7 @@ export function savePicture(canvas, draw) {
   draw(); // WebGL discards the image after the task that rendered it
   canvas.toBlob((blob) => {
     if (blob) hand(blob, `picture_${stamp()}.png`);
-    else toast("The browser could not make a file of the picture.");
+    else toast("Not saved: the browser could not encode the image.");
   }, "image/png");
   canvas.width = width;
   canvas.height = height;
@@ -21,11 +21,11 @@ export function savePicture(canvas, draw) {
 export async function saveFile(path) {
   try {
     const answer = await fetch(`/export/${path}`, { cache: "no-store" });
-    if (!answer.ok) return toast(`Nothing saved: ${(await answer.text()).trim()}`);
+    if (!answer.ok) return toast(`Not saved: ${(await answer.text()).trim()}`);
     const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? path;
     hand(await answer.blob(), name);
   } catch (error) {
-    toast(`Nothing saved: ${error.message}`);
+    toast(`Not saved: ${error.message}`);
   }
 }
 
