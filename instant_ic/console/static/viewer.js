@@ -59,7 +59,7 @@ vec3 smoothView(vec2 uv, float level) {
     mix(textureLod(view, vec2(a.x, b.y), level), textureLod(view, vec2(b.x, b.y), level), high.x), high.y).rgb;
 }
 
-// Position in the rendered view of what the moved camera sees at `at`. Fixed-point iteration on the depth, from the
+// Position in the rendered view of what the moved camera sees. Fixed-point iteration on the depth, from the
 // nearest depth on, so that near surfaces cover far ones. The number of steps is even: where the iteration alternates
 // between near and far, a gap opens behind an edge, and the far surface fills it. (Python: geometry/depth_picture.py.)
 vec2 before(vec2 at) {
