@@ -24,7 +24,7 @@ class DriveConfig:
     max_command_age_s: float = 0.3  # older commands (by the client's stamp) are dropped
     stop_repeat_s: float = 0.3  # time after a stop in which zeros are published at rate_hz
     keep_alive_hz: float = 10.0  # zeros of an idle driver whose page is heard: the operator is present
-    beat_timeout_s: float = 0.25  # silence of the driver's page after which the arbiter is told that he is lost
+    beat_timeout_s: float = 0.25  # silence of the driver's page after which he is reported lost to the arbiter
     lease_timeout_s: float = 2.0  # silence of the driver's page after which he loses the lease
 
     def __post_init__(self) -> None:
