@@ -1,4 +1,4 @@
-"""Decides who is driven, and is the only one to write /cmd_vel (paper, III.A)."""
+"""Decides which robot the operator drives; the only publisher of /cmd_vel (paper, III.A)."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ from instant_ic.msg import (
 )
 
 _MOTION_SAMPLES = 9
-"""Poses of the sensor over a sweep of points; between them it moves evenly."""
+"""Poses of the sensor over a sweep of points; between them its motion counts as even."""
 
 
 @dataclass(frozen=True)
 class ArbiterNodeConfig(ArbiterConfig):
-    """Parameters of the node ``arbiter``: the library's, and what only the node needs."""
+    """Parameters of the node ``arbiter``: the library's, and the node's own."""
 
     rate_hz: Positive = 20.0
     wall_min_length_m: Positive = 1.5
@@ -74,7 +74,7 @@ class ArbiterNodeConfig(ArbiterConfig):
 
 
 class ArbiterNode(Node[ArbiterNodeConfig]):
-    """Topics in and out of ``Arbiter`` and ``RollingCostmap``."""
+    """Connects ``Arbiter`` and ``RollingCostmap`` to topics."""
 
     name = "arbiter"
     live_parameters = (
@@ -94,25 +94,25 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         finder = WallFinder(self.config.wall_min_length_m, self.config.costmap.lethal_cost_threshold)
         self.wall_worker = self.background(finder.find, self.on_walls)
         self.map_from_odom: Matrix | None = None
-        self.placed_scan: NDArray[np.float64] | None = None  # (N, 2) hits of the newest that could be placed, in odom
-        self.used: dict[str, tuple[int, int]] = {}  # scan and points that could be placed last: stamp, when they came
-        self.sweep: SortedPoints | None = None  # the newest 3D points, in odom
+        self.placed_scan: NDArray[np.float64] | None = None  # (N, 2) hits of the newest scan with a transform, in odom
+        self.used: dict[str, tuple[int, int]] = {}  # last scan and points with a known transform: stamp, arrival
+        self.sweep: SortedPoints | None = None  # newest 3D points, in odom
         self.points_seen = False
-        self.taken: tuple[int, int] = (-1, -1)  # stamps of the scan and the points that the costmap holds
+        self.taken: tuple[int, int] = (-1, -1)  # stamps of the scan and the points in the costmap
         self.costmap_sent_ns: int | None = None
         self.camera_ns: int | None = None
         self.rhythms = {source.key: Rhythm() for source in SOURCES if source.steady}
-        self.page_rhythm = Rhythm()  # of the camera pictures at the operator's page
-        self.heard: dict[str, int] = {}  # stamp of the newest message of each source
-        self.lost_told = False  # a step was made for the driver's loss
-        self.page: tuple[int, int] = (-1, 0)  # newest camera picture there: its stamp, when it was told
-        self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: its request, when it was told
-        self.views_wanted = False  # the newest view was asked for to be shown
-        self.picture_delay_s: float | None = None  # from the camera to the operator
+        self.page_rhythm = Rhythm()  # of the camera images at the operator's page
+        self.heard: dict[str, int] = {}  # stamp of each source's newest message
+        self.lost_told = False  # a step was made for the loss of the driver
+        self.page: tuple[int, int] = (-1, 0)  # newest camera image there: stamp, time of the report
+        self.view: tuple[int, int] = (-1, 0)  # newest rendered view there: request, time of the report
+        self.views_wanted = False  # the newest view was requested to be shown
+        self.picture_delay_s: float | None = None  # from camera to operator
         self.latch = EstopLatch()
-        self.kept: estop_state.KeptStop | None = None  # the emergency stop as the next start would find it
+        self.kept: estop_state.KeptStop | None = None  # the emergency stop as the next start would restore it
         self.restore_estop()
-        self.button_ns: int | None = None  # when the robot's own emergency stop reported last
+        self.button_ns: int | None = None  # last report of the robot's own emergency stop
         self.ticks = 0
 
         self.cmd_vel = self.publisher("/cmd_vel", TwistStamped, qos=SENSOR)
@@ -122,8 +122,8 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.costmap_out = self.publisher("/costmap", OccupancyGrid, qos=SENSOR)
 
         self.operator = self.latest("/operator/cmd_vel", TwistStamped, max_age_s=10.0)
-        self.obeyed = (0.0, 0.0)  # the operator's command of the last step
-        self.early = False  # a step was made before its time since the last timer
+        self.obeyed = (0.0, 0.0)  # operator's command of the last step
+        self.early = False  # a step was made ahead of its time since the last timer
         self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
         self.scan = self.latest("/scan", LaserScan, max_age_s=10.0)
         self.points = (
@@ -139,12 +139,12 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
         self.subscribe_received("/operator/estop", self.on_estop, qos=LATCHED, message_class=Bool)
         self.subscribe_received("/robot/estop", self.on_button, qos=LATCHED, message_class=Bool)
-        # Only its age matters: the picture is never decoded here.
+        # Only its age matters: the image is never decoded here.
         self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
-        _ = self.tf  # listens from now on
+        _ = self.tf  # listens from here on
         self.timer(self.config.wall_period_s, self.update_walls)
         self.timer(1.0 / self.config.costmap.update_frequency, self.update_costmap)
-        self.cancel_extra: Callable[[], None] = lambda: None  # of a step between two timers
+        self.cancel_extra: Callable[[], None] = lambda: None  # cancels a step between two timers
         self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: ArbiterNodeConfig) -> None:
@@ -164,10 +164,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.static = StaticMap(grid, resolution, np.array(origin))
         self.map_is_new = True
         if self.walls is None:
-            self.update_walls()  # the first at once
+            self.update_walls()  # the first map at once
 
     def update_walls(self) -> None:
-        """Has walls looked for in the newest map, beside the node's thread."""
+        """Search for walls in the newest map, outside the node's thread."""
         if self.map_is_new:
             self.map_is_new = False
             self.wall_worker.submit(self.static)
@@ -176,20 +176,20 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.walls = walls
 
     def restore_estop(self) -> None:
-        """Starts stopped where the emergency stop was pressed, or the last run broke off."""
+        """Start stopped if the emergency stop was pressed when the last run ended, or that run broke off."""
         if self.run_dir is None:
             return
         kept, now_ns = estop_state.read(self.run_dir), self.clock.now_ns()
         if kept is not None:
-            # It was before now, whatever a clock said then that has been set since: a release from now on is newer.
+            # Clamp to now, in case the clock was set since: any release from here on is newer.
             self.kept = replace(kept, pressed_ns=min(kept.pressed_ns, now_ns))
             self.latch.hear(True, self.kept.publisher, self.kept.pressed_ns, now_ns)
             self.log.warning("emergency stop: %s", kept.why or "still pressed from before this start")
 
     def keep_estop(self) -> None:
-        """Keeps a press and forgets a released one, so that a restart of any node or of the machine ends no stop.
+        """Save a press and delete a released one, so that no restart of a node or of the machine ends a stop.
 
-        After the step that obeys a press: the disk may be slow.
+        Runs after the step that obeys a press: the disk may be slow.
         """
         latch, before = self.latch, self.kept
         now = estop_state.KeptStop(latch.publisher, latch.pressed_ns) if latch.pressed else None
@@ -204,16 +204,16 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.diagnose("estop", ERROR, str(error))
 
     def on_estop(self, received: Received) -> None:
-        """Obeys a press at once; a release only by the rule of :class:`EstopLatch`."""
+        """Obey a press at once; a release only by the rule of :class:`EstopLatch`."""
         pressed = bool(deserialize(received.payload, received.type_name).data)
         now_ns = self.clock.now_ns()
         if refused := self.latch.hear(pressed, received.publisher, received.publish_ns, now_ns):
             self.log.warning("emergency stop: %s", refused)
-        self.tick()  # not at the next timer: now
+        self.tick()  # at once, not at the next timer
         self.keep_estop()
 
     def on_button(self, received: Received) -> None:
-        """The robot's own emergency stop: pressed it stops; released it ends nothing, that is the operator's."""
+        """Obey the robot's own emergency stop; its release ends nothing: the operator must release the stop."""
         pressed = bool(deserialize(received.payload, received.type_name).data)
         self.button_ns = self.clock.steady_ns()
         self.latch.hear_button(pressed, received.publisher, received.publish_ns)
@@ -221,7 +221,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.keep_estop()
 
     def on_command(self, message: TwistStamped) -> None:
-        """Obeys a command that has changed at once: the next timer is half a period off."""
+        """Obey a changed command at once: the next timer is half a period away on average."""
         if not self.early and twist_values(message) != self.obeyed:
             self.early = True
             self.tick()
@@ -231,7 +231,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.tick()
 
     def look_again(self, in_s: float) -> None:
-        """Has one step made in ``in_s`` where the next timer may be later: time-outs are exact."""
+        """Schedule one step in ``in_s`` if the next timer may be later: time-outs are exact."""
         self.cancel_extra()
         if in_s < 1.0 / self.config.rate_hz:
             self.cancel_extra = self.timer(in_s + STEP_AFTER_S, self.tick).cancel
@@ -243,7 +243,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.camera_ns = now_ns
 
     def age(self, key: str, latest: Latest) -> float:
-        """Seconds since the newest message was measured or given."""
+        """Age of the newest message in seconds, by its stamp."""
         message = latest.message
         if message is None:
             return math.inf
@@ -255,7 +255,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return latest.stamp_age_s
 
     def on_shown(self, message: ShownPictures) -> None:
-        """Notes what new pictures the operator's page has."""
+        """Record new images at the operator's page."""
         now_ns, stamp, view = self.clock.steady_ns(), stamp_ns(message.picture_stamp), int(message.view_id)
         new = stamp != self.page[0] or view != self.view[0]
         if stamp not in (0, self.page[0]):
@@ -264,7 +264,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.page = stamp, now_ns
             self.picture_delay_s = min(max((self.clock.now_ns() - stamp) / 1e9, 0.0), 1.0)
         if view != self.view[0]:
-            # In REAL views are asked for rarely, which says nothing of their rate.
+            # In REAL, views are requested rarely; their distance in time says nothing of their rate.
             wanted = self.arbiter.mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
             if wanted and self.views_wanted:
                 self.rhythms["view"].heard((now_ns - self.view[1]) / 1e9)
@@ -272,14 +272,14 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         gone, told = self.operator_gone(), self.lost_told
         self.lost_told = gone
         if (new and self.arbiter.mode in (Mode.ENTERING, Mode.RETURNING)) or (gone and not told):
-            # Whether view and picture agree is true of now, not of the next timer; a lost driver is not waited with.
+            # Whether view and image agree holds at present, not at the next timer; a lost driver must not wait either.
             self.tick()
 
     def ages(self) -> dict[str, float]:
         shown, steady_ns = self.shown.message, self.clock.steady_ns()
         camera_s = math.inf if self.camera_ns is None else (steady_ns - self.camera_ns) / 1e9
         view_s = math.inf
-        if shown is not None:  # where there is a page, what matters is what has come there
+        if shown is not None:  # where there is a page, the images that arrived there count
             camera_s = max(camera_s, float(shown.picture_age_s) + self.shown.age_s)
             view_s = float(shown.view_age_s) + self.shown.age_s
         ages = {
@@ -300,7 +300,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return ages
 
     def usual(self) -> dict[str, float]:
-        """How old each source usually gets, s."""
+        """Usual age of each source in seconds when its next message arrives."""
         usual = {key: rhythm.usual_s for key, rhythm in self.rhythms.items()}
         if self.shown.message is not None:
             usual["camera"] = max(usual["camera"], self.page_rhythm.usual_s)
@@ -309,10 +309,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     # -- what the operator sees
 
     def shown_pose(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> NDArray[np.float64] | None:
-        """Where the r-bot (3,) was when the picture now shown was taken, but heading as it does now.
+        """Position of the r-bot when the image now shown was taken, with its present heading (3,).
 
-        A view of this place will be shown when the next pictures have come, so it is taken as far ahead as a view
-        takes. None without a page.
+        A view of this pose is shown when the next images have arrived, so the pose lies ahead by the delay of a view.
+        None without a page.
         """
         shown = self.shown.message
         if shown is None or self.picture_delay_s is None:
@@ -333,7 +333,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return np.array([place[0], place[1], now[2]])
 
     def picture_position(self) -> NDArray[np.float64] | None:
-        """Place (2,) of the camera in the map when it took the newest picture that the page has."""
+        """Position (2,) of the camera in the map for the page's newest image."""
         for frame in ("camera", "base_link"):
             try:
                 odom_from_camera = self.tf.lookup("odom", frame, self.page[0])
@@ -353,7 +353,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return pose
 
     def scan_in_base(self) -> NDArray[np.float64] | None:
-        """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now; by odometry, which does not jump."""
+        """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now, by odometry, which does not jump."""
         self.place_scan()
         if self.placed_scan is None:
             return None
@@ -368,7 +368,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return np.asarray(near @ base_from_odom[:2, :2].T + base_from_odom[:2, 3])
 
     def place_scan(self) -> None:
-        """Puts the newest scan into ``odom``. Until its transform has come, the scan before holds, at its own age."""
+        """Transform the newest scan to ``odom``; until its transform arrives, keep the previous scan and its age."""
         scan = self.scan.message
         if scan is None:
             self.placed_scan = None
@@ -386,11 +386,11 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.note_used("scan", self.scan)
 
     def note_used(self, key: str, latest: Latest) -> None:
-        """Notes that the newest message of a source could be placed: what counts is the age of the last such one."""
+        """Record that the newest message of a source has a transform: the age of the last such message counts."""
         self.used[key] = stamp_ns(latest.message), self.clock.steady_ns() - round(latest.age_s * 1e9)
 
     def used_age_s(self, key: str) -> float:
-        """Seconds since the last message that could be placed came, or was measured where that is longer."""
+        """Age of the last message with a transform, since its arrival or its stamp, whichever is longer."""
         if key not in self.used:
             return math.inf
         stamp, came_ns = self.used[key]
@@ -399,7 +399,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     # -- 3D points
 
     def take_points(self) -> int:
-        """Sorts the newest 3D points by height, in ``odom``; their stamp, -1 while there are none."""
+        """Sort the newest 3D points by height, in ``odom``; return their stamp, -1 without points."""
         message = None if self.points is None else self.points.message
         if self.points is None:
             self.diagnose("points", OK, "not used (costmap.points.enabled is false)")
@@ -414,10 +414,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             self.sweep = self.sorted(message)
         except (MessageError, TransformError) as error:
             if isinstance(error, MessageError):
-                self.used.pop("points", None)  # no later transform makes these usable
+                self.used.pop("points", None)  # no later transform makes them usable
             self.diagnose("points", WARN, f"3D points cannot be used: {error}")
             return -1
-        assert self.points is not None  # the message came from it
+        assert self.points is not None  # the message came from this subscription
         self.note_used("points", self.points)
         counts = self.sweep.counts
         self.diagnose("points", OK, f"{counts['obstacle']} points in the way", **counts)
@@ -448,7 +448,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if (stamp_ns(scan), points_ns) == self.taken:
             return
         try:
-            # SLAM's correction changes slowly and comes later than the scan: the newest is good for it.
+            # SLAM's correction changes slowly and arrives later than the scan: the newest one is good enough.
             map_from_odom = self.tf.lookup("map", "odom")
             map_from_lidar = map_from_odom @ self.tf.lookup("odom", scan.header.frame_id, stamp_ns(scan))
         except TransformError as error:
@@ -475,9 +475,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def publish_costmap(self, scan_ns: int) -> None:
         now_ns, costmap = self.clock.steady_ns(), self.costmap
-        # A little early counts: updates come at the scan's rate, not at this one.
+        # A little early counts: updates come at the scan's rate, not at the publish frequency.
         due_ns = 0.9e9 / self.config.costmap.publish_frequency
-        sent_ns = self.costmap_sent_ns  # later than now where the clock went back: a player began again
+        sent_ns = self.costmap_sent_ns  # later than now if the clock went back: a bag player restarted
         if costmap is None or (sent_ns is not None and 0 <= now_ns - sent_ns < due_ns):
             return
         self.costmap_sent_ns = now_ns
@@ -485,7 +485,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.costmap_out.publish(grid_message(costmap.occupancy(), costmap.resolution, origin, "map", scan_ns))
 
     def jumped(self, before: Matrix, after: Matrix) -> bool:
-        # Per costmap period, which is shorter than that of SLAM: a correction comes in one piece.
+        # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece.
         moved = relative2(pose2_from_matrix(before), pose2_from_matrix(after))
         far = math.hypot(float(moved[0]), float(moved[1])) > self.config.map_jump_m
         return far or abs(float(moved[2])) > math.radians(self.config.map_jump_deg)
@@ -531,7 +531,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             images_late_s=max(self.picture_delay_s or 0.0, 0.0 if shown is None else float(shown.view_delay_s)),
         )
         self.obeyed = inputs.operator_command
-        # Steady time: a clock that is set back must not make what has fallen silent look fresh.
+        # Steady time: setting the clock back must not make a stale source look fresh.
         decision = self.arbiter.step(inputs, self.clock.steady_ns())
         self.cmd_vel.publish(twist_stamped(*decision.command, now_ns, HARD_STOP if decision.hard else "base_link"))
         self.tell(decision, inputs, now_ns)
@@ -543,7 +543,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
     def carried_on(self, odometry: Odometry) -> NDArray[np.float64]:
-        """Pose (3,) of the v-bot now: its message is up to a period old."""
+        """Pose (3,) of the v-bot extrapolated to the present: its message is up to a period old."""
         age_s = (self.clock.now_ns() - stamp_ns(odometry)) / 1e9
         return move(pose2_from_matrix(pose_matrix(odometry)), *twist_values(odometry), min(max(age_s, 0.0), 0.1))
 
@@ -578,7 +578,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.diagnose("control", level, decision.reason, mode=decision.mode.name)
         self.ticks += 1
         if self.ticks % 2 and not decision.changed:
-            return  # 10 Hz is enough for what is looked at and planned to
+            return  # 10 Hz is enough for display and planning
         if decision.subgoal is not None:
             self.subgoal.publish(pose_stamped(matrix_from_pose2(decision.subgoal.pose), "map", now_ns))
         if self.trajectory.subscriber_count or self.lockstep:
@@ -590,7 +590,7 @@ def _twist(latest: Latest) -> tuple[float, float]:
 
 
 def _between_s(shown: ShownPictures) -> float:
-    """Seconds from the newest camera picture's coming to the page to the newest view's; 0 while one is missing."""
+    """Seconds from the arrival of the page's newest camera image to that of its newest view; 0 while one is missing."""
     between_s = float(shown.picture_age_s) - float(shown.view_age_s)
     return between_s if math.isfinite(between_s) else 0.0
 

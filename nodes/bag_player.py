@@ -1,4 +1,4 @@
-"""Plays a bag onto the bus, with /clock before each message; ends with the bag."""
+"""Plays a bag onto the bus, with /clock before each message; ends when the bag ends."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from instant_ic.msg import message_type, register_type, to_time
 _BASE = "crawler_base"
 _BASE_PERIOD_S = 0.5
 _ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
-"""What a robot's nodes act on, in the namespace of its base."""
+"""Topics that a robot's nodes act on, in the namespace of its base."""
 _HARMLESS = {"/clock", "/rosout", "/diagnostics", "/heartbeat", "/parameter_events"}
-"""What every node publishes. Of all else a second publisher would mix the bag's world with the robot's."""
+"""Topics that every node publishes. On any other topic a second publisher would mix the bag with the live robot."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,20 @@ class BagPlayerConfig:
     Attributes:
         bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
         rate: 2 plays twice as fast.
-        start_offset_s: seconds of the beginning to skip; latched values of it are still sent.
+        start_offset_s: seconds to skip at the start; latched messages from the skipped part are still published.
         duration_s: seconds of the bag to play; 0 plays to the end.
-        loop: begin again at the end; the time then goes back.
-        start_paused: wait at the beginning until told to resume or step.
-        topics: names or patterns to play; empty plays everything.
-        exclude: names or patterns to leave out.
-        drop_transforms: transforms with these child frames are left out of ``/tf``: somebody broadcasts them anew.
-        publish_clock: whether to send ``/clock``.
-        clock_hz: how often at least, also in a pause and where the bag has gaps.
-        delay_s: how long the time stands at the beginning, so that readers find the topics, s.
-        wait_for: nodes that must run, and be connected to what they read, before it begins.
-        wait_timeout_s: how long to wait for them before it gives up, s.
-        linger_s: how long it stays after the last message, so that the others finish their work, s.
-        force: play commands and states also beside a running base, which may then move the robot.
+        loop: restart at the end; the time then jumps back.
+        start_paused: wait at the start until resumed or stepped.
+        topics: names or patterns of the topics to play; empty plays everything.
+        exclude: names or patterns of the topics to leave out.
+        drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
+        publish_clock: whether to publish ``/clock``.
+        clock_hz: lowest rate of ``/clock``, also while paused and in gaps of the bag.
+        delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
+        wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
+        wait_timeout_s: seconds to wait for these nodes before giving up.
+        linger_s: seconds that the player stays after the last message, so that other nodes finish their work.
+        force: play commands and states although a base is running, which may move the robot.
     """
 
     bag: str = ""
@@ -67,13 +67,12 @@ class BagPlayerConfig:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         if not self.bag:
             raise ValueError("bag must name a folder (got '')")
         check_ranges(self)
 
     def play_options(self) -> PlayOptions:
-        """The part of it that the player takes."""
+        """The player's part of the parameters."""
         return PlayOptions(
             rate=self.rate,
             start_offset_s=self.start_offset_s,
@@ -86,7 +85,7 @@ class BagPlayerConfig:
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
-    """Sends a bag's bytes from a thread of its own; with ``use_sim_time`` its own clock is the bag's."""
+    """Publishes a bag's messages from its own thread; with ``use_sim_time`` the node's clock is the bag's."""
 
     name = "bag_player"
     live_parameters = ("rate", "linger_s")
@@ -96,7 +95,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
     _next_base_s = 0.0
 
     def setup(self) -> None:
-        """Opens the bag, makes its topics, starts the thread."""
+        """Open the bag, create its topics, start the thread."""
         try:
             self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config.play_options())
         except BagError as error:
@@ -109,7 +108,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self._clock_out: Publisher | None = None
         if self.config.publish_clock:
             self._clock_out = self.publisher("/clock", message_type("Clock"), RELIABLE)
-        for topic in self.player.topics:  # another project's types come with the bag
+        for topic in self.player.topics:  # foreign message types are defined in the bag
             register_type(topic.type_name, topic.schema.text)
         self._out = {t.topic: self.publisher_raw(t.topic, t.type_name, t.qos) for t in self.player.topics}
         for name, why in self.player.left_out.items():
@@ -127,7 +126,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         self._thread.start()
 
     def check_base(self) -> None:
-        """Looks for a base in the run directory, real or simulated, that could obey what is played.
+        """Check the run directory for a base, real or simulated, that could obey the played messages.
 
         Raises:
             NodeError: there is one, and ``force`` is not set.
@@ -169,7 +168,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
                 self._stop.wait(self.config.linger_s)
         except (BagError, NodeError) as error:
             self._failed = str(error)
-        except Exception as error:  # else the thread would be gone and the node would wait for ever
+        except Exception as error:  # otherwise the thread would be gone and the node would wait for ever
             self.log.exception("player")
             self._failed = f"{type(error).__name__}: {error}"
         self.stop()
@@ -183,25 +182,25 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             payload = without_children(message, self.config.drop_transforms)
         self._tell_time(message.stamp_ns)
         if payload is not None:
-            # Not by the clock: this node hears its own /clock too, a little later, which sets the time back.
+            # Not from the clock: this node also receives its own /clock, a little later, which sets the time back.
             stamp_ns = message.stamp_ns if isinstance(self.clock, ManualClock) else None
             self._out[message.topic].publish_bytes(payload, stamp_ns)
 
     def _tell_time(self, stamp_ns: int) -> None:
-        """The time goes before what happens at it, and goes on where nothing does."""
+        """Publish the time before each message, and keep it running where there are none."""
         if isinstance(self.clock, ManualClock):
             self.clock.set(stamp_ns)
         if self._clock_out is not None:
             self._clock_out.publish(message_type("Clock")(clock=to_time(stamp_ns)))
 
     def reconfigure(self, config: BagPlayerConfig) -> None:
-        """A new rate holds at once."""
+        """Apply a new rate at once."""
         if self.player is not None and config.rate != self.config.rate:
             self.player.set_rate(config.rate)
         super().reconfigure(config)
 
     def status(self) -> dict[str, Any]:
-        """What ``ic bag status`` shows."""
+        """The state that ``ic bag status`` shows."""
         assert self.player is not None
         player = self.player
         return {
@@ -216,7 +215,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         }
 
     def _wait_for_readers(self) -> None:
-        """Until each node of ``wait_for`` runs, reads something of the bag, and is connected to all that it reads."""
+        """Wait until each node of ``wait_for`` runs, reads a topic of the bag, and is connected to all its topics."""
         if self.run_dir is None or self.player is None:
             return
         begin_s = time.monotonic() + self.config.delay_s
@@ -230,7 +229,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             self._tell_time(self.player.start_ns)
             nodes = {info.name: info for info in registry.list_nodes(self.run_dir)}
             played = {publisher.topic for publisher in self._out.values()}
-            # A recorder subscribes only once it has found the topics: it is ready when it reads one of them.
+            # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
             absent = [
                 name for name in self.config.wait_for if name not in nodes or played.isdisjoint(nodes[name].subscribes)
             ]
@@ -251,7 +250,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         raise NodeError(f"waited {self.config.wait_timeout_s:.0f} s for {missing}")
 
     def teardown(self) -> None:
-        """Ends the thread, closes the bag."""
+        """End the thread and close the bag."""
         if self.player is None:
             return
         if self._thread is not None:

@@ -1,4 +1,4 @@
-"""Records topics into a rosbag2 folder (MCAP), byte for byte; or keeps the last seconds, and records when asked."""
+"""Records topics into a rosbag2 folder (MCAP), byte for byte; in snapshot mode keeps only the last seconds."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ class BagRecorderConfig:
     """Parameters of the recorder.
 
     Attributes:
-        path: folder of the bag, which must not exist; empty makes ``runs/bag_DATE_TIME`` in the working directory. With
-            snapshots the folder that they go into.
-        topics: names or patterns to record; empty records everything.
-        exclude: names or patterns to leave out.
-        discovery_period_s: how often to look for new topics, s.
-        duration_s: end after this time, s; 0 records until it is stopped.
-        parameters: whether to keep the nodes' parameters in the bag's metadata.
+        path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
+            snapshot mode, the folder for the snapshots.
+        topics: names or patterns of the topics to record; empty records everything.
+        exclude: names or patterns of the topics to leave out.
+        discovery_period_s: seconds between searches for new topics.
+        duration_s: seconds after which recording ends; 0 records until stopped.
+        parameters: whether to save the nodes' parameters in the bag's metadata.
         compressed: compress with zstd.
-        max_bag_size: a file of so many bytes is followed by the next; 0 makes one file.
-        max_bag_duration: a file of so many seconds is followed by the next; 0 makes one file.
-        queue_mb: how much may wait for the disk, MB; what comes beyond is left out and counted.
-        min_free_mb: stop recording while the disk has less free space, MB.
-        start_paused: record only once it is told to resume.
-        snapshot: write nothing until asked (``ic bag snapshot``, emergency stop); keep the last seconds in memory.
-            Records into a bag of its own between the commands ``record`` and ``stop`` (the page's button).
-        snapshot_seconds: how many.
-        snapshot_after_s: how much of what follows the moment goes into the snapshot too, s.
-        snapshot_on_estop: write one at each emergency stop.
-        max_cache_mb: memory for the last seconds, MB; with more traffic they are fewer.
+        max_bag_size: size in bytes at which the next file begins; 0 writes one file.
+        max_bag_duration: length in seconds at which the next file begins; 0 writes one file.
+        queue_mb: largest queue for the disk, MB; messages beyond it are dropped and counted.
+        min_free_mb: stop recording when the disk has less free space, MB.
+        start_paused: record only after a resume command.
+        snapshot: keep the last seconds in memory and write only on request (``ic bag snapshot``, emergency stop).
+            Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
+        snapshot_seconds: seconds before the request that a snapshot holds.
+        snapshot_after_s: seconds after the request that a snapshot also holds.
+        snapshot_on_estop: write a snapshot at each emergency stop.
+        max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
     """
 
     path: str = ""
@@ -67,17 +67,16 @@ class BagRecorderConfig:
     max_cache_mb: PositiveInt = 256
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
 
     def folder(self) -> Path:
-        """Where the bag goes."""
+        """Folder of the bag."""
         if self.path:
             return Path(self.path).expanduser()
         return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
 
     def options(self) -> RecordOptions:
-        """The part of it that the recorder takes."""
+        """The recorder's part of the parameters."""
         return RecordOptions(
             compressed=self.compressed,
             max_bytes=self.max_bag_size,
@@ -90,7 +89,7 @@ class BagRecorderConfig:
 
 
 class BagRecorderNode(Node[BagRecorderConfig]):
-    """Finds topics, hands their bytes to the recorder, tells size and losses."""
+    """Discovers topics, passes their bytes to the recorder, reports size and losses."""
 
     name = "bag_recorder"
     live_parameters = ("duration_s", "snapshot_after_s", "snapshot_on_estop")
@@ -100,7 +99,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     _seen: tuple[tuple[str, int], ...] = ()
 
     def setup(self) -> None:
-        """Makes the bag and starts looking for topics."""
+        """Create the bag and start discovery."""
         if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
         self._choice = TopicChoice(self.config.topics, self.config.exclude)
@@ -129,7 +128,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         }
         self._began_s = time.monotonic()
         self._discover()
-        # A thread, not a timer: with simulated time the timers stand still while topics already come.
+        # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
         threading.Thread(target=self._look, name="discovery", daemon=True).start()
 
     def _look(self) -> None:
@@ -155,7 +154,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         return self.subscribe_received(topic, forward, RECORD)
 
     def _begin(self, path: Path) -> tuple[Recorder, Callable[[], None]]:
-        """A recorder with subscriptions of its own, which bring it the latched values; and what ends them."""
+        """Return a recorder with its own subscriptions, which get the latched messages, and a function to end them."""
         taken: list[Subscription] = []
 
         def listen(topic: str, take: TakeMessage) -> Stats:
@@ -172,7 +171,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         assert self.recorder is not None and self.run_dir is not None
         due = time.monotonic() >= self._next_look_s
         changed = _changes(self.run_dir / "topics")
-        # Reading every publisher's entry five times a second would cost more than recording them.
+        # Reading every publisher's entry five times a second would cost more than recording.
         if due or changed != self._seen:
             self._seen = changed
             nodes: list[registry.NodeInfo] = []
@@ -223,7 +222,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             self.recorder.pause()
 
     def _on_stop(self, who: str, stopped: bool) -> None:
-        """A snapshot at each stop; one that was there before this recorder is none."""
+        """Write a snapshot at each stop, except one that was latched before this recorder started."""
         before = self._stopped.get(who)
         self._stopped[who] = stopped
         if stopped and before is False and self.config.snapshot_on_estop:
@@ -252,10 +251,10 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             self.diagnose("types", WARN, f"recorded without their definition, which is not known here: {named}")
 
     def teardown(self) -> None:
-        """Completes the bag."""
+        """Complete the bag."""
         if self.recorder is None:
             return
-        self.spin_once()  # what is already in the queues belongs into the bag
+        self.spin_once()  # messages already in the queues belong to the bag
         try:
             if self.on_demand is not None:
                 self.on_demand.close()
@@ -270,11 +269,11 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
 
 def _changes(topics: Path) -> tuple[tuple[str, int], ...]:
-    """Folders of topics with the times at which something came or went in them."""
+    """Topic folders with the times of their last change."""
     try:
         with os.scandir(topics) as entries:
             return tuple(sorted((entry.name, entry.stat().st_mtime_ns) for entry in entries))
-    except OSError:  # one left in this moment, or nobody has published yet: the next look tells
+    except OSError:  # one just removed, or no publisher yet: the next search finds out
         return ()
 
 

@@ -1,4 +1,4 @@
-"""Drives the tracked base over its RoboClaw controller and tells its odometry, battery and faults."""
+"""Drives the tracked base through its RoboClaw controller; publishes odometry, battery and faults."""
 
 from __future__ import annotations
 
@@ -37,25 +37,25 @@ from instant_ic.msg import (
 from instant_ic.pace import current
 
 _TWISTS = (type_name(TwistStamped), type_name(Twist))
-"""Types that /cmd_vel may carry."""
+"""Types allowed on /cmd_vel."""
 _LEAST_PERIODS = 3
 """Commands that may be missing before the controller's watchdog stops the motors."""
 
 
 @dataclass(frozen=True)
 class CrawlerBaseConfig(ControllerConfig):
-    """Parameters, on top of those of the controller.
+    """Parameters, in addition to those of the controller.
 
     Attributes:
-        rate_hz: commands and odometry a second.
+        rate_hz: commands and odometry messages per second.
         odom_frame: parent of the base's frame.
         base_frame: the base's own frame.
         battery_full_v: main battery when full, volts.
-        battery_empty_v: main battery when it has to be charged, volts; lower is a warning.
-        recent_s: repeats, dropped commands and impossible readings are a warning for this long.
-        connect_grace_s: a controller that is not there yet is an error only this long after the start.
-        command_source: name of the only node whose commands are obeyed; empty: any node's.
-        accept_unstamped: commands without a stamp are obeyed too, as if given when they come.
+        battery_empty_v: voltage of the main battery when it needs charging, volts; lower voltages warn.
+        recent_s: seconds for which repeats, dropped commands and impossible readings remain a warning.
+        connect_grace_s: seconds after the start for which a missing controller is not an error yet.
+        command_source: name of the only node whose commands are obeyed; empty: any node.
+        accept_unstamped: also obey commands without a stamp, with their arrival time as stamp.
     """
 
     rate_hz: Annotated[float, Range(5, 200)] = 30.0
@@ -69,7 +69,6 @@ class CrawlerBaseConfig(ControllerConfig):
     accept_unstamped: bool = False
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         check_ranges(self)
         if not 0.0 < self.battery_empty_v < self.battery_full_v:
@@ -85,29 +84,27 @@ class CrawlerBaseConfig(ControllerConfig):
 
 
 class CrawlerBaseNode(Node[CrawlerBaseConfig]):
-    """See the module."""
-
     name = "crawler_base"
     live_parameters = ("battery_full_v", "battery_empty_v")
     open_port: Callable[[RoboclawConfig], SerialPort] = staticmethod(open_serial)
 
     def setup(self) -> None:
-        """Topics, and the loop that talks to the controller."""
+        """Create the topics and the control loop."""
         self.thread: ControllerThread | None = None
         self.refuse_pace()
         self.controller = BaseController(self.config, self.clock.now_ns, self.clock.steady_ns, type(self).open_port)
         self.odometry = self.publisher("/wheel/odom", Odometry, qos=SENSOR)
         self.button_out = self.publisher("/robot/estop", Bool, qos=LATCHED)
-        self.button: bool | None = None  # the controller's emergency stop input
+        self.button: bool | None = None  # state of the controller's emergency stop input
         self.latch = EstopLatch()
         self.battery = self.publisher("/battery", BatteryState, qos=SENSOR)
-        self.strangers: dict[str, int] = {}  # who else publishes /cmd_vel, and when last
-        self.driver = self.config.command_source  # who is obeyed; with any source allowed, who came last
+        self.strangers: dict[str, int] = {}  # other publishers of /cmd_vel, with the time of their last message
+        self.driver = self.config.command_source  # the obeyed node; with any source allowed, the last publisher
         self.hard = False  # the newest command is a hard stop
         self.diagnose("publishers", OK, "no second publisher of /cmd_vel")
         self.show_latch()
         self.started_ns = self.clock.steady_ns()
-        self.linked = False  # since the start, once
+        self.linked = False  # connected once since the start
         self.dropped = self.retries_told = self.rejected_told = 0
         self.drops, self.repeats, self.jumps = (RecentCount(self.config.recent_s) for _ in range(3))
         self.diagnose("link", WARN, f"connecting to {self.config.roboclaw.port}")
@@ -128,17 +125,17 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.thread.start()
 
     def hurry(self) -> None:
-        """Have the controller make a step now."""
+        """Make the controller step now."""
         if self.thread is not None:
             self.thread.hurry()
         else:
             self.on_state(self.controller.step())
 
     def refuse_pace(self) -> None:
-        """A real base in slow motion would be stopped late: only the simulator's, in the run directory, may be.
+        """Refuse to run a real base on scaled time: it would stop late. Only the simulator's base may.
 
         Raises:
-            NodeError: the stack's time is not the machine's, and the port is not the simulator's.
+            NodeError: the stack's time is not the machine's, and the port is not the simulator's in the run directory.
         """
         pace, folder = current(), self.run_dir
         if pace.real or (folder is not None and Path(self.config.roboclaw.port).is_relative_to(folder)):
@@ -149,7 +146,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         )
 
     def on_command(self, received: Received) -> None:
-        """Pass a command on to the controller, unless it is another node's, stale, unstamped or no twist."""
+        """Pass a command to the controller unless it is another node's, stale, unstamped or not a twist."""
         name = received.type_name
         if not self.accepted(received.publisher):
             return
@@ -177,7 +174,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
                 self.diagnose("command", OK, "driving by /cmd_vel", dropped=self.dropped)
 
     def accepted(self, publisher: str) -> bool:
-        """Whether a node's commands are obeyed; warns of every node beside the one that drives."""
+        """Whether a node's commands are obeyed; warns of every publisher besides the driving node."""
         if not self.config.command_source and publisher != self.driver:
             if self.driver:
                 self.warn_of(self.driver)
@@ -196,7 +193,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose("publishers", WARN, f"/cmd_vel is also published by {publisher}: stop that node")
 
     def on_estop(self, received: Received) -> None:
-        """Emergency stop of any client: obeyed here too, whatever the arbiter does."""
+        """Obey any client's emergency stop here too, whatever the arbiter does."""
         pressed = bool(deserialize(received.payload, received.type_name).data)
         refused = self.latch.hear(pressed, received.publisher, received.publish_ns, received.received_ns)
         if refused:
@@ -204,14 +201,14 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.obey_latch()
 
     def on_button(self, received: Received) -> None:
-        """A button of another node; that of the controller comes with its status."""
+        """Obey another node's button; the controller's own input arrives with its status."""
         if received.publisher != self.node_name:
             pressed = bool(deserialize(received.payload, received.type_name).data)
             self.latch.hear_button(pressed, received.publisher, received.publish_ns)
             self.obey_latch()
 
     def obey_latch(self) -> None:
-        """Hold the motors for as long as the emergency stop is latched."""
+        """Hold the motors while the emergency stop is latched."""
         self.controller.emergency_stop(self.latch.stopped)
         if self.latch.stopped:
             self.hurry()
@@ -226,13 +223,13 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.diagnose("emergency stop", WARN, f"latched by {by}: release it on the operator's page")
 
     def refuse(self, reason: str) -> None:
-        """Report a command that is not obeyed."""
+        """Report a command that was refused."""
         self.dropped += 1
         self.drops.add(1, self.clock.steady_ns())
         self.diagnose("command", WARN, f"dropped: {reason}", dropped=self.dropped)
 
     def on_state(self, state: BaseState) -> None:
-        """Publish what a step of the controller gave."""
+        """Publish the result of a controller step."""
         if state.link:
             self.tell_link(state.connected, state.link)
         if state.odometry is not None:
@@ -241,13 +238,13 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.publish_health(state.health)
 
     def tell_link(self, connected: bool, text: str) -> None:
-        """What happened on the line; at start, while the controller may still be coming, its absence is a warning."""
+        """Report a change of the serial link; soon after the start, a missing controller is only a warning."""
         self.linked |= connected
         starting = not self.linked and self.clock.steady_ns() - self.started_ns < self.config.connect_grace_s * 1e9
         self.diagnose("link", OK if connected else WARN if starting else ERROR, text)
 
     def tell_recent(self) -> None:
-        """What happened in the last ``recent_s``: repeats, impossible readings, dropped commands."""
+        """Report the last ``recent_s``: repeats, impossible readings, dropped commands."""
         now_ns, counters, window = (
             self.clock.steady_ns(),
             self.controller.roboclaw.counters,
@@ -279,7 +276,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.diagnose("publishers", OK, f"no second publisher of /cmd_vel in the last {window}")
 
     def publish_odometry(self, estimate: OdometryEstimate) -> None:
-        """Odometry message and transform."""
+        """Publish the odometry message and its transform."""
         odom_from_base = matrix_from_pose2(estimate.pose)
         message = odometry_message(
             odom_from_base,
@@ -296,7 +293,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.tf_broadcast(self.config.odom_frame, self.config.base_frame, odom_from_base, estimate.stamp_ns)
 
     def publish_health(self, health: Health) -> None:
-        """Battery message, and what the controller says of its faults."""
+        """Publish the battery message and the controller's faults."""
         config = self.config
         charge = (health.battery_v - config.battery_empty_v) / (config.battery_full_v - config.battery_empty_v)
         nan, none = float("nan"), np.zeros(0, np.float32)
@@ -338,7 +335,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         )
 
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
-        """The serial thread has ended: tell why, and end the node unless it is ending anyway."""
+        """Report why the serial thread ended, and end the node unless it is ending anyway."""
         if unstopped:
             self.log.error("motors could not be told to stop (%s); the controller's watchdog does it", unstopped)
         if fault is not None:

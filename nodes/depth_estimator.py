@@ -1,4 +1,4 @@
-"""Estimates the depth of the camera's panoramas (paper, section IV.B): newest picture only, at a limited rate."""
+"""Estimates the depth of the camera's panoramas (paper, section IV.B): newest image only, at a limited rate."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from instant_ic.msg import CompressedImage, DepthModelInfo, Image, header, image
 from instant_ic.paths import shipped_file
 
 _WATCH_S = 0.5
-_GIVE_UP_S = 10.0  # an inference that does not end so long after it was told to hangs in a driver
+_GIVE_UP_S = 10.0  # an inference still running this long after its cancellation hangs in a driver
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class DepthEstimatorConfig:
     """Parameters.
 
     Attributes:
-        model: ONNX file or its manifest; a bare name is looked for in ``models/``.
-        provider: what runs it: ``auto`` takes TensorRT, CUDA or the CPU, the first that works.
-        threads: CPU threads of one inference.
-        max_rate_hz: pictures a second at most; leaves the CPU to others.
-        max_age_s: an older picture at the end of its estimation is warned about.
-        timeout_s: an inference that takes longer is ended and told.
+        model: ONNX file or its manifest; a bare name is searched for in ``models/``.
+        provider: execution provider; ``auto`` takes the first of TensorRT, CUDA and CPU that works.
+        threads: CPU threads per inference.
+        max_rate_hz: highest rate of estimates, per second; leaves CPU time to other nodes.
+        max_age_s: age of an image at the end of its estimation, in seconds, above which the node warns.
+        timeout_s: seconds after which an inference is cancelled and reported.
     """
 
     model: str = DEFAULT_MODEL
@@ -59,7 +59,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
     def setup(self) -> None:
         self.load(self.config.provider)
         self.last_ns: int | None = None
-        self.began_ns = 0  # of the inference that runs, on the steady clock; 0 while none does
+        self.began_ns = 0  # start of the running inference on the steady clock; 0 while none runs
         self.failures = 0
         self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
         self.info = self.publisher("/depth/model", DepthModelInfo, qos=LATCHED)
@@ -69,7 +69,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.timer(_WATCH_S, self.watch)
 
     def load(self, provider: str) -> None:
-        """Opens the model; says on what it runs and why on nothing faster."""
+        """Load the model; report its provider and why a faster one is not used."""
         try:
             bare = Path(self.config.model).name == self.config.model
             path = shipped_file("models", self.config.model) if bare else Path(self.config.model)
@@ -86,7 +86,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             self.log.warning("%s was asked for, %s runs the model%s", provider, self.model.provider, why)
 
     def tell_model(self) -> None:
-        """What kind of numbers ``/depth/raw`` carries, for whoever scales them."""
+        """Publish which kind of values ``/depth/raw`` carries, for the node that scales them."""
         manifest = self.model.manifest
         self.told = self.model.provider
         info = DepthModelInfo(
@@ -96,7 +96,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.info.publish(info)
 
     def on_image(self, message: Any) -> None:
-        # By the pictures' own stamps, so that a replay picks the same ones; 5 % for a camera's uneven pace.
+        # By the images' stamps, so that a replay picks the same ones; 5 % tolerance for the camera's jitter.
         stamp = stamp_ns(message)
         if self.last_ns is not None and 0 <= stamp - self.last_ns < 0.95e9 / self.config.max_rate_hz:
             return
@@ -104,16 +104,16 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.worker.submit(message)
 
     def estimate(self, message: Any) -> tuple[Any, NDArray[np.float32] | None, str]:
-        """On the worker's thread: header, depth, and the reason where there is none."""
+        """Run on the worker's thread; return header, depth, and an error text if there is no depth."""
         manifest = self.model.manifest
         self.began_ns = self.clock.steady_ns()
         try:
-            # Twice the network's input, so that the rest of the way down is by area averaging.
+            # Twice the network's input, so that the remaining reduction is by area averaging.
             rgb = decode_rgb(message.data, 2 * manifest.input_width, 2 * manifest.input_height)
             return message.header, self.model.estimate(rgb), ""
         except JpegError as error:
             return message.header, None, f"the picture {error}"
-        except ValueError as error:  # no panorama, or (ManifestError) outputs that only a run shows
+        except ValueError as error:  # not a panorama, or (ManifestError) outputs that show only in a run
             return message.header, None, str(error)
         except InferenceError as error:
             if self.model.provider == "cpu":
@@ -124,7 +124,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             self.began_ns = 0
 
     def watch(self) -> None:
-        """Ends an inference that takes too long; and the process, to be started anew, where it does not end."""
+        """Cancel an inference that takes too long; if it does not end, end the process for a restart."""
         if not (began_ns := self.began_ns):
             return
         took_s = (self.clock.steady_ns() - began_ns) / 1e9

@@ -1,4 +1,4 @@
-"""Makes depth in metres of the network's estimate, the LiDAR or both, and keyframes of it (paper, section IV.C)."""
+"""Computes metric depth from the network's estimate, the LiDAR or both, and keyframes (paper, section IV.C)."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from instant_ic.msg import (
     stamp_ns,
 )
 
-# Pictures and clouds older than this against the newest depth are let go of.
+# Images and clouds that differ more from the newest depth are discarded.
 _KEEP_NS = 4_000_000_000
 _MAX_PICTURES = 150
 _MAX_CLOUDS = 40
-# Pictures come, the source needs the network, and it has been silent for so long.
+# The network counts as silent after this time with images but no estimate.
 _SILENT_NS = 10_000_000_000
 
 
@@ -47,17 +47,17 @@ class DepthScalerConfig:
     """Parameters.
 
     Attributes:
-        source: what depth is made of: ``fused``, ``lidar`` (needs no network) or ``network``.
-        scaler: how the network's scale is found.
-        lidar: how depth is made of points alone.
-        fusion: how both are brought together.
-        keyframes: when keyframes are taken.
-        max_rate_hz: depth of the source ``lidar``, by the pictures' stamps; the others follow ``/depth/raw``.
-        rows: height of the depth picture of the source ``lidar``; the others have the network's.
-        body_elevation_deg: below this elevation the picture shows the robot itself, not the room; -90: nowhere.
-        max_cloud_age_s: the middle of a revolution may lie so far from the picture's time.
+        source: source of the depth: ``fused``, ``lidar`` (needs no network) or ``network``.
+        scaler: estimation of the network's scale.
+        lidar: depth from points alone.
+        fusion: combination of both.
+        keyframes: selection of keyframes.
+        max_rate_hz: rate of source ``lidar``, by the images' stamps; the others follow ``/depth/raw``.
+        rows: height of the depth image of source ``lidar``; the others have the network's.
+        body_elevation_deg: below this elevation the image shows the robot itself, not the room; -90: nowhere.
+        max_cloud_age_s: largest difference in seconds between the middle of a revolution and the image.
         map_frame, odom_frame: frames of the keyframe's pose and of the motion compensation.
-        base_frame: on the ground; what the camera's height is measured from.
+        base_frame: frame on the ground; reference of the camera's height.
     """
 
     source: str = "fused"
@@ -75,11 +75,11 @@ class DepthScalerConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        self.depth_source  # noqa: B018 - raises ValueError on a source that is none
+        self.depth_source  # noqa: B018 - raises ValueError on an unknown source
 
     @property
     def depth_source(self) -> SourceConfig:
-        """The part of it that the library takes."""
+        """The library's part of the parameters."""
         return SourceConfig(self.source, self.scaler, self.lidar, self.fusion)
 
 
@@ -99,12 +99,12 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.clouds: deque[Any] = deque(maxlen=_MAX_CLOUDS)
         self.model: Any = None
         self.last_ns: int | None = None
-        self.waiting: Any = None  # picture whose revolution has not come yet (source lidar)
+        self.waiting: Any = None  # image whose revolution has not arrived yet (source lidar)
         self.pictures_since_ns: int | None = None
         self.scaled = self.publisher("/depth/scaled", Image, qos=SENSOR)
         self.keyframe = self.publisher("/keyframe", Keyframe, qos=LATCHED)
         self.warn_of_method()
-        self.transforms = self.tf  # subscribes now: the past must be known when the first depth comes
+        self.transforms = self.tf  # subscribes here: the past must be known when the first depth arrives
         self.subscribe("/depth/model", DepthModelInfo, self.on_model, qos=LATCHED)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_picture, qos=SENSOR)
         self.subscribe("/lidar/points", PointCloud2, self.on_cloud, qos=SENSOR)
@@ -123,7 +123,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.log.warning("depth is taken as estimated, the LiDAR is not asked: for recordings, not for driving")
 
     def on_model(self, message: Any) -> None:
-        """What the network gives is its own word, whatever the configuration says."""
+        """Adopt the kind of values that the network reports, whatever the configuration says."""
         self.model = message
         try:
             scaler = replace(self.config.scaler, output_kind=message.output_kind)
@@ -143,7 +143,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             return
         age_s = self.config.max_cloud_age_s
         if self.waiting is not None and abs(stamp - stamp_ns(self.waiting)) > age_s * 1e9:
-            self.of_waiting()  # no revolution came for it: told, not waited for
+            self.of_waiting()  # no revolution arrived for it: report it instead of waiting
         period_ns = 1e9 / self.config.max_rate_hz
         if self.waiting is None and (self.last_ns is None or not 0 <= stamp - self.last_ns < 0.99 * period_ns):
             self.waiting = message
@@ -160,7 +160,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def on_cloud(self, message: Any) -> None:
         self.clouds.append(message)
-        # The next revolution would be nearer only if the picture was taken in its second half.
+        # The next revolution would be nearer only if the image was taken in its second half.
         if self.waiting is not None and middle_ns(message) >= stamp_ns(self.waiting):
             self.of_waiting()
 
@@ -173,7 +173,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             self.handle(image_array(message), message.header.frame_id, stamp_ns(message))
 
     def handle(self, raw: NDArray[np.float32] | None, camera: str, stamp: int) -> None:
-        """Depth of the picture taken at ``stamp``, told and published."""
+        """Compute, report and publish the depth of the image taken at ``stamp``."""
         if self.last_ns is not None and stamp < self.last_ns - _KEEP_NS:
             self.log.warning("time went back by %.1f s: starting anew", (self.last_ns - stamp) / 1e9)
             self.selector.restart()
@@ -190,7 +190,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.let_go(stamp)
 
     def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp: int) -> DepthResult:
-        """Depth by the revolution nearest in time; what is missing is told by the result's message."""
+        """Depth from the revolution nearest in time; the result's message names missing inputs."""
         size = (self.config.rows, 2 * self.config.rows)
         asks = raw is None or self.config.scaler.method != "as_estimated"
         try:
@@ -202,11 +202,11 @@ class DepthScalerNode(Node[DepthScalerConfig]):
             return self.source.refuse(raw, f"no LiDAR revolution within {self.config.max_cloud_age_s} s", size)
         result = self.source.estimate(raw, points, up, height_m, size=size)
         if not asks:
-            return result  # another place's camera has another height
+            return result  # a camera at another place has another height
         return without_body(result, up, height_m, self.config.body_elevation_deg)
 
     def stance(self, camera: str, stamp: int) -> tuple[NDArray[np.float64], float]:
-        """Gravity's up in the camera's frame (odometry is level), and the camera's height over the ground.
+        """Up direction in the camera's frame (odometry is level), and the camera's height above the ground.
 
         Raises:
             TransformError: the poses are not known.
@@ -273,12 +273,12 @@ class DepthScalerNode(Node[DepthScalerConfig]):
         self.log.info(text)
 
     def map_from_camera(self, camera: str, stamp: int) -> Matrix:
-        """Odometry of the picture's time under the newest correction: the map as it is known now."""
+        """Odometry at the image's time with the newest correction: the map as known at present."""
         map_from_odom = self.transforms.lookup(self.config.map_frame, self.config.odom_frame)
         return map_from_odom @ self.transforms.lookup(self.config.odom_frame, camera, stamp)
 
     def let_go(self, stamp: int) -> None:
-        # Also what is far ahead: it belongs to the time before the clock went back.
+        # Also images far ahead: they belong to the time before the clock went back.
         for old in [other for other in self.pictures if abs(other - stamp) > _KEEP_NS]:
             del self.pictures[old]
         while self.clouds and abs(stamp_ns(self.clouds[0]) - stamp) > _KEEP_NS:
@@ -286,7 +286,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
 
 def middle_ns(cloud: Any) -> int:
-    """The middle of a revolution; of an empty one its stamp."""
+    """Time of the middle of a revolution; of an empty one, its stamp."""
     times = cloud_array(cloud)["time"]
     return stamp_ns(cloud) + (round(0.5e9 * float(times[0] + times[-1])) if len(times) else 0)
 

@@ -1,4 +1,4 @@
-"""Serves topics, parameters and graph to Foxglove; bytes go through unchanged, and only what is watched."""
+"""Serves topics, parameters and the graph to Foxglove; forwards unchanged bytes, only of subscribed topics."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ class FoxgloveBridgeConfig:
     """Parameters.
 
     Attributes:
-        title: shown by Foxglove.
+        title: name that Foxglove shows.
         host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
-        port: 0 = any free port, told in the log.
+        port: TCP port; 0: any free port, reported in the log.
         tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
         tls_key: its private key, PKCS#8 in PEM.
-        allowed_origins: web pages that may connect, by their Origin, beside those of this machine; "*" lets every page
-            in. Programs that are no browsers send no Origin and are let in.
-        allowed_hosts: names by which clients may reach the server, beside localhost and any address.
-        max_clients: most clients at a time.
-        backlog: messages kept for a client that does not keep up; the oldest goes first, so it never gets a flood of
-            old ones.
-        topics: topics to offer, names or patterns; empty offers all.
-        exclude: names or patterns to leave out.
+        allowed_origins: web pages that may connect, by their Origin, besides those of this machine; "*" allows every
+            page. Programs that are not browsers send no Origin and are allowed.
+        allowed_hosts: names under which clients may reach the server, besides localhost and any address.
+        max_clients: largest number of clients at a time.
+        backlog: messages queued for a client that cannot keep up; the oldest are dropped first, so that it never gets a
+            burst of old ones.
+        topics: names or patterns of the topics to offer; empty offers all.
+        exclude: names or patterns of the topics to leave out.
         accept_operator: whether clients may drive (/operator/cmd_vel) and stop (/operator/estop) the robot.
-        set_parameters: whether clients may change parameters that are no safety parameters.
-        limits: what their commands have to pass.
-        discovery_period_s: how often to look for topics that come and go, s.
+        set_parameters: whether clients may change parameters, except safety parameters.
+        limits: limits on the clients' commands.
+        discovery_period_s: seconds between searches for new and removed topics.
     """
 
     title: str = "Instant IC"
@@ -62,20 +62,18 @@ class FoxgloveBridgeConfig:
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.25
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
         if bool(self.tls_cert) != bool(self.tls_key):
             raise ValueError("tls_cert and tls_key go together: give both or none")
 
 
 class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
-    """Looks at the registry, hands on what is watched."""
+    """Watches the registry and forwards subscribed topics."""
 
     name = "foxglove_bridge"
     server: FoxgloveServer | None = None
 
     def setup(self) -> None:
-        """Starts the server."""
         config = self.config
         if self.run_dir is None:
             raise NodeError("the bridge needs the real bus; it has no place in lockstep")
@@ -107,7 +105,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             what = " and ".join(may or ["read everything"])
             self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {what}: no sign-in")
         self._refused, self._next_refused_s = 0, 0.0
-        # A thread, not a timer: with simulated time the timers stand still while topics already come.
+        # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
         self._look_thread.start()
 
@@ -120,14 +118,14 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
                 next_s = now_s + self.config.discovery_period_s
                 self.server.wake.clear()
                 self.call_soon(self.reconcile)
-                time.sleep(_LEAST_S)  # a client that comes and goes without end costs no more than this
+                time.sleep(_LEAST_S)  # limits the cost of a client that connects and disconnects without end
             if self.use_sim_time and (now_ns := self.clock.now_ns()) != told_ns:
                 told_ns = now_ns
                 self.server.tell_time(now_ns)
             self.server.wake.wait(_TIME_S if self.use_sim_time else max(next_s - time.monotonic(), 0.0))
 
     def reconcile(self) -> None:
-        """Follows topics, nodes and watchers."""
+        """Update the offered topics to the present topics, nodes and subscribers."""
         if self.server is None or self.run_dir is None or self.stopping:
             return
         nodes = registry.list_nodes(self.run_dir)
@@ -144,12 +142,11 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
             dropped=self.server.dropped,
             **refused,
         )
-        if self.server.refused != self._refused and time.monotonic() >= self._next_refused_s:  # strangers fill no log
+        if self.server.refused != self._refused and time.monotonic() >= self._next_refused_s:  # must not fill the log
             self._refused, self._next_refused_s = self.server.refused, time.monotonic() + _REFUSED_S
             self.diagnose("door", WARN, f"turned away: {self.server.refusal}", requests=self.server.refused)
 
     def teardown(self) -> None:
-        """Ends the server."""
         if self.server is not None:
             self.server.wake.set()
             self._look_thread.join(2.0)

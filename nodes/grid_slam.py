@@ -1,4 +1,4 @@
-"""Grid SLAM: /scan and wheel odometry to /map, /pose and the transform map→odom."""
+"""Grid SLAM: from /scan and wheel odometry to /map, /pose and the transform map→odom."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from instant_ic.slam.motion import MotionState
 from instant_ic.slam.odometry import CorrectionLimiter, OdometryBuffer
 
 ODOMETRY_QUEUE = QoS("sensor", depth=100)
-"""Every odometry message counts, because scans are placed between two of them."""
+"""Deep, because scans are placed between two odometry messages."""
 
 
 MODES = ("mapping", "localization")
@@ -93,7 +93,7 @@ class GridSlamConfig:
 
     @property
     def slam(self) -> SlamConfig:
-        """The library's part."""
+        """The library's part of the parameters."""
         return SlamConfig(
             self.backend,
             self.odometry,
@@ -109,7 +109,7 @@ class GridSlamConfig:
 
 @dataclass(frozen=True)
 class _Pending:
-    """A scan that waits for the odometry of its moment."""
+    """A scan that waits for odometry at its stamp."""
 
     scan: Scan
     base_from_laser: np.ndarray
@@ -157,7 +157,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.saved_out = self.publisher("/slam/saved", String, qos=RELIABLE)
         self.pose_out = self.publisher("/pose", PoseWithCovarianceStamped, qos=SENSOR)
         self._restart()
-        self.tf  # noqa: B018 - listens from now on, so that the laser's mount is known when the first scan comes
+        self.tf  # noqa: B018 - listens from here on, so that the laser's mount is known when the first scan arrives
         if self.config.use_wheel_odom:
             self.subscribe("/wheel/odom", Odometry, self.on_odometry, qos=ODOMETRY_QUEUE)
             self.timer(0.02, self.place_pending)
@@ -189,7 +189,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.pending.clear()
         self.limiter.reset()
 
-    # -- in --------------------------------------------------------------------------------------
+    # -- inputs ----------------------------------------------------------------------------------
 
     def on_odometry(self, message: Any) -> None:
         stamp = stamp_ns(message)
@@ -245,10 +245,10 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.dropped += 1
         self.diagnose("scan", WARN, why, dropped=self.dropped)
 
-    # -- scans meet odometry ----------------------------------------------------------------------
+    # -- scans and odometry --------------------------------------------------------------------------
 
     def place_pending(self) -> None:
-        """Place the scans whose odometry is there, or has been waited for long enough."""
+        """Place the scans whose odometry has arrived or has been waited for long enough."""
         while self.pending:
             entry = self.pending[0]
             odometry = None
@@ -269,13 +269,13 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.first_wait_ns = self.first_wait_ns or entry.arrived_ns
             return now - self.first_wait_ns < config.odom_startup_wait_s * 1e9
         if not -0.5e9 < entry.scan.stamp_ns - newest < 0.5e9:
-            return False  # the wheels have been silent for long, or the scan is older than what is kept
+            return False  # the wheels have long been silent, or the scan is older than the stored odometry
         return now - entry.arrived_ns < config.odom_wait_s * 1e9
 
     def place(self, entry: _Pending, odometry: np.ndarray | None) -> None:
-        """One call into the library, and its answer to the topics."""
+        """Call the library for one scan and publish the result."""
         result = self.slam.process(entry.scan, odometry, entry.base_from_laser)
-        if result.status is SlamStatus.TIME_BACKWARDS:  # on_scan lets none through; a fault here if one comes
+        if result.status is SlamStatus.TIME_BACKWARDS:  # on_scan lets none through; if one comes, the fault is here
             self._drop("the scan is not newer than the one before")
             return
         self._tell(result, odometry)
@@ -309,15 +309,15 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.worker.submit((self.slam, job))
 
     def work(self, item: tuple[Slam, Callable[[], Any]]) -> tuple[Slam, Any, str]:
-        """Loop closing, optimisation, search in a saved map: on the worker's thread."""
+        """Loop closure, optimisation, search in a saved map: on the worker's thread."""
         slam, job = item
         try:
             return slam, job(), ""
-        except Exception as error:  # noqa: BLE001 - told on the node's thread; the scans go on
+        except Exception as error:  # noqa: BLE001 - reported on the node's thread; scans go on
             return slam, None, f"{type(error).__name__}: {error}"
 
     def take_over(self, result: tuple[Slam, Any, str]) -> None:
-        """What the worker found; nothing of a map that has been given up since."""
+        """Apply the worker's result, unless its map has been discarded since."""
         slam, outcome, fault = result
         if fault:
             self.diagnose("loops", ERROR, f"loop closing failed and is off until the node starts again: {fault}")
@@ -325,7 +325,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             slam.take_over(outcome)
 
     def on_initial_pose(self, message: Any) -> None:
-        """Somebody says where in the saved map the robot is (RViz's "2D pose estimate")."""
+        """Set the robot's pose in the saved map from outside (RViz's "2D pose estimate")."""
         try:
             if message.header.frame_id not in ("", self.config.map_frame):
                 raise ValueError(f"it is in frame {message.header.frame_id!r}, not {self.config.map_frame!r}")
@@ -335,7 +335,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.log.warning("/initialpose is not used: %s", error)
 
     def on_save(self, message: Any) -> None:
-        """Write the map to the path that the message names; the answer goes to /slam/saved."""
+        """Write the map to the path in the message; the answer goes to /slam/saved."""
         try:
             answer = "saved: " + ", ".join(str(file) for file in self.slam.save(Path(message.data)))
         except ValueError as error:
@@ -381,17 +381,17 @@ class GridSlamNode(Node[GridSlamConfig]):
         if self.slam.map_clipped:
             self.diagnose("map", WARN, "the map has reached max_size_m", points_left_out=self.slam.map_clipped)
 
-    # -- out, on time -----------------------------------------------------------------------------
+    # -- periodic outputs ---------------------------------------------------------------------------
 
     def publish_map(self) -> None:
-        """The map, when it has changed: in parts on /map_updates, whole at most each ``map_full_period_s``."""
+        """Publish a changed map: in parts on /map_updates, whole at most every ``map_full_period_s``."""
         version = self.slam.map_version
         if self.placed_ns is None:
             return
         if version == self.published_version:
             due = self.clock.steady_ns() - self.full_map_ns >= self.config.map_full_period_s * 1e9 * 0.99
             if self.partly and due and self.published is not None:
-                self._publish_whole(self.published, self.placed_ns)  # what late joiners get
+                self._publish_whole(self.published, self.placed_ns)  # for late subscribers
             return
         grid = self.slam.grid()
         stamp, before = self.placed_ns, self.published
@@ -427,7 +427,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.full_map_ns, self.partly = self.clock.steady_ns(), False
 
     def watch(self) -> None:
-        """Tell when no scan comes."""
+        """Report missing scans."""
         if self.last_scan_ns is None:
             if self.dropped == 0:
                 self.diagnose("scan", WARN, "no scan has come yet on /scan: is vlp16_driver running?")
@@ -438,7 +438,7 @@ class GridSlamNode(Node[GridSlamConfig]):
 
 
 def _covariance6(covariance: np.ndarray) -> np.ndarray:
-    """(36,) in the order x y z rx ry rz of a planar covariance (3, 3) x y yaw."""
+    """Covariance (36,) in the order x y z rx ry rz from a planar one (3, 3) in x y yaw."""
     full = np.zeros((6, 6))
     full[np.ix_([0, 1, 5], [0, 1, 5])] = covariance
     return full.reshape(36)

@@ -38,7 +38,7 @@ UNLISTED = "of no list"
 
 @dataclass(frozen=True)
 class HostBridgeConfig:
-    """Parameters; config/bridge.yaml says what each does."""
+    """Parameters; config/bridge.yaml explains each."""
 
     listen: str = ""
     connect: str = ""
@@ -51,7 +51,6 @@ class HostBridgeConfig:
     to_robot: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
         if bool(self.listen) == bool(self.connect):
             raise ValueError("one of listen (on the robot) and connect (at the station) must be given, not both")
@@ -69,7 +68,7 @@ class HostBridgeConfig:
 
 
 class HostBridgeNode(Node[HostBridgeConfig]):
-    """Joins a :class:`HostLink` to the topics of this host, and tells how the link stands."""
+    """Connects a :class:`HostLink` to this host's topics and reports the state of the link."""
 
     name = "host_bridge"
     live_parameters = ("driver", "max_offset_ms")
@@ -118,7 +117,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.link.stop()
 
     def reconfigure(self, config: HostBridgeConfig) -> None:
-        """Another host may drive from now on."""
+        """Apply a change of the driving host."""
         super().reconfigure(config)
         if isinstance(self.link, ListeningLink):
             self.link.wanted_driver = config.driver
@@ -126,7 +125,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
     # -- from the link -----------------------------------------------------------------------------
 
     def on_event(self, event: LinkEvent) -> None:
-        """Publishes what came at once, on the link's thread; everything else goes to the node's."""
+        """Publish arriving messages at once, on the link's thread; pass all other events to the node's thread."""
         if isinstance(event.event, Arrived):
             self.incoming.take(event.event)
         elif isinstance(event.event, Announced):
@@ -135,7 +134,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.call_soon(self.on_change, event.peer, event.event)
 
     def on_change(self, peer: str, event: Any) -> None:
-        """Tells of a link that came or went, and of who was turned away."""
+        """Report new and lost links, and refused hosts."""
         match event:
             case Up():
                 self.log.info("linked with %s", peer)
@@ -164,27 +163,27 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 )
             case Failed():
                 self.log.error("%s", event.text)
-                self.stop()  # the launcher starts it again
+                self.stop()  # the launcher restarts it
             case Problem():
                 self.problem = event.text
                 self.tell()
 
     def trouble(self, topic: str, text: str) -> None:
-        """A topic that does not go over the link; those on no list of this host share one diagnosis."""
+        """Report a topic that is not transferred; topics on no list of this host share one diagnosis."""
         if topic not in self.listed:
             topic, text = UNLISTED, f"{topic}: {text}"
         self.troubled.add(topic)
         self.diagnose(f"topic {topic}", ERROR, text)
 
-    # -- what it tells -----------------------------------------------------------------------------
+    # -- reports -------------------------------------------------------------------------------------
 
     def tell(self) -> None:
-        """State of the link, clocks, topics, strangers."""
+        """Report the state of the link, clocks, topics and strangers."""
         assert self.link is not None
         peers = self.link.peers()
         self.tell_link(peers)
         for peer in peers:
-            if not math.isnan(peer.offset_ms):  # right after the greeting
+            if not math.isnan(peer.offset_ms):  # not yet known right after the handshake
                 self.tell_clock(peer)
         for name in self.clock_told - {peer.name for peer in peers}:
             self.diagnose(f"clock of {name}", OK, "no link, not measured")
@@ -202,7 +201,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.diagnose("door", WARN if strangers else OK, text, tries=self.link.strangers)
 
     def tell_link(self, peers: list[PeerStatus]) -> None:
-        """Who is linked; why nobody is."""
+        """Report which hosts are linked, or why none is."""
         if self.problem:
             self.diagnose("link", ERROR, self.problem)
         elif not peers:
@@ -217,16 +216,16 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             self.diagnose("link", WARN if notices else OK, "; ".join([f"linked with {words}", *notices]), **values)
 
     def tell_clock(self, peer: PeerStatus) -> None:
-        """How far the other host's clock is from ours."""
+        """Report the offset of the other host's clock."""
         level, text = judge_clock(peer.offset_ms, peer.rtt_ms, self.config.max_offset_ms)
         values = {"offset_ms": peer.offset_ms, "rtt_ms": peer.rtt_ms, "jitter_ms": peer.jitter_ms}
         self.diagnose(f"clock of {peer.name}", level, text, **{key: round(value, 3) for key, value in values.items()})
 
 
 def judge_clock(offset_ms: float, rtt_ms: float, max_offset_ms: float) -> tuple[int, str]:
-    """Level and words for a clock that is ``offset_ms`` ahead: stamps in messages are not changed on the way."""
+    """Level and text for a clock that is ``offset_ms`` ahead: stamps in messages are not changed on the way."""
     text = f"{abs(offset_ms):.1f} ms {'ahead of' if offset_ms > 0 else 'behind'} this one"
-    if abs(offset_ms) <= max_offset_ms + rtt_ms / 2:  # half of the way there and back is not certain
+    if abs(offset_ms) <= max_offset_ms + rtt_ms / 2:  # half the round trip is uncertainty
         return OK, text
     return WARN, f"{text}, more than {max_offset_ms:g} ms: run chrony on both (sudo apt install chrony)"
 
@@ -242,7 +241,7 @@ def _values(peer: PeerStatus) -> dict[str, Any]:
 
 
 def _numbers(direction: str, topics: dict[str, TopicCounts]) -> dict[str, str]:
-    """A line a topic: what went over, and of what did not, why."""
+    """One line per topic: what was transferred, and why the rest was not."""
     lines = {}
     for topic, counts in sorted(topics.items()):
         words = [f"{counts.messages} messages", f"{counts.bytes} bytes"]

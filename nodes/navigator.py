@@ -54,7 +54,7 @@ class NavigatorConfig:
 
 
 class NavigatorNode(Node[NavigatorConfig]):
-    """Topics in and out of ``Navigator``."""
+    """Connects ``Navigator`` to topics."""
 
     name = "navigator"
 
@@ -72,7 +72,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.costmap = self.latest("/costmap", OccupancyGrid, c.costmap_timeout_s)
         self.vbot = self.latest("/vbot/odom", Odometry, 0.3)
         self.state = self.latest("/ic/state", ControlState, c.state_timeout_s, qos=LATCHED)
-        _ = self.tf  # listens from now on
+        _ = self.tf  # listens from here on
         self.timer(1.0 / c.controller_frequency, self.tick)
 
     def made(self, c: NavigatorConfig) -> Navigator:
@@ -81,7 +81,7 @@ class NavigatorNode(Node[NavigatorConfig]):
 
     def reconfigure(self, config: NavigatorConfig) -> None:
         super().reconfigure(config)
-        self.navigator = self.made(config)  # plans anew at once
+        self.navigator = self.made(config)  # plans again at once
 
     def tick(self) -> None:
         state = self.state.message
@@ -95,7 +95,7 @@ class NavigatorNode(Node[NavigatorConfig]):
         self.cmd_vel.publish(twist_stamped(*command, self.clock.now_ns()))
 
     def command(self, state: ControlState) -> tuple[float, float]:
-        """Twist for the r-bot; zero, with a diagnosis, when something is missing."""
+        """Twist for the r-bot; zero, with a diagnosis, while an input is missing."""
         grid, goal = self.costmap.message, self.subgoal.message
         if grid is None or goal is None:
             missing = "costmap" if grid is None else "subgoal"
@@ -116,7 +116,7 @@ class NavigatorNode(Node[NavigatorConfig]):
     def moving(
         self, subgoal: NDArray[np.float64], state: ControlState
     ) -> tuple[NDArray[np.float64], tuple[float, float]]:
-        """Subgoal and its velocity: where it is the v-bot, the v-bot's own newer pose and twist."""
+        """Subgoal and its velocity; if it is the v-bot, the v-bot's own newer pose and twist."""
         vbot = self.vbot.message
         if vbot is not None:
             pose = pose2_from_matrix(pose_matrix(vbot))

@@ -1,4 +1,4 @@
-"""Trains the virtual space from the newest keyframe and draws it by turns (paper, section IV.A)."""
+"""Trains the virtual space from the newest keyframe and renders it, in turns (paper, section IV.A)."""
 
 from __future__ import annotations
 
@@ -45,17 +45,17 @@ class NerfConfig:
     """Parameters.
 
     Attributes:
-        render_fps: pictures a second that are held where they are asked for; training gets the time that is left.
-        train_ms_per_frame: of training at a stretch, at most: a picture that is asked for waits no longer. While nobody
-            asks, training has all the time.
-        train_nice: of the threads that train, draw and prepare: what steers the robot comes first; 0 to 19.
-        lockstep_iterations: iterations at each tick of ``lockstep_period_s`` in tests and replay.
-        lockstep_period_s: see ``lockstep_iterations``.
-        max_view_pixels: larger requests are refused.
-        jpeg_quality: 1 to 100.
-        status_period_s: of ``/vspace/status``.
-        robot_mask: picture, twice as wide as high, white where the panorama shows the robot itself or its stand (see
-            also ``space.geometry.body_below_deg``); none where empty.
+        render_fps: target frame rate of requested views; training gets the remaining time.
+        train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view. While no
+            view is requested, training has all the time.
+        train_nice: nice value, 0 to 19, of the threads that train, render and prepare: robot control comes first.
+        lockstep_iterations: iterations per tick of ``lockstep_period_s`` in tests and replay.
+        lockstep_period_s: period of these ticks, in seconds.
+        max_view_pixels: largest view that may be requested; larger requests are refused.
+        jpeg_quality: JPEG quality of views, 1 to 100.
+        status_period_s: period of ``/vspace/status``, in seconds.
+        robot_mask: image, twice as wide as high, white where the panorama shows the robot itself or its stand (see also
+            ``space.geometry.body_below_deg``); empty: no mask.
         space: the virtual space itself.
     """
 
@@ -76,8 +76,8 @@ class NerfConfig:
 
 @dataclass(frozen=True)
 class Job:
-    """One piece of work: ``keyframe`` and ``scene`` for the thread that prepares, ``warm_up``, ``show``, ``learn``,
-    ``draw`` and ``train`` for the one that draws. ``made``: by the job before it.
+    """One piece of work: ``keyframe`` and ``scene`` for the preparing thread; ``warm_up``, ``show``, ``learn``,
+    ``draw`` and ``train`` for the rendering thread. ``made``: result of the previous job.
     """
 
     kind: str
@@ -88,7 +88,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a job came to; ``error`` is a fault that the job did not expect."""
+    """Result of a job; ``error`` is an unexpected fault."""
 
     job: Job
     status: Status | None = None
@@ -104,14 +104,14 @@ class Outcome:
 
 
 NOTHING_SEEN = 0.98
-"""A picture of which more than this share has been seen by nobody shows nothing that is known."""
+"""A view with a larger share of unseen pixels shows nothing that is known."""
 
 
 def read_mask(path: str) -> NDArray[np.bool_] | None:
-    """The robot's mask, (H, 2 H), or None where there is none.
+    """Load the robot's mask, (H, 2 H); None without a file name.
 
     Raises:
-        NodeError: no picture, or no panorama.
+        NodeError: not an image, or not a panorama.
     """
     if not path:
         return None
@@ -128,7 +128,7 @@ def decode_keyframe(keyframe: Any) -> tuple[Any, Any, Any, Any]:
     """Arguments of ``VirtualSpace.prepare``.
 
     Raises:
-        KeyframeError: the keyframe is not fit, or cannot be decoded.
+        KeyframeError: the keyframe is marked unfit, or cannot be decoded.
     """
     if not keyframe.fit:
         raise KeyframeError(f"its depth is not fit: {keyframe.message or 'no reason given'}")
@@ -145,9 +145,9 @@ def decode_keyframe(keyframe: Any) -> tuple[Any, Any, Any, Any]:
 
 
 class NerfNode(Node[NerfConfig]):
-    """One thread draws and trains by turns; another one prepares a new keyframe meanwhile, in two steps.
+    """One thread renders and trains in turns; another prepares a new keyframe in two steps.
 
-    First what pictures need, which then show it; then what the field needs, which then learns it.
+    The first step makes what views need, so that they show the keyframe; the second what the field needs to learn it.
     """
 
     name = "nerf"
@@ -158,21 +158,21 @@ class NerfNode(Node[NerfConfig]):
 
     def setup(self) -> None:
         self.robot = read_mask(self.config.robot_mask)
-        self.space: Space | None = None  # touched by the two workers alone
-        self.keyframe: Any = None  # newest that pictures show
+        self.space: Space | None = None  # used only by the two workers
+        self.keyframe: Any = None  # newest one that views show
         self.status: Status | None = None
         self.waiting_keyframe: Any = None
         self.waiting_request: Any = None
-        self.job: Job | None = None  # that the worker has in hand
-        self.todo: deque[Job] = deque()  # of the keyframe in preparation
+        self.job: Job | None = None  # the rendering worker's present job
+        self.todo: deque[Job] = deque()  # jobs of the keyframe in preparation
         self.preparing = False
-        self.learns = False  # the field has been given something to learn
+        self.learns = False  # the field has something to learn
         self.warned = False
         self.failure = ""
         self.keyframe_ns = self.ready_ns = 0
         self.ready_seconds = 0.0
         self.render_ms = 0.0
-        self.expected_psnr_db = self.unseen_share = 0.0  # of the picture drawn last; 0 = unknown
+        self.expected_psnr_db = self.unseen_share = 0.0  # of the last rendered view; 0 = unknown
         self.drawn_ns: deque[int] = deque(maxlen=20)
         self.turns = Turns(self.config.render_fps, self.config.train_ms_per_frame)
         self.view_out = self.publisher("/vspace/view", RenderedView, qos=SENSOR)
@@ -196,10 +196,10 @@ class NerfNode(Node[NerfConfig]):
         self.waiting_request = request
         self.next_job()
 
-    # -- who is next ---------------------------------------------------------------------------------
+    # -- scheduling -----------------------------------------------------------------------------------
 
     def next_job(self) -> None:
-        """Gives idle threads their next jobs; idle they stay when there is nothing to take in, draw or train."""
+        """Give idle threads their next jobs; they stay idle when there is nothing to prepare, render or train."""
         if self.space is not None and self.waiting_keyframe is not None and not self.preparing:
             waiting, self.waiting_keyframe = self.waiting_keyframe, None
             self.preparing = True
@@ -225,7 +225,7 @@ class NerfNode(Node[NerfConfig]):
 
     @property
     def trains(self) -> bool:
-        """Whether there is anything left to train."""
+        """Whether anything is left to train."""
         status = self.status
         return not (status is None or not self.learns or self.failure or status.converged)
 
@@ -251,8 +251,8 @@ class NerfNode(Node[NerfConfig]):
         start = time.perf_counter()
         try:
             outcome = self.do(job)
-        except Exception as error:  # noqa: BLE001 - told on the node's thread, which must learn that the worker is free
-            # A keyframe or request that is no good is the sender's fault, anything else is ours.
+        except Exception as error:  # noqa: BLE001 - reported on the node's thread, which must know that the worker is free
+            # A bad keyframe or request is the sender's fault, anything else is ours.
             refused = job.kind in ("keyframe", "show", "draw") and isinstance(error, ValueError)
             outcome = Outcome(job, refused=str(error)) if refused else Outcome(job, error=error)
         status = None if self.space is None else self.space.status
@@ -295,14 +295,14 @@ class NerfNode(Node[NerfConfig]):
         return Outcome(job)
 
     def yield_to_others(self) -> None:
-        """Lowers this thread's priority (Linux has one for each thread)."""
+        """Lower this thread's priority (Linux has one per thread)."""
         if self.config.train_nice and sys.platform == "linux":
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self.config.train_nice)
 
     # -- back on the node's thread -------------------------------------------------------------------
 
     def on_prepared(self, outcome: Outcome) -> None:
-        """What the thread that prepares has made goes to the one that draws."""
+        """Pass the preparing thread's result to the rendering thread."""
         job = outcome.job
         if outcome.error is not None or outcome.refused:
             self.preparing = False
@@ -342,14 +342,14 @@ class NerfNode(Node[NerfConfig]):
     def on_error(self, kind: str, error: Exception | None) -> None:
         words = f"{kind}: {type(error).__name__}: {error}"
         if kind in ("warm_up", "learn", "train"):
-            # What fails once fails again: no endless loop at full load. A new keyframe tries again.
+            # It would fail again: no endless loop at full load. A new keyframe tries again.
             self.failure = words
             self.diagnose("vspace", ERROR, words)
             self.publish_status()
         else:
             self.diagnose(kind, ERROR, words)
         if error is not None and type(error).__name__ not in ("OutOfMemoryError", "DeviceError", "MeshError"):
-            self.fault(f"virtual space, {kind}", error)  # those are no bugs, and told
+            self.fault(f"virtual space, {kind}", error)  # those two are not bugs, and are reported
 
     def refuse(self, keyframe: Any, words: str) -> None:
         self.diagnose("keyframe", ERROR, f"keyframe {keyframe.id} refused: {words}", id=keyframe.id)
@@ -374,7 +374,7 @@ class NerfNode(Node[NerfConfig]):
             self.diagnose("view", WARN, f"request {request.id} refused: {outcome.refused}", id=request.id)
             return
         now = self.clock.now_ns()
-        # Wall time would make a replay differ from run to run.
+        # Wall time would make a replay differ between runs.
         self.render_ms = 0.0 if self.lockstep else outcome.elapsed_ms
         self.turns.drew(self.render_ms)
         self.drawn_ns.append(now)
@@ -436,7 +436,7 @@ class NerfNode(Node[NerfConfig]):
         return f"{words}; shown: {share:.0%} warped panorama" if share > 0 else words
 
     def frames_per_second(self, now_ns: int) -> float:
-        """Over the last 20 pictures; 0 when none was drawn for 2 s."""
+        """Frame rate over the last 20 views; 0 when none was rendered for 2 s."""
         if len(self.drawn_ns) < 2 or now_ns - self.drawn_ns[-1] > 2_000_000_000:
             return 0.0
         span = self.drawn_ns[-1] - self.drawn_ns[0]

@@ -1,4 +1,4 @@
-"""Simulated robot in a simulated world: its devices over their real protocols, ground truth for evaluation."""
+"""Simulated robot in a simulated world: its devices with their real protocols, and ground truth for evaluation."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from instant_ic.sim.vlp16 import Vlp16Server
 
 _STEP_S = 0.01
 _TRUTH_S = 1.0 / 30.0
-#: How long the end waits for a step under way.
+#: Longest wait for a running step at shutdown.
 _MOST_WAIT_S = 0.3
-#: Most simulated time made up for at once after a stall.
+#: Most simulated time to catch up on at once after a stall.
 _MOST_BEHIND_S = 0.25
 
 
@@ -34,9 +34,9 @@ class SimulatorConfig(SimulationConfig):
     """Parameters.
 
     Attributes:
-        panorama: picture file that the camera shows instead of the world; empty: the world.
-        pcap: VLP-16 recording that is sent instead of simulated packets; empty: the world.
-        pcap_loop: whether the recording starts again after its end.
+        panorama: image file that the camera shows instead of the world; empty: the world.
+        pcap: VLP-16 recording to send instead of simulated packets; empty: the world.
+        pcap_loop: whether to restart the recording at its end.
     """
 
     panorama: str = ""
@@ -50,7 +50,7 @@ class SimulatorNode(Node[SimulatorConfig]):
     name = "simulator"
 
     def setup(self) -> None:
-        """Makes the world and opens the devices."""
+        """Create the world and open the devices."""
         if self.lockstep:
             raise NodeError("the simulator serves real devices in real time; use sim.Simulation in lockstep tests")
         config = self.config
@@ -75,7 +75,6 @@ class SimulatorNode(Node[SimulatorConfig]):
         self.timer(1.0, self._check)
 
     def teardown(self) -> None:
-        """Stops the world and closes the devices."""
         if not hasattr(self, "_stopped"):  # the node failed before its setup
             return
         self._stopped.set()
@@ -85,7 +84,7 @@ class SimulatorNode(Node[SimulatorConfig]):
             device.close()
 
     def _warm_up(self) -> None:
-        # Compiled on first use: before the clock starts, not in the first picture.
+        # Compiles on first use: do it before the clock starts, not at the first image.
         if self.config.camera.enabled and not self.config.panorama:
             self.simulation.panorama(self.config.camera.width, self.config.camera.height)
 
@@ -116,7 +115,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         return self.simulation.panorama(width, height).rgb
 
     def _run(self) -> None:
-        """Keeps simulated time with the stack's (own thread)."""
+        """Keep simulated time at the stack's time (own thread)."""
         simulation, pace = self.simulation, current()
         offset = pace.steady_s() - simulation.time_s
         simulation.start_ns = pace.now_ns() - round(simulation.time_s * 1e9)
@@ -128,7 +127,7 @@ class SimulatorNode(Node[SimulatorConfig]):
                     pace.sleep(_STEP_S - lag)
                     continue
                 if lag > _MOST_BEHIND_S:
-                    # The machine stood still: the robot did too, and the devices fall silent rather than hurry.
+                    # The machine stalled: the robot stands too, and the devices pause instead of catching up.
                     self._behind_s += lag - _MOST_BEHIND_S
                     offset += lag - _MOST_BEHIND_S
                     simulation.start_ns += round((lag - _MOST_BEHIND_S) * 1e9)
@@ -149,7 +148,7 @@ class SimulatorNode(Node[SimulatorConfig]):
         told = (robot.contact, robot.contacts)
         if told != self._told:
             if robot.contacts > self._told[1] and not robot.contact:
-                # It came and went between two ticks: that is told too.
+                # The contact began and ended between two ticks: report it too.
                 self.contact.publish(Bool(data=True))
             self._told = told
             self.contact.publish(Bool(data=robot.contact))

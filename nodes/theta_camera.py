@@ -1,4 +1,4 @@
-"""Publishes the 360-degree picture: Theta Z1 live preview, a video device or stream, or picture files."""
+"""Publishes 360-degree images: Theta Z1 live preview, a video device or stream, or image files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from instant_ic.msg import CompressedImage, compressed_image_message
 
 USER_VARIABLE = "INSTANT_IC_THETA_USER"
 PASSWORD_VARIABLE = "INSTANT_IC_THETA_PASSWORD"
-"""Environment of the credentials: parameters are shown by ``ic param`` and stand in files."""
+"""Environment variable for the credentials: parameters are visible in ``ic param`` and in files."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +30,18 @@ class ThetaCameraConfig:
 
     Attributes:
         source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
-        url: of the Theta; device, address or path for the other sources.
+        url: address of the Theta; device, address or path for the other sources.
         frame_id: the camera's frame.
-        mount_xyz: its place on base_link, metres.
-        mount_rpy_deg: its roll, pitch, yaw on base_link, degrees.
-        silence_s: no picture for this long is a warning; four times as long is an error.
-        health_period_s: the Theta is asked for battery and temperature this often.
-        battery_low: charge under which to warn, 0-1.
-        board_hot_c: board temperature from which to warn, degrees Celsius.
+        mount_xyz: camera position on base_link, metres.
+        mount_rpy_deg: camera roll, pitch, yaw on base_link, degrees.
+        silence_s: seconds without an image that cause a warning; four times as long is an error.
+        health_period_s: seconds between requests for the Theta's battery and temperature.
+        battery_low: battery charge below which to warn, 0-1.
+        board_hot_c: board temperature from which on to warn, degrees Celsius.
         theta: live preview.
-        video: stream by OpenCV.
-        files: pictures from files.
-        reconnect: waits between attempts to connect.
+        video: stream through OpenCV.
+        files: images from files.
+        reconnect: delays between connection attempts.
     """
 
     source: Literal["theta", "video", "files"] = "theta"
@@ -59,20 +59,17 @@ class ThetaCameraConfig:
     reconnect: ReconnectConfig = field(default_factory=ReconnectConfig)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         if not self.url:
             raise ValueError("url must not be empty")
 
 
 class ThetaCameraNode(Node[ThetaCameraConfig]):
-    """See the module."""
-
     name = "theta_camera"
     live_parameters = ("silence_s", "battery_low", "board_hot_c", "mount_xyz", "mount_rpy_deg")
 
     def setup(self) -> None:
-        """Topics, mount, and the loop that reads the camera."""
+        """Create the topics, the mount and the loop that reads the camera."""
         config = self.config
         self.loop: CameraLoop | None = None
         self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
@@ -98,7 +95,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.loop.start()
 
     def tell_mount(self) -> None:
-        """Where the camera is on the robot."""
+        """Broadcast the camera's mount on the robot."""
         mount = pose_matrix(*self.config.mount_xyz, *np.radians(self.config.mount_rpy_deg))
         self.tf_broadcast_static("base_link", self.config.frame_id, mount)
 
@@ -107,7 +104,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.tell_mount()
 
     def make_camera(self) -> Camera:
-        """The camera that the parameters name."""
+        """The camera that the parameters select."""
         config, now_ns = self.config, self.clock.now_ns
         if config.source == "theta":
             user, password = os.environ.get(USER_VARIABLE, ""), os.environ.get(PASSWORD_VARIABLE, "")
@@ -117,7 +114,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         return FileCamera(config.url, config.files, now_ns)
 
     def play_in_lockstep(self) -> None:
-        """Files by the node's own timer; devices have a time of their own and cannot be stepped."""
+        """Play files on the node's own timer; devices have their own time and cannot be stepped."""
         camera = self.camera
         if not isinstance(camera, FileCamera):
             raise NodeError(f"source {self.config.source} cannot run in lockstep: use source:=files")
@@ -128,17 +125,17 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.timer(1.0 / self.config.files.rate_hz, lambda: self.publish(camera.next_frame()))
 
     def publish(self, frame: Frame) -> None:
-        """Send a picture as it is; runs on the camera's thread."""
+        """Publish an image unchanged; runs on the camera's thread."""
         self.out.publish(compressed_image_message(frame.jpeg, self.config.frame_id, frame.stamp_ns))
         self.last_ns = self.clock.steady_ns()
         self.published += 1
 
     def on_event(self, connected: bool, text: str) -> None:
-        """The connection came or went."""
+        """Report a connection or its loss."""
         self.diagnose("camera", OK if connected else ERROR, text)
 
     def check(self) -> None:
-        """Tell of silence, and of the rate; each second."""
+        """Report silence and the frame rate; each second."""
         silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
         values = {
             "pictures": self.published,
@@ -154,7 +151,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.diagnose("pictures", level, f"no picture for {silent_s:.1f} s", **values)
 
     def on_health(self, health: ThetaState | str) -> None:
-        """Battery, temperature and errors of the Theta."""
+        """Report battery, temperature and errors of the Theta."""
         if isinstance(health, str):
             self.diagnose("health", WARN, health)
             return
@@ -175,7 +172,6 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         )
 
     def teardown(self) -> None:
-        """Let go of the camera."""
         loop = getattr(self, "loop", None)
         if loop is not None:
             if loop.is_alive() and not loop.end():
@@ -185,7 +181,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
 
 
 def ask_state(client: ThetaClient) -> ThetaState | str:
-    """State of the camera, or why there is none; for a worker thread."""
+    """State of the camera, or the reason why it is unknown; for a worker thread."""
     try:
         return client.state()
     except CameraError as error:

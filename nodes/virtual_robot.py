@@ -1,4 +1,4 @@
-"""The robot that the operator drives in the virtual space; in real mode it stands where the r-bot is."""
+"""The robot that the operator drives in the virtual space; in REAL it stays at the r-bot's pose."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class VirtualRobotConfig:
 
 
 class VirtualRobotNode(Node[VirtualRobotConfig]):
-    """Topics in and out of ``VirtualRobot``."""
+    """Connects ``VirtualRobot`` to topics."""
 
     name = "virtual_robot"
     live_parameters = ("vbot", "limits", "command_timeout_s", "state_timeout_s")
@@ -61,8 +61,8 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
         self.command = self.latest("/operator/cmd_vel", TwistStamped, self.config.command_timeout_s)
-        self.obeyed = (0.0, 0.0)  # the operator's command of the last step
-        self.early = False  # a step was made before its time since the last timer
+        self.obeyed = (0.0, 0.0)  # operator's command of the last step
+        self.early = False  # a step was made ahead of its time since the last timer
         self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
@@ -82,10 +82,10 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             return
         self.map, self.map_is_new = StaticMap(grid, resolution, np.array(origin)), True
         if self.walls is None:
-            self.update_walls()  # the first at once
+            self.update_walls()  # the first map at once
 
     def update_walls(self) -> None:
-        """Has walls looked for in the newest map, beside the node's thread."""
+        """Search for walls in the newest map, outside the node's thread."""
         if self.map_is_new:
             self.map_is_new = False
             self.wall_worker.submit(self.map)
@@ -94,7 +94,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.walls = walls
 
     def on_command(self, message: TwistStamped) -> None:
-        """Obeys a command that has changed at once: the next timer is half a period off."""
+        """Obey a changed command at once: the next timer is half a period away on average."""
         if self.action == VbotAction.DRIVEN and not self.early and twist_values(message) != self.obeyed:
             self.early = True
             self.tick()
@@ -105,7 +105,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def tick(self) -> None:
         now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
-        # A late timer must not become a leap of the picture.
+        # A late timer must not make the view jump.
         dt_s = min((steady_ns - self.stepped_ns) / 1e9, 0.2)
         self.stepped_ns = steady_ns
         state = self.state.message
@@ -113,7 +113,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
             self.diagnose("state", WARN, "the arbiter is silent: the v-bot stands still")
             self.robot.place(self.robot.pose, (0.0, 0.0))
             if self.action is None:
-                return  # nowhere yet
+                return  # no pose yet
         else:
             self.obey(state, dt_s)
         self.odom.publish(
@@ -121,15 +121,15 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         )
 
     def obey(self, state: ControlState, dt_s: float) -> None:
-        """Does what the arbiter says."""
+        """Act as the arbiter's state demands."""
         action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
         robot_pose = pose2_from_matrix(pose_matrix(state.robot_pose))
         robot_twist = twist_values(state.robot_twist)
         age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
-        # The arbiter's word is up to a period old, and the r-bot goes on.
+        # The arbiter's message is up to a period old, and the r-bot moves on.
         target = move(pose2_from_matrix(pose_matrix(state.vbot_target)), *robot_twist, min(max(age_s, 0.0), 0.1))
         if before is None and action != VbotAction.WITH_ROBOT:
-            self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_pose)), (0.0, 0.0))  # started anew
+            self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_pose)), (0.0, 0.0))  # the node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
@@ -145,7 +145,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 
     def operator(self) -> tuple[float, float]:
-        """The operator's command; zero when it is old, by arrival or by its stamp."""
+        """The operator's command; zero when stale, by arrival or by stamp."""
         message = self.command.message
         if message is None or self.command.stamp_age_s > self.config.command_timeout_s:
             return 0.0, 0.0

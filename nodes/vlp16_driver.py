@@ -1,4 +1,4 @@
-"""Turns the VLP-16's packets, from the network, a capture or a bag, into point clouds and flat scans."""
+"""Converts the VLP-16's packets, from the network, a capture or a bag, to point clouds and flat scans."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from instant_ic.msg import (
 
 _PPS = ("absent", "synchronising", "locked", "error")
 _MAX_WAITING = 5
-"""Revolutions that may wait for the node's thread; more, and the machine is too slow for the sensor."""
+"""Revolutions that may wait for the node's thread; with more the machine is too slow for the sensor."""
 _MOTION_SAMPLES = 13
 
 
@@ -46,18 +46,18 @@ class Vlp16DriverConfig:
     Attributes:
         source: ``udp``, ``pcap``, or ``topic`` (packets of a bag from /lidar/packets).
         host: local address; 0.0.0.0 also takes broadcasts.
-        port: of data packets.
-        position_port: of position packets; -1 does without.
-        sensor: the sensor's IPv4 address; empty locks onto the first sender until the driver restarts.
+        port: port of data packets.
+        position_port: port of position packets; -1: not received.
+        sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
         pcap: capture file, for source pcap.
-        rate: the capture's pace, 1 as it was recorded.
-        loop: start the capture again at its end.
+        rate: playback rate of the capture; 1 is the recorded rate.
+        loop: restart the capture at its end.
         frame_id: the sensor's frame.
-        mount_xyz: its place on base_link, metres.
-        mount_rpy_deg: its roll, pitch, yaw on base_link, degrees.
-        silence_s: no packet for this long is an error.
-        decoder: packets to points.
-        scan: points to the flat scan.
+        mount_xyz: sensor position on base_link, metres.
+        mount_rpy_deg: sensor roll, pitch, yaw on base_link, degrees.
+        silence_s: seconds without a packet that are an error.
+        decoder: conversion of packets to points.
+        scan: conversion of points to the flat scan.
     """
 
     source: Literal["udp", "pcap", "topic"] = "udp"
@@ -76,25 +76,22 @@ class Vlp16DriverConfig:
     scan: FlatScanConfig = field(default_factory=FlatScanConfig)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         check_ranges(self)
         if self.source == "pcap" and not self.pcap:
             raise ValueError("pcap must name a capture file where source is pcap (got '')")
         self.receiver()
 
     def receiver(self) -> ReceiverConfig:
-        """The part that the receiver takes."""
+        """The receiver's part of the parameters."""
         return ReceiverConfig(self.host, self.port, self.position_port, self.sensor)
 
 
 class Vlp16DriverNode(Node[Vlp16DriverConfig]):
-    """See the module."""
-
     name = "vlp16_driver"
     live_parameters = ("silence_s", "scan")
 
     def setup(self) -> None:
-        """Topics, mount, and the source of packets."""
+        """Create the topics, the mount and the packet source."""
         config = self.config
         warm_up()
         self.ending = threading.Event()
@@ -112,7 +109,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.last_ns = self.clock.steady_ns()
         self.base_from_lidar = pose_matrix(*config.mount_xyz, *np.radians(config.mount_rpy_deg))
         self.tf_broadcast_static("base_link", config.frame_id, self.base_from_lidar)
-        self.tf.frames()  # odometry is listened to from now on
+        self.tf.frames()  # listens to odometry from here on
         self.points = self.publisher("/lidar/points", PointCloud2, qos=SENSOR)
         self.scan = self.publisher("/scan", LaserScan, qos=SENSOR)
         self.packets = self.publisher("/lidar/packets", VelodyneScan, qos=SENSOR) if config.source != "topic" else None
@@ -136,7 +133,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     # -- sources -----------------------------------------------------------------------------------
 
     def receive(self) -> None:
-        """Receive and decode until the node ends; the receiver's own thread."""
+        """Receive and decode until the node ends; runs on the receiver's own thread."""
         try:
             while not self.ending.is_set():
                 for stamp, payload, is_data in self.receiver.read(timeout_s=0.2):
@@ -144,12 +141,12 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                         self.take(payload, stamp)
                     else:
                         self.call_soon(self.on_position, payload)
-        except Exception as error:  # noqa: BLE001 - nobody else hears what ends a thread
+        except Exception as error:  # noqa: BLE001 - nothing else reports what ends a thread
             self.call_soon(self.fault, "receiver", error)
             self.call_soon(self.stop)
 
     def on_packets(self, message: Any) -> None:
-        """Packets of a bag."""
+        """Take the packets of a bag."""
         for packet in message.packets:
             self.take(packet.data.tobytes(), stamp_ns(packet))
 
@@ -167,11 +164,11 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.play_start_ns, self.play_start_steady_ns = self.clock.now_ns(), self.clock.steady_ns()
 
     def play(self) -> None:
-        """Take the capture's packets that are due by now."""
+        """Take the packets of the capture that are due."""
         elapsed_ns = (self.clock.steady_ns() - self.play_start_steady_ns) * self.config.rate
         while self.next_datagram is not None and self.next_datagram.stamp_ns - self.first_ns <= elapsed_ns:
             stamp, port, payload = self.next_datagram
-            # Stamps run at the sensor's own pace, whatever the rate, or its clock would seem to drift.
+            # Stamps keep the sensor's own rate at any playback rate; otherwise its clock would seem to drift.
             stamp = self.play_start_ns + stamp - self.first_ns
             if port == self.config.position_port and len(payload) != DATA_PACKET_BYTES:
                 self.on_position(payload)
@@ -182,7 +179,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
                 self.end_capture()
 
     def end_capture(self) -> None:
-        """The capture's last datagram was taken."""
+        """Handle the end of the capture."""
         last = self.stream.finish()
         if last is not None:
             self.hand_on(last)
@@ -194,7 +191,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.open_capture()
 
     def take(self, payload: bytes, stamp: int) -> None:
-        """Take one data packet; on whichever thread packets come."""
+        """Take one data packet, on whichever thread packets arrive."""
         self.last_ns = self.clock.steady_ns()
         counters = self.stream.counters
         taken, late = counters.packets, counters.late + counters.clock_resets
@@ -202,7 +199,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.sources.count(counters.packets - taken, counters.late + counters.clock_resets - late, self.last_ns)
         doubtful, self.doubtful = self.doubtful, self.sources.doubt(self.last_ns) is not None
         if doubtful and not self.doubtful:
-            # A forged packet may have moved the sensor's clock, and is in the revolution so far.
+            # A forged packet may have moved the sensor's clock, and is part of the revolution so far.
             self.stream.restart()
             revolution = None
         if len(payload) == DATA_PACKET_BYTES:
@@ -211,7 +208,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.hand_on(revolution)
 
     def hand_on(self, revolution: Revolution) -> None:
-        """Bring a revolution and its packets to the node's thread."""
+        """Pass a revolution and its packets to the node's thread."""
         raw, self.raw = self.raw, []
         if self.thread is None:
             self.on_revolution(revolution, raw)
@@ -224,7 +221,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
     # -- results -----------------------------------------------------------------------------------
 
     def on_received(self, revolution: Revolution, raw: list[tuple[bytes, int]]) -> None:
-        """A revolution from the receiver's thread."""
+        """Handle a revolution from the receiver's thread."""
         self.waiting -= 1
         self.on_revolution(revolution, raw)
 
@@ -243,13 +240,13 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             )
         doubt = self.sources.doubt(self.clock.steady_ns())
         if doubt is not None:
-            # No scan stops the robot; a forged one could drive it into a wall.
+            # Without a scan the robot stops; a forged one could drive it into a wall.
             self.withheld += 1
             self.diagnose("source", ERROR, doubt, withheld=self.withheld)
             return
         self.points.publish(cloud_message(revolution.points, config.frame_id, revolution.stamp_ns))
         if coverage(revolution) < config.scan.min_coverage:
-            # Half blind: matched to a map it misleads, and nobody else could see that from the scan.
+            # Half blind: it would mislead map matching, and the scan itself does not show the fault to other nodes.
             self.partial += 1
             return
         motion = self.motion(revolution)
@@ -272,12 +269,12 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         )
 
     def motion(self, revolution: Revolution) -> PlanarMotion | None:
-        """The base's poses around a revolution by /tf; None where nobody tells them."""
+        """Poses of the base around a revolution from /tf; None where they are not published."""
         newest_ns = self.tf.newest_ns("base_link")
         if newest_ns is None:
             self.diagnose("motion", OK, "no odometry: the base is taken to stand")
             return None
-        # Odometry of the last milliseconds is still on its way: the motion goes on as it was.
+        # Odometry of the last milliseconds has not arrived yet: the motion is extrapolated.
         stop_ns = min(revolution.end_ns, newest_ns)
         start_ns = min(revolution.stamp_ns, stop_ns - 50_000_000)
         stamps_ns = np.linspace(start_ns, stop_ns, _MOTION_SAMPLES).astype(np.int64)
@@ -290,7 +287,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         return PlanarMotion(stamps_ns, np.array(poses))
 
     def on_position(self, payload: bytes) -> None:
-        """Tell of the sensor's clock."""
+        """Report the sensor's clock."""
         try:
             position = decode_position_packet(payload)
         except PacketError as error:
@@ -300,7 +297,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.diagnose("position", OK, f"pulse per second {pps}", nmea=position.nmea)
 
     def check(self) -> None:
-        """Tell of silence and losses; each second."""
+        """Report silence and losses; each second."""
         counters = self.stream.counters
         silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
         losses = (counters.missing, counters.bad, self.skipped)
@@ -339,7 +336,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.diagnose("packets", OK, text, **values)
 
     def silence(self, silent_s: float) -> str:
-        """What to look at when nothing comes."""
+        """What to check when no packets arrive."""
         if self.config.source == "topic":
             return f"no /lidar/packets for {silent_s:.1f} s"
         if self.config.source == "pcap":
@@ -351,7 +348,6 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         )
 
     def teardown(self) -> None:
-        """End the receiver."""
         if hasattr(self, "ending"):
             self.ending.set()
         if getattr(self, "thread", None) is not None:

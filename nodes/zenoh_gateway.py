@@ -1,4 +1,4 @@
-"""Hands topics to Zenoh as topics of ROS 2 (rmw_zenoh's format), byte for byte, and takes topics from there."""
+"""Publishes topics to Zenoh as ROS 2 topics (rmw_zenoh's format), byte for byte, and subscribes to topics there."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ class ZenohGatewayConfig:
         domain: ROS domain (``ROS_DOMAIN_ID``).
         mode: peer: of a router on this host, as rmw_zenoh; client: of a router elsewhere.
         connect: routers to connect to; empty: tcp/localhost:7447, or those of the session file.
-        session_file: Zenoh configuration (JSON5), path or file of config/, instead of mode; empty: none.
-        publish: topics that go out: NAME or PATTERN, with rate_hz=N behind it for at most N messages a second.
-        subscribe: topics that come in: NAME, PATTERN, or "NAME TYPE" to have it before anybody publishes it.
-        commands: which commands of operators may come in: /operator/cmd_vel, /operator/estop. Only over TLS with
-            certificates on both sides (session_file); without it nothing but the pressing of the emergency stop.
-        insecure_loopback_commands: take commands without TLS where every link stays within this machine, as in a
-            simulation; everybody who can run a program on it can then drive.
-        limits: what commands have to pass.
-        discovery_period_s: how often to look for topics that come and go, s.
+        session_file: Zenoh configuration (JSON5), path or file of config/, which replaces mode; empty: none.
+        publish: topics to send: NAME or PATTERN, optionally followed by rate_hz=N for at most N messages per second.
+        subscribe: topics to receive: NAME, PATTERN, or "NAME TYPE" to create it before it has a publisher.
+        commands: operators' commands to accept: /operator/cmd_vel, /operator/estop. Only over TLS with certificates on
+            both sides (session_file); without it only pressing the emergency stop.
+        insecure_loopback_commands: accept commands without TLS where every link stays within this machine, as in a
+            simulation; anybody who can run a program on it can then drive.
+        limits: limits on the commands.
+        discovery_period_s: seconds between searches for new and removed topics.
     """
 
     namespace: str = ""
@@ -61,7 +61,6 @@ class ZenohGatewayConfig:
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.2
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
         parse_publish(self.publish)
         try:
@@ -73,7 +72,7 @@ class ZenohGatewayConfig:
 
 
 class ZenohGatewayNode(Node[ZenohGatewayConfig]):
-    """Looks for topics on both sides, tells counts and losses."""
+    """Discovers topics on both sides, reports counts and losses."""
 
     name = "zenoh_gateway"
     session: RosSession | None = None
@@ -81,7 +80,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
     _no_commands: str
 
     def setup(self) -> None:
-        """Opens the session."""
+        """Open the session."""
         if self.run_dir is None:
             raise NodeError("the gateway needs the real bus and a real Zenoh session; it has no place in lockstep")
         if self.namespace:
@@ -100,7 +99,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
                 self.opened(RosSession(self._zenoh, config.domain))
         except (ZenohError, MessageError, FileNotFoundError, registry.RegistryError) as error:
             raise NodeError(str(error)) from None
-        if client:  # its router may come later
+        if client:  # its router may start later
             self._opener = self.background(self.open, self.opened)
             self._opener.submit(None)
             self.timer(_AGAIN_S, self.try_again)
@@ -108,7 +107,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.timer(1.0, self.tell)
 
     def check_link(self) -> str:
-        """Why no commands are taken over this configuration's links; empty where they are."""
+        """Why commands are refused over this configuration's links; empty where they are accepted."""
         why = insecurity(self._zenoh)
         if why and self.config.insecure_loopback_commands:
             if beyond := beyond_loopback(self._zenoh):
@@ -124,14 +123,14 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         return why
 
     def open(self, _: None) -> RosSession | ZenohError:
-        """Tries to reach the router (background thread)."""
+        """Try to reach the router (background thread)."""
         try:
             return RosSession(self._zenoh, self.config.domain)
         except ZenohError as error:
             return error
 
     def opened(self, session: RosSession | ZenohError) -> None:
-        """Enters the ROS graph."""
+        """Join the ROS graph."""
         if isinstance(session, ZenohError):
             self.diagnose("link", WARN, f"{session}; trying again (is the router running? ic run zenoh_router)")
             return
@@ -148,19 +147,19 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.look()
 
     def try_again(self) -> None:
-        """Tries the router again."""
+        """Try the router again."""
         if self.session is None and not self._opener.busy:
             self._opener.submit(None)
 
     def look(self) -> None:
-        """Follows what comes and goes."""
+        """Follow new and removed topics."""
         if self.session is None:
             return
         self.outgoing.reconcile(self._watch.topics())
         self.incoming.reconcile()
 
     def tell(self) -> None:
-        """Tells links, counts and losses."""
+        """Report links, counts and losses."""
         if self.session is None:
             return
         routers, peers = self.session.routers(), self.session.peers()
@@ -192,7 +191,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         )
 
     def teardown(self) -> None:
-        """Leaves the ROS graph."""
+        """Leave the ROS graph."""
         if self.session is not None:
             self.session.close()
 

@@ -1,4 +1,4 @@
-"""A Zenoh router, for a fleet on one machine and for tests; on a real site run zenohd, which is the same router."""
+"""A Zenoh router for a fleet on one machine and for tests; on a real site run zenohd, which is the same router."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ class ZenohRouterNode(Node[ZenohRouterConfig]):
     session: Any = None
 
     def setup(self) -> None:
-        """Listens."""
         try:
             path = config_path(self.config.session_file)
             self.session = open_zenoh(load_config(path, (), self.config.listen, ROUTER_DEFAULTS))
@@ -39,12 +38,11 @@ class ZenohRouterNode(Node[ZenohRouterConfig]):
         self.timer(1.0, self.tell)
 
     def tell(self) -> None:
-        """Tells who is connected."""
+        """Report the connected peers."""
         info = self.session.info
         self.diagnose("link", OK, f"{len(info.peers_zid())} peers, {len(info.routers_zid())} other routers")
 
     def teardown(self) -> None:
-        """Closes every link."""
         if self.session is not None:
             self.session.close()
 

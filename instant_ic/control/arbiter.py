@@ -1,6 +1,6 @@
-"""Who is driven and what is sent: the state machine of illusory control (paper, III.A).
+"""State machine of illusory control: which robot the operator drives and which command is sent (paper, III.A).
 
-The machine is data (``states.py``); ``Arbiter.step`` runs it.
+The tables are data in ``states.py``; ``Arbiter.step`` runs them.
 """
 
 from __future__ import annotations
@@ -33,45 +33,45 @@ Twist2 = tuple[float, float]
 
 PASSAGE_PERIOD_NS = 200_000_000
 STEP_AFTER_S = 0.001
-"""The step that finds a time-out over comes this long after it, to be surely late: so each ends that much sooner."""
+"""Delay of a step after the time-out it checks: the source is then surely stale. Time-outs end that much sooner."""
 _STANDS_M_S, _STANDS_RAD_S = 0.03, 0.1
-"""Slower than this a robot counts as standing."""
+"""Below this speed a robot counts as standing."""
 _CATCH_UP = 0.8
-"""Share of the r-bot's speed limit that is the v-bot's."""
+"""Speed limit of the v-bot as a share of the r-bot's."""
 _SLOW_NS = 800_000_000
-"""Longer than it takes to reach full speed."""
+"""Longer than the v-bot takes to reach full speed."""
 
 
 @dataclass(frozen=True)
 class SwitchConfig:
-    """Thresholds of the change between real and virtual.
+    """Thresholds for switching between real and virtual.
 
     Attributes:
-        position_m: m between the two robots below which they agree.
-        yaw_deg: degrees, likewise.
-        return_dwell_s: s that they must agree before the return begins.
-        return_near_m: m to which the r-bot, which closes up faster than the v-bot is drawn on, is let come before that.
-        return_patience_s: s of agreement after which the return begins with what is left.
-        picture_position_m: m between the places of view and camera picture at a switch; what jumps is no more.
-        picture_yaw_deg: degrees, likewise.
-        return_picture_m: m, likewise at the return, where the v-bot is still being drawn on until it is seen and done.
-        return_picture_yaw_deg: degrees, likewise.
-        return_turn_rad_s: rad/s; the camera is not shown again while the r-bot turns faster: its heading is known late.
-        enter_timeout_s: s in which the r-bot slows to a stand while a fitting view is awaited; an image and a view of
-            that place are waited for after it.
-        return_timeout_s: s after which the return ends although view and picture do not meet: they come too rarely.
-        min_virtual_s: s; shortest stay in the virtual space.
-        min_real_s: s after a return, or an entry given up, before the next entry.
-        return_margin_m: m that the way must be free beyond the horizon that switches in.
-        return_side_m: m that it must be wider than the robot on each side.
-        neutral_return_s: s of hands off after which the real view comes back before an obstacle too.
-        lead_back_after_s: s of hands off after which the v-bot is led back to an r-bot that cannot come; 0: never.
-        stop_margin_m: m kept to an obstacle when no switch is possible.
-        min_switch_speed_m_s: m/s; slower than this forward the robot is turning.
-        min_expected_psnr_db: dB that the view where the robot stands must be expected to have; 0: not looked at.
-        ready_hold_s: s; a virtual space that learns its next keyframe still counts as ready with the last one.
-        require_camera: false: drive without pictures (tests, replays).
-        require_view: false: nobody shows the virtual space; it is neither waited for nor missed.
+        position_m: largest distance between the two robots at which they agree, in metres.
+        yaw_deg: largest difference in heading at which they agree, in degrees.
+        return_dwell_s: seconds that the two must agree before the return begins.
+        return_near_m: distance in metres to which the r-bot may close up before the return; faster than easing.
+        return_patience_s: seconds of agreement after which the return begins from any remaining distance.
+        picture_position_m: largest position error between view and camera image at a switch, in metres.
+        picture_yaw_deg: largest heading error at a switch, in degrees.
+        return_picture_m: as picture_position_m, at the return, where the v-bot is eased until the page has switched.
+        return_picture_yaw_deg: as picture_yaw_deg, at the return.
+        return_turn_rad_s: rad/s; no return to the camera while the r-bot turns faster: its heading estimate lags.
+        enter_timeout_s: seconds in which the r-bot slows to a stand while no view fits. The arbiter then waits for an
+            image and a view of that place.
+        return_timeout_s: seconds after which the return ends although view and image (too rare) do not match.
+        min_virtual_s: shortest stay in the virtual space, in seconds.
+        min_real_s: seconds between a return, or an abandoned entry, and the next entry.
+        return_margin_m: length in metres that must be free beyond the horizon that triggers an entry.
+        return_side_m: width in metres that must be free beside the footprint, on each side.
+        neutral_return_s: seconds of hands off after which the real view returns even before an obstacle.
+        lead_back_after_s: seconds of hands off after which the v-bot goes back to an r-bot that cannot come; 0: never.
+        stop_margin_m: distance in metres kept to an obstacle when no switch is possible.
+        min_switch_speed_m_s: forward speed in m/s below which the robot counts as turning.
+        min_expected_psnr_db: expected quality in dB that a view of the robot's place needs; 0: not checked.
+        ready_hold_s: seconds for which a virtual space that learns its next keyframe counts as ready with the last one.
+        require_camera: false: drive without camera images (tests, replays).
+        require_view: false: nobody shows the virtual space; views are not waited for and may be missing.
     """
 
     position_m: Positive = 0.15
@@ -105,7 +105,7 @@ class SwitchConfig:
 
 @dataclass(frozen=True)
 class ArbiterConfig:
-    """Everything that the arbiter's library part is set up by."""
+    """Configuration of the arbiter's library part."""
 
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)
@@ -120,74 +120,74 @@ class ArbiterConfig:
 
 @dataclass(frozen=True)
 class Vspace:
-    """What the virtual space says of itself (VspaceStatus)."""
+    """State that the virtual space reports (VspaceStatus)."""
 
     ready: bool = False
     training: bool = False
     failed: bool = False
     position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
-    """(2,) of the newest keyframe in the map frame."""
+    """(2,) position of the newest keyframe in the map frame."""
     ready_radius_m: float = 0.0
     message: str = ""
     expected_psnr_db: float = 0.0
-    """Of the view asked for last; 0 or NaN while unknown."""
+    """Of the view requested last; 0 or NaN: unknown."""
 
 
 @dataclass(frozen=True)
 class ArbiterInputs:
-    """The world as the arbiter sees it in one step; an age is inf while nothing has come yet."""
+    """Inputs of one step; an age is inf until the first message."""
 
     robot_pose: NDArray[np.float64] | None = None
     """(3,) map_from_base of the r-bot; None while unknown."""
     robot_velocity: Twist2 = (0.0, 0.0)
     operator_command: Twist2 = (0.0, 0.0)
     operator_gone: bool = False
-    """Whoever gave that command is known to have gone since: it is void, whatever its age."""
+    """The client that sent the command has left since: the command is void, whatever its age."""
     estop: bool = False
     estop_button: bool = False
-    """The button on the robot is pressed: nothing else ends the stop."""
+    """The button on the robot is pressed; only releasing it ends the stop."""
     estop_why: str = ""
-    """Text for the operator where nobody pressed the stop in this run; empty: the usual one."""
+    """Operator's text for a stop that nobody pressed in this run; empty: the usual text."""
     scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(N, 2) hits of the newest scan and 3D points in ``base_link``, where the robot is now."""
+    """(N, 2) hits of the newest scan and 3D points in ``base_link``, at the robot's present pose."""
     costmap: Costmap | None = None
     walls: WallMap | None = None
     vspace: Vspace = field(default_factory=Vspace)
     vbot_pose: NDArray[np.float64] | None = None
-    """(3,) of the v-bot in the map frame."""
+    """(3,) pose of the v-bot in the map frame."""
     vbot_velocity: Twist2 = (0.0, 0.0)
     nav_command: Twist2 = (0.0, 0.0)
     shown_pose: NDArray[np.float64] | None = None
-    """(3,) of the r-bot when the camera picture now shown was taken, but its heading of now, to which the page turns
-    each picture; None: ``robot_pose``."""
+    """(3,) position of the r-bot when the camera image now shown was taken, with its present heading, to which the page
+    turns each image; None: ``robot_pose``."""
     picture_position: NDArray[np.float64] | None = None
-    """(2,) of the camera in the map frame when it took the newest picture that the operator has."""
+    """(2,) position of the camera in the map frame for the newest image that the operator has."""
     view_position: NDArray[np.float64] | None = None
-    """(2,) of the camera in the map frame for the newest rendered view that the operator has."""
+    """(2,) position of the camera in the map frame for the newest rendered view that the operator has."""
     view_after_picture_s: float = 0.0
-    """Seconds from when that picture came to when that view did."""
+    """Seconds from the arrival of that image to the arrival of that view."""
     ages: dict[str, float] = field(default_factory=dict)
-    """Seconds since the last of: scan, odometry, pose, camera, view, vbot, nav, command, vspace; points and
-    estop_input once they came."""
+    """Seconds since the last message of: scan, odometry, pose, camera, view, vbot, nav, command, vspace; points and
+    estop_input from their first message on."""
     usual: dict[str, float] = field(default_factory=dict)
-    """How old a source usually is when its next message comes (``freshness.Rhythm``), s."""
+    """Usual age of a source in seconds when its next message arrives (``freshness.Rhythm``)."""
     images_late_s: float = 0.0
-    """Seconds from a camera exposure, or from the request of a view where that is longer, until the operator has it."""
+    """Seconds until the operator has an image, from its exposure, or from the view's request if that takes longer."""
 
     def age(self, key: str) -> float:
-        """Age of a source; inf when it has never been seen."""
+        """Age of a source in seconds; inf before its first message."""
         return self.ages.get(key, math.inf)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the arbiter wants sent and shown."""
+    """Result of one step: what to send and what to show."""
 
     mode: Mode
     reason: str
-    """Plain words for the operator."""
+    """Text for the operator."""
     command: Twist2
-    """For ``/cmd_vel``, past the collision monitor."""
+    """For ``/cmd_vel``, after the collision monitor."""
     blocked: bool
     transitions: int
     changed: bool
@@ -198,36 +198,36 @@ class Decision:
     yaw_gap_rad: float
     time_to_obstacle_s: float
     trajectory: NDArray[np.float64]
-    """(N, 3) predicted for the robot that is driven."""
+    """(N, 3) predicted poses of the driven robot."""
     subgoal: Subgoal | None
     estop: bool
     operator_command: Twist2
-    """As it counts: zero when it is old."""
+    """The command as used: zero when stale."""
     vbot_action: VbotAction
     vbot_target: NDArray[np.float64]
-    """(3,) to which the v-bot goes, if it does: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
+    """(3,) pose that the v-bot moves to: the r-bot as it will be shown; for LED_BACK the r-bot itself."""
     vbot_limit_m_s: float
-    """m/s; speed limit of the v-bot by the rate of the views."""
+    """Speed limit of the v-bot that follows from the rate of the views, in m/s."""
     hard: bool = False
-    """The command is zero because something is lost or in the way: the base must not take its soft ramp."""
+    """The command is zero because a source is lost or an obstacle is near: the base must brake hard."""
 
 
 @dataclass
 class _Situation:
-    """One step's inputs and what was worked out from them."""
+    """Inputs of one step and the values derived from them."""
 
     inputs: ArbiterInputs
     now_ns: int
     command: Twist2
-    """The operator's, zero when stale."""
+    """The operator's command; zero when stale."""
     prediction: Prediction | None
     target: NDArray[np.float64]
-    """(3,) of the r-bot as it is, or will be, shown."""
+    """(3,) pose of the r-bot as it is, or will be, shown."""
     vbot_pose: NDArray[np.float64]
     gap_m: float
     yaw_gap_rad: float
     fresh: bool = True
-    """The operator's command is not stale, and whoever gave it is there."""
+    """The operator's command is not stale, and its client is still there."""
 
 
 class _Driven(NamedTuple):
@@ -236,29 +236,29 @@ class _Driven(NamedTuple):
 
 
 class Arbiter:
-    """Runs the table; pure: time comes in as ``now_ns``, everything else as ``ArbiterInputs``."""
+    """Runs the transition table; pure: time comes in as ``now_ns``, everything else as ``ArbiterInputs``."""
 
     def __init__(self, config: ArbiterConfig | None = None) -> None:
         self.reconfigure(config or ArbiterConfig())
         self.mode = Mode.STOPPED
         self.transitions = 0
-        self._since_ns: int | None = None  # of the present mode
-        self._returned_ns: int | None = None  # of the last change from VIRTUAL to REAL
+        self._since_ns: int | None = None  # start of the present mode
+        self._returned_ns: int | None = None  # last return or abandoned entry
         self._fresh_since_ns: int | None = None
         self._agree_since_ns: int | None = None
-        self._driven: _Driven | None = None  # the last command that was not zero
+        self._driven: _Driven | None = None  # last command that was not zero
         self._leading_back = False
-        self._hard = False  # the last command was zero by a hard stop
-        self._monitor_stops = False  # in this step
-        self._yaw_gap_before = 0.0  # of the last step
-        self._slow_since_ns: int | None = None  # the v-bot drives more slowly than it is told to
+        self._hard = False  # the last command was a hard stop
+        self._monitor_stops = False  # the collision monitor stopped the robot in this step
+        self._yaw_gap_before = 0.0  # in the previous step
+        self._slow_since_ns: int | None = None  # the v-bot drives slower than commanded since then
         self._stop_reason = "waiting for the sensors"
         self._await_operator = False  # STOPPED because the operator's link was lost
-        self._ready: tuple[int, Vspace] | None = None  # when the v-space was ready last, and what it said then
+        self._ready: tuple[int, Vspace] | None = None  # when the v-space was last ready, and its status then
         self._vbot_start: NDArray[np.float64] = np.zeros(3)
         self._subgoal: Subgoal | None = None
         self._passage_found: tuple[int, Passage] | None = None
-        self._no_view_fits = False  # the last entry was given up
+        self._no_view_fits = False  # the last entry was abandoned
         self._guards: dict[str, Callable[[_Situation], str]] = {
             "estop_pressed": self._estop_pressed,
             "source_lost": self._source_lost,
@@ -281,25 +281,25 @@ class Arbiter:
         }
 
     def reconfigure(self, config: ArbiterConfig) -> None:
-        """Takes other parameters from the next step on; mode and history stay as they are."""
+        """Apply other parameters from the next step on; mode and history stay."""
         self.config = config
         self.predictor = Predictor(config.prediction, config.limits, config.footprint)
         self.monitor = CollisionMonitor(config.collision_monitor, config.footprint)
         self._planner = HybridPlanner(config.planner, config.footprint)
 
     def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
-        """One step: at most one transition, then the command of the state that it left the machine in."""
+        """Take at most one transition, then return the command of the resulting state."""
         if self._since_ns is None:
             self._since_ns = now_ns
         situation = self._assess(inputs, now_ns)
         changed = self._transit(situation)
         if changed:
-            # The robot driven is another one now: its prediction, its gap.
+            # The driven robot has changed, and with it prediction and gap.
             situation = self._assess(inputs, now_ns)
         self._yaw_gap_before = situation.yaw_gap_rad
         self._monitor_stops = False
         command, blocked, reason = self._command(situation)
-        # A key that is let go once the robot brakes hard makes it no softer.
+        # Letting go of the key during hard braking does not make it softer.
         self._hard = command == (0.0, 0.0) and (self._hard or self._stops_hard(situation))
         prediction = situation.prediction
         return Decision(
@@ -326,7 +326,7 @@ class Arbiter:
             vbot_limit_m_s=self._vbot_limit_m_s(inputs),
         )
 
-    # -- what the step starts from
+    # -- assessing the inputs
 
     def _assess(self, inputs: ArbiterInputs, now_ns: int) -> _Situation:
         fresh = inputs.age("command") <= self._command_s and not inputs.operator_gone
@@ -342,7 +342,7 @@ class Arbiter:
         robot = inputs.robot_pose
         target = inputs.shown_pose if inputs.shown_pose is not None else robot if robot is not None else np.zeros(3)
         vbot = self._vbot_pose(inputs, target, now_ns)
-        # Not with the r-bot itself: what must agree is what the operator sees of the one and of the other.
+        # Compared with the r-bot as shown, not as it is: the two images that the operator sees must agree.
         gap = float(np.linalg.norm(vbot[:2] - target[:2]))
         yaw_gap = wrap_angle(float(vbot[2] - target[2]))
         prediction = None
@@ -353,7 +353,7 @@ class Arbiter:
         situation = _Situation(inputs, now_ns, command, prediction, np.asarray(target), vbot, gap, yaw_gap, fresh)
         self._watch_agreement(situation)
         if self._no_view_fits and self.mode == Mode.REAL:
-            # Not tried again and again under a held key: by now a view must fit, or the operator has let go.
+            # Do not retry under a held key: wait until a view fits or the operator lets go.
             switch = self.config.switch
             fits = self._pictures_agree(situation, switch.picture_position_m, switch.picture_yaw_deg)
             self._no_view_fits = not fits and command != (0.0, 0.0)
@@ -370,7 +370,7 @@ class Arbiter:
     def _vbot_pose(self, inputs: ArbiterInputs, target: NDArray[np.float64], now_ns: int) -> NDArray[np.float64]:
         if self.mode in (Mode.REAL, Mode.STOPPED):
             return np.asarray(target)
-        # What it said before the entry is not yet from where it starts.
+        # Poses sent before the entry do not yet start from the right place.
         if inputs.vbot_pose is None or (self.mode == Mode.ENTERING and not self._vbot_spoke(inputs, now_ns)):
             return np.asarray(target if self.mode == Mode.ENTERING else self._vbot_start)
         return np.asarray(inputs.vbot_pose)
@@ -379,7 +379,7 @@ class Arbiter:
         return inputs.age("vbot") < self._seconds_in_mode(now_ns)
 
     def _leads_back(self, situation: _Situation) -> bool:
-        """Whether the v-bot goes back to the r-bot by itself: nobody drives it, and the r-bot cannot come to it."""
+        """Whether the v-bot returns to the r-bot by itself: nobody drives it, and the r-bot cannot reach it."""
         after, idle_s = self.config.switch.lead_back_after_s, self._idle_s(situation)
         if self.mode != Mode.VIRTUAL or situation.inputs.robot_pose is None or after == 0.0 or idle_s < after:
             return False
@@ -389,7 +389,7 @@ class Arbiter:
         return self._agree_since_ns is None and abs(linear) < _STANDS_M_S and abs(angular) < _STANDS_RAD_S
 
     def _idle_s(self, situation: _Situation) -> float:
-        """Seconds of hands off."""
+        """Seconds since the operator's last command that was not zero."""
         return (situation.now_ns - (self._since_ns or 0 if self._driven is None else self._driven.at_ns)) / 1e9
 
     def _watch_agreement(self, situation: _Situation) -> None:
@@ -406,7 +406,7 @@ class Arbiter:
             self._agree_since_ns = situation.now_ns
 
     def _lacking(self, inputs: ArbiterInputs, mode: Mode, now_ns: int) -> list[tuple[Source, float]]:
-        """Sources that ``mode`` needs and that are stale, with their ages."""
+        """Stale sources that ``mode`` needs, with their ages."""
         lacking = []
         for source in self._required(mode):
             if source.optional and source.key not in inputs.ages:
@@ -417,27 +417,27 @@ class Arbiter:
         return lacking
 
     def _required(self, mode: Mode | None = None) -> list[Source]:
-        """Sources that a mode, else the present one, needs as this arbiter is set up."""
+        """Sources that a mode (default: the present one) needs under this configuration."""
         mode, switch = self.mode if mode is None else mode, self.config.switch
         unused = {key for key, used in (("camera", switch.require_camera), ("view", switch.require_view)) if not used}
         return [source for source in SOURCES if mode in source.modes and source.key not in unused]
 
     def _source_age_s(self, source: Source, inputs: ArbiterInputs, now_ns: int) -> float:
         age = inputs.age(source.key)
-        # What only another mode needs need not have spoken before the change: its silence counts from there.
+        # A source that REAL does not need may be silent before the change: its age counts from the change.
         return min(age, self._seconds_in_mode(now_ns)) if Mode.REAL not in source.modes else age
 
     def stale_in_s(self, inputs: ArbiterInputs, now_ns: int) -> float:
-        """Seconds from this step until the first of the sources that are fresh will be stale; inf for none.
+        """Seconds from this step until the first fresh source becomes stale; inf for none.
 
-        A step then, and the command is zero when the time-out is over, not a period of steps later.
+        A step at that moment sends the zero command on time, not up to a period later.
         """
         left = [math.inf]
         for source in SOURCES:
             if self.mode in source.modes:
                 left.append(self._allowed_s(source, inputs) - self._source_age_s(source, inputs, now_ns))
         left.append(self._command_s - inputs.age("command"))
-        # 0: it is not stale yet, and will be right after this step.
+        # 0: not stale yet, but right after this step.
         return min(one for one in left if one >= 0.0)
 
     def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
@@ -446,16 +446,16 @@ class Arbiter:
 
     @property
     def _command_s(self) -> float:
-        """Age up to which the operator's command counts, s."""
+        """Age in seconds up to which the operator's command counts."""
         return self.config.timeouts.command - STEP_AFTER_S
 
     def _lost_s(self, source: Source, inputs: ArbiterInputs) -> float:
         return self.config.timeouts.lost_s(source.key, inputs.usual.get(source.key) if source.steady else None)
 
     def _speed_limit_m_s(self, inputs: ArbiterInputs) -> float:
-        """Speed at which no more than ``image_travel_m`` is driven until a missing image stops the robot.
+        """Speed at which the robot drives at most ``image_travel_m`` until a missing image stops it.
 
-        Rare images so make the robot slow, and not stop at each that is late.
+        Rare images therefore slow the robot, instead of stopping it at each late one.
         """
         longest_s = max(
             (self._allowed_s(source, inputs) for source in self._required() if source.key in IMAGES), default=0.0
@@ -464,12 +464,12 @@ class Arbiter:
         return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
 
     def _vbot_limit_m_s(self, inputs: ArbiterInputs) -> float:
-        """The same for the v-bot; where it is less than full speed, slow enough for the r-bot to catch up."""
+        """Speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
         limit = self._speed_limit_m_s(inputs)
         return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
 
     def _too_rare(self, inputs: ArbiterInputs) -> bool:
-        """Whether camera images come too rarely to drive by, or not yet long enough to know."""
+        """Whether camera images are too rare to drive by, or their rate is not known yet."""
         usual_s = inputs.usual.get("camera", 0.0) if self.config.switch.require_camera else 0.0
         return usual_s > self.config.timeouts.slowest_image_s
 
@@ -494,7 +494,7 @@ class Arbiter:
                 return True
         return False
 
-    # Guards give the reason when they hold, "" when they do not.
+    # A guard returns its reason when it holds, else "".
 
     def _estop_pressed(self, situation: _Situation) -> str:
         return "emergency stop" if situation.inputs.estop or situation.inputs.estop_button else ""
@@ -519,7 +519,7 @@ class Arbiter:
         return f"obstacle in {prediction.time_to_obstacle_s:.1f} s: the virtual space is about to be shown"
 
     def _why_not_virtual(self, situation: _Situation) -> str:
-        """What keeps the machine from switching although an obstacle is ahead; "" when nothing does."""
+        """Reason against a switch although an obstacle is ahead; "" when there is none."""
         inputs, switch = situation.inputs, self.config.switch
         assert inputs.robot_pose is not None and situation.prediction is not None
         if abs(situation.command[0]) < switch.min_switch_speed_m_s:
@@ -532,7 +532,7 @@ class Arbiter:
         away = float(np.linalg.norm(vspace.position - inputs.robot_pose[:2]))
         if away > vspace.ready_radius_m:
             return f"the virtual space is fit to show {vspace.ready_radius_m:.1f} m round a place {away:.1f} m off"
-        if 0.0 < vspace.expected_psnr_db < switch.min_expected_psnr_db:  # NaN is unknown too
+        if 0.0 < vspace.expected_psnr_db < switch.min_expected_psnr_db:  # NaN means unknown
             return (
                 f"the virtual space would show this place too badly ({vspace.expected_psnr_db:.0f} dB expected, "
                 f"{switch.min_expected_psnr_db:.0f} dB needed)"
@@ -547,7 +547,7 @@ class Arbiter:
         return self._passage(situation, inputs.costmap).reason
 
     def _shown_vspace(self, situation: _Situation) -> Vspace:
-        """The virtual space by its last keyframe that was ready, while it learns the next one for a moment."""
+        """Status of the virtual space, or of its last ready keyframe for a short time while it learns the next one."""
         now = situation.inputs.vspace
         if now.ready or not now.training or self._ready is None:
             return now
@@ -555,7 +555,7 @@ class Arbiter:
         return before if situation.now_ns - since_ns <= self.config.switch.ready_hold_s * 1e9 else now
 
     def _passage(self, situation: _Situation, costmap: Costmap) -> Passage:
-        """Way round the obstacle ahead; planning takes milliseconds, so an answer holds for a costmap's period."""
+        """Way round the obstacle ahead; planning takes milliseconds, so the answer is kept for a costmap's period."""
         assert situation.prediction is not None
         if self._passage_found is None or situation.now_ns - self._passage_found[0] >= PASSAGE_PERIOD_NS:
             passage = find_passage(
@@ -579,7 +579,7 @@ class Arbiter:
         return "you drive the robot" if self._safe_ahead(situation) else ""
 
     def _entry_patience_s(self, inputs: ArbiterInputs) -> float:
-        """Seconds until an image and a view could have come of the place where the r-bot stands at last."""
+        """Seconds in ENTERING after which an image and a view of the standing r-bot must have arrived."""
         slow = (self.config.timeouts.allowed_s(key, inputs.usual.get(key)) for key in IMAGES)
         return self.config.switch.enter_timeout_s + sum(slow) + inputs.images_late_s
 
@@ -591,10 +591,10 @@ class Arbiter:
         return "you drive the virtual robot" if agree else ""
 
     def _pictures_agree(self, situation: _Situation, within_m: float, within_deg: float) -> bool:
-        """Whether view and camera picture show the same place, so that nothing jumps when one follows the other.
+        """Whether view and camera image show the same place, so that a switch between them does not jump.
 
-        Neither waits for the other: what the robot drove from when the one came to when the other did is motion, and
-        no jump. But the eye sees it as one where it is much.
+        They arrive at different times. The distance driven between the two arrivals is motion, not an error; but the
+        operator sees even that as a jump when it is large.
         """
         inputs, switch = situation.inputs, self.config.switch
         if inputs.robot_pose is None:
@@ -626,18 +626,18 @@ class Arbiter:
         return "you drive the robot" if self._safe_ahead(situation) else ""
 
     def _safe_ahead(self, situation: _Situation) -> bool:
-        """Whether the r-bot may be driven by the operator's command.
+        """Whether the operator may drive the r-bot with the present command.
 
-        No obstacle on the way that switches in, nor on a longer and wider one: what leads back and what leads in never
-        hold together.
+        The way that triggers an entry must be free, and also a longer and wider one. Thus the conditions for entry and
+        return never hold together.
         """
         inputs, switch = situation.inputs, self.config.switch
         if inputs.robot_pose is None or inputs.costmap is None:
             return False
         command = situation.command
         if command == (0.0, 0.0) and self._driven is not None and self._idle_s(situation) < switch.neutral_return_s:
-            # Hands off before the obstacle: what would be driven next is most likely what was driven last. Only
-            # after a while is the real view given back.
+            # Hands off before the obstacle: the next command is most likely the last one again. The real view returns
+            # only after a while.
             command = self._driven.command
         return all(
             self.predictor.predict(
@@ -659,9 +659,9 @@ class Arbiter:
         switch, words = self.config.switch, "you drive the robot"
         waited = self._seconds_in_mode(situation.now_ns) / switch.return_timeout_s
         if waited >= 2.0:
-            return words  # a pose that trembles by more than the thresholds; the page eases what is left
+            return words  # the pose jitters by more than the thresholds; the page eases the rest
         within_m, within_deg = switch.return_picture_m, switch.return_picture_yaw_deg
-        # In two steps: SLAM's heading trembles, and the last that was shown counts as well.
+        # In two consecutive steps: SLAM's heading jitters, and the pose shown before counts too.
         yaw_gap = max(abs(situation.yaw_gap_rad), abs(self._yaw_gap_before))
         if situation.gap_m > within_m or yaw_gap > math.radians(within_deg):
             return ""
@@ -682,7 +682,7 @@ class Arbiter:
         return "you drive the robot"
 
     def _operator_missed(self, situation: _Situation) -> bool:
-        """Whether the machine stopped because of the operator's silence, which goes on."""
+        """Whether the machine stopped because the operator's link was lost, and it still is."""
         inputs = situation.inputs
         return self._await_operator and (inputs.operator_gone or inputs.age("command") > self._command_s)
 
@@ -696,7 +696,7 @@ class Arbiter:
         self._vbot_start = situation.vbot_pose.copy()
 
     def _keep(self, situation: _Situation, reason: str) -> None:
-        """Nothing is to be done but what the new state does."""
+        """Do nothing: the new state does everything."""
 
     def _hand_back(self, situation: _Situation, reason: str) -> None:
         self._driven = _Driven(situation.command, situation.now_ns)
@@ -704,7 +704,7 @@ class Arbiter:
     # -- the command of each state
 
     def _command(self, situation: _Situation) -> tuple[Twist2, bool, str]:
-        """Command past the collision monitor, whether it is held back, and why."""
+        """Command after the collision monitor, whether it is blocked, and the reason."""
         if self.mode == Mode.STOPPED:
             return (0.0, 0.0), False, self._why_stopped(situation)
         hold = self._hold_reason(situation)
@@ -715,7 +715,7 @@ class Arbiter:
         return self._real_command(situation)
 
     def _stops_hard(self, situation: _Situation) -> bool:
-        """Whether a zero is more than the operator's wish to stop."""
+        """Whether a zero command has another cause than the operator."""
         if self.mode == Mode.STOPPED or self._hold_reason(situation) or not situation.fresh:
             return True
         return self._monitor_stops
@@ -729,7 +729,7 @@ class Arbiter:
             return (0.0, 0.0), False, reason + "; no free place for the robot near it"
         wanted = clip_twist(*inputs.nav_command, self.config.limits)
         if inputs.age("nav") > self.config.timeouts.nav:
-            wanted = (0.0, 0.0)  # in the first moments: the follower has not spoken yet
+            wanted = (0.0, 0.0)  # at first: the follower has not sent a command yet
         sent = self._monitored(self._paced(wanted, situation), situation)
         left_s = self.config.switch.lead_back_after_s - self._idle_s(situation)
         if self._agree_since_ns is None and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
@@ -747,11 +747,11 @@ class Arbiter:
             return VbotAction.WITH_ROBOT
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
         if any(source.key in ("view", "command") for source, _ in lacking):
-            return VbotAction.HELD  # nobody sees where it goes, or nobody drives
+            return VbotAction.HELD  # nobody sees it, or nobody drives it
         return VbotAction.LED_BACK if self._leading_back else VbotAction.DRIVEN
 
     def _far_from_keyframe(self, situation: _Situation) -> str:
-        """Words for a v-bot that has left what the virtual space can show; "" where it can."""
+        """Text for a v-bot outside the region that the virtual space shows well; "" inside."""
         expected_db = situation.inputs.vspace.expected_psnr_db
         if 0.0 < expected_db < self.config.switch.min_expected_psnr_db:
             return f"; the picture is mostly guessed here ({expected_db:.0f} dB expected)"
@@ -775,7 +775,7 @@ class Arbiter:
         if self.mode == Mode.ENTERING:
             reason = "obstacle ahead: the virtual space is about to be shown"
             waited = self._seconds_in_mode(situation.now_ns) / self.config.switch.enter_timeout_s
-            left = max(0.0, 1.0 - waited**2)  # hardly felt while the view comes in time
+            left = max(0.0, 1.0 - waited**2)  # hardly noticed if the view comes in time
             command = (command[0] * left, command[1] * left)
         elif self.mode == Mode.RETURNING:
             reason = "you drive the robot; the real view is about to come back"
@@ -791,7 +791,7 @@ class Arbiter:
         return sent.command, blocked, reason
 
     def _monitored(self, command: Twist2, situation: _Situation) -> MonitoredCommand:
-        """The command past the collision monitor, by all that is seen and remembered near the robot."""
+        """The command after the collision monitor, which gets all points seen and remembered near the robot."""
         inputs = situation.inputs
         points = inputs.scan_points
         if inputs.costmap is not None and inputs.robot_pose is not None:
@@ -805,19 +805,19 @@ class Arbiter:
     def _slowed(self, command: Twist2, distance_m: float) -> Twist2:
         """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""
         left = max(0.0, distance_m - self.config.switch.stop_margin_m)
-        # Half of the base's deceleration: the other half is there for the latency.
+        # Half of the base's deceleration; the other half covers the latency.
         allowed = math.sqrt(self.config.limits.max_linear_accel_m_s2 * left)
         speed = abs(command[0]) + self.predictor.reach_m * abs(command[1])
         factor = min(1.0, allowed / speed) if speed > 0 else 1.0
         return command[0] * factor, command[1] * factor
 
     def _paced(self, command: Twist2, situation: _Situation) -> Twist2:
-        """The command slowed to what the image rate allows; its curvature is kept."""
+        """The command slowed to what the image rate allows, with the same curvature."""
         factor = min(1.0, self._speed_limit_m_s(situation.inputs) / max(abs(command[0]), 1e-9))
         return command[0] * factor, command[1] * factor
 
     def _hold_reason(self, situation: _Situation) -> str:
-        """Why nothing may move although the state would let it; "" when it may."""
+        """Reason why nothing may move in this state; "" when it may."""
         lacking = self._lacking(situation.inputs, self.mode, situation.now_ns)
         if lacking:
             return "stopped: " + _no_data(lacking)

@@ -24,14 +24,14 @@ LETHAL = 254
 UNKNOWN = 255
 
 _LOOKED = 1
-"""In what a scan saw: a beam went through."""
+"""Mark of a cell that a beam of the scan passed through."""
 SLACK_M = 1e-6
-"""For comparing distances: five cells of 0.05 m are not quite 0.25 m in floating point."""
+"""Tolerance of comparisons of distances: five cells of 0.05 m are not quite 0.25 m in floating point."""
 
 
 @dataclass(frozen=True)
 class CostmapConfig:
-    """Parameters of the rolling window, by nav2's names."""
+    """Parameters of the rolling window, with nav2's names."""
 
     width: Positive = 12.0
     resolution: Positive = 0.05
@@ -55,15 +55,15 @@ class CostmapConfig:
 
 @dataclass(frozen=True)
 class Costmap:
-    """Costs with their place in the map frame."""
+    """Costs and their place in the map frame."""
 
     costs: NDArray[np.uint8]
     """(H, W), row 0 at the lowest y."""
     resolution: float
     origin: NDArray[np.float64]
-    """(2,) metres: the outer corner of cell (0, 0)."""
+    """(2,) metres: outer corner of cell (0, 0)."""
     remembered: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
-    """(N, 2) centres of the cells that 3D points marked: low and hanging things, which the flat scan does not see."""
+    """(N, 2) centres of the cells that 3D points marked: low and hanging things that the flat scan does not see."""
 
     def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Row and column of points (..., 2); not checked against the window."""
@@ -88,7 +88,7 @@ class Costmap:
         return np.where(self.contains(points), found, UNKNOWN).astype(np.uint8)
 
     def lethal_overlap(self, poses: NDArray[np.float64], body: NDArray[np.float64]) -> NDArray[np.int64]:
-        """How many of the ``body`` points (M, 2) lie in a lethal cell, for each pose (N, 3)."""
+        """Number of ``body`` points (M, 2) in a lethal cell, for each pose (N, 3)."""
         poses = np.ascontiguousarray(poses, dtype=np.float64).reshape(-1, 3)
         body = np.ascontiguousarray(body, dtype=np.float64)
         ox, oy = float(self.origin[0]), float(self.origin[1])
@@ -111,8 +111,8 @@ class Costmap:
     def memory_near(
         self, pose: NDArray[np.float64], blind_radius_m: float, remembered_radius_m: float
     ) -> NDArray[np.float64]:
-        """What no sensor may see just now, (N, 2) in the frame of ``pose``: lethal cells in the blind zone round the
-        LiDAR, and farther out what 3D points have marked.
+        """Marks that no sensor may see at present, (N, 2) in the frame of ``pose``: lethal cells in the blind zone
+        round the LiDAR, and farther out the marks of 3D points.
         """
         away = self.remembered - np.asarray(pose)[:2]
         away = away[(away**2).sum(axis=-1) <= remembered_radius_m**2]
@@ -120,12 +120,12 @@ class Costmap:
         return np.concatenate([self.lethal_near(pose, blind_radius_m), away @ np.array([[c, -s], [s, c]])])
 
     def occupancy(self) -> NDArray[np.int8]:
-        """The costs in the -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
+        """The costs in the range -1..100 of ``nav_msgs/OccupancyGrid``, as nav2 publishes them."""
         return _TO_OCCUPANCY[self.costs]
 
     @staticmethod
     def from_occupancy(occupancy: NDArray[np.int8], resolution: float, origin: NDArray[np.float64]) -> Costmap:
-        """Inverse of ``occupancy``; inflated costs come back within 1.3 of what they were."""
+        """Inverse of ``occupancy``; inflated costs are exact to 1.3."""
         costs = _FROM_OCCUPANCY[np.asarray(occupancy, dtype=np.int8).view(np.uint8)]
         return Costmap(costs, float(resolution), np.asarray(origin, dtype=np.float64)[:2])
 
@@ -136,7 +136,7 @@ def _occupancy_tables() -> tuple[NDArray[np.int8], NDArray[np.uint8]]:
     to[INSCRIBED], to[LETHAL], to[UNKNOWN] = 99, 100, -1
     back = np.full(256, UNKNOWN, dtype=np.uint8)
     back[0] = FREE
-    for value in range(1, 99):  # the middle one of the costs that fall on each published value
+    for value in range(1, 99):  # the middle of the costs that map to each published value
         costs = np.flatnonzero(to == value)
         back[value] = costs[costs.size // 2]
     back[99], back[100] = INSCRIBED, LETHAL
@@ -166,17 +166,17 @@ class ScanRays:
     """One scan in the map frame, ready for marking and clearing."""
 
     origin: NDArray[np.float64]
-    """(2,) where the sensor was."""
+    """(2,) position of the sensor."""
     ends: NDArray[np.float64]
-    """(N, 2) where each beam ended."""
+    """(N, 2) end of each beam."""
     hits: NDArray[np.bool_]
-    """(N,) whether it ended on something near enough to be marked."""
+    """(N,) whether the beam ended on something near enough to be marked."""
 
 
 def scan_points(
     ranges: NDArray[np.floating], angle_min: float, angle_increment: float, range_min: float, range_max: float
 ) -> NDArray[np.float64]:
-    """Hits (N, 2) in the sensor's plane, metres; what is no measurement (REP-117) is left out."""
+    """Hits (N, 2) in the sensor's plane, metres, without invalid ranges (REP-117)."""
     r = np.asarray(ranges, dtype=np.float64)
     valid = np.isfinite(r) & (r >= range_min) & (r <= range_max)
     angle = angle_min + angle_increment * np.flatnonzero(valid)
@@ -194,9 +194,9 @@ def scan_rays(
 ) -> ScanRays:
     """Beams of a scan in the map frame.
 
-    +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` where ``inf_is_valid``: only for sensors
-    that tell «nothing there» from «too near to be seen», which a VLP-16 does not. NaN, -inf and what is closer than
-    ``range_min`` neither mark nor clear.
+    +inf (nothing within range, REP-117) clears to ``raytrace_max_range`` if ``inf_is_valid``. Use that only with
+    sensors that distinguish «nothing there» from «too near to be seen»; a VLP-16 does not. NaN, -inf and ranges
+    below ``range_min`` neither mark nor clear.
 
     Args:
         ranges: (N,) metres.
@@ -229,19 +229,19 @@ class RollingCostmap:
         self.size = round(config.width / config.resolution)
         self.heights = HeightLayer(config.points, self.size, config.resolution)
         self._observed = np.full((self.size, self.size), UNKNOWN, dtype=np.uint8)
-        # Scans in a row that have looked through a cell, saturating; a hit in it or beside it begins anew.
+        # Consecutive scans that looked through a cell, saturating; a hit in the cell or beside it restarts the count.
         self._through = np.zeros((self.size, self.size), dtype=np.uint8)
-        self._corner: tuple[int, int] | None = None  # window's first column and row in the endless grid
+        self._corner: tuple[int, int] | None = None  # first column and row of the window in the endless grid
         self._body = footprint.points(0.5 * config.resolution)
-        # What 3D points marked may never be seen again from near: a pose that is a cell off must not wipe it out.
+        # Marks of 3D points may never be seen again from near: a pose that is a cell off must not erase them.
         self._under = footprint.points(0.5 * config.resolution, -config.resolution)
-        # Distances between cells are roots of whole numbers: the cost of each, up to the inflation radius.
+        # Squared distances between cells are whole numbers: the cost of each, up to the inflation radius.
         reach = (max(config.inflation_radius, footprint.inscribed_radius_m) + SLACK_M) / config.resolution
         metres = np.sqrt(np.arange(math.floor(reach**2) + 1)) * config.resolution
         self._cost_of_square = np.array([inflated_cost(d, config, footprint) for d in metres], dtype=np.uint8)
 
     def reset(self) -> None:
-        """Forgets what was seen, as after a jump of the map."""
+        """Forget all observations, as after a jump of the map."""
         self._observed.fill(UNKNOWN)
         self._through.fill(0)
         self.heights.reset()
@@ -254,9 +254,9 @@ class RollingCostmap:
         points: SortedPoints | None = None,
         map_from_points: NDArray[np.float64] | None = None,
     ) -> Costmap:
-        """Moves the window over the robot (x, y, yaw), takes in a scan and a sweep of points, and gives the costs.
+        """Move the window over the robot (x, y, yaw), add a scan and a sweep of points, and return the costs.
 
-        ``map_from_points`` (x, y, yaw) places the frame of the points in the map; None: it is the map's own.
+        ``map_from_points`` (x, y, yaw) places the frame of the points in the map; None: it is the map frame.
         """
         resolution = self.config.resolution
         self._move_to(float(robot_pose[0]), float(robot_pose[1]))
@@ -309,10 +309,10 @@ class RollingCostmap:
             layer[index[:, 1], index[:, 0]] = value
 
     def _master(self, static: StaticMap | None, origin: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Layers joined as nav2's ``combination_method`` max does: what any holds occupied is occupied.
+        """Join the layers like nav2's ``combination_method`` max: a cell is occupied if any layer says so.
 
-        But for what the map alone holds and ``static_seen_through`` scans in a row have looked through: a ghost of a
-        scan that was put in the wrong place, or a thing that has gone.
+        Exception: a cell that only the map holds and that ``static_seen_through`` consecutive scans have looked through
+        is free. It is a ghost of a misplaced scan, or a thing that has been removed.
         """
         occupancy, shift = np.full((1, 1), -1, dtype=np.int8), np.zeros(2)
         resolution = self.config.resolution
@@ -333,7 +333,7 @@ class RollingCostmap:
         )
 
     def _inflate(self, master: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """nav2's inflation: 252·exp(-cost_scaling_factor·(d - inscribed_radius)); inscribed within it."""
+        """Inflate as nav2: 252·exp(-cost_scaling_factor·(d - inscribed_radius)); 253 within the inscribed radius."""
         import cv2
 
         free = (master != LETHAL).astype(np.uint8)
@@ -368,7 +368,7 @@ def _join(
     through: NDArray[np.uint8],
     seen_through: int,
 ) -> NDArray[np.uint8]:
-    """Master grid from what was observed and the map, whose origin lies ``shift`` metres before the window's."""
+    """Master grid of the observations and the map, whose origin lies ``shift`` metres before the window's."""
     size_y, size_x = observed.shape
     height, width = occupancy.shape
     master = np.empty_like(observed)
@@ -392,7 +392,7 @@ def _join(
 
 @njit(cache=True)
 def _inflate(master: NDArray[np.uint8], distance: NDArray[np.float32], cost_of_square: NDArray[np.uint8]) -> None:
-    """Writes the cost of each cell's distance (cells) to the nearest lethal one; unknown cells only if inscribed."""
+    """Write the cost for each cell's distance (cells) to the nearest lethal one; unknown cells only if inscribed."""
     most = math.sqrt(len(cost_of_square) - 0.5)
     for r in range(master.shape[0]):
         for c in range(master.shape[1]):
@@ -412,10 +412,10 @@ def _clear_and_mark(
     ends: NDArray[np.float64],
     hits: NDArray[np.bool_],
 ) -> None:
-    """Clears along every beam up to its last cell, then marks the hits: a hit outlives a grazing beam.
+    """Clear along every beam up to its last cell, then mark the hits: a hit outlives a grazing beam.
 
-    ``looked`` is told what this scan saw: ``_LOOKED`` for a beam that went through, 254 for a hit. Coordinates are in
-    cells of ``observed``. Walks the cells a beam touches (Amanatides & Woo 1987).
+    ``looked`` receives what this scan saw: ``_LOOKED`` where a beam passed, 254 for a hit. Coordinates are in cells of
+    ``observed``. The loop visits the cells that a beam touches (Amanatides & Woo 1987).
     """
     height, width = observed.shape
     for i in range(ends.shape[0]):

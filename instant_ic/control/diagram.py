@@ -1,4 +1,4 @@
-"""Prints the arbiter's table as a Mermaid state diagram and as Markdown tables, for docs/control.md."""
+"""Prints the arbiter's tables as a Mermaid state diagram and as Markdown tables, for docs/control.md."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ def state_diagram() -> str:
 
 
 def state_table() -> str:
-    """What each state means, as a Markdown table."""
+    """The states and their meaning, as a Markdown table."""
     rows = ["| State | Driven by the operator | Shown | Meanwhile |", "|---|---|---|---|"]
     rows += [f"| {mode.name} | {state.driven} | {state.shown} | {state.other} |" for mode, state in STATES.items()]
     return "\n".join(rows)
 
 
 def guard_table() -> str:
-    """What each guard and action of the diagram means, as a Markdown table."""
+    """The guards and actions of the diagram and their meaning, as a Markdown table."""
     rows = ["| Guard or action | Meaning |", "|---|---|"]
     rows += [f"| `{name}` | {meaning} |" for name, meaning in {**GUARDS, **ACTIONS}.items()]
     return "\n".join(rows)
 
 
 def source_table(timeouts: TimeoutConfig | None = None) -> str:
-    """What must be fresh in which state, as a Markdown table."""
+    """Sources, the states that need them, and their time-outs, as a Markdown table."""
     timeouts = timeouts or TimeoutConfig()
     rows = [
         "| Source | Needed in | Command zero after | STOPPED after |",

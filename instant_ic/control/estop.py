@@ -1,4 +1,4 @@
-"""Latch of the emergency stop, one rule for every node that obeys it."""
+"""Latch of the emergency stop: one rule for every node that obeys it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FUTURE_NS = 500_000_000
 
 @dataclass
 class EstopLatch:
-    """Emergency stop that anybody sets at once and only a newer release ends.
+    """Emergency stop that any client sets at once and only a newer release ends.
 
     Each client has a latched value of its own. After a restart these values arrive in any order, so an old release of
     one client must not end the stop of another: a press always counts, a release only if it is newer than the press.
@@ -74,7 +74,7 @@ class EstopLatch:
             self.buttons.discard(publisher)
 
     def _press(self, publisher: str, publish_ns: int) -> None:
-        # The same publisher's own time counts, also after its clock was set back: its stop and release go together.
+        # Compare only times of one publisher, even if its clock was set back: its stop and release belong together.
         same = publisher == self.publisher
         self.pressed_ns = publish_ns if same else max(publish_ns, self.pressed_ns)
         self.pressed, self.publisher = True, publisher

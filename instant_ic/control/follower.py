@@ -1,4 +1,4 @@
-"""Path follower for a skid-steer robot: regulated pure pursuit, with tracking of a goal that moves.
+"""Path follower for a skid-steer robot: regulated pure pursuit, and tracking of a moving goal.
 
 Source: Macenski, Singh, Martin, Gines: Regulated pure pursuit for robot path tracking, Autonomous Robots 47, 2023;
 the tracking law is that of Kanayama et al., ICRA 1990.
@@ -20,15 +20,15 @@ from instant_ic.control.planner import Plan
 from instant_ic.geometry.poses import relative2, wrap_angle
 
 _BESIDE_M = 0.3
-"""Nearer than this a goal that moves is tracked whatever the path to it."""
+"""A moving goal nearer than this may be tracked off the path, if the straight way to it is free."""
 
 CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
-"""Of the lookahead: the carrot comes nearer where the arc to it would touch something."""
+"""Shares of the lookahead that are tried in turn while the arc to the carrot would touch something."""
 
 
 @dataclass(frozen=True)
 class FollowerConfig:
-    """Parameters; those that nav2's regulated pure pursuit has carry its names."""
+    """Parameters, with the names of nav2's regulated pure pursuit where it has them."""
 
     desired_linear_vel: Positive = 0.5
     lookahead_dist: Positive = 0.5
@@ -62,7 +62,7 @@ class FollowerConfig:
 
 @dataclass(frozen=True)
 class FollowerCommand:
-    """Twist (m/s, rad/s) and what the follower is doing."""
+    """Twist (m/s, rad/s) and the follower's activity."""
 
     command: tuple[float, float]
     state: str
@@ -70,9 +70,9 @@ class FollowerCommand:
 
 
 class PathFollower:
-    """Follows a plan; keeps no time, only whether it is turning on the spot or at the goal.
+    """Follows a plan; its only state is whether it turns on the spot or stands at the goal.
 
-    Pieces of the path that are driven forwards and backwards are followed one after the other.
+    Forward and backward stretches of the path are followed one after the other.
     """
 
     def __init__(self, config: FollowerConfig, limits: MotionLimits, footprint: Footprint | None = None) -> None:
@@ -82,7 +82,7 @@ class PathFollower:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the last path."""
+        """Forget the last path."""
         self._rotating = False
         self._at_goal = False
 
@@ -94,14 +94,14 @@ class PathFollower:
         goal_velocity: tuple[float, float] = (0.0, 0.0),
         costmap: Costmap | None = None,
     ) -> FollowerCommand:
-        """Twist for the robot at ``pose`` (3,) driving ``speed_m_s``; the goal is the plan's last pose.
+        """Twist for the robot at ``pose`` (3,) at ``speed_m_s``; the goal is the plan's last pose.
 
         Args:
             pose: x, y, yaw in the frame of the plan.
-            speed_m_s: the robot's own.
+            speed_m_s: the robot's speed.
             plan: newest plan; an empty one stops the robot.
-            goal_velocity: of the goal itself (m/s, rad/s), when it is the v-bot driving on.
-            costmap: where arcs to the carrot are looked at for collisions; None: not at all.
+            goal_velocity: velocity of the goal (m/s, rad/s) when it is a driving v-bot.
+            costmap: checks arcs to the carrot for collisions; None: no check.
         """
         c = self.config
         if len(plan.poses) == 0:
@@ -111,8 +111,8 @@ class PathFollower:
         distance = math.hypot(ahead, left)
         moving = plan.reached and max(abs(goal_velocity[0]), abs(goal_velocity[1])) > c.track_min_speed_m_s
         near = distance < c.track_distance_m and abs(turn) < 1.0
-        # Tracking drives straight at the goal: only where the path does so too, not round a corner. To a place so near
-        # that the robot does not point at, the path is a manoeuvre, which a goal that moves on is not worth.
+        # Tracking drives straight at the goal: only where the path does so too, not round a corner. A path to a goal
+        # that is very near but not ahead is a manoeuvre, which is not worth it for a moving goal.
         if (
             moving
             and near
@@ -175,7 +175,7 @@ class PathFollower:
         return FollowerCommand(clip_twist(v, v * curvature, self.limits), "reverse" if back else "pursue")
 
     def _rotate(self, pose: NDArray[np.float64], bearing: float, costmap: Costmap | None) -> FollowerCommand:
-        """Turns on the spot, the other way round where the near way is closed."""
+        """Turn on the spot; the other way round if the shorter turn is blocked."""
         if not self._turn_is_free(pose, bearing, costmap):
             bearing -= math.copysign(2.0 * math.pi, bearing)
             if not self._turn_is_free(pose, bearing, costmap):
@@ -198,7 +198,7 @@ class PathFollower:
             return True
         count = max(2, math.ceil(abs(length_m) / 0.05))
         along = length_m * np.arange(count + 1) / count
-        # One metre of the arc a second; backwards it bends the other way.
+        # One metre of arc per second; backwards it bends the other way.
         turn = curvature * (-1.0 if length_m < 0 else 1.0)
         poses = np.array([move(pose, math.copysign(1.0, length_m), turn, abs(s)) for s in along])
         return self._is_free(poses, costmap)
@@ -211,13 +211,13 @@ class PathFollower:
         return self._is_free(pose + share * np.array([*(goal[:2] - pose[:2]), turn]), costmap)
 
     def _is_free(self, poses: NDArray[np.float64], costmap: Costmap) -> bool:
-        """Whether no pose lies on more obstacle than the first one, on which the robot stands."""
+        """Whether no pose overlaps more obstacle points than the first one, where the robot stands."""
         overlap = costmap.lethal_overlap(poses, self._body)
         return bool((overlap <= overlap[0]).all())
 
     def _turn_rate(self, angle: float) -> float:
         rate = max(self.config.rotate_to_heading_gain * abs(angle), 0.1)
-        # Never faster than it can be stopped again before the angle is reached.
+        # Never faster than the robot can stop before the angle is reached.
         rate = min(rate, math.sqrt(self.limits.max_angular_accel_rad_s2 * abs(angle)))
         return math.copysign(min(rate, self.limits.max_angular_rad_s), angle)
 
@@ -226,10 +226,10 @@ class PathFollower:
 
 
 def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[NDArray[np.float64], bool]:
-    """The part of the path that is driven in one direction and is not behind the robot yet; and whether backwards."""
+    """The next part of the path with one driving direction, from the robot on; and whether it is driven backwards."""
     if len(plan.reverse) != len(plan.poses) or len(plan.poses) < 2:
         return plan.poses, False
-    # A turn on the spot belongs to what follows it.
+    # A turn on the spot belongs to the piece that follows it.
     moves = np.linalg.norm(np.diff(plan.poses[:, :2], axis=0), axis=1) > 1e-6
     changes = np.flatnonzero(moves)
     if changes.size == 0:
@@ -246,7 +246,7 @@ def _piece(pose: NDArray[np.float64], plan: Plan, tolerance_m: float) -> tuple[N
 
 
 def _carrot(pose: NDArray[np.float64], path: NDArray[np.float64], lookahead: float) -> NDArray[np.float64]:
-    """Point (2,) of the path ``lookahead`` from the robot, past its nearest point."""
+    """Point (2,) of the path at distance ``lookahead`` from the robot, past its nearest point."""
     away = np.linalg.norm(path[:, :2] - np.asarray(pose)[:2], axis=1)
     near = int(np.argmin(away))
     far = np.flatnonzero(away[near:] >= lookahead)

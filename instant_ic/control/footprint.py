@@ -23,12 +23,12 @@ class Footprint:
 
     @property
     def inscribed_radius_m(self) -> float:
-        """Closer than this to an obstacle, the centre is in collision at any heading."""
+        """Distance to an obstacle below which the centre is in collision at every heading."""
         return 0.5 * min(self.length_m, self.width_m)
 
     @property
     def circumscribed_radius_m(self) -> float:
-        """Farther than this from every obstacle, the robot is free at any heading."""
+        """Distance to every obstacle above which the robot is free at every heading."""
         return 0.5 * math.hypot(self.length_m, self.width_m)
 
     def corners(self, padding_m: float = 0.0) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""How long a source may be silent before it counts as lost."""
+"""Time-outs: when a source counts as stale or lost."""
 
 from __future__ import annotations
 
@@ -11,41 +11,41 @@ from typing import Annotated, TypeAlias
 from instant_ic.config.ranges import Positive, Range, check_ranges
 
 _Timeout: TypeAlias = Annotated[float, Range(above=0, high=10)]
-"""Longer than this is no time-out: a robot must not drive on what it saw or was told so long ago."""
+"""More than 10 s is no time-out: a robot must not drive on such old data or commands."""
 
 IMAGES = ("camera", "view")
-"""Sources that show the operator where the robot is."""
+"""Sources that show the operator the robot's place."""
 _LATE_SHARE = 0.25
-"""Images that come rarely vary by more than ``late_s``: by this share of their period."""
+"""Rare images vary by more than ``late_s``: by this share of their period."""
 _UNKNOWN_PERIOD_S = 0.5
-"""Period assumed of images until their rate is known."""
+"""Period assumed for images until their rate is known."""
 
 
 @dataclass(frozen=True)
 class TimeoutConfig:
     """Seconds of silence after which a source is stale and the command is zero.
 
-    An image source (camera, view) comes at a rate of its own: it is stale ``late_s`` after it usually comes, where that
-    is later. Images may come as rarely as ``slowest_image_s``: the robot then drives slower, ``image_travel_m`` per
-    image at most. Everything else keeps the robot off obstacles and has a fixed time-out.
+    An image source (camera, view) has its own rate: it is stale ``late_s`` after its usual arrival, if that is later.
+    The period of images may be as long as ``slowest_image_s``: the robot then drives slower, at most ``image_travel_m``
+    per image. All other sources keep the robot off obstacles and have fixed time-outs.
 
     Attributes:
         scan: s; ``/scan``.
         points: s; ``/lidar/points``.
         odometry: s; ``/wheel/odom``.
         pose: s; ``/pose``.
-        camera: s; camera pictures, here and at the operator's page.
+        camera: s; camera images, at the robot and at the operator's page.
         view: s; rendered views at the operator's page.
         vbot: s; ``/vbot/odom``.
         nav: s; ``/nav/cmd_vel``.
         command: s; ``/operator/cmd_vel``.
-        estop_input: s; ``/robot/estop``, from a button that repeats its state; 0: it speaks only on a change.
+        estop_input: s; ``/robot/estop``, from a button that repeats its state; 0: it reports only changes.
         vspace: s; ``/vspace/status``.
-        late_s: s after an image is usually there that make it late.
-        slowest_image_s: s between two images beyond which the robot does not start.
-        image_travel_m: m driven at most until a missing image stops the robot; limits the speed at low image rates.
-        stop_after_s: s of silence that lead to STOPPED.
-        recover_s: s for which everything must be fresh before driving on.
+        late_s: seconds after its usual arrival at which an image counts as late.
+        slowest_image_s: longest period of images in seconds at which the robot starts.
+        image_travel_m: largest distance in metres driven until a missing image stops the robot: slower at low rates.
+        stop_after_s: seconds of silence that lead to STOPPED.
+        recover_s: seconds for which every source must be fresh before the robot drives on.
     """
 
     scan: _Timeout = 0.3
@@ -69,7 +69,7 @@ class TimeoutConfig:
         check_ranges(self)
 
     def allowed_s(self, key: str, usual_s: float | None = None) -> float:
-        """Seconds that source ``key`` may be silent, which usually is ``usual_s`` old when the next message comes.
+        """Allowed age of source ``key`` in seconds, if its usual age is ``usual_s`` when the next message arrives.
 
         >>> timeouts = TimeoutConfig()
         >>> [round(timeouts.allowed_s("camera", usual_s), 2) for usual_s in (0.1, 0.2, 0.33, 1.0, 2.0, math.inf)]
@@ -82,7 +82,7 @@ class TimeoutConfig:
         return max(least, period_s + max(self.late_s, _LATE_SHARE * period_s))
 
     def lost_s(self, key: str, usual_s: float | None = None) -> float:
-        """Seconds of silence from which source ``key`` counts as lost: the machine goes to STOPPED.
+        """Seconds of silence after which source ``key`` counts as lost: the machine goes to STOPPED.
 
         One missing image is no loss at any image rate.
         """
@@ -92,9 +92,9 @@ class TimeoutConfig:
 
 
 class Rhythm:
-    """How old a source usually is when its next message comes: its period, and its delay where age is since the stamp.
+    """Usual age of a source when its next message arrives: its period, plus its delay where age counts from the stamp.
 
-    The median of the last messages. Before ``_NEEDED`` have come it is not known: inf.
+    The median of the last messages; inf until ``_NEEDED`` have arrived.
     """
 
     _NEEDED, _KEPT = 5, 20
@@ -103,7 +103,7 @@ class Rhythm:
         self._ages: deque[float] = deque(maxlen=self._KEPT)
 
     def heard(self, age_s: float) -> None:
-        """A message came, when the one before had this age. A pause or a clock that was set tells nothing."""
+        """Record an arrival and the previous message's age. Ages from a pause or a clock change are ignored."""
         if 0.0 <= age_s < 2.0:
             self._ages.append(age_s)
 

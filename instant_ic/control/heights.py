@@ -1,8 +1,8 @@
-"""Obstacles by their height, from 3D points: low things, hanging things, and nothing that can be driven over or under.
+"""Obstacles by height, from 3D points: low and hanging things, without what can be driven over or under.
 
 A scanner with few rings sees a low or a hanging thing only from afar: at 0.6 m above the ground, a lowest beam of -15°
-meets a thing 0.1 m high no nearer than 1.9 m. So what was seen stays marked until a beam is seen to pass through the
-very heights at which it was marked; a beam of the flat scan that passes over it says nothing.
+meets a thing 0.1 m high no nearer than 1.9 m. A mark therefore stays until a beam passes through the very heights at
+which it was made; a beam of the flat scan that passes over it proves nothing.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 Cell = TypeVar("Cell", bound=np.generic)
 
 GROUND, OBSTACLE, OVERHEAD, NEAR = 0, 1, 2, 3
-"""Kinds of points: driven over, stands in the way, passed under, on the robot's own body."""
+"""Kinds of points: can be driven over, stands in the way, can be passed under, lies on the robot's own body."""
 AZIMUTHS = 720
-"""Directions in which beams are told apart."""
+"""Number of azimuth bins."""
 FAST = {"contract", "arcp", "afn"}
-"""Faster arithmetic that still knows nan and inf."""
+"""Fast-math flags that keep nan and inf."""
 INSTANTS = 65
-"""Poses of the sensor over a sweep: at 1 rad/s, within 1 mrad of where it was."""
+"""Sensor poses per sweep: accurate to 1 mrad at 1 rad/s."""
 
 
 @dataclass(frozen=True)
 class HeightConfig:
-    """Which points stand in the robot's way, and how they are kept. nav2's names where nav2 has the parameter."""
+    """Which points are obstacles, and how long they are kept; nav2's names where nav2 has the parameter."""
 
     enabled: bool = True
     min_obstacle_height: float = 0.05
@@ -51,19 +51,19 @@ class HeightConfig:
 
 @dataclass(frozen=True)
 class SortedPoints:
-    """The points of one sweep in a level frame, told apart by height; what is no measurement is left out."""
+    """Points of one sweep in a level frame, sorted by height, without invalid measurements."""
 
     obstacles: NDArray[np.float32]
-    """(N, 3) those that stand in the way: metres, z above the ground."""
+    """(N, 3) obstacle points: metres, z above the ground."""
     nearest: NDArray[np.float64]
-    """(M, 2) the nearest of them in each direction from the sensor that has one: what a flat scan would say."""
+    """(M, 2) the nearest obstacle point in each direction that has one, as a flat scan would measure it."""
     ends: NDArray[np.float32]
     """(E, AZIMUTHS) nearest end of the beams of each elevation (from straight down) and azimuth (from -pi), metres
-    over ground; inf where no beam came back."""
+    over ground; inf where no beam returned."""
     origin: NDArray[np.float64]
-    """(3,) where the sensor was at the end of the sweep."""
+    """(3,) position of the sensor at the end of the sweep."""
     counts: dict[str, int]
-    """How many points of each kind: what the height filter took (obstacle), and what it dropped."""
+    """Number of points of each kind: kept by the height filter (obstacle), or dropped."""
 
 
 def sort_points(
@@ -73,15 +73,15 @@ def sort_points(
     duration_s: float,
     config: HeightConfig,
 ) -> SortedPoints:
-    """Points of a sweep brought into a level frame, each from where the sensor was when it was measured.
+    """Sort the points of a sweep by height in a level frame, each from the sensor's pose at its measurement.
 
     Args:
-        points: (N, 3) in the sensor's frame, metres; what is not finite is left out.
-        time_s: (N,) since the first point.
+        points: (N, 3) in the sensor's frame, metres; non-finite points are left out.
+        time_s: (N,) seconds since the first point.
         level_from_lidar: (K, 4, 4) poses of the sensor at K even instants from 0 to ``duration_s``, in a frame whose
             z is the height above the ground.
-        duration_s: of the sweep.
-        config: the heights that count.
+        duration_s: length of the sweep.
+        config: height limits.
     """
     poses = np.ascontiguousarray(level_from_lidar, dtype=np.float64).reshape(-1, 4, 4)
     rows = math.ceil(180.0 / config.vertical_resolution_deg)
@@ -104,10 +104,10 @@ def sort_points(
 
 
 class HeightLayer:
-    """Cells of a rolling window in which something stands between two heights.
+    """Cells of a rolling window that hold an obstacle between two heights.
 
-    A cell is marked once ``mark_threshold`` points have fallen into it, with the lowest and highest of them. It is
-    cleared when a beam at one of those heights is seen to end well behind it, and none ends at it.
+    A cell is marked once ``mark_threshold`` points have fallen into it; it keeps the lowest and highest of them. It is
+    cleared when a beam at one of those heights ends well behind it and none ends in it.
     """
 
     def __init__(self, config: HeightConfig, size: int, resolution: float) -> None:
@@ -115,22 +115,22 @@ class HeightLayer:
         self.size = size
         self.resolution = resolution
         self.hits = np.zeros((size, size), dtype=np.uint8)
-        """(H, W) points that fell into a cell; from ``mark_threshold`` on it is occupied."""
+        """(H, W) number of points in a cell; occupied from ``mark_threshold`` on."""
         self.low = np.zeros((size, size), dtype=np.float32)
         self.high = np.zeros((size, size), dtype=np.float32)
 
     def reset(self) -> None:
-        """Forgets everything."""
+        """Forget all marks."""
         self.hits.fill(0)
 
     def shift(self, columns: int, rows: int) -> None:
-        """Moves the window by whole cells; what leaves it is forgotten."""
+        """Move the window by whole cells; cells that leave it are forgotten."""
         self.hits = shifted(self.hits, columns, rows, 0)
         self.low = shifted(self.low, columns, rows, 0.0)
         self.high = shifted(self.high, columns, rows, 0.0)
 
     def update(self, sweep: SortedPoints, placed: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
-        """Takes in a sweep whose frame stands at ``placed`` (x, y, yaw) in that of the window.
+        """Add a sweep whose frame has the pose ``placed`` (x, y, yaw) in the window's frame.
 
         ``origin`` (2,) is the window's outer corner.
         """
@@ -151,12 +151,12 @@ class HeightLayer:
         )
 
     def occupied(self) -> NDArray[np.bool_]:
-        """Cells (H, W) in which something stands in the way."""
+        """Mask (H, W) of the cells that hold an obstacle."""
         return self.hits >= self.config.mark_threshold
 
 
 def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArray[Cell]:
-    """A window (H, W) moved by whole cells; ``fill`` where it has not been before."""
+    """Window (H, W) moved by whole cells; new cells get ``fill``."""
     moved = np.full_like(array, fill)
     height, width = array.shape
     if abs(columns) < width and abs(rows) < height:
@@ -168,7 +168,7 @@ def shifted(array: NDArray[Cell], columns: int, rows: int, fill: float) -> NDArr
 
 @njit(cache=True, fastmath=FAST)
 def _angle(y: float, x: float) -> float:
-    """atan2 to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
+    """atan2 accurate to 1e-5 rad, four times as fast (Hastings: Approximations for digital computers, 1955)."""
     ax, ay = abs(x), abs(y)
     if ax == 0.0 and ay == 0.0:
         return 0.0
@@ -224,14 +224,14 @@ def _sort(
             counts[3] += 1
             continue
         x, y, z = dx + m[0, 3], dy + m[1, 3], dz + m[2, 3]
-        # Seen from where the sensor is at the end.
+        # Relative to the sensor's position at the end of the sweep.
         dx, dy, dz = x - sensor[0], y - sensor[1], z - sensor[2]
         distance = math.sqrt(dx * dx + dy * dy)
         column = min(int((_angle(dy, dx) + math.pi) * per_radian), AZIMUTHS - 1)
         row = min(int((_angle(dz, distance) + 0.5 * math.pi) * rows_per_radian), rows - 1)
         if distance < ends[row, column]:
             ends[row, column] = distance
-        # The robot pitches a little: far off, a given tilt lifts the ground by its share of the distance.
+        # The robot pitches a little: a tilt raises the ground in proportion to the distance.
         if z < low + slope * distance:
             counts[0] += 1
         elif z > high:
@@ -267,7 +267,7 @@ def _clear_and_mark(
     low: NDArray[np.float32],
     high: NDArray[np.float32],
 ) -> None:
-    """Clears what beams pass through, then marks."""
+    """Clear the cells that beams pass through, then mark."""
     rows, azimuths = ends.shape
     size_y, size_x = hits.shape
     cos, sin = math.cos(placed[2]), math.sin(placed[2])
@@ -284,7 +284,7 @@ def _clear_and_mark(
                 continue
             azimuth = _angle(cos * dy - sin * dx, cos * dx + sin * dy)
             column = min(int((azimuth + math.pi) * azimuths / (2.0 * math.pi)), azimuths - 1)
-            # Half a cell more each way: the points of a surface scatter by that much.
+            # Half a cell more on each side: the points of a surface scatter by that much.
             first = (_angle(low[r, c] - 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
             last = (_angle(high[r, c] + 0.5 * resolution - sensor[2], distance) + 0.5 * math.pi) / per_row
             passed, stands = False, False

@@ -26,9 +26,9 @@ class MotionLimits:
 
 
 def clip_twist(linear: float, angular: float, limits: MotionLimits) -> tuple[float, float]:
-    """Twist within the speed limits, the curvature kept where the linear speed is cut.
+    """Clip a twist to the speed limits; curvature is kept where the linear speed is cut.
 
-    A command that is not finite gives zero: it is no command.
+    A command that is not finite gives zero.
     """
     if not (math.isfinite(linear) and math.isfinite(angular)):
         return 0.0, 0.0
@@ -43,7 +43,7 @@ def _towards(value: float, target: float, step: float) -> float:
 def accelerate(
     velocity: tuple[float, float], command: tuple[float, float], limits: MotionLimits, dt_s: float
 ) -> tuple[float, float]:
-    """Velocity (m/s, rad/s) after ``dt_s`` of going towards ``command`` at the acceleration limits."""
+    """Velocity (m/s, rad/s) after accelerating towards ``command`` for ``dt_s`` within the limits."""
     return (
         _towards(velocity[0], command[0], limits.max_linear_accel_m_s2 * dt_s),
         _towards(velocity[1], command[1], limits.max_angular_accel_rad_s2 * dt_s),
@@ -54,7 +54,7 @@ def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) 
     """Pose (x, y, yaw) after ``dt_s`` of a constant twist: the exact arc, not a straight step."""
     x, y, yaw = float(pose[0]), float(pose[1]), float(pose[2])
     turn = angular * dt_s
-    # sin(t/2)/(t/2) is the chord over the arc; numpy's sinc carries the limit at zero.
+    # sin(t/2)/(t/2) is chord over arc; numpy's sinc handles the limit at zero.
     chord = linear * dt_s * float(np.sinc(turn / (2.0 * math.pi)))
     heading = yaw + 0.5 * turn
     return np.array([x + chord * math.cos(heading), y + chord * math.sin(heading), wrap_angle(yaw + turn)])

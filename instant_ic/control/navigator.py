@@ -1,4 +1,4 @@
-"""Brings the r-bot to a subgoal: plans on each new costmap, follows at the controller's rate."""
+"""Drives the r-bot to a subgoal: plans on each new costmap, follows at the controller's rate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from instant_ic.geometry.poses import relative2
 
 @dataclass(frozen=True)
 class RecoveryConfig:
-    """When the robot counts as stuck, and how it gets free."""
+    """When the robot counts as stuck, and how it frees itself."""
 
     stuck_after_s: Positive = 1.5
     duration_s: Positive = 1.5
@@ -36,7 +36,7 @@ _NO_PLAN = no_plan("no plan yet")
 
 @dataclass(frozen=True)
 class NavigatorStep:
-    """What to send, and the plan it rests on."""
+    """The command and the plan it is based on."""
 
     command: tuple[float, float]
     state: str
@@ -45,13 +45,13 @@ class NavigatorStep:
 
 
 class Navigator:
-    """Planner and follower behind one call, and a way out when the collision monitor lets nothing through.
+    """Planner and follower behind one call, with a recovery when the collision monitor blocks the robot.
 
-    A robot that is told to move and does not (a corner would touch when it turns, say) backs off a little, the next
-    time forwards, and plans again. The collision monitor stands behind that as behind everything.
+    A robot that is commanded to move and does not (a corner would touch when it turns, for example) backs off a little
+    and plans again; the next time it moves forwards. The collision monitor also checks these commands.
 
-    In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. A path to the
-    goal that is still free is therefore kept for ``recovery.keep_plan_s`` when no new one is found.
+    In a passage hardly wider than the robot, noise opens and closes the way from one plan to the next. When no new path
+    is found, a path to the goal that is still free is therefore kept for ``recovery.keep_plan_s``.
     """
 
     def __init__(
@@ -69,12 +69,12 @@ class Navigator:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets plan and follower's state."""
+        """Forget the plan and the follower's state."""
         self.follower.reset()
         self._plan = _NO_PLAN
         self._planned_ns: int | None = None
-        self._found_ns: int | None = None  # when a path all the way was planned last
-        self._moved_ns: int | None = None  # when the robot last moved, or was not told to
+        self._found_ns: int | None = None  # when a path all the way to the goal was last planned
+        self._moved_ns: int | None = None  # when the robot last moved, or was not commanded to
         self._moved_pose: NDArray[np.float64] = np.zeros(3)
         self._recovering_ns: int | None = None
         self._direction = -1.0
@@ -137,23 +137,23 @@ class Navigator:
 
 
 _MOST_AHEAD_M = 0.2
-"""A camera that is later than this at full speed is not made up for."""
+"""Largest lead: a camera that is later than this at full speed is not compensated fully."""
 
 
 def meeting_pose(
     vbot_pose: NDArray[np.float64], shown_pose: NDArray[np.float64], robot_pose: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Where the r-bot has to be (3,) for the camera's picture, which is late, to be taken from where the v-bot is.
+    """Pose (3,) of the r-bot at which the delayed camera image is one taken from the v-bot's place.
 
-    Ahead of the v-bot by as much as the r-bot, at ``robot_pose``, has driven on from ``shown_pose``, where the picture
-    was taken that comes with the next view. So nothing is left to be eased when the two meet.
+    It lies ahead of the v-bot by the distance that the r-bot, at ``robot_pose``, has driven since ``shown_pose``, where
+    the image was taken that arrives with the next view. When the two meet, nothing is left to ease.
     """
     ahead = float(relative2(shown_pose, robot_pose)[0])
     return move(vbot_pose, min(max(ahead, -_MOST_AHEAD_M), _MOST_AHEAD_M), 0.0, 1.0)
 
 
 def _with_end(plan: Plan, subgoal: NDArray[np.float64]) -> Plan:
-    """The plan with its end where the subgoal is by now: it moves between two plans."""
+    """The plan with its end at the present subgoal, which moves between two plans."""
     if not plan.reached or float(np.linalg.norm(plan.poses[-1, :2] - subgoal[:2])) > 0.3:
         return plan
     return replace(plan, poses=np.concatenate([plan.poses[:-1], subgoal[None]]))

@@ -1,4 +1,4 @@
-"""Whether going on virtually makes sense: is there something behind the obstacle, and a way round for the r-bot?"""
+"""Whether a switch to the v-bot makes sense: is there space behind the obstacle, and a way round for the r-bot?"""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from instant_ic.control.walls import WallMap
 
 @dataclass(frozen=True)
 class PassageConfig:
-    """How far behind the obstacle free space must be, and how long the way round may be."""
+    """How soon free space must follow behind the obstacle, and how long the detour may be."""
 
     max_pass_m: NotNegative = 3.0
     max_detour_m: NotNegative = 4.0
@@ -30,7 +30,7 @@ class PassageConfig:
 
 @dataclass(frozen=True)
 class Passage:
-    """``open`` when the r-bot can get behind the obstacle; else why not, in plain words."""
+    """``open`` when the r-bot can get behind the obstacle; else the reason, as text for the operator."""
 
     open: bool
     reason: str
@@ -44,10 +44,10 @@ def find_passage(
     planner: HybridPlanner,
     config: PassageConfig,
 ) -> Passage:
-    """Looks straight on from where the predicted trajectory meets an obstacle, then plans a way there.
+    """Look straight on from where the predicted trajectory meets an obstacle, then plan a way there.
 
-    The first place behind that is free, or not seen yet, must come before any wall and be reachable by a path at
-    most ``max_detour_m`` longer than the straight line.
+    The first place behind it that is free, or not seen yet, must come before any wall. The path to it may be at most
+    ``max_detour_m`` longer than the straight line.
     """
     if prediction.hit_index is None:
         return Passage(True, "")

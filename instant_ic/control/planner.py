@@ -22,20 +22,20 @@ from instant_ic.control.costmap import INSCRIBED, LETHAL, UNKNOWN, Costmap
 from instant_ic.control.footprint import Footprint
 
 SPACING_M = 0.05
-"""Between the poses of a path."""
+"""Distance between the poses of a path."""
 STEP_CELLS = 3.0
 """Length of a primitive."""
 LEAST_WEIGHT = 0.8
-"""No cell is cheaper: ``retrospective_gain`` is 0.2 at most."""
+"""Lower bound of a cell's weight: ``retrospective_gain`` is 0.2 at most."""
 DEAR = np.float32(8.0)
-"""Weight of cells that are closed but for a robot that stands in them."""
+"""Weight of cells that are closed, except for a robot that stands in them."""
 HURRY = 1.2
-"""Weight of the cost-to-go (weighted A*, Pohl 1970): a path may cost this much more than the best, and comes sooner."""
+"""Weight of the cost-to-go (weighted A*, Pohl 1970): paths cost at most this factor more, but come sooner."""
 
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """What the planner may cross, and at what price. nav2's (Smac's) names where it has the parameter."""
+    """What the planner may cross, and at what cost; names of nav2's Smac planner where it has the parameter."""
 
     cost_penalty: NotNegative = 3.0
     tight_cost: Annotated[int, Range(0, 251)] = 165
@@ -61,21 +61,21 @@ class PlannerConfig:
 
 @dataclass(frozen=True)
 class Plan:
-    """A path and how far it gets."""
+    """A path and how far it leads."""
 
     poses: NDArray[np.float64]
-    """(N, 3) x, y, yaw in the map frame, 5 cm or less apart; empty when there is no way at all. Where the robot turns
-    on the spot, poses of one place follow each other."""
+    """(N, 3) x, y, yaw in the map frame, at most 5 cm apart; empty when there is no way at all. A turn on the spot is
+    a run of poses at one place."""
     reached: bool
     """The path ends at the goal (not in front of something)."""
     reason: str
-    """Why it does not end at the goal; empty when it does."""
+    """Reason why the path does not end at the goal; empty when it does."""
     whole_length_m: float
-    """Length to the goal, the part through unknown space included; inf when there is no way."""
+    """Length to the goal, including the part through unknown space; inf when there is no way."""
     reverse: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    """(N,) whether the robot comes to a pose backwards."""
+    """(N,) whether the robot reaches a pose backwards."""
     iterations: int = 0
-    """Poses that the search opened."""
+    """Number of poses that the search expanded."""
 
 
 def no_plan(reason: str) -> Plan:
@@ -84,15 +84,15 @@ def no_plan(reason: str) -> Plan:
 
 
 class HybridPlanner:
-    """Paths for the true footprint, from wherever the robot stands.
+    """Finds paths for the true footprint from any pose of the robot.
 
-    A step costs its length times (1 + cost_penalty·cost/252); above ``tight_cost``, where the robot cannot turn on the
-    spot, up to ``tight_penalty`` comes on top. Reversing, changing direction and turning cost more.
-    No pose lays the footprint (with ``footprint_padding``) on a lethal cell. A robot that stands on some may leave
-    them, never go deeper. With ``allow_unknown`` a way through unknown cells is taken into account, but the path ends
+    A step costs its length times (1 + cost_penalty·cost/252). Above ``tight_cost``, where the robot cannot turn on the
+    spot, up to ``tight_penalty`` is added. Reversing, changing direction and turning cost more.
+    No pose puts the footprint (with ``footprint_padding``) on a lethal cell. A robot that stands on lethal cells may
+    leave them, but never go deeper. With ``allow_unknown`` a way may cross unknown cells, but the path ends
     ``unknown_standoff_m`` before the first of them: the robot drives up, sees more, and plans again. Without it,
-    unknown cells are walls. Cells near the path before are a little cheaper (``retrospective_gain``), so that two ways
-    that are equally good do not take turns.
+    unknown cells are walls. Cells near the previous path are a little cheaper (``retrospective_gain``), so that the
+    planner does not alternate between two equally good ways.
     """
 
     def __init__(self, config: PlannerConfig, footprint: Footprint | None = None) -> None:
@@ -106,7 +106,7 @@ class HybridPlanner:
         goal: NDArray[np.float64],
         before: Plan | None = None,
     ) -> Plan:
-        """Path from pose ``start`` to pose ``goal`` (3,); to the nearest place where the goal is out of reach."""
+        """Path from pose ``start`` to pose ``goal`` (3,), or to the nearest reachable place."""
         start, goal = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
         height, width = costmap.costs.shape
         row, column = (int(i) for i in costmap.cells(start[:2]))
@@ -126,7 +126,7 @@ class HybridPlanner:
         target = None if taken or outside or not reachable else goal
         near = (goal_row, goal_column)
         if target is None:
-            # The reachable place nearest to the goal stands in for it; no way ends in what was never seen.
+            # Plan to the nearest reachable place instead; it is never one that was not seen.
             near = grid.nearest(connected, (row, column), near)
             place = costmap.centres(np.array(near[0]), np.array(near[1]))
             target = np.array([place[0], place[1], np.nan])
@@ -160,15 +160,15 @@ class HybridPlanner:
         return Plan(poses, False, reason, whole, reverse, opened)
 
     def _at_the_goal(self, start: NDArray[np.float64], goal: NDArray[np.float64]) -> Plan:
-        # It may stand at the goal already, and that inside inflation.
+        # The robot may stand at the goal already, inside the inflation.
         back = (goal[:2] - start[:2]) @ np.array([math.cos(start[2]), math.sin(start[2])]) < 0.0
         return Plan(np.stack([start, goal]), True, "", _length(np.stack([start, goal])), np.array([False, back]))
 
     def _before_unknown(self, costmap: Costmap, poses: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-        """Which poses of a path lie before the first unknown cell; None when there is none on it."""
+        """Mask of the poses of a path before the first unknown cell; None when it crosses none."""
         costs = costmap.cost_at(poses[:, :2])
         from_start = np.linalg.norm(poses[:, :2] - poses[0, :2], axis=1)
-        # Right round the robot the scan sees nothing; where it stands is free.
+        # The scan sees nothing close to the robot; the cells under it are free.
         unknown = np.flatnonzero((costs == UNKNOWN) & (from_start > self.config.unknown_standoff_m))
         if unknown.size == 0:
             return None
@@ -179,7 +179,7 @@ class HybridPlanner:
 
 
 class _Grid:
-    """One costmap ready for the search: weights of its cells, distance to obstacles, the footprint at each heading."""
+    """One costmap prepared for the search: cell weights, distance to obstacles, the footprint at each heading."""
 
     def __init__(self, planner: HybridPlanner, costmap: Costmap, before: Plan | None) -> None:
         import cv2
@@ -207,20 +207,20 @@ class _Grid:
             unknown,
             1.0 - config.retrospective_gain,
         )
-        # The body in cells, at each heading and all over: posts inside the outline count too. With points 0.7 cells
-        # apart one lies in every cell whose middle is covered.
+        # The body in cells at each heading, filled: posts inside the outline count too. At a spacing of 0.7 cells
+        # every cell whose middle is covered holds a point.
         body = planner.footprint.points(0.7 * costmap.resolution, config.footprint_padding) / costmap.resolution
         body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
         yaw = 2.0 * math.pi * np.arange(self.bins) / self.bins
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
         self.body = np.ascontiguousarray(body)
         self.bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
-        # A pose lies anywhere in its cell: 0.71 cells more until nothing can touch.
+        # A pose may lie anywhere in its cell: nothing can touch from 0.71 cells farther on.
         reach = planner.footprint.circumscribed_radius_m + 1.5 * config.footprint_padding
         self.reach = reach / costmap.resolution + 1.42
 
     def connected(self, row: int, column: int) -> NDArray[np.bool_]:
-        """Cells (H, W) that the robot's centre can get to from one."""
+        """Mask (H, W) of the cells that the robot's centre can reach from one."""
         import cv2
 
         rows, columns = np.ogrid[: self.weights.shape[0], : self.weights.shape[1]]
@@ -235,7 +235,7 @@ class _Grid:
         return reached
 
     def cost_to_go(self, row: int, column: int, start_row: int, start_column: int) -> NDArray[np.float32]:
-        """Cost in cells (H, W) of the point robot's way from where it may lead on from the start, to one cell."""
+        """Cost in cells (H, W) of the point robot's way to one cell, from all cells that matter for the start."""
         escape = self.config.escape_radius_m / self.costmap.resolution
         costs: NDArray[np.float32] = _cost_to_go(
             self.costmap.costs, self.weights, row, column, start_row, start_column, escape
@@ -243,9 +243,9 @@ class _Grid:
         return costs
 
     def nearest(self, connected: NDArray[np.bool_], start: tuple[int, int], goal: tuple[int, int]) -> tuple[int, int]:
-        """The reachable, known cell nearest to the goal in which the robot may face anywhere but along a wall.
+        """The reachable, known cell nearest to the goal in which the robot may face any way except along a wall.
 
-        The start itself where none is nearer.
+        Returns the start where none is nearer.
         """
         half = 0.5 * max(self.planner.footprint.length_m, self.planner.footprint.width_m)
         room = (half + self.config.footprint_padding) / self.costmap.resolution + 0.5
@@ -262,7 +262,7 @@ class _Grid:
     def search(
         self, to_go: NDArray[np.float32], start: NDArray[np.float64], goal: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], bool, int]:
-        """Poses (N, 4) in cells and radians, the fourth 1 where it is reached backwards; found; poses opened."""
+        """Poses (N, 4) in cells and radians, the fourth 1 where reached backwards; found; number of poses expanded."""
         config, resolution = self.config, self.costmap.resolution
         origin = self.costmap.origin
         return _search(
@@ -289,7 +289,7 @@ class _Grid:
         )
 
     def smooth(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The poses with straight pieces where these cost no more; metres in the map frame."""
+        """Replace runs of poses by straight pieces where these cost no more; metres in the map frame."""
         kept = _smooth(self.costmap.costs, self.weights, self.clearance, self.body, self.reach, nodes)
         kept[:, :2] = kept[:, :2] * self.costmap.resolution + self.costmap.origin
         return kept
@@ -302,7 +302,7 @@ def _length(poses: NDArray[np.float64]) -> float:
 def _resample(
     nodes: NDArray[np.float64], start: NDArray[np.float64], goal: NDArray[np.float64] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Poses ``SPACING_M`` or less apart along nodes (N, 4), from the true start to the true goal; and which reverse."""
+    """Poses at most ``SPACING_M`` apart along nodes (N, 4), from the true start to the true goal; and which reverse."""
     nodes = nodes.copy()
     nodes[0, :3] = start
     if goal is not None:
@@ -315,7 +315,7 @@ def _resample(
         part = (np.arange(1, count + 1) / count)[:, None]
         piece = np.empty((count, 3))
         piece[:, :2] = a[:2] + step * part
-        # On a straight line the robot has turned before it drives; on an arc it turns on the way.
+        # On a straight line the robot turns before it drives; on an arc it turns on the way.
         along = math.atan2(step[1], step[0]) + math.pi * b[3]
         straight = length > 1e-6 and abs(math.remainder(b[2] - along, 2 * math.pi)) < 1e-3
         piece[:, 2] = b[2] if straight else a[2] + math.remainder(b[2] - a[2], 2 * math.pi) * part[:, 0]
@@ -338,7 +338,7 @@ def _weights(
     unknown: float,
     discount: float,
 ) -> NDArray[np.float32]:
-    """Price (H, W) of a cell's length in a cell; 0 where the robot's centre may not go."""
+    """Cost (H, W) of one cell length in a cell; 0 where the robot's centre may not go."""
     weights = np.empty(costs.shape, dtype=np.float32)
     for r in range(costs.shape[0]):
         for c in range(costs.shape[1]):
@@ -364,12 +364,12 @@ def _cost_to_go(
     start_column: int,
     escape: float,
 ) -> NDArray[np.float32]:
-    """Dijkstra from (row, column), only where a way to the robot's start may lead through.
+    """Dijkstra from (row, column), limited to cells on possible ways to the robot's start.
 
-    That is where cost and straight distance to the start together are little more than the best way costs (A*).
+    In these cells, cost plus straight distance to the start is little more than the cost of the best way (A*).
 
-    Cells within ``escape`` of the start count as dear instead of closed where they are inscribed (lethal: a quarter
-    of that): the robot may stand there.
+    Inscribed cells within ``escape`` of the start count as dear instead of closed (lethal ones within a quarter of
+    that): the robot may stand there.
     """
     height, width = costs.shape
     best = np.full((height, width), np.inf, dtype=np.float32)
@@ -413,9 +413,9 @@ def _cost_to_go(
 def _overlap(
     costs: NDArray[np.uint8], clearance: NDArray[np.float32], x: float, y: float, body: NDArray[np.float64]
 ) -> int:
-    """How many of the body's points, already turned, lie in lethal cells; the centre at (x, y) in cells.
+    """Number of the body's points, already rotated, in lethal cells; the centre at (x, y) in cells.
 
-    The points come farthest first: those nearer than the nearest lethal cell need no look.
+    The points are sorted farthest first: those nearer than the nearest lethal cell are skipped.
     """
     height, width = costs.shape
     nearest = max(clearance[math.floor(y), math.floor(x)] - 1.5, 0.0)
@@ -453,9 +453,9 @@ def _line_cost(
     yaw: float,
     dearest: float,
 ) -> float:
-    """Price in cells of a straight way at a heading; inf where the footprint meets something.
+    """Cost in cells of a straight way at a heading.
 
-    Inf, too, where a cell is dearer than ``dearest``.
+    Inf where the footprint meets something, or a cell is dearer than ``dearest``.
     """
     height, width = costs.shape
     length = math.hypot(bx - ax, by - ay)
@@ -492,7 +492,7 @@ def _turn_is_free(
     yaw: float,
     turn: float,
 ) -> bool:
-    """Whether the footprint turns on the spot from ``yaw`` by ``turn`` without meeting anything."""
+    """Whether the footprint can turn on the spot from ``yaw`` by ``turn`` without contact."""
     if clearance[math.floor(y), math.floor(x)] > reach:
         return True
     count = max(1, math.ceil(abs(turn) / 0.15))
@@ -530,7 +530,7 @@ def _search(
     escape: float,
     most: int,
 ) -> tuple[NDArray[np.float64], bool, int]:
-    """Hybrid A*. Headings stay on the bins, places are continuous; one pose is kept for each cell and heading."""
+    """Hybrid A*. Headings stay on the bins, positions are continuous; one pose is kept per cell and heading."""
     height, width = costs.shape
     bins = bodies.shape[0]
     per_bin = 2.0 * math.pi / bins
@@ -554,7 +554,7 @@ def _search(
     start_row, start_column = math.floor(start_y), math.floor(start_x)
     best[(first * height + start_row) * width + start_column] = 0.0
     queue = [(HURRY * float(to_go[start_row, start_column]), 0)]
-    # The goal itself is one more node, reached from any node by a turn, a straight line and a turn.
+    # The goal is one more node, reached from any node by a turn, a straight line and a turn.
     goal_price, goal_parent, goal_backwards = np.inf, -1, 0
     nearest, nearest_to_go = 0, np.float32(np.inf)
     closed = np.zeros(bins * height * width, dtype=np.bool_)
@@ -572,7 +572,7 @@ def _search(
         left = to_go[row, column]
         if left < nearest_to_go and (costs[row, column] != 255):
             nearest, nearest_to_go = node, left
-        # Straight to the goal, ahead or (from near) backwards: from near always, from far now and then.
+        # Try the straight way to the goal, forwards or (from near) backwards: always from near, sometimes from far.
         away = math.hypot(goal_x - x, goal_y - y)
         if overlap[node] == 0 and (away < 20.0 or opened % max(1, int(away / 12.0)) == 0):
             for backwards in range(2 if may_reverse and 0.2 < away < 20.0 else 1):
@@ -589,7 +589,7 @@ def _search(
                     continue
                 line = _line_cost(costs, weights, clearance, body, reach, x, y, goal_x, goal_y, yaw, np.inf)
                 total += share * line
-                # The point robot's way is no guide to a place beside a better line.
+                # The point robot's way gives no bound at a place beside a better line.
                 if total < goal_price and line <= 1.05 * left + 3.0:
                     goal_price, goal_parent, goal_backwards = total, node, backwards
         for k in range(kinds):
@@ -614,7 +614,7 @@ def _search(
             weight = weights[r, c]
             if weight == 0.0:
                 if overlap[node] == 0 and costs[row, column] < 253:
-                    continue  # out of what is closed, never into it
+                    continue  # out of closed cells, never into them
                 weight = DEAR
             direction = 2 if length == 0.0 else (1 if length < 0.0 else 0)
             if length == 0.0:
@@ -632,13 +632,13 @@ def _search(
             if clearance[r, c] <= reach:
                 touching = _overlap(costs, clearance, new_x, new_y, bodies[other])
                 if touching > 0:
-                    # Only a robot that stands on something already, and only to leave it.
+                    # Only for a robot that already stands on an obstacle, and only to leave it.
                     near = math.hypot(new_x - start_x, new_y - start_y) <= escape
                     if overlap[node] == 0 or touching > overlap[node] or not near:
                         continue
                     new += 2.0 * touching / body.shape[0] * 100.0
                 elif length != 0.0 and overlap[node] == 0:
-                    # Half way too: a primitive is three cells long.
+                    # Check halfway too: a primitive is three cells long.
                     turned = bodies[b] if turns[k] == 0 else _turned(body, (b + 0.5 * turns[k]) * per_bin)
                     if _overlap(costs, clearance, 0.5 * (x + new_x), 0.5 * (y + new_y), turned) > 0:
                         continue
@@ -695,9 +695,9 @@ def _smooth(
     reach: float,
     nodes: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Replaces runs of forward nodes by straight lines that cost no more than the run."""
+    """Replace runs of forward nodes by straight lines that cost no more."""
     count = len(nodes)
-    along = np.zeros(count)  # price from the first node on
+    along = np.zeros(count)  # cost from the first node on
     for i in range(1, count):
         length = math.hypot(nodes[i, 0] - nodes[i - 1, 0], nodes[i, 1] - nodes[i - 1, 1])
         along[i] = along[i - 1] + length * max(_weight_at(weights, nodes[i]), 1.0)

@@ -1,4 +1,4 @@
-"""Where the command now given leads, and whether the footprint meets an obstacle on the way."""
+"""Where the present command leads, and whether the footprint meets an obstacle on the way."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ class PredictionConfig:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A predicted trajectory and what it meets."""
+    """A predicted trajectory and the obstacle it meets."""
 
     times_s: NDArray[np.float64]
-    """(N,) from now, first 0."""
+    """(N,) seconds from now, first 0."""
     poses: NDArray[np.float64]
     """(N, 3) x, y, yaw in the map frame."""
     hit_index: int | None
-    """First pose whose footprint lies on an obstacle that it is not on already; None when the way is free."""
+    """First pose whose footprint overlaps more obstacle than at the start; None when the way is free."""
     distance_m: float
-    """How far the robot's farthest corner travels until then; inf when free."""
+    """Distance that the robot's farthest corner travels until then; inf when free."""
 
     @property
     def time_to_obstacle_s(self) -> float:
@@ -49,15 +49,15 @@ class Prediction:
 
 
 def stopping_distance(speed_m_s: float, limits: MotionLimits, latency_s: float) -> float:
-    """Metres from the command to stop until the robot stands."""
+    """Metres from the stop command to standstill."""
     return speed_m_s * latency_s + speed_m_s**2 / (2.0 * limits.max_linear_accel_m_s2)
 
 
 class Predictor:
     """Rolls a command out with the base's latency and acceleration limits.
 
-    The horizon is a length, not a time: the stopping distance at the speed commanded (or driven, if that is more)
-    plus a margin. It is measured at the footprint's farthest corner, so turning on the spot is looked at too.
+    The horizon is a length, not a time: the stopping distance at the commanded (or measured, if higher) speed plus a
+    margin. It is measured at the footprint's farthest corner, so it also covers turning on the spot.
     """
 
     def __init__(self, config: PredictionConfig, limits: MotionLimits, footprint: Footprint) -> None:
@@ -68,7 +68,7 @@ class Predictor:
         self.body = footprint.points(0.045, config.padding_m)
 
     def horizon(self, linear: float, angular: float) -> float:
-        """Metres that the farthest corner is followed, for a speed of (m/s, rad/s)."""
+        """Metres for which the farthest corner is followed at a speed of (m/s, rad/s)."""
         speed = abs(linear) + self.reach_m * abs(angular)
         if speed == 0.0:
             return 0.0
@@ -87,12 +87,12 @@ class Predictor:
     ) -> Prediction:
         """Trajectory from ``pose`` (x, y, yaw) at ``velocity`` under ``command`` (m/s, rad/s).
 
-        ``extra_m`` is added to the horizon, ``side_m`` to every side of the footprint. Without a costmap nothing is
-        met.
+        ``extra_m`` is added to the horizon, ``side_m`` to every side of the footprint. Without a
+        costmap the way is free.
         """
         step = self.config.step_s
         command = clip_twist(*command, self.limits)
-        # Encoders read late make a measured speed that the base cannot drive; it would look metres too far ahead.
+        # Delayed encoder readings can give a speed that the base cannot drive: the horizon would be metres too long.
         velocity = clip_twist(*velocity, self.limits)
         faster = command if _speed(command, self.reach_m) >= _speed(velocity, self.reach_m) else velocity
         length = self.horizon(*faster)
@@ -114,7 +114,7 @@ class Predictor:
             if side_m > 0:
                 body = self.footprint.points(0.045, self.config.padding_m + side_m)
             overlap = costmap.lethal_overlap(path, body)
-            # Standing on an obstacle already (a map that jumped) must not hold the robot there for good.
+            # A robot that stands on an obstacle already (after a map jump) must not be blocked for good.
             worse = np.flatnonzero(overlap > overlap[0])
             hit = int(worse[0]) if worse.size else None
         return Prediction(times, path, hit, math.inf if hit is None else travelled[hit])

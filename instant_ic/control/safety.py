@@ -1,7 +1,7 @@
-"""Collision monitor: the last thing before ``/cmd_vel`` (after nav2_collision_monitor).
+"""Collision monitor: the last step before ``/cmd_vel`` (after nav2_collision_monitor).
 
-It looks at the newest scan and 3D points, and the true footprint; what is too near or too low to be seen is the
-costmap's memory (``blind_radius_m``, ``memory_range_m``), which the caller adds to the points.
+It checks the newest scan and 3D points against the true footprint. The caller adds the costmap's memory
+(``blind_radius_m``, ``memory_range_m``) of things that are too near or too low to be seen.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ ActionType = Literal["stop", "slowdown", "limit", "approach"]
 
 @dataclass(frozen=True)
 class PolygonConfig:
-    """A place round the robot, and what happens to the command when something is in it.
+    """A region round the robot, and its effect on the command when something is inside.
 
     Attributes:
-        enabled: whether it is looked at.
+        enabled: whether the polygon is checked.
         action_type: stop, slowdown, limit or approach.
         points: "[[x, y], ...]" in base_link, convex; empty: the footprint with padding_m.
         padding_m: m round the footprint.
-        min_points: points inside that count as something.
-        slowdown_ratio: share of the command that is left; slowdown.
-        linear_limit: m/s; limit.
-        angular_limit: rad/s; limit.
-        time_before_collision: s to contact from which on the command is slowed in proportion; approach.
-        stop_time_s: s to contact at which it becomes zero; approach.
-        simulation_time_step: s between the poses looked at; approach and stop.
+        min_points: number of points inside from which on the region counts as occupied.
+        slowdown_ratio: slowdown: share of the command that remains.
+        linear_limit: limit: largest linear speed, in m/s.
+        angular_limit: limit: largest angular speed, in rad/s.
+        time_before_collision: approach: seconds to contact below which the command is slowed in proportion.
+        stop_time_s: approach: seconds to contact at which the command becomes zero.
+        simulation_time_step: approach, stop: seconds between the simulated poses.
     """
 
     enabled: bool = True
@@ -64,10 +64,10 @@ class PolygonConfig:
 
 
 def parse_polygon(text: str) -> NDArray[np.float64]:
-    """Corners (N, 2), counter-clockwise, of a convex polygon written as nav2 does: ``[[0.5, 0.3], [0.5, -0.3], ...]``.
+    """Corners (N, 2), counter-clockwise, of a convex polygon in nav2's notation: ``[[0.5, 0.3], [0.5, -0.3], ...]``.
 
     Raises:
-        ValueError: not that form, fewer than three corners, or not convex; the message begins with ``points``.
+        ValueError: another form, fewer than three corners, or not convex; the message begins with ``points``.
     """
     try:
         corners = np.array(json.loads(text), dtype=np.float64)
@@ -86,7 +86,7 @@ def parse_polygon(text: str) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class CollisionMonitorConfig:
-    """Polygons, of which the most restrictive wins, and how old their points may be."""
+    """Polygons, of which the most restrictive wins, and the largest age of their points."""
 
     source_timeout: Positive = 0.5
     blind_radius_m: NotNegative = 0.45
@@ -102,7 +102,7 @@ class CollisionMonitorConfig:
         check_ranges(self)
 
     def polygons(self) -> dict[str, PolygonConfig]:
-        """Those that are enabled, by name."""
+        """The enabled polygons, by name."""
         named = {"stop": self.stop, "slowdown": self.slowdown, "limit": self.limit, "approach": self.approach}
         return {name: polygon for name, polygon in named.items() if polygon.enabled}
 
@@ -113,11 +113,11 @@ class MonitoredCommand:
 
     command: tuple[float, float]
     action: str
-    """``free``, ``limit``, ``slowdown``, ``approach`` (slowed by the time to collision) or ``stop``."""
+    """``free``, ``limit``, ``slowdown``, ``approach`` (slowed in proportion to the time to collision) or ``stop``."""
     time_to_collision_s: float
-    """For the command as asked; inf when nothing is met within ``time_before_collision``."""
+    """Of the requested command; inf without contact within ``time_before_collision``."""
     polygon: str = ""
-    """Name of the polygon that decided; ``source_timeout`` for points that are too old."""
+    """Name of the deciding polygon; ``source_timeout`` when the points are too old."""
 
 
 @dataclass(frozen=True)
@@ -127,15 +127,15 @@ class _Polygon:
     normals: NDArray[np.float64]
     """(E, 2) outward."""
     offsets: NDArray[np.float64]
-    """(E,) of the edges along their normals: inside, normals @ point < offsets."""
+    """(E,) of the edges along their normals; inside: normals @ point < offsets."""
     reach: float
 
 
 class CollisionMonitor:
-    """Cuts a command down to what every polygon allows.
+    """Reduces a command to what every polygon allows.
 
-    Linear and angular speed are cut by one factor, so that the robot stays on the arc that was looked at. A robot that
-    is in contact already may move so that the contact gets less: ``stop`` and ``approach`` hold only what goes deeper.
+    Linear and angular speed are cut by one factor, so that the robot stays on the checked arc. A robot in contact may
+    move so that the contact gets smaller: ``stop`` and ``approach`` block only motion that goes deeper.
     """
 
     def __init__(self, config: CollisionMonitorConfig, footprint: Footprint) -> None:
@@ -143,17 +143,17 @@ class CollisionMonitor:
         self.footprint = footprint
         self._polygons = [_polygon(name, polygon, footprint) for name, polygon in config.polygons().items()]
         self.most_points_needed = max((p.config.min_points for p in self._polygons), default=1)
-        """A cell of memory must count as that many points to be seen by every polygon."""
+        """A cell of memory must count as that many points for every polygon to notice it."""
 
     def limit(
         self, command: tuple[float, float], points: NDArray[np.float64], source_age_s: float = 0.0
     ) -> MonitoredCommand:
-        """The command (m/s, rad/s) as it may be sent.
+        """The part of the command (m/s, rad/s) that may be sent.
 
         Args:
-            command: as asked for.
-            points: (N, 2) what was seen, in ``base_link``, now.
-            source_age_s: of the oldest source of the points that is needed.
+            command: the requested command.
+            points: (N, 2) points seen, in ``base_link`` at present.
+            source_age_s: age of the oldest required source of the points.
         """
         linear, angular = command
         if not (math.isfinite(linear) and math.isfinite(angular)):
@@ -180,7 +180,7 @@ class CollisionMonitor:
         points: NDArray[np.float64],
         squares: NDArray[np.float64],
     ) -> tuple[float, float]:
-        """Share of the command that one polygon lets through, and the time to collision, inf if it looks at none."""
+        """Share of the command that one polygon allows, and the time to collision; inf where not computed."""
         config = polygon.config
         looks_ahead = config.action_type in ("approach", "stop")
         horizon = config.time_before_collision if config.action_type == "approach" else 3 * config.simulation_time_step
@@ -243,7 +243,7 @@ def _time_to_collision(
     horizon: float,
     min_points: int,
 ) -> float:
-    """Start of the first step in which at least ``min_points`` points go (deeper) into the polygon."""
+    """Start of the first step in which at least ``min_points`` points enter the polygon (or go deeper)."""
     depth = np.empty(points.shape[0])
     for j in range(points.shape[0]):
         depth[j] = _depth(points[j, 0], points[j, 1], normals, offsets)

@@ -25,7 +25,7 @@ class Mode(IntEnum):
 
 
 class VbotAction(IntEnum):
-    """Values of ControlState.vbot_action: what the v-bot does."""
+    """Values of ControlState.vbot_action: how the v-bot moves."""
 
     WITH_ROBOT = 0
     DRIVEN = 1
@@ -36,7 +36,7 @@ class VbotAction(IntEnum):
 
 @dataclass(frozen=True)
 class State:
-    """What a mode means: who obeys the operator, what he sees, what the other robot does."""
+    """Meaning of a mode: which robot the operator drives, what is shown, what the other robot does."""
 
     driven: str
     shown: str
@@ -58,7 +58,7 @@ STATES: dict[Mode, State] = {
 
 @dataclass(frozen=True)
 class Transition:
-    """One arrow: from ``source`` to ``target`` when ``guard`` holds, doing ``action``."""
+    """One transition: from ``source`` to ``target`` when ``guard`` holds, with ``action``."""
 
     source: Mode
     target: Mode
@@ -85,7 +85,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.RETURNING, Mode.REAL, "picture_fits", "hand_back"),
     Transition(Mode.STOPPED, Mode.REAL, "may_resume", "hand_back"),
 )
-"""In order: the first row of the present state whose guard holds is taken, at most one a step."""
+"""In order: the first row of the present state whose guard holds is taken, at most one per step."""
 
 GUARDS: dict[str, str] = {
     "estop_pressed": "the emergency stop is pressed",
@@ -129,12 +129,12 @@ class Source:
     name: str
     modes: tuple[Mode, ...]
     words: str = ""
-    """What the operator is told of its loss; empty: "no NAME for SECONDS"."""
+    """Text for the operator when it is lost; empty: "no NAME for SECONDS"."""
     optional: bool = False
-    """Needed only once it has come: a robot without 3D points drives by its flat scan."""
+    """Needed only after its first message: a robot without 3D points drives by its flat scan."""
     steady: bool = False
-    """It comes at a rate of its own: its time-out is longer where it usually comes rarer. Images only: what keeps the
-    robot off obstacles has fixed time-outs, so that it stands in time on a slow machine too."""
+    """It has its own rate: the time-out is longer if its messages are usually rare. Images only: sources that keep the
+    robot off obstacles have fixed time-outs, so that it stops in time on a slow machine too."""
 
 
 OPERATOR_LOST = "the operator's link is lost, the robot waits"
@@ -151,7 +151,7 @@ SOURCES: tuple[Source, ...] = (
     Source("view", "picture of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
     Source("vbot", "v-bot", (Mode.VIRTUAL, Mode.RETURNING)),
     Source("nav", "path follower", (Mode.VIRTUAL,)),
-    # Where the operator drives the r-bot, silence is a zero command and no more; in VIRTUAL the r-bot would go on to
-    # the v-bot by itself.
+    # Where the operator drives the r-bot, silence is only a zero command; in VIRTUAL the r-bot would go on to the
+    # v-bot by itself.
     Source("command", "operator's link", (Mode.VIRTUAL,), OPERATOR_LOST),
 )

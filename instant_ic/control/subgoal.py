@@ -17,7 +17,7 @@ from instant_ic.control.walls import WallMap
 
 @dataclass(frozen=True)
 class SubgoalConfig:
-    """What counts as a free place, and how far ahead one is looked for."""
+    """What counts as a free place, and how far ahead to look for one."""
 
     max_cost: Annotated[int, Range(0, LETHAL - 2)] = 150
     extend_m: NotNegative = 3.0
@@ -31,7 +31,7 @@ class SubgoalConfig:
 
 @dataclass(frozen=True)
 class Subgoal:
-    """Pose (x, y, yaw) for the r-bot, and which of the rules gave it."""
+    """Pose (x, y, yaw) for the r-bot, and the rule that chose it."""
 
     pose: NDArray[np.float64]
     rule: str
@@ -47,13 +47,13 @@ def extend_ahead(pose: NDArray[np.float64], length_m: float, step_m: float) -> N
 
 
 _UNSEEN_DEPTH_M = 0.6
-"""What is not seen behind a thing's near side may be the thing itself, to this depth."""
+"""Unseen space behind an obstacle's near side counts as the obstacle to this depth."""
 
 
 def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64], max_cost: int) -> NDArray[np.bool_]:
-    """Which of the poses (N, 3) straight ahead, a cell apart, are places behind the first thing on the line.
+    """Which of the poses (N, 3) straight ahead, one cell apart, lie behind the first obstacle on the line.
 
-    What is free before the thing has begun is not behind it. Where nothing is taken every free place counts.
+    Free space before the obstacle does not count. Without an obstacle every free place counts.
     """
     costs = costmap.cost_at(ahead[:, :2])
     unseen = (costs == UNKNOWN) & costmap.contains(ahead[:, :2])
@@ -70,8 +70,8 @@ def behind_obstacle(costmap: Costmap, ahead: NDArray[np.float64], max_cost: int)
 def _free(costmap: Costmap, points: NDArray[np.float64], config: SubgoalConfig) -> NDArray[np.bool_]:
     """Which points (..., 2) may be the subgoal."""
     costs = costmap.cost_at(points)
-    # The place behind an obstacle has not been seen yet: unknown may be a goal. The planner does not drive into
-    # it; it goes on as the robot sees more.
+    # The place behind an obstacle has not been seen yet, so unknown cells may be a goal. The planner does not drive
+    # into them; it goes on as the robot sees more.
     return (costs <= config.max_cost) | ((costs == UNKNOWN) & costmap.contains(points))
 
 
@@ -86,9 +86,9 @@ def choose_subgoal(
     """Subgoal for the v-bot's pose (3,) and its predicted trajectory.
 
     The v-bot's pose if free; else the farthest free point of the trajectory; else the first free point straight on
-    from its end, short of any wall; else the nearest free cell round the v-bot; else None. With ``anticipate`` a
-    free v-bot that is about to pass an obstacle sends the r-bot behind it already, so that it need not first follow
-    up to the obstacle and turn there.
+    from its end, before any wall; else the nearest free cell round the v-bot; else None. With ``anticipate``, a free
+    v-bot that is about to pass an obstacle already sends the r-bot behind it. The r-bot then does not first follow up
+    to the obstacle and turn there.
     """
     vbot_pose = np.asarray(vbot_pose, dtype=np.float64)
     if _free(costmap, vbot_pose[:2], config):
@@ -122,7 +122,7 @@ def _straight_on(
     walls: WallMap | None,
     config: SubgoalConfig,
 ) -> NDArray[np.float64] | None:
-    """First free pose (3,) behind the obstacle that ``pose`` runs into; None when a wall comes first."""
+    """First free pose (3,) behind the obstacle ahead of ``pose``; None when a wall comes first."""
     heading = pose if forward else pose + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, config.extend_m, costmap.resolution)
     index = np.flatnonzero(behind_obstacle(costmap, ahead, config.max_cost))

@@ -20,20 +20,20 @@ _TRACK_M = 0.1
 
 @dataclass(frozen=True)
 class VbotConfig:
-    """How far the v-bot may draw ahead, how near its outline comes to walls, how gently it goes by itself.
+    """How far the v-bot may lead, how near its outline may come to walls, how gently it moves by itself.
 
     Attributes:
-        max_lead_m: m; it is never driven farther ahead of the r-bot.
-        slow_lead_m: m; from here on it is slowed.
-        trail_slow: share of its speed that it loses while the r-bot trails it: too little to be felt, and the two meet
-            again metres sooner.
-        trail_m: m of lead at which that is reached.
-        wall_clearance_m: m between its outline and a wall: room for the r-bot at the same place.
-        ease_m_s: m/s, at most, by which it is drawn onto the r-bot at the return, beside the motion of both.
-        ease_deg_s: degrees/s, likewise.
-        ease_time_s: s in which the last of it goes.
-        lead_back_m_s: m/s, at most, by which a v-bot that nobody drives goes back to the r-bot.
-        lead_back_deg_s: degrees/s, likewise.
+        max_lead_m: largest lead over the r-bot, in metres.
+        slow_lead_m: lead in metres from which on the v-bot is slowed.
+        trail_slow: share of its speed that it loses while the r-bot trails it: too little to be noticed, but the two
+            meet metres sooner.
+        trail_m: lead in metres at which trail_slow is reached.
+        wall_clearance_m: metres between its outline and a wall, so that the r-bot has room at the same place.
+        ease_m_s: largest speed in m/s at which it is eased onto the r-bot at the return, on top of the motion of both.
+        ease_deg_s: as ease_m_s, for the heading, in degrees/s.
+        ease_time_s: time constant in seconds with which the last of the error vanishes.
+        lead_back_m_s: largest speed in m/s at which a v-bot that nobody drives goes back to the r-bot.
+        lead_back_deg_s: as lead_back_m_s, for the heading, in degrees/s.
     """
 
     max_lead_m: Positive = 3.0
@@ -65,10 +65,10 @@ class VirtualRobot:
         self.slowed_by = ""
         """Why the last step was slower than commanded: ``lead``, ``wall`` or empty."""
         self._led_m_s = 0.0
-        self._track: list[NDArray[np.float64]] = []  # where it was driven, ``_TRACK_M`` apart: the way back
+        self._track: list[NDArray[np.float64]] = []  # driven places, ``_TRACK_M`` apart: the way back
 
     def place(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> None:
-        """Puts the v-bot at ``pose`` (x, y, yaw), moving at ``velocity`` (m/s, rad/s)."""
+        """Place the v-bot at ``pose`` (x, y, yaw), moving at ``velocity`` (m/s, rad/s)."""
         self.pose = np.asarray(pose, dtype=np.float64).copy()
         self.velocity = clip_twist(*velocity, self.limits)
         self.slowed_by = ""
@@ -82,19 +82,19 @@ class VirtualRobot:
         walls: WallMap | None = None,
         speed_limit_m_s: float = math.inf,
     ) -> NDArray[np.float64]:
-        """Moves by ``dt_s`` under the operator's command; returns the new pose (3,) in the map frame."""
+        """Move by ``dt_s`` under the operator's command; return the new pose (3,) in the map frame."""
         linear, angular = clip_twist(*command, self.limits)
         slower = min(1.0, speed_limit_m_s / max(abs(linear), 1e-9))
         linear, angular = linear * slower, angular * slower
         factor = self.lead_factor(linear, robot_pose)
         self.slowed_by = "lead" if factor < 1.0 - self.config.trail_slow else ""
-        # Curvature is kept, as far as the v-bot moves: the operator's line stays the same line.
+        # Curvature is kept when slowed: the operator's line stays the same.
         target = (linear * factor, angular * factor if linear != 0.0 else angular)
         if factor == 0.0:
             target = (0.0, angular)
         self.velocity = accelerate(self.velocity, target, self.limits, dt_s)
         pose = move(self.pose, self.velocity[0], self.velocity[1], dt_s)
-        # Turning on the spot is never held: a corner that grazes a wall is less harm than controls that stick.
+        # Turning on the spot is never blocked: a corner that grazes a wall does less harm than controls that stick.
         if walls is not None and self.velocity[0] != 0.0 and self._into_wall(pose, walls):
             self.slowed_by = "wall"
             self.velocity = (0.0, self.velocity[1])
@@ -106,7 +106,7 @@ class VirtualRobot:
         return pose
 
     def ease(self, target: NDArray[np.float64], velocity: tuple[float, float], dt_s: float) -> NDArray[np.float64]:
-        """Moves by ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), and draws the rest onto ``target`` (3,)."""
+        """Move for ``dt_s`` at the r-bot's ``velocity`` (m/s, rad/s), easing the remaining error to ``target`` (3,)."""
         config = self.config
         moved = move(self.pose, *velocity, dt_s)
         share = min(1.0, dt_s / config.ease_time_s)
@@ -118,7 +118,7 @@ class VirtualRobot:
     def lead_back(
         self, robot_pose: NDArray[np.float64], dt_s: float, walls: WallMap | None = None
     ) -> NDArray[np.float64]:
-        """Goes back towards the r-bot by ``dt_s``: straight, or by the way it came where a wall lies between."""
+        """Go back towards the r-bot for ``dt_s``: straight, or along the driven track where a wall lies between."""
         config = self.config
         while self._track and _distance(self.pose, self._track[-1]) < _TRACK_M:
             self._track.pop()
@@ -133,9 +133,9 @@ class VirtualRobot:
         return self.pose
 
     def lead_factor(self, linear: float, robot_pose: NDArray[np.float64]) -> float:
-        """Share of the linear speed that is left: a little less than 1 with a lead, 0 at ``max_lead_m``.
+        """Share of the linear speed that remains: a little less than 1 with a lead, 0 at ``max_lead_m``.
 
-        Only what draws the two apart is slowed; back towards the r-bot the v-bot drives freely.
+        Only motion that draws the two apart is slowed; back towards the r-bot the v-bot drives freely.
         """
         gap = self.pose[:2] - np.asarray(robot_pose)[:2]
         lead = float(math.hypot(gap[0], gap[1]))
@@ -159,7 +159,7 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def _towards(
     pose: NDArray[np.float64], goal: NDArray[np.float64], share: float, most_m: float, most_rad: float
 ) -> NDArray[np.float64]:
-    """``pose`` (3,) brought nearer to ``goal`` by a share of what lies between, at most so much."""
+    """``pose`` (3,) moved towards ``goal`` by a share of the error, within the given limits."""
     gap, turn = np.asarray(goal)[:2] - pose[:2], wrap_angle(float(goal[2] - pose[2]))
     step = min(share, most_m / max(float(np.linalg.norm(gap)), 1e-9))
     turn = max(-most_rad, min(most_rad, share * turn))

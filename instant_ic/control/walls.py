@@ -1,4 +1,4 @@
-"""Walls of the static map: long straight runs of occupied cells. What is shorter is an obstacle."""
+"""Walls of the static map: long straight runs of occupied cells. Shorter runs are obstacles."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ def occupied_cells(static: StaticMap, occupied_threshold: int) -> NDArray[np.boo
 class WallMap:
     """Distance to the nearest wall of a map.
 
-    Two things are told apart by length alone: a straight run of at least ``min_length_m`` is a wall, which the
-    v-bot does not pass; a box, a chair or a person is not, even where it touches a wall. Curved walls count as
-    obstacles.
+    Only length separates the two: a straight run of at least ``min_length_m`` is a wall, which the v-bot does not
+    pass. A box, a chair or a person is an obstacle, even where it touches a wall. Curved walls count as obstacles.
     """
 
     def __init__(self, static: StaticMap, min_length_m: float = 1.5, occupied_threshold: int = 65) -> None:
@@ -51,9 +50,9 @@ class WallMap:
 
 
 class WallFinder:
-    """Walls of a map that grows: looked for anew only where occupied cells have changed.
+    """Walls of a growing map; searched again only where occupied cells have changed.
 
-    Finding walls in a large map takes tens of milliseconds, and a map comes each second; most say nothing new. Not
+    Finding walls in a large map takes tens of milliseconds, and a map comes each second; most bring nothing new. Not
     thread-safe: one caller at a time, on any thread.
     """
 
@@ -63,7 +62,7 @@ class WallFinder:
         self._found: WallMap | None = None
 
     def find(self, static: StaticMap) -> WallMap:
-        """The walls of ``static``; the same object as before where nothing has changed."""
+        """Return the walls of ``static``; the same object as before if nothing has changed."""
         if self._found is None or not self._same(self._found.static, static):
             self._found = WallMap(static, self.min_length_m, self.occupied_threshold)
         return self._found

@@ -1,4 +1,4 @@
-"""Compiles the kernels before the robot moves: the first call of each costs up to seconds."""
+"""Compiles the kernels before the robot moves: the first call of each takes up to seconds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig
 
 
 def warm_up() -> None:
-    """Runs each numba kernel of this folder once on a small room."""
+    """Run each numba kernel of this folder once on a small room."""
     config, footprint = CostmapConfig(width=4.0), Footprint()
     ranges = np.full(90, 1.5, dtype=np.float64)
     rays = scan_rays(ranges, -math.pi, 2 * math.pi / 90, 0.1, 10.0, np.eye(4), config)
