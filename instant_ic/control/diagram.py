@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from instant_ic.control.freshness import TimeoutConfig
-from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS
+from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, STATES, TRANSITIONS, Mode
 
 
 def state_diagram() -> str:
@@ -35,9 +35,10 @@ def source_table(timeouts: TimeoutConfig | None = None) -> str:
         "|---|---|---|---|",
     ]
     for source in SOURCES:
-        modes = ", ".join(mode.name for mode in source.modes)
+        unused = set(STATES) - set(source.modes)
+        modes = "all but STOPPED" if unused == {Mode.STOPPED} else ", ".join(mode.name for mode in source.modes)
         timeout = getattr(timeouts, source.key)
-        zero = f"{timeout:g} s" + (", or its own rhythm" if source.steady else "") if timeout else "never, as shipped"
-        stop = f"{max(timeout, timeouts.stop_after_s):g} s" if timeout else "never, as shipped"
+        zero = f"{timeout:g} s" + (", longer at low rates" if source.steady else "") if timeout else "never by default"
+        stop = f"{max(timeout, timeouts.stop_after_s):g} s" if timeout else "never by default"
         rows.append(f"| {source.name} | {modes} | {zero} | {stop} |")
     return "\n".join(rows)

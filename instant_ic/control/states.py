@@ -44,13 +44,13 @@ class State:
 
 
 STATES: dict[Mode, State] = {
-    Mode.REAL: State("r-bot", "camera", "the v-bot goes with the r-bot"),
+    Mode.REAL: State("r-bot", "camera", "the v-bot moves with the r-bot"),
     Mode.ENTERING: State(
-        "r-bot, slowing to a stand by enter_timeout_s",
+        "r-bot, slowing to a stand within enter_timeout_s",
         "camera",
-        "the v-bot stands where the r-bot was when the picture shown was taken; its first view is awaited",
+        "the v-bot waits for its first view where the shown image was taken",
     ),
-    Mode.VIRTUAL: State("v-bot", "virtual space", "the r-bot follows to the subgoal"),
+    Mode.VIRTUAL: State("v-bot", "virtual space", "the r-bot drives to the subgoal"),
     Mode.RETURNING: State("r-bot", "virtual space", "the v-bot moves as the r-bot and is eased onto it"),
     Mode.STOPPED: State("nobody", "camera", "both stand"),
 }
@@ -88,36 +88,33 @@ TRANSITIONS: tuple[Transition, ...] = (
 """In order: the first row of the present state whose guard holds is taken, at most one per step."""
 
 GUARDS: dict[str, str] = {
-    "estop_pressed": "the emergency stop is pressed",
-    "source_lost": "a source that this state needs has been silent for stop_after_s (camera and views: for twice "
-    "their time-out, where that is longer)",
+    "estop_pressed": "the emergency stop is latched",
+    "source_lost": "a source that this state needs has been silent for stop_after_s (camera, views: for twice their "
+    "time-out, if that is longer)",
     "vspace_lost": "the virtual space has failed, or its node is silent",
-    "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready here, and there is a way "
-    "round for the r-bot; after an entry that was given up, a view must fit first, or the operator let go",
-    "entry_moot": "the virtual space is no longer ready, no fitting view has come within enter_timeout_s and the "
-    "time in which an image and a view of the standing r-bot can come, or the operator's command is safe for the r-bot "
-    "over the way that `rejoined` looks at",
-    "view_fits": "the newest rendered view and the newest camera picture were taken within picture_position_m and "
-    "picture_yaw_deg of each other",
-    "rejoined": "r-bot and v-bot agree in position and yaw for return_dwell_s, within return_near_m or for "
-    "return_patience_s, and the operator's command is safe for the r-bot over the way that switches in and over a "
-    "longer and wider one",
-    "unsafe_again": "the operator's command leads the r-bot into an obstacle again",
-    "picture_fits": "the v-bot has been eased onto the r-bot, the r-bot turns no faster than return_turn_rad_s, and "
-    "view and picture agree as in `view_fits`, within return_picture_m and return_picture_yaw_deg (after "
-    "return_timeout_s the first is enough, after twice that it goes on with what is left)",
-    "may_resume": "the emergency stop is released, every source is fresh for recover_s, camera images come every "
-    "slowest_image_s or more often, the operator's command is zero (silence counts as zero), and the operator's link "
-    "is back where its loss was the reason",
+    "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
+    "round; after an abandoned entry, also: a view fits, or the operator let go",
+    "entry_moot": "the virtual space is no longer ready; no view fits after enter_timeout_s plus the delay of an image "
+    "and a view; or the command is safe for the r-bot as in `rejoined`",
+    "view_fits": "the places of the newest view and the newest camera image agree within picture_position_m and "
+    "picture_yaw_deg",
+    "rejoined": "r-bot and v-bot agree for return_dwell_s, to within return_near_m or for return_patience_s; the "
+    "command is safe for the r-bot over the prediction horizon and over a longer and wider one",
+    "unsafe_again": "the command leads the r-bot into an obstacle again",
+    "picture_fits": "the v-bot is on the r-bot within return_picture_m and return_picture_yaw_deg, the r-bot turns no "
+    "faster than return_turn_rad_s, and view and image agree as closely (after return_timeout_s the first is enough, "
+    "after twice that nothing is required)",
+    "may_resume": "the emergency stop is released, every source has been fresh for recover_s, images arrive at least "
+    "every slowest_image_s, the command is zero or silent, and a lost operator's link that caused the stop is back",
 }
 
 ACTIONS: dict[str, str] = {
-    "stop": "command zero; the r-bot is shown",
-    "call_vbot": "views of the v-bot's pose are asked for; the r-bot slows",
-    "place_vbot": "the v-bot is driven and shown, from where it is: the pose of the picture that was shown",
-    "ease_vbot": "the r-bot is driven, the v-bot is eased onto it and still shown",
-    "drive_vbot_on": "the v-bot is driven again, from where it is",
-    "hand_back": "the r-bot is driven and shown",
+    "stop": "command zero; show the camera",
+    "call_vbot": "request views of the v-bot's pose; slow the r-bot",
+    "place_vbot": "drive and show the v-bot, from the pose of the shown image",
+    "ease_vbot": "drive the r-bot, ease the v-bot onto it, keep showing the v-bot",
+    "drive_vbot_on": "drive the v-bot again, from its present pose",
+    "hand_back": "drive and show the r-bot",
 }
 
 
