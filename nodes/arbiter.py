@@ -420,7 +420,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         assert self.points is not None  # the message came from this subscription
         self.note_used("points", self.points)
         counts = self.sweep.counts
-        self.diagnose("points", OK, f"{counts['obstacle']} points in the way", **counts)
+        self.diagnose("points", OK, f"{counts['obstacle']} obstacle points", **counts)
         return stamp_ns(message)
 
     def sorted(self, message: PointCloud2) -> SortedPoints:
@@ -443,7 +443,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         pose, scan = self.robot_pose(), self.scan.message
         if pose is None or scan is None:
             missing = "no pose" if pose is None else "no LiDAR scan"
-            self.diagnose("costmap", WARN if self.costmap is not None else OK, f"costmap stands still: {missing}")
+            self.diagnose("costmap", WARN if self.costmap is not None else OK, f"costmap is not updated: {missing}")
             return
         if (stamp_ns(scan), points_ns) == self.taken:
             return
@@ -452,10 +452,10 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             map_from_odom = self.tf.lookup("map", "odom")
             map_from_lidar = map_from_odom @ self.tf.lookup("odom", scan.header.frame_id, stamp_ns(scan))
         except TransformError as error:
-            self.diagnose("costmap", WARN, f"costmap stands still: {error}")
+            self.diagnose("costmap", WARN, f"costmap is not updated: {error}")
             return
         if self.map_from_odom is not None and self.jumped(self.map_from_odom, map_from_odom):
-            self.log.info("the map has been corrected: the costmap forgets what the scans marked")
+            self.log.info("the map has jumped: the marks of scans are cleared from the costmap")
             self.costmaps.reset()
         self.map_from_odom = map_from_odom
         rays = scan_rays(

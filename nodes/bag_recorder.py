@@ -195,7 +195,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     def _record(self, name: str = "") -> dict[str, Any]:
         assert self.run_dir is not None
         if self.on_demand is None:
-            raise NodeError("it records all the time: one with snapshot: true records when it is asked")
+            raise NodeError("this recorder records all the time; only one with snapshot: true records on request")
         try:
             path = self.on_demand.start(name)
         except BagError as error:
@@ -206,7 +206,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     def _end(self) -> dict[str, Any]:
         if self.on_demand is None:
-            raise NodeError("it records all the time, until it ends")
+            raise NodeError("this recorder records all the time, until it is shut down")
         return {"path": str(self.on_demand.stop())}
 
     def _status(self) -> dict[str, Any]:
@@ -241,14 +241,14 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         elif self.recorder.state in (FAILED, DISK_FULL):
             self.diagnose("bag", ERROR, self.recorder.error)
         elif self.recorder.told.overflow:
-            self.diagnose("bag", ERROR, f"{words}; the disk is too slow, left out: {_numbers(told['overflow'])}")
+            self.diagnose("bag", ERROR, f"{words}; the disk is too slow, dropped: {_numbers(told['overflow'])}")
         elif lost := self.recorder.lost():
             self.diagnose("bag", WARN, f"{words}; lost: {_numbers(lost)}", **{t.strip("/"): n for t, n in lost.items()})
         else:
             self.diagnose("bag", OK, words, messages=told["messages"])
         if unknown := self.recorder.unknown_types():
             named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
-            self.diagnose("types", WARN, f"recorded without their definition, which is not known here: {named}")
+            self.diagnose("types", WARN, f"recorded without type definition, which is unknown here: {named}")
 
     def teardown(self) -> None:
         """Complete the bag."""
@@ -264,7 +264,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             raise SystemExit(1) from None
         self.log.info("%s: %d messages", self.recorder.path, self.recorder.count)
         if self.recorder.failed:
-            self.log.error("not everything is in it: %s", self.recorder.error or "see the errors above")
+            self.log.error("the bag is incomplete: %s", self.recorder.error or "see the errors above")
             raise SystemExit(1)
 
 

@@ -337,7 +337,7 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
     def on_end(self, fault: BaseException | None, unstopped: str) -> None:
         """Report why the serial thread ended, and end the node unless it is ending anyway."""
         if unstopped:
-            self.log.error("motors could not be told to stop (%s); the controller's watchdog does it", unstopped)
+            self.log.error("no stop could be sent to the motors (%s); the controller's watchdog stops them", unstopped)
         if fault is not None:
             self.diagnose("link", ERROR, f"serial thread failed: {fault!r}")
             self.log.error("serial thread failed", exc_info=fault)

@@ -83,7 +83,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             self.model.provider, why,
         )  # fmt: skip
         if provider not in ("auto", self.model.provider):
-            self.log.warning("%s was asked for, %s runs the model%s", provider, self.model.provider, why)
+            self.log.warning("provider %s was requested, the model runs on %s%s", provider, self.model.provider, why)
 
     def tell_model(self) -> None:
         """Publish which kind of values ``/depth/raw`` carries, for the node that scales them."""
@@ -112,7 +112,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
             rgb = decode_rgb(message.data, 2 * manifest.input_width, 2 * manifest.input_height)
             return message.header, self.model.estimate(rgb), ""
         except JpegError as error:
-            return message.header, None, f"the picture {error}"
+            return message.header, None, f"the image {error}"
         except ValueError as error:  # not a panorama, or (ManifestError) outputs that show only in a run
             return message.header, None, str(error)
         except InferenceError as error:
@@ -130,10 +130,12 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         took_s = (self.clock.steady_ns() - began_ns) / 1e9
         if took_s <= self.config.timeout_s:
             return
-        self.diagnose("depth", ERROR, f"the inference has run for {took_s:.1f} s on {self.model.provider}; it is ended")
+        self.diagnose(
+            "depth", ERROR, f"the inference has run for {took_s:.1f} s on {self.model.provider}; it is cancelled"
+        )
         self.model.cancel()
         if took_s > self.config.timeout_s + _GIVE_UP_S:
-            self.log.error("the inference on %s hangs: ending, to be started anew", self.model.provider)
+            self.log.error("the inference on %s hangs: the node ends for a restart", self.model.provider)
             self.stop()
 
     def on_result(self, result: tuple[Any, NDArray[np.float32] | None, str]) -> None:

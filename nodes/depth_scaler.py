@@ -120,7 +120,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
 
     def warn_of_method(self) -> None:
         if self.config.scaler.method == "as_estimated" and self.config.source != "lidar":
-            self.log.warning("depth is taken as estimated, the LiDAR is not asked: for recordings, not for driving")
+            self.log.warning("depth is used as estimated, without the LiDAR: for recordings, not for driving")
 
     def on_model(self, message: Any) -> None:
         """Adopt the kind of values that the network reports, whatever the configuration says."""
@@ -175,7 +175,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     def handle(self, raw: NDArray[np.float32] | None, camera: str, stamp: int) -> None:
         """Compute, report and publish the depth of the image taken at ``stamp``."""
         if self.last_ns is not None and stamp < self.last_ns - _KEEP_NS:
-            self.log.warning("time went back by %.1f s: starting anew", (self.last_ns - stamp) / 1e9)
+            self.log.warning("time went back by %.1f s: restarting", (self.last_ns - stamp) / 1e9)
             self.selector.restart()
         self.last_ns = stamp
         result = self.estimate(raw, camera, stamp)
@@ -243,7 +243,7 @@ class DepthScalerNode(Node[DepthScalerConfig]):
     def offer_keyframe(self, result: DepthResult, camera: str, stamp: int) -> None:
         picture = self.pictures.get(stamp)
         if picture is None:
-            self.diagnose("keyframe", WARN, "the picture that this depth is of did not arrive here")
+            self.diagnose("keyframe", WARN, "the image that this depth belongs to did not arrive")
             return
         try:
             map_from_camera = self.map_from_camera(camera, stamp)

@@ -76,7 +76,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
     def setup(self) -> None:
         config = self.config
         if self.run_dir is None:
-            raise NodeError("the bridge needs the real bus; it has no place in lockstep")
+            raise NodeError("the bridge needs the real bus: it cannot run in lockstep")
         settings = ServerSettings(
             title=config.title,
             host=config.host,
@@ -103,7 +103,9 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         may = ["drive the robot"] * config.accept_operator + ["change parameters"] * config.set_parameters
         if not is_loopback(config.host):
             what = " and ".join(may or ["read everything"])
-            self.diagnose("access", WARN, f"whoever reaches {config.host}:{self.server.port} can {what}: no sign-in")
+            self.diagnose(
+                "access", WARN, f"anyone who reaches {config.host}:{self.server.port} can {what}: there is no sign-in"
+            )
         self._refused, self._next_refused_s = 0, 0.0
         # A thread, not a timer: with simulated time the timers may stand still while messages already arrive.
         self._look_thread = threading.Thread(target=self._look, name="discovery", daemon=True)
@@ -144,7 +146,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         )
         if self.server.refused != self._refused and time.monotonic() >= self._next_refused_s:  # must not fill the log
             self._refused, self._next_refused_s = self.server.refused, time.monotonic() + _REFUSED_S
-            self.diagnose("door", WARN, f"turned away: {self.server.refusal}", requests=self.server.refused)
+            self.diagnose("door", WARN, f"refused: {self.server.refusal}", requests=self.server.refused)
 
     def teardown(self) -> None:
         if self.server is not None:

@@ -197,7 +197,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         if newest is not None and newest - stamp > self.config.reset_on_time_jump_s * 1e9:
             self.wheel.clear()
         if not self.wheel.add(stamp, pose2_from_matrix(pose_matrix(message))):
-            self.diagnose("odometry", WARN, "a message that is not newer than the last, or not finite, was left out")
+            self.diagnose("odometry", WARN, "dropped a message that is not finite, or not newer than the last")
             return
         self.place_pending()
 
@@ -320,7 +320,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         """Apply the worker's result, unless its map has been discarded since."""
         slam, outcome, fault = result
         if fault:
-            self.diagnose("loops", ERROR, f"loop closing failed and is off until the node starts again: {fault}")
+            self.diagnose("loops", ERROR, f"loop closure failed and is off until the node restarts: {fault}")
         if slam is self.slam:
             slam.take_over(outcome)
 
@@ -357,7 +357,9 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.localized = result.localized
             if not result.localized:
                 self.diagnose(
-                    "place", WARN, "the robot's place in the saved map is not known yet: drive on, or tell it"
+                    "place",
+                    WARN,
+                    "the robot's place in the saved map is not known yet: drive on, or set it (/initialpose)",
                 )
             elif self.config.map_file:
                 self.diagnose("place", OK, "found in the saved map")
@@ -375,7 +377,7 @@ class GridSlamNode(Node[GridSlamConfig]):
             correction_m = round(float(np.hypot(*self.slam.map_from_odom[:2])), 3)
             self.diagnose("odometry", OK, "wheel odometry", correction_m=correction_m)
         elif self.config.use_wheel_odom:
-            self.diagnose("odometry", WARN, "no wheel odometry comes on /wheel/odom: LiDAR odometry stands in")
+            self.diagnose("odometry", WARN, "no wheel odometry on /wheel/odom: LiDAR odometry is used instead")
         else:
             self.diagnose("odometry", OK, "LiDAR odometry (use_wheel_odom is false)")
         if self.slam.map_clipped:
@@ -430,7 +432,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         """Report missing scans."""
         if self.last_scan_ns is None:
             if self.dropped == 0:
-                self.diagnose("scan", WARN, "no scan has come yet on /scan: is vlp16_driver running?")
+                self.diagnose("scan", WARN, "no scan on /scan yet: is vlp16_driver running?")
             return
         age_s = (self.clock.steady_ns() - self.scan_came_ns) * 1e-9
         if age_s > self.config.max_scan_age_s:

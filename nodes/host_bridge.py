@@ -139,7 +139,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             case Up():
                 self.log.info("linked with %s", peer)
                 for topic in self.troubled:
-                    self.diagnose(f"topic {topic}", OK, "no trouble since the newest link was made")
+                    self.diagnose(f"topic {topic}", OK, "no fault since the newest link")
                 self.troubled.clear()
                 self.tell()
             case Ended():
@@ -156,7 +156,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
             case Stranger():
                 self.strangers.add(1, time.time_ns())
                 self.log.warning(
-                    "turned away: %s, key %s, %d tries since the last such line (allowed hosts: ic keys list)",
+                    "refused: %s, key %s, %d attempts since the last such line (allowed hosts: ic keys list)",
                     event.address,
                     event.fingerprint,
                     event.times,
@@ -197,7 +197,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         self.diagnose("topics", WARN if recent else OK, text, **_numbers("out", out), **_numbers("in", into))
         if isinstance(self.link, ListeningLink):
             strangers = self.strangers.count(time.time_ns())
-            text = "somebody without an allowed key was turned away" if strangers else "nobody turned away lately"
+            text = "refused a host without an allowed key" if strangers else "no host refused recently"
             self.diagnose("door", WARN if strangers else OK, text, tries=self.link.strangers)
 
     def tell_link(self, peers: list[PeerStatus]) -> None:

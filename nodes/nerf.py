@@ -117,7 +117,7 @@ def read_mask(path: str) -> NDArray[np.bool_] | None:
         return None
     picture = load_image(path, cv2.IMREAD_GRAYSCALE)
     if picture is None:
-        raise NodeError(f"robot_mask {path}: no such file, or no picture that can be decoded")
+        raise NodeError(f"robot_mask {path}: no such file, or it cannot be decoded as an image")
     if picture.shape[1] != 2 * picture.shape[0]:
         size = f"{picture.shape[1]} x {picture.shape[0]}"
         raise NodeError(f"robot_mask {path}: must be twice as wide as high, as the panorama is (got {size})")
@@ -131,7 +131,7 @@ def decode_keyframe(keyframe: Any) -> tuple[Any, Any, Any, Any]:
         KeyframeError: the keyframe is marked unfit, or cannot be decoded.
     """
     if not keyframe.fit:
-        raise KeyframeError(f"its depth is not fit: {keyframe.message or 'no reason given'}")
+        raise KeyframeError(f"its depth is marked unfit: {keyframe.message or 'no reason given'}")
     data = np.asarray(keyframe.panorama.data, np.uint8)
     picture = decode_image(data, cv2.IMREAD_COLOR)
     if picture is None:
@@ -232,9 +232,9 @@ class NerfNode(Node[NerfConfig]):
     def draw(self, request: Any) -> None:
         pixels = int(request.width) * int(request.height)
         if self.state() == State.EMPTY:
-            self.diagnose("view", WARN, "a view was asked for, but no keyframe has come yet")
+            self.diagnose("view", WARN, "a view was requested before the first keyframe")
         elif pixels > self.config.max_view_pixels:
-            words = f"{request.width} x {request.height} asked for, max_view_pixels is {self.config.max_view_pixels}"
+            words = f"{request.width} x {request.height} requested, max_view_pixels is {self.config.max_view_pixels}"
             self.diagnose("view", WARN, words)
         else:
             self.start_job(Job("draw", request))
@@ -349,7 +349,7 @@ class NerfNode(Node[NerfConfig]):
         else:
             self.diagnose(kind, ERROR, words)
         if error is not None and type(error).__name__ not in ("OutOfMemoryError", "DeviceError", "MeshError"):
-            self.fault(f"virtual space, {kind}", error)  # those two are not bugs, and are reported
+            self.fault(f"virtual space, {kind}", error)  # the named errors are not bugs; they are reported above
 
     def refuse(self, keyframe: Any, words: str) -> None:
         self.diagnose("keyframe", ERROR, f"keyframe {keyframe.id} refused: {words}", id=keyframe.id)
@@ -382,7 +382,7 @@ class NerfNode(Node[NerfConfig]):
         self.expected_psnr_db, self.unseen_share = 0.0 if math.isnan(expected) else expected, view.unseen_share
         words = f"{request.width} x {request.height} in {self.render_ms:.0f} ms"
         if view.unseen_share > NOTHING_SEEN:
-            self.diagnose("view", WARN, f"{words}: no keyframe has seen anything from that pose; is it far off?")
+            self.diagnose("view", WARN, f"{words}: no keyframe shows anything from that pose; is it far away?")
         else:
             self.diagnose("view", OK, words)
         image = compressed_image_message(outcome.jpeg, "map", now)

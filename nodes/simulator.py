@@ -156,13 +156,13 @@ class SimulatorNode(Node[SimulatorConfig]):
     def _check(self) -> None:
         robot, config = self.simulation.robot, self.config
         if self._fault:
-            self.diagnose("simulation", ERROR, f"the simulation stopped: {self._fault}; start it again")
+            self.diagnose("simulation", ERROR, f"the simulation stopped: {self._fault}; restart it")
             return
         level, text = (WARN, "the robot pushes against something") if robot.contact else (OK, "free")
         self.diagnose("contact", level, text, contacts=robot.contacts)
         behind, self._behind_s = self._behind_s, 0.0
         if behind > 0:
-            self.diagnose("pace", WARN, f"the machine is too slow: the world stood still for {behind:.2f} s")
+            self.diagnose("pace", WARN, f"the machine is too slow: the simulation paused for {behind:.2f} s")
         else:
             self.diagnose("pace", OK, "real time" if current().real else f"{current().factor:g} of real time")
         if isinstance(self.scanner, Vlp16Server):
@@ -177,12 +177,12 @@ class SimulatorNode(Node[SimulatorConfig]):
         if self.camera is not None:
             rate, wanted = self.camera.rate_hz, config.camera.rate
             if not self.camera.watched:
-                self.diagnose("camera", OK, "nobody watches the preview", frames=self.camera.frames)
+                self.diagnose("camera", OK, "no client reads the preview", frames=self.camera.frames)
             elif 0 < rate < 0.8 * wanted:
-                text = f"{rate:.1f} of {wanted:.1f} pictures a second: the machine is too slow"
+                text = f"{rate:.1f} of {wanted:.1f} images per second: the machine is too slow"
                 self.diagnose("camera", WARN, text, frames=self.camera.frames)
             else:
-                text = f"{rate:.1f} pictures a second" if rate else "the preview begins"
+                text = f"{rate:.1f} images per second" if rate else "the preview starts"
                 self.diagnose("camera", OK, text, frames=self.camera.frames)
 
 

@@ -145,10 +145,10 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.published_told = self.published
         if silent_s <= self.config.silence_s:
             if self.published:
-                self.diagnose("pictures", OK, "pictures come", **values)
+                self.diagnose("pictures", OK, "receiving images", **values)
             return
         level = ERROR if silent_s > 4.0 * self.config.silence_s else WARN
-        self.diagnose("pictures", level, f"no picture for {silent_s:.1f} s", **values)
+        self.diagnose("pictures", level, f"no image for {silent_s:.1f} s", **values)
 
     def on_health(self, health: ThetaState | str) -> None:
         """Report battery, temperature and errors of the Theta."""
@@ -165,7 +165,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         self.diagnose(
             "health",
             ERROR if health.errors else WARN if low or hot else OK,
-            ", ".join(text) or "well",
+            ", ".join(text) or "no faults",
             battery=health.battery,
             battery_temperature_c=health.battery_temperature_c,
             board_temperature_c=health.board_temperature_c,
@@ -175,7 +175,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         loop = getattr(self, "loop", None)
         if loop is not None:
             if loop.is_alive() and not loop.end():
-                self.log.warning("the camera's thread is still waiting for %s; left behind", self.config.url)
+                self.log.warning("the camera's thread is still waiting for %s and is abandoned", self.config.url)
         elif hasattr(self, "camera"):
             self.camera.close()
 

@@ -272,7 +272,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         """Poses of the base around a revolution from /tf; None where they are not published."""
         newest_ns = self.tf.newest_ns("base_link")
         if newest_ns is None:
-            self.diagnose("motion", OK, "no odometry: the base is taken to stand")
+            self.diagnose("motion", OK, "no odometry: the base is assumed to stand still")
             return None
         # Odometry of the last milliseconds has not arrived yet: the motion is extrapolated.
         stop_ns = min(revolution.end_ns, newest_ns)
@@ -327,12 +327,14 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
             self.diagnose("packets", WARN, "no packet yet", **values)
         elif any(new):
             text = (
-                f"in the last second {new[0]} packets missing, {new[1]} no VLP-16 packets, {new[2]} revolutions skipped"
+                f"in the last second {new[0]} packets missing, {new[1]} not from a VLP-16, {new[2]} revolutions skipped"
             )
             self.diagnose("packets", WARN, text, **values)
         else:
             partial, self.partial_told = self.partial - self.partial_told, self.partial
-            text = f"packets come; {partial} revolutions were cut short and gave no scan" if partial else "packets come"
+            text = (
+                f"receiving packets; {partial} incomplete revolutions gave no scan" if partial else "receiving packets"
+            )
             self.diagnose("packets", OK, text, **values)
 
     def silence(self, silent_s: float) -> str:
@@ -340,7 +342,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         if self.config.source == "topic":
             return f"no /lidar/packets for {silent_s:.1f} s"
         if self.config.source == "pcap":
-            return f"{self.config.pcap} is at its end"
+            return f"{self.config.pcap} has ended"
         return (
             f"no packet on UDP {self.config.host}:{self.receiver.port} for {silent_s:.1f} s: is the sensor on, does "
             "its destination address fit, is this host in its network (factory: 192.168.1.201), does a firewall "

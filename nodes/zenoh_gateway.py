@@ -82,9 +82,11 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
     def setup(self) -> None:
         """Open the session."""
         if self.run_dir is None:
-            raise NodeError("the gateway needs the real bus and a real Zenoh session; it has no place in lockstep")
+            raise NodeError("the gateway needs the real bus and a real Zenoh session: it cannot run in lockstep")
         if self.namespace:
-            raise NodeError(f"--namespace {self.namespace}: for the names there set the parameter namespace instead")
+            raise NodeError(
+                f"--namespace {self.namespace}: to set the names in Zenoh, use the parameter namespace instead"
+            )
         config = self.config
         self.gate = CommandGate(config.limits)
         self._watch = TopicWatch(self.run_dir)

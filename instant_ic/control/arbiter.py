@@ -516,7 +516,7 @@ class Arbiter:
             return ""
         if self._why_not_virtual(situation):
             return ""
-        return f"obstacle in {prediction.time_to_obstacle_s:.1f} s: the virtual space is about to be shown"
+        return f"obstacle in {prediction.time_to_obstacle_s:.1f} s: switching to the virtual space"
 
     def _why_not_virtual(self, situation: _Situation) -> str:
         """Reason against a switch although an obstacle is ahead; "" when there is none."""
@@ -531,14 +531,17 @@ class Arbiter:
             return "the virtual space is not ready" + (f" ({vspace.message})" if vspace.message else "")
         away = float(np.linalg.norm(vspace.position - inputs.robot_pose[:2]))
         if away > vspace.ready_radius_m:
-            return f"the virtual space is fit to show {vspace.ready_radius_m:.1f} m round a place {away:.1f} m off"
+            return (
+                f"the virtual space is valid within {vspace.ready_radius_m:.1f} m of its keyframe, "
+                f"which is {away:.1f} m away"
+            )
         if 0.0 < vspace.expected_psnr_db < switch.min_expected_psnr_db:  # NaN means unknown
             return (
-                f"the virtual space would show this place too badly ({vspace.expected_psnr_db:.0f} dB expected, "
+                f"the virtual space shows this place too poorly ({vspace.expected_psnr_db:.0f} dB expected, "
                 f"{switch.min_expected_psnr_db:.0f} dB needed)"
             )
         if self._no_view_fits:
-            return "no image of the virtual space fits here; let go and drive on to try again"
+            return "no view of the virtual space fits here; let go, then drive on to try again"
         back = self._returned_ns
         if back is not None and situation.now_ns - back < switch.min_real_s * 1e9:
             return "just back from the virtual space"
@@ -572,10 +575,10 @@ class Arbiter:
     def _entry_moot(self, situation: _Situation) -> str:
         inputs = situation.inputs
         if inputs.age("vspace") > self.config.timeouts.vspace or not self._shown_vspace(situation).ready:
-            return "the virtual space is not ready any more"
+            return "the virtual space is no longer ready"
         if self._seconds_in_mode(situation.now_ns) > self._entry_patience_s(inputs):
             self._no_view_fits = True
-            return "no fitting picture of the virtual space has come"
+            return "no fitting view of the virtual space has arrived"
         return "you drive the robot" if self._safe_ahead(situation) else ""
 
     def _entry_patience_s(self, inputs: ArbiterInputs) -> float:
@@ -724,7 +727,7 @@ class Arbiter:
         inputs = situation.inputs
         reason = "you drive the virtual robot" + self._far_from_keyframe(situation)
         if self._leading_back:
-            return (0.0, 0.0), False, "nobody drives: the view is led back to the robot; drive to go on"
+            return (0.0, 0.0), False, "no command: the view goes back to the robot; drive to continue"
         if self._subgoal is None:
             return (0.0, 0.0), False, reason + "; no free place for the robot near it"
         wanted = clip_twist(*inputs.nav_command, self.config.limits)
@@ -733,9 +736,9 @@ class Arbiter:
         sent = self._monitored(self._paced(wanted, situation), situation)
         left_s = self.config.switch.lead_back_after_s - self._idle_s(situation)
         if self._agree_since_ns is None and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
-            reason = f"the robot cannot come to where you stopped: in {left_s:.0f} s the view is led back to it"
+            reason = f"the robot cannot reach your place: the view goes back to the robot in {left_s:.0f} s"
         elif sent.action != "free":
-            reason += "; the robot slows down for something close"
+            reason += "; the robot slows down near an obstacle"
         elif self._slow_since_ns is not None and situation.now_ns - self._slow_since_ns > _SLOW_NS:
             reason += "; slowed: a wall is ahead, or the robot must catch up"
         return sent.command, False, reason
@@ -754,14 +757,12 @@ class Arbiter:
         """Text for a v-bot outside the region that the virtual space shows well; "" inside."""
         expected_db = situation.inputs.vspace.expected_psnr_db
         if 0.0 < expected_db < self.config.switch.min_expected_psnr_db:
-            return f"; the picture is mostly guessed here ({expected_db:.0f} dB expected)"
+            return f"; most of the view is guessed here ({expected_db:.0f} dB expected)"
         if self._ready is None:
             return ""
         vspace = self._ready[1]
         away = float(np.linalg.norm(situation.vbot_pose[:2] - vspace.position))
-        return (
-            "" if away <= vspace.ready_radius_m else f"; the picture gets worse {away:.1f} m from where it was learnt"
-        )
+        return "" if away <= vspace.ready_radius_m else f"; the view gets worse {away:.1f} m from its keyframe"
 
     def _real_command(self, situation: _Situation) -> tuple[Twist2, bool, str]:
         command, prediction = situation.command, situation.prediction
@@ -773,21 +774,21 @@ class Arbiter:
                 why = self._why_not_virtual(situation) or "obstacle ahead"
                 reason = f"blocked: obstacle in {prediction.distance_m:.1f} m; {why}"
         if self.mode == Mode.ENTERING:
-            reason = "obstacle ahead: the virtual space is about to be shown"
+            reason = "obstacle ahead: switching to the virtual space"
             waited = self._seconds_in_mode(situation.now_ns) / self.config.switch.enter_timeout_s
             left = max(0.0, 1.0 - waited**2)  # hardly noticed if the view comes in time
             command = (command[0] * left, command[1] * left)
         elif self.mode == Mode.RETURNING:
-            reason = "you drive the robot; the real view is about to come back"
+            reason = "you drive the robot; switching back to the camera"
         paced = self._paced(command, situation)
         if paced != command and not blocked:
-            reason += "; slower: images come rarely"
+            reason += "; slowed: the image rate is low"
         sent = self._monitored(paced, situation)
         if sent.action in ("approach", "stop") and not blocked:
             blocked = True
             reason = f"blocked: contact in {sent.time_to_collision_s:.1f} s"
         elif sent.action != "free" and not blocked:
-            reason += "; slowed down for something close"
+            reason += "; slowed down near an obstacle"
         return sent.command, blocked, reason
 
     def _monitored(self, command: Twist2, situation: _Situation) -> MonitoredCommand:
@@ -830,9 +831,9 @@ class Arbiter:
     def _why_stopped(self, situation: _Situation) -> str:
         inputs = situation.inputs
         if inputs.estop_button:
-            return "emergency stop button: let it out, then release the stop here"
+            return "emergency stop button is pressed: release it, then release the stop here"
         if inputs.estop:
-            return inputs.estop_why or "emergency stop: release it to go on"
+            return inputs.estop_why or "emergency stop: release it to continue"
         lacking = self._lacking(inputs, Mode.REAL, situation.now_ns)
         if lacking:
             return "stopped: " + _no_data(lacking)
@@ -841,7 +842,7 @@ class Arbiter:
         if self._too_rare(inputs):
             return f"stopped: waiting for a camera image every {self.config.timeouts.slowest_image_s:g} s or more often"
         if situation.command != (0.0, 0.0):
-            return f"let go of the controls to go on (stopped: {self._stop_reason})"
+            return f"let go of the controls to continue (stopped: {self._stop_reason})"
         return f"stopped: {self._stop_reason}"
 
 

@@ -247,7 +247,7 @@ def test_diagnoses_tell_link_clock_topics_and_door(hosts):
     _, _, values = b.node.diagnoses()["clock of robot"]
     assert set(values) == {"offset_ms", "rtt_ms", "jitter_ms"} and abs(values["offset_ms"]) < 5
     assert a.told("link").startswith("linked with station (127.0.0.1, ") and a.told("link").endswith("; station drives")
-    assert a.told("door") == "nobody turned away lately"
+    assert a.told("door") == "no host refused recently"
     hand = hosts.neighbour("station", "hand")
     out = hand.publisher("/operator/estop", Bool, LATCHED)
     out.publish(Bool(data=True))

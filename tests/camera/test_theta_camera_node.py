@@ -112,7 +112,7 @@ def test_theta_over_real_sockets(run_dir: Path, monkeypatch: pytest.MonkeyPatch)
                 camera.last_ns = camera.clock.steady_ns() - round(seconds * 1e9)
                 camera.check()
                 level, text, _ = camera.diagnoses()["pictures"]
-                assert level == expected and text.startswith("no picture for")
+                assert level == expected and text.startswith("no image for")
         finally:
             for node in reversed(nodes):
                 node.close()

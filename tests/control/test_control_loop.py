@@ -70,7 +70,7 @@ def test_through_the_box_and_back(box: tuple[float, float, float, float], mapped
     ("vspace", "words"),
     [
         (Vspace(ready=False, message="training 1.2 s"), "not ready (training 1.2 s)"),
-        (Vspace(ready=True, position=np.array([-1.0, 0.0]), ready_radius_m=1.5), "fit to show 1.5 m round"),
+        (Vspace(ready=True, position=np.array([-1.0, 0.0]), ready_radius_m=1.5), "valid within 1.5 m of its keyframe"),
     ],
 )
 def test_without_a_virtual_space_the_robot_stops_and_says_why(vspace: Vspace, words: str) -> None:
@@ -259,7 +259,7 @@ def test_the_reason_of_a_stop_is_told_once_and_what_to_do_first() -> None:
     assert made.step(FORWARD).decision.reason == "stopped: no camera picture for 1.6 s"
     made.ages["camera"] = 0.0
     reason = made.step(FORWARD).decision.reason
-    assert reason == "let go of the controls to go on (stopped: no camera picture for 1.6 s)"
+    assert reason == "let go of the controls to continue (stopped: no camera picture for 1.6 s)"
     assert made.step(NOTHING).decision.reason == "stopped: no camera picture for 1.6 s"  # for recover_s
 
 
@@ -301,10 +301,10 @@ def test_a_vbot_beyond_what_the_space_can_show_is_told() -> None:
     drive(made, 4.6, FORWARD)
     assert made.modes()[-1] == "VIRTUAL"
     assert made.vbot.pose[0] < 2.0
-    assert "picture" not in made.frames[-1].decision.reason
+    assert "the view gets worse" not in made.frames[-1].decision.reason
     while made.vbot.pose[0] <= 2.2:
         drive(made, 0.05, FORWARD)
-    assert "the picture gets worse 2.2 m from where it was learnt" in made.step(FORWARD).decision.reason
+    assert "the view gets worse 2.2 m from its keyframe" in made.step(FORWARD).decision.reason
 
 
 def test_a_failed_virtual_space_gives_the_real_view_back_by_way_of_a_stop() -> None:

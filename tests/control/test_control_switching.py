@@ -211,7 +211,7 @@ def test_without_a_fitting_view_the_entry_is_given_up_and_the_robot_stops_before
     made.ages["view"] = math.inf if lost == "view" else 0.0
     made.until(Mode.ENTERING, FORWARD)
     made.until(Mode.REAL, FORWARD, entry_patience_s() + 0.1)
-    assert "no image of the virtual space fits here; let go" in made.steps[-1].reason
+    assert "no view of the virtual space fits here; let go" in made.steps[-1].reason
     # Not tried again and again while the key is held.
     changes = made.steps[-1].transitions
     made.drive(8.0, FORWARD)
@@ -340,7 +340,7 @@ def test_no_entry_where_the_view_would_be_bad_and_an_unknown_quality_is_none() -
         made.drive(4.0, FORWARD)
         assert (Mode.ENTERING in {d.mode for d in made.steps}) == (mode == Mode.ENTERING)
         if mode == Mode.REAL:
-            assert "too badly (9 dB expected, 12 dB needed)" in made.steps[-1].reason
+            assert "too poorly (9 dB expected, 12 dB needed)" in made.steps[-1].reason
 
 
 def test_without_views_in_the_virtual_space_both_robots_stand() -> None:
@@ -364,7 +364,7 @@ def test_a_vbot_left_inside_an_obstacle_is_led_back_gently_and_told_and_a_comman
     made.start()
     while made.vbot.pose[0] < 2.6:
         made.step(FORWARD)
-    while "in 2 s the view is led back" not in made.step(NOTHING).decision.reason:
+    while "the view goes back to the robot in 2 s" not in made.step(NOTHING).decision.reason:
         assert len(made.frames) < 600
     while made.frames[-1].decision.vbot_action != VbotAction.LED_BACK:
         made.step(NOTHING)
@@ -373,7 +373,7 @@ def test_a_vbot_left_inside_an_obstacle_is_led_back_gently_and_told_and_a_comman
     for _ in range(10):
         frame = made.step(NOTHING)
         assert frame.command == NOTHING
-        assert "led back to the robot; drive to go on" in frame.decision.reason
+        assert "the view goes back to the robot; drive to continue" in frame.decision.reason
     assert 0.02 < np.linalg.norm(made.vbot.pose[:2] - start[:2]) <= 0.1
     assert made.step(FORWARD).decision.vbot_action == VbotAction.DRIVEN
     while made.decision.mode.shows_vbot:

@@ -122,7 +122,7 @@ def test_hanging_inference_is_ended_and_then_the_process(
         assert not node.stopping
         with caplog.at_level(logging.ERROR):
             bus.advance_to(START + 16 * S)
-        assert node.stopping and "hangs: ending, to be started anew" in caplog.text
+        assert node.stopping and "hangs: the node ends for a restart" in caplog.text
 
 
 def test_unknown_provider_is_refused() -> None:

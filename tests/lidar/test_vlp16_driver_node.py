@@ -78,7 +78,7 @@ def test_capture_gives_points_packets_scans_and_the_mount(capture: Path) -> None
     assert transform_matrix(mount)[:3, 3].tolist() == [0.0, 0.0, 0.6]
     assert node.diagnoses()["capture"][:2] == (WARN, "303 datagrams played; left out: 1 x not IP")
     bus.advance(0.6)
-    text = "packets come; 1 revolutions were cut short and gave no scan"
+    text = "receiving packets; 1 incomplete revolutions gave no scan"
     assert node.diagnoses()["packets"][:2] == (OK, text)
     assert node.diagnoses()["position"][:2] == (OK, "pulse per second locked")
 
