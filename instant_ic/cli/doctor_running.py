@@ -23,8 +23,8 @@ ADVICE: tuple[tuple[str, str], ...] = (
     ("3D points", "look at the VLP-16's driver (ic topic info /lidar/points)"),
     ("wheel odometry", "look at crawler_base and its serial port (ic topic info /wheel/odom)"),
     ("SLAM pose", "look at grid_slam and the machine's load (ic top)"),
-    ("camera picture", "look at the camera and the link to the page (ic topic info /camera/image/compressed)"),
-    ("picture of the virtual space", "look at nerf, the console and the machine's load (ic top)"),
+    ("camera image", "look at the camera and the link to the page (ic topic info /camera/image/compressed)"),
+    ("view of the virtual space", "look at nerf, the console and the machine's load (ic top)"),
     ("virtual space", "look at depth and keyframes; without a virtual space the robot stops before obstacles"),
     (
         "no way round",

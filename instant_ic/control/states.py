@@ -143,9 +143,9 @@ SOURCES: tuple[Source, ...] = (
     Source("points", "3D points", _MOVING, optional=True),
     Source("odometry", "wheel odometry", _MOVING),
     Source("pose", "SLAM pose", _MOVING),
-    Source("camera", "camera picture", (Mode.REAL, Mode.ENTERING, Mode.RETURNING), steady=True),
-    Source("estop_input", "word from the emergency stop button", _MOVING, optional=True),
-    Source("view", "picture of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
+    Source("camera", "camera image", (Mode.REAL, Mode.ENTERING, Mode.RETURNING), steady=True),
+    Source("estop_input", "message from the emergency stop button", _MOVING, optional=True),
+    Source("view", "view of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
     Source("vbot", "v-bot", (Mode.VIRTUAL, Mode.RETURNING)),
     Source("nav", "path follower", (Mode.VIRTUAL,)),
     # Where the operator drives the r-bot, silence is only a zero command; in VIRTUAL the r-bot would go on to the

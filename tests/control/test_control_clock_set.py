@@ -36,7 +36,7 @@ def test_silent_sources_stop_the_robot_after_the_clock_was_set(jump_s: int) -> N
         arbiter.spin_once()
     assert arbiter.ages()["camera"] == pytest.approx(3.0)
     state = bus.last("/ic/state")
-    assert state.mode == ControlState.STOPPED and "no camera picture for 3.0 s" in state.reason
+    assert state.mode == ControlState.STOPPED and "no camera image for 3.0 s" in state.reason
     assert state.header.stamp.sec == clock.now_ns() // S  # stamps are those of the clock as it is now
     assert len(bus.messages("/cmd_vel")) >= 50  # 20 a second, none left out and none made up for
     assert all(message.twist.linear.x == 0.0 for message in bus.messages("/cmd_vel"))

@@ -256,11 +256,11 @@ def test_the_reason_of_a_stop_is_told_once_and_what_to_do_first() -> None:
     made = loop(None)
     drive(made, 1.0, FORWARD)
     made.ages["camera"] = 1.6
-    assert made.step(FORWARD).decision.reason == "stopped: no camera picture for 1.6 s"
+    assert made.step(FORWARD).decision.reason == "stopped: no camera image for 1.6 s"
     made.ages["camera"] = 0.0
     reason = made.step(FORWARD).decision.reason
-    assert reason == "let go of the controls to continue (stopped: no camera picture for 1.6 s)"
-    assert made.step(NOTHING).decision.reason == "stopped: no camera picture for 1.6 s"  # for recover_s
+    assert reason == "let go of the controls to continue (stopped: no camera image for 1.6 s)"
+    assert made.step(NOTHING).decision.reason == "stopped: no camera image for 1.6 s"  # for recover_s
 
 
 @functools.cache

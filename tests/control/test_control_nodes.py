@@ -226,7 +226,7 @@ def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
         ("/lidar/points", "3D points", 0.1),
         ("/wheel/odom", "wheel odometry", 0.05),
         ("/operator/cmd_vel", "you drive the robot", 0.05),
-        ("/camera/image/compressed", "camera picture", 0.1),
+        ("/camera/image/compressed", "camera image", 0.1),
         ("/pose", "SLAM pose", 0.1),
     ],
 )
@@ -259,10 +259,10 @@ def test_a_camera_at_5_hz_is_late_by_its_own_rhythm() -> None:
         state = stack.step((0.4, 0.0) if k > 30 else None)
         age_s = (stack.now - last_ns) / 1e9
         if k > 32 and age_s < 0.299:  # the step at 0.3 s commands zero
-            assert "picture" not in state.reason
+            assert "camera image" not in state.reason
         if age_s > 0.31:
             assert twist_values(state.applied_command) == (0.0, 0.0)
-    assert "camera picture" in state.reason
+    assert "camera image" in state.reason
 
 
 def test_pictures_that_do_not_reach_the_operator_stop_the_robot() -> None:
@@ -275,7 +275,7 @@ def test_pictures_that_do_not_reach_the_operator_stop_the_robot() -> None:
         stack.step((0.4, 0.0))
         stack.picture_ns = frozen
     assert twist_values(stack.bus.last("/cmd_vel")) == (0.0, 0.0)
-    assert "camera picture" in stack.bus.last("/ic/state").reason
+    assert "camera image" in stack.bus.last("/ic/state").reason
 
 
 def test_both_robots_stand_when_the_views_stop_and_the_real_view_comes_back() -> None:

@@ -99,7 +99,7 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     began_s, began_x = made.time_s, made.base.pose[0]
     assert made.run(2.0, lambda: twist_values(made.state.applied_command) == NOTHING)
     assert made.time_s - began_s <= 1.0 / camera_hz + 0.3 + 0.06
-    assert "no camera picture" in made.state.reason
+    assert "no camera image" in made.state.reason
     assert made.run(3.0, lambda: made.modes[-1] == "STOPPED")
     # What is driven on one image, and then the base's latency and its braking.
     travel_m, speed = TimeoutConfig().image_travel_m, FORWARD[0]
@@ -122,7 +122,7 @@ def test_lost_views_stop_both_robots_in_the_virtual_space_at_one_view_per_second
     began_s = made.time_s
     assert made.run(3.0, lambda: twist_values(made.state.applied_command) == NOTHING)
     assert made.time_s - began_s <= 1.0 + 0.3 + 0.06
-    assert "no picture of the virtual space" in made.state.reason
+    assert "no view of the virtual space" in made.state.reason
     assert made.run(3.0, lambda: made.modes[-1] == "STOPPED")
 
 

@@ -350,7 +350,7 @@ def test_without_views_in_the_virtual_space_both_robots_stand() -> None:
     made.ages["view"] = 0.36
     decision = made.step(FORWARD)
     assert (decision.command, decision.vbot_action) == (NOTHING, VbotAction.HELD)
-    assert "no picture of the virtual space for 0.4 s" in decision.reason
+    assert "no view of the virtual space for 0.4 s" in decision.reason
     stood = made.drive(0.6, FORWARD) and made.vbot.pose.copy()
     made.drive(0.6, FORWARD)
     np.testing.assert_allclose(made.vbot.pose, stood, atol=1e-9)
