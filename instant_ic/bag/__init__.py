@@ -1,4 +1,4 @@
-"""Bags: rosbag2 folders (MCAP) written and read as bytes, replayed in lockstep, compared (docs/bags.md)."""
+"""Bags: write and read rosbag2 folders (MCAP) as bytes, replay them in lockstep, compare them (docs/bags.md)."""
 
 from instant_ic.bag.errors import BagError, DiskFullError
 from instant_ic.bag.files import BagMessage, BagReader, TopicSummary

@@ -1,4 +1,4 @@
-"""Decompression that stops at a limit, for our readers and for those of `rosbags`: 19 kB of zstd became 617 MB."""
+"""Bounded decompression, for our readers and for those of `rosbags`: 19 kB of zstd can expand to 617 MB."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ if TYPE_CHECKING:
     import apsw
 
 MOST_CHUNK_BYTES = 256 << 20
-"""Of a chunk or a message, decompressed. Recorders end chunks at about 1 MB, but a message may be larger alone."""
+"""Largest decompressed chunk or message. Recorders close chunks at about 1 MB, but a single message may be larger."""
 MOST_FILE_BYTES = 64 << 30
-"""Of a file that was compressed as a whole."""
+"""Largest decompressed size of a file that was compressed as a whole."""
 _FREE_BYTES = 2 << 30
-"""Stay free on the disk that such a file is unpacked to."""
+"""Space that must stay free on the disk such a file is unpacked to."""
 _PIECE = 1 << 20
 
 
 def decompress(data: bytes | memoryview, compression: str, declared_bytes: int | None = None) -> bytes:
-    """The content of one frame; of a cut one, what its whole blocks hold.
+    """Decompress one frame. A truncated frame yields the content of its complete blocks.
 
     Args:
-        data: compressed.
+        data: compressed bytes.
         compression: ``zstd``, ``lz4`` or ``bz2``; empty for none.
-        declared_bytes: what it says to hold; `MOST_CHUNK_BYTES` is the limit in any case.
+        declared_bytes: decompressed size that the frame declares; `MOST_CHUNK_BYTES` is the limit in any case.
 
     Raises:
-        ValueError: damaged, longer than declared or than the limit, or an unknown compression.
+        ValueError: the data are damaged or larger than declared or allowed, or the compression is unknown.
     """
     most_bytes = MOST_CHUNK_BYTES if declared_bytes is None else declared_bytes
     if most_bytes > MOST_CHUNK_BYTES:
@@ -51,15 +51,15 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
             if size > most_bytes:
                 raise ValueError(f"it holds more than the {most_bytes} bytes that it declares or may have")
             out.append(piece)
-    except (RuntimeError, OSError, EOFError) as error:  # lz4's, bz2's
+    except (RuntimeError, OSError, EOFError) as error:  # raised by lz4 and bz2
         raise ValueError(str(error)) from None
     return b"".join(out)
 
 
 def guard_rosbags() -> None:
-    """Put the limits into `rosbags`, which has none: chunks of MCAP and ROS 1, messages, whole files, SQLite's values.
+    """Add size limits to `rosbags`, which has none: MCAP and ROS 1 chunks, messages, whole files, SQLite values.
 
-    Its tables of decompressors are replaced; a test holds that they are used.
+    This replaces the decompressor tables of `rosbags`; a test checks that `rosbags` uses the replacements.
     """
     import apsw
     from rosbags.rosbag1 import reader as ros1
@@ -73,7 +73,7 @@ def guard_rosbags() -> None:
     ros2.zstd = SimpleNamespace(  # type: ignore[assignment]
         decompress=lambda data: decompress(data, "zstd"), open=_open_zstd
     )
-    # A column may be computed: zeroblob(1000000000) is a gigabyte in 20 bytes.
+    # A column may be computed: the 20 bytes of zeroblob(1000000000) yield a gigabyte.
     if _limit_values not in apsw.connection_hooks:
         apsw.connection_hooks.append(_limit_values)
 
@@ -93,14 +93,14 @@ def _open_zstd(stream: BinaryIO, _mode: str) -> Iterator[_FileLimit]:
 
 
 class _FileLimit:
-    """A stream that ends with an error at the limit of files, or before the disk of temporary files is full."""
+    """A stream that raises at the file size limit, or before the disk for temporary files is full."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
         self._left = min(MOST_FILE_BYTES, shutil.disk_usage(tempfile.gettempdir()).free - _FREE_BYTES)
 
     def read(self, size: int = _PIECE) -> bytes:
-        """The next piece.
+        """Return the next piece.
 
         Raises:
             BagError: the limit is reached.

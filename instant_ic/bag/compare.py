@@ -1,4 +1,4 @@
-"""Compares two bags topic by topic, message by message, field by field, with tolerances where they are wanted."""
+"""Compares two bags topic by topic, message by message, field by field, with optional tolerances."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from instant_ic.bag.files import BagMessage, BagReader
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What may differ.
+    """Allowed differences between two bags.
 
     Attributes:
-        atol: numbers may differ by this,
-        rtol: plus this share of the first bag's value.
-        fields: pattern → absolute tolerance of its own.
-        ignore: patterns of fields that are not looked at.
-        stamp_s: pairs the messages of a topic by their stamps, which may differ by so many seconds; None pairs them by
-            their order, and their stamps must be the same.
+        atol: allowed absolute difference of numbers.
+        rtol: allowed relative difference, as a share of the first bag's value; added to ``atol``.
+        fields: pattern → absolute tolerance of the fields that match it.
+        ignore: patterns of fields that are not compared.
+        stamp_s: pair the messages of a topic by stamp, where stamps may differ by this many seconds; None pairs them by
+            order and requires equal stamps.
 
-    A pattern is a field with all that is in it (``header.stamp``, ``pose.*.position``), for one topic alone with its
-    name before (``/scan:ranges``). Entries of lists are written ``transforms[].header``.
+    A pattern matches a field and everything inside it (``header.stamp``, ``pose.*.position``). A topic name before it
+    limits it to that topic (``/scan:ranges``). List entries are written ``transforms[].header``.
     """
 
     atol: float = 0.0
@@ -40,7 +40,6 @@ class Tolerance:
     stamp_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         for name, value in (("atol", self.atol), ("rtol", self.rtol), ("stamp_s", self.stamp_s or 0.0)):
             if not value >= 0:
                 raise ValueError(f"{name} must be >= 0 (got {value})")
@@ -50,15 +49,15 @@ class Tolerance:
 
     @property
     def exact(self) -> bool:
-        """Whether nothing may differ."""
+        """Whether no difference is allowed."""
         return not (self.atol or self.rtol or self.fields or self.ignore)
 
     def ignores(self, topic: str, path: str) -> bool:
-        """Whether a field is not looked at."""
+        """Whether a field is excluded from the comparison."""
         return any(_matches(pattern, topic, path) for pattern in self.ignore)
 
     def of(self, topic: str, path: str) -> tuple[float, float]:
-        """Absolute and relative tolerance of a field."""
+        """Return the absolute and relative tolerance of a field."""
         for pattern, atol in self.fields.items():
             if _matches(pattern, topic, path):
                 return atol, 0.0
@@ -70,13 +69,13 @@ EXACT = Tolerance()
 
 @dataclass
 class FieldDifference:
-    """One field of a topic.
+    """How one field of a topic differs.
 
     Attributes:
-        messages: in how many pairs it differs beyond the tolerance.
+        messages: number of pairs in which it differs beyond the tolerance.
         first: number of the first such pair, from 1.
-        largest: the largest difference; nan for what is no number, and where one of two is not finite.
-        words: the first difference.
+        largest: largest difference; nan for non-numbers, and where one of the two values is not finite.
+        words: text of the first difference.
     """
 
     messages: int = 0
@@ -87,17 +86,17 @@ class FieldDifference:
 
 @dataclass(frozen=True)
 class TopicDifference:
-    """One topic of two bags.
+    """How one topic of two bags differs.
 
     Attributes:
         topic: its name.
         count_a: messages in the first bag.
         count_b: messages in the second bag.
-        first: in words, the first difference; empty where the topic is the same in both, within the tolerance.
-        only_a: messages without partner, where they are paired by stamp.
-        only_b: the same of the second bag.
+        first: text of the first difference; empty where the topic is the same in both bags, within the tolerance.
+        only_a: messages of the first bag without a partner, when pairing by stamp.
+        only_b: messages of the second bag without a partner, when pairing by stamp.
         differing: pairs that differ.
-        fields: what differs in them.
+        fields: field → how it differs in those pairs.
     """
 
     topic: str
@@ -118,17 +117,17 @@ class TopicDifference:
 def compare(
     a: Path, b: Path, ignore: tuple[str, ...] = (), common: bool = False, tolerance: Tolerance = EXACT
 ) -> list[TopicDifference]:
-    """Every topic of two bags, by name.
+    """Compare every topic of two bags, in the order of the names.
 
     Args:
         a: first bag.
         b: second bag.
         ignore: topics to leave out, names or patterns.
-        common: only topics that both bags have.
-        tolerance: what may differ.
+        common: compare only topics that both bags have.
+        tolerance: allowed differences.
 
     Raises:
-        BagError: one of them cannot be read.
+        BagError: a bag cannot be read.
     """
     with BagReader(a) as one, BagReader(b) as two:
         names = [{t.topic for t in reader.topics} for reader in (one, two)]
@@ -138,7 +137,7 @@ def compare(
 
 
 def digest(bag: Path) -> str:
-    """SHA-256 over topics, types, stamps and bytes of all messages, in the order of the bag."""
+    """Return the SHA-256 of the topics, types, stamps and bytes of all messages, in bag order."""
     total = hashlib.sha256()
     with BagReader(bag) as reader:
         for message in reader.messages():
@@ -231,7 +230,7 @@ class _Comparison:
         return self._decoders[key](message.payload)
 
     def _values(self, a: Any, b: Any, path: str) -> Iterator[tuple[str, tuple[str, float]]]:
-        """Fields that differ beyond the tolerance: path → (words, size); of a list's entries the largest."""
+        """Yield each field that differs beyond the tolerance: path → (text, size); a list gives its largest."""
         if path and self.tolerance.ignores(self.topic, path):
             return
         if dataclasses.is_dataclass(a) and not isinstance(a, type):
@@ -276,7 +275,7 @@ class _Comparison:
             gap = np.abs(wide[0] - wide[1])
             if atol or rtol:
                 equal = (a == b) | (np.isnan(wide[0]) & np.isnan(wide[1])) | (gap <= atol + rtol * np.abs(wide[0]))
-            else:  # bit for bit: -0.0 is not 0.0, and one nan is another's equal only as bits
+            else:  # bit for bit: -0.0 differs from 0.0, and two nan are equal only when their bits are
                 bits = [np.ascontiguousarray(x).view(np.uint8).reshape(a.size, -1) for x in (a, b)]
                 equal = (bits[0] == bits[1]).all(axis=1)
         different = np.flatnonzero(~equal)
@@ -297,6 +296,6 @@ def _matches(pattern: str, topic: str, path: str) -> bool:
         if not fnmatch.fnmatchcase(topic, wanted):
             return False
     plain = pattern.replace("[]", "")
-    # A field, or one inside of it; brackets may be left out.
+    # A field, or one inside it; brackets may be omitted.
     whole = fnmatch.translate(plain)[:-2] + r"(\..*)?\Z"
     return re.match(whole, path.replace("[]", "")) is not None

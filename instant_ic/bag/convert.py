@@ -1,4 +1,4 @@
-"""Makes one of our bags of others: ROS 1 and SQLite bags, bare files; some topics, a span of time, merged, split."""
+"""Converts bags into one of ours: reads ROS 1 and SQLite bags and bare files; filters, cuts, merges, splits."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from instant_ic.bag.writer import BagWriter
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """What to take, and how to write it.
+    """What to copy, and how to write it.
 
     Attributes:
-        choice: which topics, by the names of the source.
-        start_s: leave out this much of the beginning of the earliest bag; latched values of it are kept.
-        end_s: end so long after that beginning; 0 takes everything.
-        remap: topic → other name.
-        skip_unknown: leave out topics whose type nobody knows, instead of refusing.
+        choice: topics to copy, by their names in the source.
+        start_s: skip this many seconds from the start of the earliest bag; latched values from that part are kept.
+        end_s: stop this many seconds after that start; 0 copies everything.
+        remap: topic → new name.
+        skip_unknown: skip topics of unknown type instead of failing.
         compressed: compress with zstd.
-        max_bytes: size of a file; 0 makes one.
-        max_duration_s: the same by time.
+        max_bytes: file size at which a new file starts; 0 writes one file.
+        max_duration_s: duration in seconds after which a new file starts; 0 writes one file.
     """
 
     choice: TopicChoice = EVERYTHING
@@ -44,7 +44,7 @@ class ConvertOptions:
 
 @dataclass
 class Converted:
-    """What came out: messages by (new) topic, files, and types that were skipped with their topics."""
+    """Result of a conversion: messages by (new) topic, files, and skipped types with their topics."""
 
     counts: Counter[str] = field(default_factory=Counter)
     files: int = 0
@@ -57,16 +57,16 @@ def convert(
     options: ConvertOptions | None = None,
     on_progress: Callable[[float], None] | None = None,
 ) -> Converted:
-    """Writes the messages of one bag or several, in the order of their stamps, into a new one.
+    """Write the messages of one or more bags into a new bag, in stamp order.
 
     Args:
-        sources: what :class:`BagReader` opens.
+        sources: anything that :class:`BagReader` opens.
         target: folder of the new bag, which must not exist.
-        options: what to take, and how to write it.
-        on_progress: called with the share that is done, 0 to 1.
+        options: what to copy, and how to write it.
+        on_progress: called with the completed share, 0 to 1.
 
     Raises:
-        BagError: a bag cannot be read or written, nothing was chosen, or a type is not known.
+        BagError: a bag cannot be read or written, no topic was selected, or a type is unknown.
     """
     options = options or ConvertOptions()
     result = Converted()
@@ -136,7 +136,7 @@ def _write_latched(
     writer: BagWriter,
     result: Converted,
 ) -> None:
-    """The latched values that held when the span begins, with its stamp."""
+    """Write the latched values valid at the start of the selected span, with the stamp of that start."""
     values = LatchedValues()
     latched = {topic.topic for topic in topics.values() if topic.qos.latched}
     for message in reader.messages(latched, None, start_ns) if latched else ():

@@ -1,9 +1,9 @@
-"""What can go wrong with a bag."""
+"""Errors of the bag package."""
 
 
 class BagError(RuntimeError):
-    """A bag that cannot be written or read; the message says why and what to do."""
+    """A bag cannot be written or read; the message says why and what to do."""
 
 
 class DiskFullError(BagError):
-    """No space left: the bag is complete without what did not fit."""
+    """No space left on the disk. The bag is complete except for the messages that did not fit."""

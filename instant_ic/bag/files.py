@@ -27,14 +27,14 @@ guard_rosbags()
 
 @dataclass(frozen=True)
 class BagMessage:
-    """A message as it stands in a bag.
+    """A message in a bag.
 
     Attributes:
         topic: name of the topic.
-        type_name: for example ``sensor_msgs/msg/Image``.
+        type_name: message type, for example ``sensor_msgs/msg/Image``.
         payload: CDR bytes.
-        stamp_ns: when it was published, nanoseconds since the epoch.
-        qos: the preset that comes closest to what its publisher offered.
+        stamp_ns: time of publication, nanoseconds since the epoch.
+        qos: preset closest to the QoS that its publisher offered.
     """
 
     topic: str
@@ -57,7 +57,7 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class PartSummary:
-    """One file of a bag: its path, first and last stamp, messages."""
+    """One file of a bag: path, first and last stamp, message count."""
 
     path: Path
     start_ns: int
@@ -68,13 +68,13 @@ class PartSummary:
 class BagReader:
     """Reads a bag; a context manager.
 
-    The latched values that a recorder repeats at the beginning of each file count once, and are read once.
+    Latched values that a recorder repeats at the start of each file are counted once and returned once.
 
     Args:
         path: rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
 
     Raises:
-        BagError: no bag there, or one that was cut short.
+        BagError: there is no bag at the path, or the bag is truncated.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,7 +98,7 @@ class BagReader:
         except (ReaderError, OSError) as error:
             hint = "not written by ROS 2; its CDR messages" if "rofile" in str(error) else "if it was cut"
             raise BagError(f"bag {path} cannot be read: {error}; {hint}: ic bag recover {path}") from None
-        except Exception as error:  # noqa: BLE001 - whatever a parser raises on bytes that are no bag
+        except Exception as error:  # noqa: BLE001 - a parser may raise anything on bytes that are not a bag
             raise BagError(
                 f"bag {path} cannot be read: {type(error).__name__}: {error}; if it was cut: ic bag recover {path}"
             ) from None
@@ -114,17 +114,15 @@ class BagReader:
             ) from None
 
     def __enter__(self) -> BagReader:
-        """The reader itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes the files."""
         self.close()
 
     def close(self) -> None:
-        """Closes the files; twice does no harm."""
+        """Close the files. Idempotent."""
         if self._reader.is_open:
             self._reader.close()
 
@@ -145,13 +143,13 @@ class BagReader:
 
     @property
     def custom(self) -> dict[str, str]:
-        """Text that the recorder put into the metadata."""
+        """Text that the recorder stored in the metadata."""
         metadata = getattr(self._reader.storage, "metadata", None)
         return dict(getattr(metadata, "custom", None) or {})
 
     @property
     def topics(self) -> list[TopicSummary]:
-        """Its topics, by name."""
+        """Topics of the bag, by name."""
         counts: Counter[tuple[str, str]] = Counter()
         first: dict[tuple[str, str], Connection] = {}
         for connection in self._reader.connections:
@@ -167,14 +165,14 @@ class BagReader:
 
     @property
     def files(self) -> list[Path]:
-        """The files that hold the messages, in their order."""
+        """Message files, in order."""
         if self.path.is_file():
             return [self.path]
         return [Path(storage.path) for storage in self._storages]
 
     @property
     def parts(self) -> list[PartSummary]:
-        """The files with their spans."""
+        """Message files with their time spans."""
         if self.path.is_file():
             return [PartSummary(self.path, self.start_ns, self.end_ns, self.count)]
         found = []
@@ -187,7 +185,7 @@ class BagReader:
 
     @property
     def compression(self) -> str:
-        """``zstd``, ``lz4``, or empty: how its messages are compressed."""
+        """Compression of the messages: ``zstd``, ``lz4`` or empty."""
         kinds = {str(self._reader.compression_format or "")} if self._ros1 is None else {""}
         if self._ros1 is None:
             kinds |= {chunk.compression for storage in self._storages for chunk in getattr(storage, "chunks", ())}
@@ -195,7 +193,7 @@ class BagReader:
 
     @property
     def unlisted(self) -> list[Path]:
-        """Files in the folder that ``metadata.yaml`` does not tell: what a killed recorder was writing."""
+        """Files in the folder that ``metadata.yaml`` does not list, such as the last file of a killed recorder."""
         if self.path.is_file():
             return []
         listed = {file.name for file in self.files}
@@ -207,15 +205,15 @@ class BagReader:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[BagMessage]:
-        """Messages in the order of their stamps.
+        """Yield the messages in stamp order.
 
         Args:
-            topics: only these; default all.
-            start_ns: from this stamp on.
-            stop_ns: before this stamp.
+            topics: topics to read; default all.
+            start_ns: first stamp, inclusive.
+            stop_ns: last stamp, exclusive.
 
         Raises:
-            BagError: a damaged file.
+            BagError: a file is damaged.
         """
         connections = [c for c in self._reader.connections if topics is None or c.topic in topics]
         if not connections:
@@ -226,14 +224,14 @@ class BagReader:
                 for connection, stamp_ns, payload in raw:
                     qos = presets[connection.topic, connection.msgtype]
                     yield BagMessage(connection.topic, connection.msgtype, payload, stamp_ns, qos)
-        except Exception as error:  # noqa: BLE001 - whatever a parser or decompressor raises on damaged bytes
+        except Exception as error:  # noqa: BLE001 - a parser or decompressor may raise anything on damaged bytes
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
 
     def decoder(self, topic: TopicSummary) -> Callable[[bytes], Any]:
-        """Turns the bytes of a topic into messages: by our types, or by the bag's own definition where it differs.
+        """Return a function that decodes a topic's bytes: by our type, or by the bag's definition where that differs.
 
         Raises:
-            BagError: nobody knows the type.
+            BagError: the type is unknown.
         """
         own = schema_or_unknown(topic.type_name)
         if own.encoding and topic.schema.type_hash in ("", own.type_hash):
@@ -244,7 +242,7 @@ class BagReader:
         return lambda payload: store.deserialize_cdr(payload, topic.type_name)
 
     def differing_types(self) -> list[str]:
-        """Types whose definition in the bag is another than ours: their messages do not fit our nodes."""
+        """Types whose definition in the bag differs from ours: their messages do not fit our nodes."""
         found = set()
         for topic in self.topics:
             own = schema_or_unknown(topic.type_name)
@@ -264,7 +262,7 @@ class BagReader:
         if self._ros1 is not None or self._reader.compression_mode == "message":
             yield from self._reader.messages(connections, start_ns, stop_ns)
             return
-        # Merged by stamp: where a clock was set back, or files overlap, one file after the other is not the order.
+        # Merge by stamp: files are not in stamp order where a clock was set back or files overlap.
         streams = [self._of_part(storage, connections, start_ns, stop_ns) for storage in self._storages]
         yield from streams[0] if len(streams) == 1 else heapq.merge(*streams, key=lambda entry: entry[1])
 
@@ -277,7 +275,7 @@ class BagReader:
             return
         name = Path(storage.path).name
         repeated, repeated_ns = Counter(self._repeated.get(name, {})), self._repeated_ns.get(name)
-        # What is repeated stands first in its file, before other messages of the same stamp.
+        # Repeated values come first in their file, before other messages with the same stamp.
         for connection, stamp_ns, payload in storage.messages(chosen, start_ns, stop_ns):
             if stamp_ns == repeated_ns and repeated[connection.topic] > 0:
                 repeated[connection.topic] -= 1

@@ -1,4 +1,4 @@
-"""The present value of each latched topic, so that every file of a bag can begin with it."""
+"""The current value of each latched topic, so that every file of a bag can start with it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Key = tuple[str, frozenset[str]]
 
 @dataclass(frozen=True)
 class LatchedValue:
-    """A message whose value still holds.
+    """A message of a latched topic that is still valid.
 
     Attributes:
         topic: its topic.
         type_name: its type.
         payload: CDR bytes.
-        publish_ns: when it was published.
+        publish_ns: time of publication.
     """
 
     topic: str
@@ -31,22 +31,22 @@ class LatchedValue:
 class LatchedValues:
     """Keeps the last message of each latched topic and publisher.
 
-    On ``/tf_static`` every publisher sends all of its own frames each time: there a message replaces those whose
-    frames it tells anew, whoever sent it.
+    On ``/tf_static`` every message carries all frames of its publisher. A message replaces the earlier messages whose
+    frames it repeats, whoever published them.
     """
 
     def __init__(self) -> None:
         self._values: dict[Key, LatchedValue] = {}
 
     def put(self, value: LatchedValue, publisher: str = "") -> None:
-        """Takes a newer value."""
+        """Store a newer value."""
         key = (value.topic, self._names(value, publisher))
         for other in [k for k in self._values if k[0] == value.topic and k[1] <= key[1]]:
             del self._values[other]
         self._values[key] = value
 
     def values(self, but: LatchedValue | None = None, publisher: str = "") -> list[LatchedValue]:
-        """All present values, oldest first; without those that ``but`` is about to replace."""
+        """Return all current values, oldest first, without those that ``but`` is about to replace."""
         names = (but.topic, self._names(but, publisher)) if but is not None else ("", frozenset())
         kept = [v for k, v in self._values.items() if not (k[0] == names[0] and k[1] <= names[1])]
         return sorted(kept, key=lambda value: value.publish_ns)
@@ -57,6 +57,6 @@ class LatchedValues:
             try:
                 message = deserialize(value.payload, value.type_name)
                 return frozenset(transform.child_frame_id for transform in message.transforms)
-            except (MessageError, AttributeError):  # bytes of another type: recorded all the same, by its publisher
+            except (MessageError, AttributeError):  # bytes of another type: recorded anyway, keyed by publisher
                 pass
         return frozenset([publisher])

@@ -1,4 +1,4 @@
-"""Reads an MCAP file from its beginning, without its index, as far as it can be read: cut, damaged or whole."""
+"""Reads an MCAP file sequentially, without its index, as far as possible: complete, truncated or damaged."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import CHANNEL, CHUNK, DATA_END, HEADER, MAGIC, MESSAGE, METADATA, SCHEMA, Schema
 
 OWN_LIBRARY = "instant_ic"
-_KNOWN_OPCODES = range(0x01, 0x10)  # and from 0x80 on private ones
+_KNOWN_OPCODES = range(0x01, 0x10)  # opcodes from 0x80 on are private
 _MOST_DAMAGED = 1000
-"""Damaged records that are listed; a file can be made of nothing else."""
+"""Damaged records that are listed; a hostile file may contain nothing else."""
 _UNREADABLE = (struct.error, IndexError, ValueError)  # UnicodeDecodeError is a ValueError
 
 
 @dataclass(frozen=True)
 class ScannedMessage:
-    """A message as it stands in a file.
+    """A message in an MCAP file.
 
     Attributes:
         topic: its topic.
         schema: definition of its type.
-        encoding: of the payload; ``cdr`` in bags of ROS 2.
-        metadata: of its topic; rosbag2 notes the QoS there.
+        encoding: encoding of the payload; ``cdr`` in ROS 2 bags.
+        metadata: metadata of its topic, where rosbag2 stores the QoS.
         stamp_ns: log time.
-        payload: its bytes.
-        repeated: a latched value that an earlier file of the bag holds.
+        payload: message bytes.
+        repeated: whether it repeats a latched value of an earlier file of the bag.
     """
 
     topic: str
@@ -44,20 +44,20 @@ class ScannedMessage:
 
 
 class McapScan:
-    """One pass over a file; the attributes tell what was found once :meth:`messages` has come to its end.
+    """One pass over a file. The attributes are complete once :meth:`messages` is exhausted.
 
     Args:
         path: the file.
 
     Raises:
-        BagError: it cannot be opened, or is no MCAP file at all.
+        BagError: the file cannot be opened, or is not an MCAP file.
 
     Attributes:
-        whole: the file has its end.
-        stopped_by: in words, where reading ended before the end of the file; empty when it did not.
-        damaged: in words, chunks inside the file that were left out.
-        metadata: metadata records, name → values; the last of each name.
-        library: who wrote the file.
+        whole: whether the end of the file is intact.
+        stopped_by: reason why reading stopped before the end of the file; empty when it did not.
+        damaged: descriptions of damaged chunks that were skipped.
+        metadata: metadata records, name → values; the last record of each name.
+        library: library that wrote the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,7 +72,7 @@ class McapScan:
         try:
             with path.open("rb") as file:
                 size = path.stat().st_size
-                # An empty file cannot be mapped.
+                # An empty file cannot be memory-mapped.
                 self._data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) if size else b"")
         except OSError as error:
             raise BagError(f"{path} cannot be read: {error.strerror}") from None
@@ -80,7 +80,7 @@ class McapScan:
             raise BagError(f"{path} is no MCAP file")
 
     def messages(self) -> Iterator[ScannedMessage]:
-        """Every message that can be read, in the order of the file."""
+        """Yield every readable message, in file order."""
         data, at = self._data, len(MAGIC)
         while at < len(data):
             if len(data) - at < 9:

@@ -1,7 +1,7 @@
-"""Writes one MCAP file (https://mcap.dev/spec), chunk by chunk, without copying what it is given.
+"""Writes one MCAP file (https://mcap.dev/spec) in chunks, without copying the payloads.
 
-A chunk goes out in one gathered write, so the file always ends with whole chunks unless the disk is full; then it is
-cut back to the last whole one. The index at the end is made from memory.
+Each chunk is one gathered write, so the file always ends with a complete chunk. On a full disk the writer truncates
+the file to the last complete chunk. The index at the end is built from memory.
 """
 
 from __future__ import annotations
@@ -25,20 +25,20 @@ CHUNK_BYTES = 1 << 20
 """A chunk is closed once it is larger than this."""
 
 _LIBRARY = "instant_ic"
-_IOV_MOST = 1000  # a gathered write takes at most IOV_MAX (1024) parts
+_IOV_MOST = 1000  # IOV_MAX limits a gathered write to 1024 parts
 
 Buffer = bytes | memoryview
 
 
 @dataclass(frozen=True)
 class Schema:
-    """Definition of a message type as it stands in a bag.
+    """Definition of a message type in a bag.
 
     Attributes:
-        name: for example ``sensor_msgs/msg/Image``.
-        encoding: ``ros2msg`` or ``ros2idl``; empty where the definition is not known.
-        text: the definition, with those of the types inside.
-        type_hash: RIHS01 hash; empty where it is not known.
+        name: type name, for example ``sensor_msgs/msg/Image``.
+        encoding: ``ros2msg`` or ``ros2idl``; empty where the definition is unknown.
+        text: the definition, including those of nested types.
+        type_hash: RIHS01 hash; empty where it is unknown.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Schema:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """What the index at the end of the file tells of a chunk."""
+    """Index entry of a chunk, written at the end of the file."""
 
     start_ns: int
     end_ns: int
@@ -63,15 +63,15 @@ class _Chunk:
 
 
 class McapWriter:
-    """One MCAP file of CDR messages; not for several threads at once.
+    """One MCAP file of CDR messages; not thread-safe.
 
     Args:
         path: the file, which must not exist; only its owner can read it.
-        compressed: chunks are compressed with zstd.
-        level: from 1, for what must keep pace, to 19, for what must be small.
+        compressed: compress chunks with zstd.
+        level: zstd level, from 1 (fastest) to 19 (smallest).
 
     Raises:
-        OSError: the file cannot be made.
+        OSError: the file cannot be created.
     """
 
     def __init__(self, path: Path, compressed: bool = False, level: int = 3) -> None:
@@ -98,11 +98,11 @@ class McapWriter:
 
     @property
     def size(self) -> int:
-        """Bytes so far, those of the open chunk before compression."""
+        """Bytes so far; the open chunk counts uncompressed."""
         return self._offset + self._chunk_bytes
 
     def add_schema(self, schema: Schema) -> int:
-        """Notes a message type; returns its number in this file."""
+        """Add a message type and return its number in this file."""
         number = len(self._schemas) + 1
         body = struct.pack("<H", number) + _string(schema.name) + _string(schema.encoding) + _string(schema.text)
         self._schemas[number] = b"".join(_record(SCHEMA, body))
@@ -110,7 +110,7 @@ class McapWriter:
         return number
 
     def add_channel(self, topic: str, schema: int, metadata: Mapping[str, str]) -> int:
-        """Notes a topic with its type; returns its number in this file."""
+        """Add a topic with its type and return its number in this file."""
         number = len(self._channels) + 1
         body = struct.pack("<HH", number, schema) + _string(topic) + _string("cdr") + _string_map(metadata)
         self._channels[number] = (schema, b"".join(_record(CHANNEL, body)))
@@ -118,10 +118,10 @@ class McapWriter:
         return number
 
     def write(self, channel: int, stamp_ns: int, payload: Buffer, publish_ns: int | None = None) -> None:
-        """Appends one message; ``payload`` must not change until its chunk is written.
+        """Append one message; ``payload`` must not change until its chunk is written.
 
         Raises:
-            OSError: the disk is full; the file then ends with the last whole chunk.
+            OSError: the disk is full; the file then ends with the last complete chunk.
         """
         self._index.setdefault(channel, []).append((stamp_ns, self._chunk_bytes))
         publish = stamp_ns if publish_ns is None else publish_ns
@@ -131,7 +131,7 @@ class McapWriter:
             self.flush()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """Writes a metadata record, before the open chunk.
+        """Write a metadata record before the open chunk.
 
         Raises:
             OSError: the disk is full.
@@ -145,15 +145,15 @@ class McapWriter:
             raise
 
     def flush(self) -> None:
-        """Writes the open chunk: from here on its messages survive the end of this process.
+        """Write the open chunk. Its messages then survive the end of this process.
 
         Raises:
-            OSError: the disk is full; the chunk is lost and the file ends with the one before.
+            OSError: the disk is full; the chunk is lost and the file ends with the previous chunk.
         """
         if not self._parts:
             return
         parts, index, size = self._parts, self._index, self._chunk_bytes
-        if not index:  # schemas and channels alone: the next messages take them along
+        if not index:  # only schemas and channels: they go out with the next messages
             return
         self._clear()
         crc = 0
@@ -182,13 +182,13 @@ class McapWriter:
         self._chunks.append(chunk)
 
     def finish(self) -> OSError | None:
-        """Writes index and footer and closes the file. On a full disk the last chunks make room for them.
+        """Write index and footer and close the file. On a full disk, drop the last chunks to make room for them.
 
         Returns:
-            The error of a full disk, when messages had to be given up for a whole file; None when all is written.
+            The disk-full error if messages were dropped; None if everything was written.
 
         Raises:
-            OSError: not even that was possible, or another error of the disk; the file is closed and can be recovered.
+            OSError: dropping chunks was not enough, or the disk failed; the file is closed and can be recovered.
         """
         full = None
         try:
@@ -209,7 +209,7 @@ class McapWriter:
             self.abandon()
 
     def abandon(self) -> None:
-        """Closes the file without index; twice does no harm."""
+        """Close the file without an index. Idempotent."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -217,19 +217,19 @@ class McapWriter:
 
     @property
     def count(self) -> int:
-        """Messages in whole chunks on the disk."""
+        """Messages in complete chunks on the disk."""
         return sum(sum(chunk.counts.values()) for chunk in self._chunks)
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """First and last stamp in whole chunks; (0, 0) without any."""
+        """First and last stamp in complete chunks; (0, 0) if there are none."""
         if not self._chunks:
             return 0, 0
         return min(c.start_ns for c in self._chunks), max(c.end_ns for c in self._chunks)
 
     @property
     def counts(self) -> dict[int, int]:
-        """Messages in whole chunks by channel."""
+        """Messages in complete chunks, by channel."""
         counts = dict.fromkeys(self._channels, 0)
         for chunk in self._chunks:
             for channel, count in chunk.counts.items():
@@ -250,7 +250,7 @@ class McapWriter:
         return b"".join([*(stream.compress(part) for part in parts), stream.flush()])
 
     def _put(self, parts: Sequence[Buffer]) -> None:
-        """Writes all of it or nothing."""
+        """Write all parts or none."""
         if self._fd < 0:
             raise ValueError(f"{self.path} is closed")
         begin = self._offset
@@ -276,7 +276,7 @@ class McapWriter:
         self._metadata = [entry for entry in self._metadata if entry[0] < offset]
 
     def _summary(self) -> list[bytes]:
-        """Everything after the last chunk: data end, schemas, channels, indexes, statistics, footer."""
+        """Return everything after the last chunk: data end, schemas, channels, indexes, statistics, footer."""
         data_end = b"".join(_record(DATA_END, struct.pack("<I", 0)))
         summary_start = self._offset + len(data_end)
         used = self.counts
@@ -330,7 +330,7 @@ class McapWriter:
 
 
 def _if_full(error: OSError) -> OSError:
-    """The error, when it tells of a full disk; any other is raised."""
+    """Return a disk-full error; raise any other."""
     if error.errno not in (errno.ENOSPC, errno.EDQUOT):
         raise error
     return error

@@ -1,4 +1,4 @@
-"""What stands beside the messages of a bag: ``metadata.yaml``, QoS profiles, definitions of types."""
+"""Everything in a bag except its messages: ``metadata.yaml``, QoS profiles, type definitions."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from instant_ic.private import open_file
 
 METADATA_FILE = "metadata.yaml"
 REPEATED = "instant_ic.repeated"
-"""Key of ``custom_data``: JSON, file → its latched messages that only repeat what an earlier file holds:
-``{"stamp_ns": their stamp, "topics": {topic: how many}}``."""
+"""Key of ``custom_data``: JSON, file → its latched messages that only repeat those of an earlier file:
+``{"stamp_ns": their stamp, "topics": {topic: count}}``."""
 
-# What DDS writes for "no limit", and rosbag2 for the start of an empty bag.
+# The values that DDS writes for "no limit" and rosbag2 for the start of an empty bag.
 _FOREVER = QosTime(2147483647, 4294967295)
 _NO_START = (1 << 63) - 1
 
 Topic = tuple[str, str]
-"""Name and type."""
+"""Topic name and type."""
 
 
 @dataclass
@@ -48,12 +48,12 @@ class PartInfo:
     """One file of a bag.
 
     Attributes:
-        path: its name in the bag's folder.
+        path: file name in the bag's folder.
         start_ns: first stamp.
         end_ns: last stamp.
-        counts: messages by topic, repeated ones too.
-        repeated: latched messages at its beginning that an earlier file has, by topic.
-        repeated_ns: the stamp that they have here.
+        counts: messages by topic, including repeated ones.
+        repeated: topic → latched messages at the start of the file that repeat those of an earlier file.
+        repeated_ns: stamp of the repeated messages in this file.
     """
 
     path: str
@@ -75,16 +75,16 @@ def write_metadata(
     topics: dict[Topic, tuple[QoS, Schema]],
     custom: dict[str, str],
 ) -> None:
-    """Writes ``metadata.yaml`` (rosbag2, version 9) in one step: there is always a whole one, the old or the new.
+    """Write ``metadata.yaml`` (rosbag2, version 9) atomically: readers see either the old or the new file.
 
     Args:
         folder: the bag.
-        parts: its files in their order.
-        topics: what its topics were offered with.
+        parts: its files, in order.
+        topics: QoS and definition of each topic.
         custom: ``custom_data``.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     repeated = {part.path: {"stamp_ns": part.repeated_ns, "topics": part.repeated} for part in parts if part.repeated}
     custom = {**custom, **({REPEATED: json.dumps(repeated)} if repeated else {})}
@@ -136,10 +136,10 @@ def _span(parts: Sequence[PartInfo]) -> dict[str, Any]:
 
 @functools.cache
 def own_schema(type_name: str) -> Schema:
-    """Definition of a type that this project knows.
+    """Return the definition of a type of this project.
 
     Raises:
-        MessageError: it does not.
+        MessageError: the type is unknown.
     """
     message_type(type_name)
     text, _ = typestore().generate_msgdef(type_name, ros_version=2)
@@ -147,16 +147,16 @@ def own_schema(type_name: str) -> Schema:
 
 
 def schema_or_unknown(type_name: str) -> Schema:
-    """As :func:`own_schema`; without definition where the type is not known, as rosbag2 does."""
+    """As :func:`own_schema`, but without a definition where the type is unknown, as rosbag2 does."""
     try:
         return own_schema(type_name)
-    except (MessageError, TypesysError):  # the second: our type, but not by this full name
+    except (MessageError, TypesysError):  # TypesysError: a type of ours, but not by this full name
         return Schema(type_name, "", "", "")
 
 
 @functools.lru_cache(maxsize=200)
 def store_of(schema: Schema) -> Any:
-    """Type store with the types of a definition that a bag carries."""
+    """Return a type store with the types of a definition in a bag."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.EMPTY)
@@ -166,31 +166,31 @@ def store_of(schema: Schema) -> Any:
 
 @functools.lru_cache(maxsize=200)
 def with_hash(schema: Schema) -> Schema:
-    """The same with its RIHS01 hash, where the definition gives it; ours without one, none for a damaged one."""
-    if not schema.encoding or not schema.text:  # old SQLite bags hold none
+    """Add the RIHS01 hash of the definition. A missing definition is replaced by ours, a damaged one is emptied."""
+    if not schema.encoding or not schema.text:  # old SQLite bags store none
         return schema_or_unknown(schema.name)
     if schema.type_hash or schema.encoding != "ros2msg":
         return schema
     try:
         return dataclasses.replace(schema, type_hash=store_of(schema).hash_rihs01(schema.name))
-    except Exception:  # noqa: BLE001 - whatever a parser raises on a damaged definition
+    except Exception:  # noqa: BLE001 - a parser may raise anything on a damaged definition
         return Schema(schema.name, "", "", "")
 
 
 def schema_of(connection: Connection) -> Schema:
-    """Definition of a topic's type as `rosbags` read it."""
+    """Return the type definition of a topic as read by `rosbags`."""
     encodings = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
     encoding = encodings.get(connection.msgdef.format, "")
     return with_hash(Schema(connection.msgtype, encoding, connection.msgdef.data, connection.digest))
 
 
 def channel_metadata(qos: QoS) -> dict[str, str]:
-    """What rosbag2 notes with a topic inside an MCAP file."""
+    """Return the metadata that rosbag2 stores with a topic in an MCAP file."""
     return {"offered_qos_profiles": yaml.safe_dump(dump_qos_v9([ros_qos(qos)]), sort_keys=False).strip()}
 
 
 def ros_qos(qos: QoS) -> Qos:
-    """ROS 2's profile for one of our presets."""
+    """Return the ROS 2 profile of one of our presets."""
     return Qos(
         QosHistory.KEEP_LAST,
         qos.depth,
@@ -206,15 +206,15 @@ def ros_qos(qos: QoS) -> Qos:
 
 @functools.lru_cache(maxsize=200)  # asked once per message; the YAML parser takes a millisecond
 def preset_of_text(profiles: str) -> QoS:
-    """As :func:`preset_of`, of what an MCAP file notes with a topic; ``reliable`` where that is damaged."""
+    """As :func:`preset_of`, from the text in an MCAP file; ``reliable`` where the text is damaged."""
     try:
         return preset_of(parse_qos(profiles))
-    except Exception:  # noqa: BLE001 - whatever a parser raises on damaged YAML
+    except Exception:  # noqa: BLE001 - a parser may raise anything on damaged YAML
         return RELIABLE
 
 
 def preset_of(profiles: Collection[Qos]) -> QoS:
-    """Our preset that comes closest to what a bag's topic was offered with; ``reliable`` where it does not say."""
+    """Return the preset closest to a topic's offered QoS; ``reliable`` where the bag has none."""
     profile = next(iter(profiles), None)
     if profile is None:
         return RELIABLE

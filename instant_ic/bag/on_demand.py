@@ -1,4 +1,4 @@
-"""Recordings that are begun and ended on request, one at a time, in one folder."""
+"""Recordings started and stopped on request, one at a time, in one folder."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ log = logging.getLogger(__name__)
 
 
 class OnDemand:
-    """Begins and ends recordings; used from the node's thread.
+    """Starts and stops recordings; used from the node's thread.
 
     Args:
-        folder: that the bags go into, each a folder of its own, ``rec_DATE_TIME_NAME``.
-        begin: makes the recorder of one bag, and gives what ends its subscriptions.
+        folder: parent of the bags; each bag is a folder ``rec_DATE_TIME_NAME``.
+        begin: creates the recorder of one bag; returns it with a function that ends its subscriptions.
     """
 
     def __init__(self, folder: Path, begin: Callable[[Path], tuple[Recorder, Callable[[], None]]]) -> None:
         self.folder = folder
         self.error = ""
-        """Why the last recording could not be completed, in words; empty when it was."""
+        """Why the last recording could not be completed; empty when it was."""
         self._begin = begin
         self._recorder: Recorder | None = None
         self._drop: Callable[[], None] = lambda: None
@@ -39,11 +39,11 @@ class OnDemand:
         self._closing: threading.Thread | None = None
 
     def start(self, name: str = "") -> Path:
-        """Begins a bag; returns its folder.
+        """Start a bag and return its folder.
 
         Raises:
-            ValueError: one is being recorded, or the one before is not on the disk yet.
-            BagError: it cannot be made.
+            ValueError: a recording runs, or the previous one is not fully written.
+            BagError: the bag cannot be created.
         """
         if self._recorder is not None:
             raise ValueError(f"{self._recorder.path} is being {'completed' if self._closing else 'recorded'} already")
@@ -53,10 +53,10 @@ class OnDemand:
         return path
 
     def stop(self) -> Path:
-        """Ends the bag; what waits for the disk is written by and by (``status`` tells).
+        """Stop the recording. Queued messages are written in the background (see :meth:`status`).
 
         Raises:
-            ValueError: nothing is being recorded.
+            ValueError: no recording runs.
         """
         if self._recorder is None or self._closing is not None:
             raise ValueError("nothing is being recorded")
@@ -67,12 +67,12 @@ class OnDemand:
         return self._recorder.path
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
-        """Takes in new topics; see :meth:`Recorder.discover`."""
+        """Subscribe to new topics; see :meth:`Recorder.discover`."""
         if self._recorder is not None and self._closing is None:
             self._recorder.discover(topics, nodes)
 
     def tick(self) -> None:
-        """Called now and then, as :meth:`Recorder.tick`; sees when a bag is complete."""
+        """Run periodic work, as :meth:`Recorder.tick`, and detect when a bag is complete."""
         if self._recorder is None:
             return
         if self._closing is None:
@@ -82,7 +82,7 @@ class OnDemand:
             self._recorder = self._closing = None
 
     def trouble(self) -> str:
-        """Why the present bag is not written, or the last one not complete; empty when all is well."""
+        """Return why the current bag is not being written or the last one is incomplete; empty when all is well."""
         if self._recorder is None or self._closing is not None:
             return self.error
         told = self._recorder.status()
@@ -91,10 +91,10 @@ class OnDemand:
         return self._recorder.error
 
     def status(self) -> dict[str, Any]:
-        """What becomes of the present bag, else of the last.
+        """Return the state of the current bag, otherwise of the last one.
 
-        ``state`` (``idle``, ``ending`` or the recorder's), ``path``, ``seconds``, ``bytes``, ``messages``, ``error``;
-        ``free_bytes`` of the disk, None where it cannot be asked.
+        Keys: ``state`` (``idle``, ``ending`` or the recorder's), ``path``, ``seconds``, ``bytes``, ``messages``,
+        ``error``, and ``free_bytes`` of the disk, None where that is unknown.
         """
         told = {"state": IDLE, **self._last} if self._recorder is None else self._told(self._recorder)
         try:
@@ -104,10 +104,10 @@ class OnDemand:
         return told
 
     def close(self) -> None:
-        """Completes the bag, and waits for it.
+        """Complete the bag and wait for it.
 
         Raises:
-            BagError: the disk does not take it.
+            BagError: the bag could not be written completely.
         """
         if self._recorder is not None and self._closing is None:
             self._drop()

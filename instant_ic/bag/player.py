@@ -1,4 +1,4 @@
-"""Plays a bag at its own pace, or another; can be paused, stepped, and told to play from elsewhere."""
+"""Plays a bag in real time or at another rate; can be paused, stepped and moved to another position."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 
 NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics", "/parameter_events")
-"""What nodes tell of themselves and the time itself: those who run now tell their own."""
+"""The time itself, and what nodes report about themselves: the running nodes publish their own."""
 
 RATES = (0.01, 100.0)
-"""Slowest and fastest that a player may be told to play while it plays."""
+"""Smallest and largest rate that can be set during playback."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class PlayOptions:
     """How a bag is played.
 
     Attributes:
-        rate: 2 plays twice as fast.
-        start_offset_s: skip this much of the beginning; latched values of it are still sent.
-        duration_s: end after this much of the bag; 0 plays to the end.
-        loop: begin again at the end.
-        choice: which topics.
-        start_paused: wait at the beginning for :meth:`BagPlayer.resume` or :meth:`BagPlayer.step`.
-        clock_hz: how often at least the time is told, also while paused and between messages.
+        rate: playback speed; 2 plays twice as fast.
+        start_offset_s: seconds to skip at the start; latched values of the skipped part are still sent.
+        duration_s: seconds of the bag to play; 0 plays to the end.
+        loop: start again at the end.
+        choice: topics to play.
+        start_paused: wait at the start for :meth:`BagPlayer.resume` or :meth:`BagPlayer.step`.
+        clock_hz: lowest rate of clock updates, also while paused and between messages.
     """
 
     rate: float = 1.0
@@ -44,7 +44,6 @@ class PlayOptions:
     clock_hz: float = 40.0
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         for key in ("rate", "clock_hz"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
@@ -54,23 +53,23 @@ class PlayOptions:
 
 
 class BagPlayer:
-    """Paces the messages of a bag; knows no bus. Its controls may be called from any thread.
+    """Paces the messages of a bag, independent of the bus. Its controls may be called from any thread.
 
     Args:
         path: the bag.
         options: how to play it.
 
     Raises:
-        BagError: no bag, or nothing in it to play.
+        BagError: there is no bag, or it has nothing to play.
     """
 
     def __init__(self, path: Path, options: PlayOptions) -> None:
         self.options = options
         self._reader = BagReader(path)
         self.left_out: dict[str, str] = {}
-        """Topics, and types, that are not sent, with the reason."""
+        """Topics and types that are not sent, with the reason."""
         chosen: dict[str, TopicSummary] = {}
-        # Of a topic with several types the one with most messages: a publisher has one type.
+        # Of a topic with several types, play the one with most messages: a publisher has one type.
         for topic in sorted(self._reader.topics, key=lambda topic: -topic.count):
             if topic.topic in NEVER_PLAYED or not options.choice.takes(topic.topic):
                 continue
@@ -79,7 +78,7 @@ class BagPlayer:
             else:
                 chosen[topic.topic] = topic
         self.topics = [chosen[topic] for topic in sorted(chosen)]
-        """What will be sent."""
+        """Topics to send."""
         self._types = {t.topic: t.type_name for t in self.topics}
         self.start_ns = self._reader.start_ns + int(options.start_offset_s * 1e9)
         self.end_ns = self._reader.end_ns
@@ -93,13 +92,13 @@ class BagPlayer:
             self._reader.close()
             raise BagError(f"bag {path} ends before start_offset_s = {options.start_offset_s}")
         self.position_ns = self.start_ns
-        """The time of the bag that holds now."""
+        """Current time in the bag."""
         self.sent = 0
         """Messages sent."""
         self.rounds = 0
-        """How often it has come to the end."""
+        """Number of times that playback reached the end."""
         self.latest_s = 0.0
-        """By how much the latest message was late: the machine, or who takes them, is slower than the bag."""
+        """Lag of the latest message in seconds: positive when the machine or the receiver is slower than the bag."""
         self._rate = options.rate
         self._paused = options.start_paused
         self._steps = 0
@@ -114,7 +113,7 @@ class BagPlayer:
         self._reader.close()
 
     def _why_not(self, topic: TopicSummary) -> str:
-        """Why a topic cannot be sent; empty where it can."""
+        """Return why a topic cannot be sent; empty where it can."""
         own = schema_or_unknown(topic.type_name)
         if not own.encoding and topic.schema.encoding != "ros2msg":
             return "its type is not known, and the bag holds no definition of it"
@@ -126,19 +125,19 @@ class BagPlayer:
 
     @property
     def rate(self) -> float:
-        """2 plays twice as fast."""
+        """Playback speed; 2 plays twice as fast."""
         return self._rate
 
     @property
     def paused(self) -> bool:
-        """Whether time stands still."""
+        """Whether playback is paused."""
         return self._paused
 
     def set_rate(self, rate: float) -> None:
-        """Plays faster or slower from here on.
+        """Change the playback speed.
 
         Raises:
-            ValueError: out of :data:`RATES`.
+            ValueError: outside :data:`RATES`.
         """
         if not RATES[0] <= rate <= RATES[1]:
             raise ValueError(f"rate must lie in {RATES[0]:g}..{RATES[1]:g} (got {rate})")
@@ -147,27 +146,27 @@ class BagPlayer:
             self._rate = rate
 
     def pause(self) -> None:
-        """Stops the time."""
+        """Pause playback."""
         self._paused = True
 
     def resume(self) -> None:
-        """Goes on from where the time stands."""
+        """Continue from the current position."""
         with self._lock:
             self._anchor(self.position_ns)
             self._paused = False
 
     def toggle(self) -> None:
-        """Pauses, or goes on."""
+        """Pause, or resume."""
         if self._paused:
             self.resume()
         else:
             self.pause()
 
     def step(self, count: int = 1) -> None:
-        """Sends the next messages, and stands still again.
+        """Send the next ``count`` messages, then pause.
 
         Raises:
-            ValueError: less than one.
+            ValueError: ``count`` is less than 1.
         """
         if count < 1:
             raise ValueError(f"count must be >= 1 (got {count})")
@@ -176,10 +175,10 @@ class BagPlayer:
             self._steps += count
 
     def seek(self, offset_s: float) -> None:
-        """Plays from elsewhere: seconds from the beginning of what is played; the latched values of there are sent.
+        """Jump to a position, in seconds from the start of playback, and send the latched values valid there.
 
         Raises:
-            ValueError: outside of it.
+            ValueError: the position is outside the played span.
         """
         length_s = (self.end_ns - self.start_ns) / 1e9
         if not 0 <= offset_s <= length_s:
@@ -195,16 +194,17 @@ class BagPlayer:
         now_s: Callable[[], float] = time.monotonic,
         on_clock: Callable[[int], None] = lambda stamp_ns: None,
     ) -> bool:
-        """Sends every message at its time; returns at the end, or when ``stop`` is set.
+        """Send every message at its time; return at the end, or when ``stop`` is set.
 
         Args:
-            send: called with each message, once its time has come.
-            stop: ends it; also interrupts waiting.
-            now_s: the clock of the pace.
-            on_clock: told the bag's time now and then, first at the beginning; in between :attr:`position_ns` holds.
+            send: called with each message when it is due.
+            stop: ends playback; also interrupts waiting.
+            now_s: clock for the pace.
+            on_clock: called with the bag's time, first at the start and then periodically; in between,
+                :attr:`position_ns` is valid.
 
         Returns:
-            Whether it came to the end.
+            Whether playback reached the end.
         """
         self._now_s = now_s
         begin_ns = self.start_ns
@@ -233,7 +233,7 @@ class BagPlayer:
         stop: threading.Event,
         on_clock: Callable[[int], None],
     ) -> bool:
-        """True at the end of the messages; False when it shall stop or play from elsewhere."""
+        """Return True at the end of the messages, False when playback must stop or jump."""
         period_s = 1.0 / self.options.clock_hz
         next_clock_s = self._now_s() + period_s
         for message in messages:
@@ -270,7 +270,7 @@ class BagPlayer:
         self._anchor_s, self._anchor_ns = self._now_s(), stamp_ns
 
     def _send_latched_before(self, begin_ns: int, send: Callable[[BagMessage], None]) -> None:
-        """The state that the skipped part left: the last value of each latched topic; transforms, all of them."""
+        """Send the state at the end of the skipped part: the last value of each latched topic, and all transforms."""
         latched = {topic.topic for topic in self.topics if topic.qos.latched}
         if begin_ns == self._reader.start_ns or not latched:
             return

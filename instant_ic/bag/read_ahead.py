@@ -1,4 +1,4 @@
-"""Reads a bag ahead of who plays it, so that no message waits for the disk or for a chunk to be decompressed."""
+"""Reads a bag ahead of the player, so that no message waits for the disk or for decompression."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from instant_ic.bag.files import BagMessage
 
 
 class ReadAhead:
-    """Iterates over messages that a thread of its own reads; a context manager.
+    """Iterates over messages that a separate thread reads; a context manager.
 
     Args:
-        messages: what to read; used by that thread alone until :meth:`close`.
-        stop: ends the iteration also while a disk does not answer.
-        max_bytes: how much may lie ready.
+        messages: messages to read; only that thread uses them until :meth:`close`.
+        stop: ends the iteration, even while the disk does not respond.
+        max_bytes: size of the buffer.
     """
 
     def __init__(self, messages: Iterator[BagMessage], stop: threading.Event, max_bytes: int = 64_000_000) -> None:
@@ -33,24 +33,22 @@ class ReadAhead:
         self._thread.start()
 
     def __enter__(self) -> ReadAhead:
-        """Itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the thread."""
         self.close()
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """Ends the thread; what lies ready is dropped."""
+        """End the thread and drop the buffered messages."""
         with self._condition:
             self._closed = True
             self._condition.notify_all()
         self._thread.join(timeout_s)
 
     def __iter__(self) -> Iterator[BagMessage]:
-        """The messages in their order; raises what reading raised."""
+        """Yield the messages in order; re-raise errors of the reading thread."""
         while True:
             with self._condition:
                 while not self._condition.wait_for(lambda: self._ready or self._ended or self._closed, 0.5):
@@ -69,14 +67,14 @@ class ReadAhead:
         try:
             for message in self._messages:
                 with self._condition:
-                    # Until somebody takes one, which in a pause is never: close() ends it.
+                    # Wait until a message is taken. In a pause that never happens, and close() ends the wait.
                     self._condition.wait_for(lambda: self._bytes < self._max_bytes or self._closed)
                     if self._closed:
                         return
                     self._ready.append(message)
                     self._bytes += len(message.payload)
                     self._condition.notify_all()
-        except Exception as error:  # noqa: BLE001 - it belongs to the one who iterates
+        except Exception as error:  # noqa: BLE001 - re-raised to the iterating thread
             self._error = error
         finally:
             with self._condition:

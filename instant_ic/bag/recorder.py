@@ -1,7 +1,7 @@
-"""Records topics as they come: new publishers are found while it runs, nothing is decoded, what is lost is counted.
+"""Records topics without decoding them, finds new publishers while it runs, and counts losses.
 
-The node that hands over messages never waits for the disk: they go into a queue, bounded by bytes, that a thread writes
-from. What finds no place there is counted by topic and told.
+The node never waits for the disk: messages go into a queue, bounded by bytes, and a thread writes them. Messages that
+do not fit are counted by topic and reported.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.private import make_folder
 
 FOREIGN_CLOCK_NS = 10_000_000_000
-"""A stamp farther than this from the simulated clock was made by another clock."""
+"""A stamp farther than this from the simulated clock comes from another clock."""
 
 RECORDING, PAUSED, DISK_FULL, FAILED, ENDED = "recording", "paused", "disk full", "failed", "ended"
 
@@ -36,25 +36,25 @@ _LEVEL = 1  # of zstd: it must keep pace
 _FLUSH_S = 1.0
 _KEEP_CUSTOM_S = 10.0
 _SPACE_S = 1.0
-_ROOM_AGAIN = 64_000_000  # so much above the reserve, before it begins again
+_ROOM_AGAIN = 64_000_000  # free space above the reserve before recording restarts
 
 log = logging.getLogger(__name__)
 
 
 class LossCounter(Protocol):
-    """What a subscription knows of itself."""
+    """Loss counts of a subscription."""
 
     @property
     def lost(self) -> int:
-        """Messages missing by the gaps in the sequence."""
+        """Missing messages, from gaps in the sequence."""
 
     @property
     def lost_by(self) -> dict[str, int]:
-        """The same by publisher."""
+        """Missing messages by publisher."""
 
 
 class TakeMessage(Protocol):
-    """Takes ``(topic, type_name, payload, publish_ns, publisher)``."""
+    """Accepts ``(topic, type_name, payload, publish_ns, publisher)``."""
 
     def __call__(
         self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""
@@ -69,13 +69,13 @@ class RecordOptions:
     """How a recording is written.
 
     Attributes:
-        compressed: chunks are compressed with zstd.
-        max_bytes: a file of this size is followed by the next; 0 makes one file.
-        max_duration_s: the same by time; 0 makes one file.
-        queue_bytes: what may wait for the disk.
+        compressed: compress chunks with zstd.
+        max_bytes: file size at which a new file starts; 0 writes one file.
+        max_duration_s: duration in seconds after which a new file starts; 0 writes one file.
+        queue_bytes: bytes that may wait for the disk.
         reserve_bytes: stop while the disk has less free space than this.
-        snapshot_s: keep only so many seconds, in memory, and write them when asked; 0 writes everything at once.
-        cache_bytes: memory for them.
+        snapshot_s: keep only the last seconds in memory and write them on request; 0 writes everything immediately.
+        cache_bytes: memory for those seconds.
     """
 
     compressed: bool = False
@@ -87,7 +87,6 @@ class RecordOptions:
     cache_bytes: int = 256_000_000
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         for key in ("max_bytes", "max_duration_s", "reserve_bytes", "snapshot_s"):
             if getattr(self, key) < 0:
                 raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
@@ -97,7 +96,7 @@ class RecordOptions:
 
 
 class _Queue:
-    """Messages and calls on their way to the writing thread."""
+    """Messages and calls queued for the writing thread."""
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
@@ -106,7 +105,7 @@ class _Queue:
         self._condition = threading.Condition()
 
     def put(self, item: Entry | Callable[[], None]) -> bool:
-        """False where a message finds no place; latched ones and calls always find one."""
+        """Queue an item; return False if a message does not fit. Latched messages and calls always fit."""
         size = len(item.payload) if isinstance(item, Entry) else 0
         with self._condition:
             if isinstance(item, Entry) and not item.qos.latched and self.bytes + size > self.max_bytes:
@@ -117,27 +116,27 @@ class _Queue:
         return True
 
     def take(self, timeout_s: float) -> Entry | Callable[[], None] | None:
-        """The next; None when there is none for so long."""
+        """Return the next item, or None after `timeout_s`."""
         with self._condition:
             if not self._items and not self._condition.wait_for(lambda: bool(self._items), timeout_s):
                 return None
             return self._items.popleft()
 
     def done(self, item: Entry) -> None:
-        """The message has been written: its bytes count no more."""
+        """Release the bytes of a message that has been written."""
         with self._condition:
             self.bytes -= len(item.payload)
 
 
 @dataclass
 class Snapshot:
-    """One written snapshot.
+    """One snapshot.
 
     Attributes:
         path: its bag.
         state: ``waiting``, ``writing``, ``done`` or ``failed``.
-        words: what it holds, or why it failed.
-        due_s: when it is written, by the monotonic clock.
+        words: content of the bag, or why it failed.
+        due_s: time at which it is written, by the monotonic clock.
     """
 
     path: Path
@@ -148,7 +147,7 @@ class Snapshot:
 
 @dataclass
 class _Told:
-    """What the metadata tell at the end."""
+    """Counts for the metadata, written at the end."""
 
     overflow: Counter[str] = field(default_factory=Counter)
     paused: Counter[str] = field(default_factory=Counter)
@@ -157,19 +156,19 @@ class _Told:
 
 
 class Recorder:
-    """The recording itself, without a bus: it is told of publishers and given bytes.
+    """The recording, independent of the bus: the caller reports publishers and passes bytes.
 
     Args:
-        path: the bag's folder; with snapshots the folder that they go into, each a bag of its own.
-        choice: which topics.
-        subscribe: ``(topic, take)`` subscribes to raw bytes and gives the counter of lost messages.
-        sim_now_ns: the simulated clock, where there is one. Who does not follow it (the recorder itself, the console)
-            stamps with the machine's time; such messages get the simulated time of their arrival instead.
+        path: the bag's folder; with snapshots, the parent folder of one bag per snapshot.
+        choice: topics to record.
+        subscribe: ``(topic, take)`` subscribes to raw bytes and returns the counter of lost messages.
+        sim_now_ns: the simulated clock, if there is one. Nodes that do not follow it (the recorder itself, the console)
+            stamp with the machine's time; their messages get the simulated time of their arrival instead.
         options: see :class:`RecordOptions`.
-        free_bytes: free space where the bag is; for tests.
+        free_bytes: free space on the bag's disk; replaced in tests.
 
     Raises:
-        BagError: the bag cannot be made.
+        BagError: the bag cannot be created.
     """
 
     def __init__(
@@ -186,9 +185,9 @@ class Recorder:
         self.counts: Counter[str] = Counter()
         self.early = 0
         self.error = ""
-        """Why it failed, or why it waits, in words."""
+        """Why recording failed or waits."""
         self.failed = False
-        """Whether something went wrong since it began."""
+        """Whether an error occurred since the start."""
         self.told = _Told()
         self.snapshots: list[Snapshot] = []
         self._choice = choice
@@ -226,7 +225,7 @@ class Recorder:
 
     @property
     def topics(self) -> Collection[str]:
-        """Topics that it listens to."""
+        """Subscribed topics."""
         return self._losses.keys()
 
     @property
@@ -236,15 +235,15 @@ class Recorder:
 
     @property
     def count(self) -> int:
-        """Messages written, in snapshot mode those in memory or written."""
+        """Messages written; in snapshot mode, messages in memory or written."""
         return self._writer.count if self._writer is not None else sum(self.counts.values())
 
     def discover(self, topics: Collection[TopicInfo], nodes: Collection[NodeInfo] = ()) -> None:
-        """Subscribes to what is new and wanted; notes the parameters of nodes."""
+        """Subscribe to new selected topics and store the parameters of nodes."""
         for info in topics:
             if info.topic not in self._losses and self._choice.takes(info.topic):
                 offered = [PRESETS.get(publisher.qos, SENSOR) for publisher in info.publishers]
-                # Several publishers of one topic: a reader must know that it is latched if any of them is.
+                # With several publishers of one topic, a reader must know that it is latched if any of them is.
                 self._qos[info.topic] = max(offered, key=lambda qos: (qos.latched, qos.reliable))
                 self._losses[info.topic] = self._subscribe(info.topic, self.take)
         for node in nodes:
@@ -253,51 +252,51 @@ class Recorder:
     def take(
         self, topic: str, type_name: str, payload: bytes | memoryview, publish_ns: int, publisher: str = ""
     ) -> None:
-        """Takes one message; never waits. The payload is copied: it may stand in memory that others write again."""
+        """Queue one message; never waits. The payload is copied, since its memory may be overwritten."""
         stamp_ns = self._stamp_ns(publish_ns)
         if not type_name:
             self.told.no_type[topic] += 1
-        elif stamp_ns <= 0:  # a node on simulated time, before the first /clock: it has no time to be filed under
+        elif stamp_ns <= 0:  # a node on simulated time before the first /clock: the message has no time
             self.early += 1
         elif self._begun_ns:
             self._hand_on(topic, type_name, bytes(payload), stamp_ns, publisher)
         elif self._qos.get(topic, SENSOR).latched:
-            # Its value may be minutes old: it waits for the first message that says when this bag begins.
+            # The value may be minutes old: keep it until the first other message sets the start of this bag.
             self._held.append((topic, type_name, bytes(payload), stamp_ns, publisher))
         else:
             self._begin(stamp_ns)
             self._hand_on(topic, type_name, bytes(payload), stamp_ns, publisher)
 
     def pause(self) -> None:
-        """Leaves out what comes from now on; latched values are kept for the end of the pause."""
+        """Stop recording; latched values received meanwhile are recorded on resume."""
         self._paused = True
 
     def resume(self) -> None:
-        """Records again, beginning with the latched values that came meanwhile."""
+        """Continue recording, starting with the latched values received meanwhile."""
         if self._paused:
             self._paused = False
             self.tick()
 
     def split(self) -> None:
-        """Ends the present file; the next message begins another.
+        """End the current file; the next message starts another.
 
         Raises:
-            ValueError: snapshots are kept; there is no file to split.
+            ValueError: snapshot mode has no file to split.
         """
         if self._writer is None:
             raise ValueError("snapshots are kept: there is no file to split")
         self._queue.put(self._end_part)
 
     def snapshot(self, reason: str = "", after_s: float = 0.0) -> Snapshot:
-        """Writes what is in memory, after so many seconds more, into a bag of its own.
+        """Write the messages in memory into a separate bag after ``after_s`` more seconds.
 
         Raises:
-            ValueError: it does not keep snapshots.
+            ValueError: not in snapshot mode.
         """
         if self._cache is None:
             raise ValueError("it does not keep snapshots: start it with --snapshot")
         for waiting in self.snapshots:
-            if waiting.state == "waiting":  # one that is about to be written will have this too
+            if waiting.state == "waiting":  # a pending snapshot will contain this moment too
                 return waiting
         found = Snapshot(dated(self.path, reason), due_s=time.monotonic() + after_s)
         self.snapshots.append(found)
@@ -305,7 +304,7 @@ class Recorder:
         return found
 
     def tick(self) -> None:
-        """Called now and then: begins snapshots that are due; after a full disk hands on the latched values again."""
+        """Run periodic work: start due snapshots, and queue latched values again after a full disk."""
         while self._not_written:
             entry = self._not_written.popleft()
             self._missed.put(LatchedValue(entry.topic, entry.type_name, entry.payload, entry.stamp_ns), entry.publisher)
@@ -316,20 +315,20 @@ class Recorder:
                 self._write_snapshot(waiting)
 
     def lost(self) -> dict[str, int]:
-        """Messages lost on the way, by topic, where there are any."""
-        # A copy: the writing thread asks while this one may find topics.
+        """Messages lost in transit, by topic; only topics with losses."""
+        # A copy: the writing thread reads while this one may add topics.
         return {topic: counter.lost for topic, counter in list(self._losses.items()) if counter.lost}
 
     def lost_by(self) -> dict[str, dict[str, int]]:
-        """The same, topic → publisher → messages."""
+        """Messages lost in transit: topic → publisher → messages."""
         return {topic: dict(counter.lost_by) for topic, counter in list(self._losses.items()) if counter.lost_by}
 
     def unknown_types(self) -> dict[str, str]:
-        """Types recorded without their definition, with one of their topics."""
+        """Types recorded without a definition → one of their topics."""
         return dict(self._writer.unknown_types) if self._writer is not None else {}
 
     def status(self) -> dict[str, Any]:
-        """What ``ic bag status`` shows."""
+        """Return the values that ``ic bag status`` shows."""
         writer, cache = self._writer, self._cache
         told: dict[str, Any] = {
             "path": str(self.path),
@@ -349,10 +348,10 @@ class Recorder:
         return told
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Completes the bag; its metadata tell losses and the nodes' parameters.
+        """Complete the bag; its metadata contain the losses and the nodes' parameters.
 
         Raises:
-            BagError: the disk does not take it.
+            BagError: the bag could not be written completely.
         """
         if self._held:
             self._begin(max(stamp_ns for _, _, _, stamp_ns, _ in self._held))
@@ -370,7 +369,7 @@ class Recorder:
             raise BagError(self.error)
 
     def _count(self, counter: Counter[str], topic: str) -> None:
-        with self._counting:  # two threads leave out messages
+        with self._counting:  # two threads skip messages
             counter[topic] += 1
 
     def _begin(self, stamp_ns: int) -> None:
@@ -444,7 +443,7 @@ class Recorder:
                 self._stop(DISK_FULL, str(error))
             except BagError as error:
                 self._stop(FAILED, str(error))
-            except Exception as error:  # a bug here must not leave a recorder that seems to record
+            except Exception as error:  # a bug here must not leave a recorder that only appears to record
                 log.exception("bag writer")
                 self._stop(FAILED, f"{type(error).__name__}: {error}")
         self._finish()
@@ -488,10 +487,10 @@ class Recorder:
 
     def _stop(self, state: str, words: str) -> None:
         self._state, self.error, self.failed = state, words, True
-        log.debug("%s", words)  # told by the node's diagnosis, and by close()
+        log.debug("%s", words)  # reported by the node's diagnostics and by close()
 
     def _save(self, snapshot: Snapshot, content: list[Entry]) -> None:
-        """Writes a snapshot; what goes wrong concerns this one, the next may succeed."""
+        """Write a snapshot. An error concerns this snapshot only; the next may succeed."""
         try:
             if not content:
                 raise BagError(f"snapshot {snapshot.path}: no message has come yet")
@@ -532,12 +531,12 @@ class Recorder:
             if self._state != FAILED:
                 self._state = ENDED
         except BagError as error:
-            if self._state != FAILED:  # else the first reason is the one to tell
+            if self._state != FAILED:  # otherwise keep the first reason
                 self._stop(FAILED, str(error))
 
 
 def dated(folder: Path, words: str, prefix: str = "") -> Path:
-    """A path in ``folder`` that is free, named by date, time and what of ``words`` a file name can hold."""
+    """Return an unused path in ``folder``, named by date, time and the characters of ``words`` valid in file names."""
     slug = "".join(c if c.isalnum() else "_" for c in words.strip())[:40].strip("_")
     name = f"{prefix}{datetime.now():%Y%m%d_%H%M%S}" + (f"_{slug}" if slug else "")
     path, number = folder / name, 1

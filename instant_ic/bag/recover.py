@@ -1,4 +1,4 @@
-"""Makes a readable bag of one that was cut short (power loss, full disk, killed recorder), or writes its index anew."""
+"""Recovers truncated bags (power loss, full disk, killed recorder) and rebuilds ``metadata.yaml``."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from instant_ic.bus.qos import QoS
 
 @dataclass(frozen=True)
 class Recovered:
-    """What came out.
+    """Result of a recovery.
 
     Attributes:
         count: messages written.
-        stopped_by: what stopped the reading, in words; empty when every file was whole.
-        damaged: chunks that were left out, in words.
-        skipped: topic → why its messages were left out: they are no CDR.
+        stopped_by: reason why reading stopped early; empty when every file was complete.
+        damaged: descriptions of skipped chunks.
+        skipped: topic → why its messages were skipped: they are not CDR.
     """
 
     count: int
@@ -35,28 +35,28 @@ class Recovered:
 
 
 def recover(source: Path, target: Path, compressed: bool = False) -> Recovered:
-    """Copies every message that can be read into a new bag: all whole chunks, and of a cut one the whole messages.
+    """Copy every readable message into a new bag: all complete chunks, and the complete messages of a truncated chunk.
 
     Args:
         source: bag folder or ``.mcap`` file.
         target: folder of the new bag, which must not exist.
-        compressed: compress the new one.
+        compressed: compress the new bag.
 
     Raises:
-        BagError: nothing to read, or the target cannot be written.
+        BagError: nothing can be read, or the target cannot be written.
     """
     files = mcap_files(source)
     stopped_by: list[str] = []
     damaged: list[str] = []
     skipped: dict[str, str] = {}
-    # Sorted only within its chunks, which a recorder may overlap by a little: readers sort by the new index.
+    # Sorted only within chunks, and chunks of a recorder may overlap slightly: readers sort by the new index.
     with BagWriter(target, compressed) as writer:
         for number, file in enumerate(files):
             scan = McapScan(file)
             for message in scan.messages():
                 if message.encoding != "cdr":
                     skipped[message.topic] = f"encoding {message.encoding!r}"
-                elif not message.repeated:  # the writer repeats by itself
+                elif not message.repeated:  # the writer adds its own repetitions
                     qos = preset_of_text(message.metadata.get("offered_qos_profiles", ""))
                     schema = with_hash(message.schema)
                     writer.write(message.topic, schema.name, message.payload, message.stamp_ns, qos, schema)
@@ -78,13 +78,13 @@ def recover(source: Path, target: Path, compressed: bool = False) -> Recovered:
 
 
 def reindex(folder: Path) -> tuple[int, int]:
-    """Writes ``metadata.yaml`` of a folder anew from what its MCAP files tell of themselves.
+    """Rebuild ``metadata.yaml`` of a folder from its MCAP files.
 
     Returns:
-        Files and messages.
+        Number of files and of messages.
 
     Raises:
-        BagError: no MCAP files in it, or one that was cut: that is for :func:`recover`.
+        BagError: the folder has no MCAP files, or one is truncated (use :func:`recover`).
     """
     if not folder.is_dir():
         raise BagError(f"{folder} is no folder; a single file needs no index beside it")
@@ -94,7 +94,7 @@ def reindex(folder: Path) -> tuple[int, int]:
     for file in mcap_files(folder):
         try:
             parts.append(_part(file, topics, custom))
-        except Exception as error:  # noqa: BLE001 - whatever a parser raises on bytes that are no bag
+        except Exception as error:  # noqa: BLE001 - a parser may raise anything on bytes that are not a bag
             raise BagError(f"{file} is not whole: {error}; ic bag recover {folder}") from None
     try:
         write_metadata(folder, parts, topics, custom)
@@ -104,7 +104,7 @@ def reindex(folder: Path) -> tuple[int, int]:
 
 
 def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str, str]) -> PartInfo:
-    """What a file tells of itself; its topics and custom data go into those given."""
+    """Summarise one file; its topics and custom data are added to ``topics`` and ``custom``."""
     part = PartInfo(file.name)
     reader = McapReader(file)
     reader.open()
@@ -119,7 +119,7 @@ def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str,
     finally:
         reader.close()
     for message in McapScan(file).messages():
-        if not message.repeated:  # those that are stand first
+        if not message.repeated:  # repeated messages come first
             break
         part.repeated[message.topic] = part.repeated.get(message.topic, 0) + 1
         part.repeated_ns = message.stamp_ns
@@ -130,7 +130,7 @@ def _part(file: Path, topics: dict[Topic, tuple[QoS, Schema]], custom: dict[str,
 
 
 def mcap_files(source: Path) -> list[Path]:
-    """The MCAP files of a bag in the order of their numbers; a file alone.
+    """Return the MCAP files of a bag in numeric order, or the file itself.
 
     Raises:
         BagError: there is none.

@@ -1,4 +1,4 @@
-"""Lockstep replay: a bag through real nodes in one process, with the same result every time, bit for bit."""
+"""Lockstep replay: runs a bag through real nodes in one process; every run gives the same result, bit for bit."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ BROADCASTS: Mapping[str, tuple[str, ...]] = {
     "theta_camera": ("camera",),
     "vlp16_driver": ("velodyne",),
 }
-"""Child frames that the shipped nodes broadcast: the bag's own are left out where the node is replayed.
+"""Child frames that the shipped nodes broadcast: transforms with these frames in the bag are not fed to a replay.
 
-Only these: what such a node broadcasts for a while in another's place (the SLAM without wheel odometry) stays the
-other's. Of other nodes every frame is left out from its first broadcast on.
+Frames that a node broadcasts only temporarily for another node (SLAM without wheel odometry) are not listed and stay
+with that other node. For nodes not listed, every frame is dropped from its first broadcast on.
 """
 
 
 class ReplayError(RuntimeError):
-    """A replay that cannot begin; the message says why."""
+    """A replay cannot start; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ReplayNode:
     """A node to replay.
 
     Attributes:
-        name: of a shipped node.
+        name: name of a shipped node.
         node_class: its class.
         config: its parameters.
     """
@@ -61,15 +61,15 @@ class ReplayNode:
 
 @dataclass
 class ReplayResult:
-    """What a replay did.
+    """Result of a replay.
 
     Attributes:
-        fed: messages of the bag that went in, by topic.
-        left_out: messages of the bag that did not, because a replayed node makes them.
-        made: messages that came out, by topic.
-        bag_s: length of the bag.
-        setup_s: time that the nodes took to start.
-        wall_s: time that feeding took.
+        fed: messages of the bag passed to nodes, by topic.
+        left_out: messages of the bag that were not passed because a replayed node publishes them.
+        made: messages that the nodes published, by topic.
+        bag_s: duration of the bag.
+        setup_s: start-up time of the nodes.
+        wall_s: time for processing the messages.
     """
 
     fed: Counter[str] = field(default_factory=Counter)
@@ -81,19 +81,19 @@ class ReplayResult:
 
 
 def shipped_parameter_files(name: str) -> list[Path]:
-    """Files of ``config/`` with a section for a node, in the order of their names, except those of simulated robots."""
+    """Return the files of ``config/`` with a section for a node, sorted by name, except those of simulated robots."""
     try:
         folder = paths.share_dir("config")
     except FileNotFoundError:
         return []
     found = []
     for file in sorted(folder.glob("*.yaml")):
-        if file.name in ("sim.yaml", "fleet_sim.yaml"):  # the fleet's lowers rates, so that many robots fit in
+        if file.name in ("sim.yaml", "fleet_sim.yaml"):  # fleet_sim.yaml lowers rates to fit many robots
             continue
         try:
             named = name in _sections(file, file.stat().st_mtime_ns)
         except (OSError, yaml.YAMLError):
-            continue  # a broken file that this node may not even use: whoever names it gets the message
+            continue  # a broken file that this node may not use: an error appears when it is named explicitly
         if named:
             found.append(file)
     return found
@@ -101,22 +101,22 @@ def shipped_parameter_files(name: str) -> list[Path]:
 
 @functools.lru_cache(maxsize=64)
 def _sections(file: Path, changed_ns: int) -> frozenset[str]:
-    """Nodes that a parameter file names; read again when it has changed. Reading takes longer than making a node."""
+    """Return the nodes that a parameter file configures. Cached by time of change: parsing is slow."""
     content = yaml.safe_load(file.read_text())
     return frozenset(content) if isinstance(content, dict) else frozenset()
 
 
 def make_node(name: str, params_files: Sequence[Path] | None, overrides: Sequence[str]) -> ReplayNode:
-    """A node with its parameters.
+    """Create a node with its parameters.
 
     Args:
-        name: of a shipped node.
-        params_files: parameter files; None takes what ``config/`` has for the node.
-        overrides: ``node.key:=value`` words; those of other nodes are skipped.
+        name: name of a shipped node.
+        params_files: parameter files; None takes those of ``config/`` for the node.
+        overrides: ``node.key:=value`` arguments; those of other nodes are skipped.
 
     Raises:
-        NodeFileError: no such node.
-        ParameterError: wrong parameters.
+        NodeFileError: there is no such node.
+        ParameterError: a parameter is wrong.
     """
     files = shipped_parameter_files(name) if params_files is None else list(params_files)
     own = [word.removeprefix(f"{name}.") for word in overrides if word.startswith(f"{name}.")]
@@ -133,22 +133,22 @@ def replay(
     on_progress: Callable[[float], None] | None = None,
     compressed: bool = False,
 ) -> ReplayResult:
-    """Feeds a bag to nodes message by message and records what they publish.
+    """Feed a bag to nodes message by message and record what they publish.
 
-    The clock is the bag's: it stands still while a node works, so nothing depends on how fast the machine is. Topics
-    that a replayed node publishes are not fed, and of the transforms those with a child frame that one broadcasts.
+    The clock is the bag's and stands still while a node works, so the result does not depend on the machine's speed.
+    Topics that a replayed node publishes are not fed, nor are transforms whose child frame a replayed node broadcasts.
 
     Args:
-        bag: what to feed.
-        nodes: what to feed it to.
+        bag: bag to feed.
+        nodes: nodes to run.
         output: folder of the new bag, which must not exist.
-        drop_transforms: further child frames to leave out.
-        on_progress: called with the share of the bag that has gone in, 0 to 1.
+        drop_transforms: further child frames to drop.
+        on_progress: called with the completed share of the bag, 0 to 1.
         compressed: compress the new bag.
 
     Raises:
         BagError: a bag cannot be read or written.
-        ReplayError: a node reads a type that has another definition in the bag.
+        ReplayError: a node reads a type whose definition differs in the bag.
     """
     result = ReplayResult()
     began_s = time.monotonic()
@@ -202,7 +202,7 @@ def _check_types(reader: BagReader, bus: LockstepBus) -> None:
 
 
 def _what_to_feed(message: BagMessage, made_topics: set[str], made_frames: set[str]) -> bytes | None:
-    """The message's bytes; None when a replayed node makes it itself."""
+    """Return the message's bytes; None when a replayed node publishes it."""
     if message.topic in TRANSFORM_TOPICS:
         return without_children(message, made_frames)
     if message.topic in made_topics or message.topic in NEVER_PLAYED:

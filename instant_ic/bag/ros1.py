@@ -1,4 +1,4 @@
-"""ROS 1 ``.bag`` files as if they were ROS 2's: types renamed, definitions and bytes converted message by message."""
+"""Reads ROS 1 ``.bag`` files as ROS 2: types are renamed, definitions and bytes converted message by message."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from instant_ic.msg import typestore
 
 
 class Ros1Source:
-    """Reads one ROS 1 bag, in the shape of `rosbags`' rosbag2 reader.
+    """Reads one ROS 1 bag, with the interface of `rosbags`' rosbag2 reader.
 
-    Types that ROS 2 has (and ours) become those, field by field where they changed (``Header.seq`` goes, ``tfMessage``
-    becomes ``TFMessage``); all others are taken over from the definitions in the bag.
+    Types that ROS 2 or this project has are converted, field by field where they changed (``Header.seq`` is dropped,
+    ``tfMessage`` becomes ``TFMessage``). All others use the definitions in the bag.
 
     Args:
         path: the ``.bag`` file.
@@ -38,10 +38,10 @@ class Ros1Source:
         self._converters: dict[str, Callable[[bytes], bytes]] = {}
 
     def open(self) -> None:
-        """Reads index and types.
+        """Read index and types.
 
         Raises:
-            BagError: no ROS 1 bag, or one without index.
+            BagError: the file is not a ROS 1 bag, or has no index.
         """
         try:
             self._bag.open()
@@ -66,7 +66,6 @@ class Ros1Source:
             self._converters[source.msgtype] = self._converter(target, source.msgtype, name)
 
     def close(self) -> None:
-        """Closes the file."""
         self._bag.close()
         self.is_open = False
 
@@ -88,14 +87,14 @@ class Ros1Source:
     def messages(
         self, connections: list[Connection], start: int | None = None, stop: int | None = None
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Messages as CDR, in the order of their stamps."""
+        """Yield the messages as CDR, in stamp order."""
         chosen = {c.id: c for c in connections}
         sources = [c for c in self._bag.connections if c.id in chosen]
         for source, stamp_ns, raw in self._bag.messages(sources, start, stop):
             yield chosen[source.id], stamp_ns, self._converters[source.msgtype](raw)
 
     def _target_store(self) -> Any:
-        """Our types, and those of the bag that we do not have."""
+        """Return a type store with our types and the bag's types that we do not have."""
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
         store = get_typestore(Stores.EMPTY)

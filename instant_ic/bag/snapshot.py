@@ -1,4 +1,4 @@
-"""The last seconds of all topics in memory, ready to be written when something has happened."""
+"""The last seconds of all topics in memory, for a snapshot on request."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from instant_ic.bus.qos import QoS
 
 @dataclass(frozen=True)
 class Entry:
-    """A message on its way into a bag."""
+    """A message to be written into a bag."""
 
     topic: str
     type_name: str
@@ -22,11 +22,11 @@ class Entry:
 
 
 class SnapshotCache:
-    """Keeps messages for a while; not for several threads at once.
+    """Keeps the latest messages in memory; not thread-safe.
 
     Args:
-        seconds: how long, by the clock that :meth:`add` is given.
-        max_bytes: the oldest go earlier when they are more than this together.
+        seconds: how long to keep a message, by the clock passed to :meth:`add`.
+        max_bytes: total size above which the oldest messages are dropped earlier.
     """
 
     def __init__(self, seconds: float, max_bytes: int) -> None:
@@ -38,13 +38,13 @@ class SnapshotCache:
         self._before_qos: dict[str, QoS] = {}
 
     def add(self, entry: Entry, now_s: float) -> None:
-        """Takes a message that came at ``now_s``; forgets what is too old."""
+        """Add a message received at ``now_s``; drop expired ones."""
         self._entries.append((now_s, entry))
         self.bytes += len(entry.payload)
         while self._entries and (self._entries[0][0] < now_s - self.seconds or self.bytes > self.max_bytes):
             _, old = self._entries.popleft()
             self.bytes -= len(old.payload)
-            if old.qos.latched:  # its value still holds when the window begins
+            if old.qos.latched:  # its value is still valid at the start of the window
                 self._before.put(LatchedValue(old.topic, old.type_name, old.payload, old.stamp_ns), old.publisher)
                 self._before_qos[old.topic] = old.qos
 
@@ -54,7 +54,7 @@ class SnapshotCache:
         return self._entries[-1][0] - self._entries[0][0] if self._entries else 0.0
 
     def content(self) -> list[Entry]:
-        """The messages, oldest first; before them the latched values that held when they begin, with their stamp."""
+        """Return the messages, oldest first, preceded by the latched values valid at their start, with that stamp."""
         entries = [entry for _, entry in self._entries]
         if not entries:
             return []

@@ -1,4 +1,4 @@
-"""Takes transforms out of ``/tf`` messages that somebody else broadcasts now."""
+"""Removes transforms from ``/tf`` messages when a running node broadcasts them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ TRANSFORM_TOPICS = ("/tf", "/tf_static")
 
 
 def without_children(message: BagMessage, frames: Collection[str]) -> bytes | None:
-    """The bytes of a message on a transform topic less the transforms with a child frame in ``frames``.
+    """Remove the transforms with a child frame in ``frames`` from a transform message.
 
     Returns:
-        The very same bytes where nothing is taken out; None where nothing is left.
+        The same bytes object if nothing was removed; None if nothing is left.
     """
     transforms = deserialize(message.payload, message.type_name).transforms
     kept = [transform for transform in transforms if transform.child_frame_id not in frames]

@@ -1,4 +1,4 @@
-"""Writes rosbag2 folders: one MCAP file or several, each whole by itself, with the latched values at its beginning."""
+"""Writes rosbag2 folders of one or more MCAP files; each file is self-contained and starts with the latched values."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from instant_ic.private import make_folder
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 CUSTOM_RECORD = "instant_ic"
-"""Name of the metadata record in which a file keeps ``custom_data`` while the bag is being written."""
+"""Name of the metadata record that holds ``custom_data`` in a file while the bag is being written."""
 
 
 @dataclass
 class _Part:
-    """The file being written."""
+    """The current file."""
 
     file: McapWriter
     info: PartInfo
@@ -35,20 +35,20 @@ class _Part:
 
 
 class BagWriter:
-    """Writes a bag folder; a context manager; not for several threads at once.
+    """Writes a bag folder; a context manager; not thread-safe.
 
-    Each file that is complete is in ``metadata.yaml`` at once: who dies while recording leaves a bag that opens, and
+    Each completed file is listed in ``metadata.yaml`` immediately. A killed recorder leaves a bag that opens, and
     one file to recover.
 
     Args:
-        path: the folder, which must not exist yet; only its owner can read it.
-        compressed: chunks are compressed by zstd, for bags to keep or send: half the size for point packets.
-        level: of the compression; 1 keeps pace with raw pictures, 3 is smaller.
-        max_bytes: a file that has grown so large is followed by the next; 0 does not look at the size.
-        max_duration_s: the same by the stamps of its messages.
+        path: the folder, which must not exist; only its owner can read it.
+        compressed: compress chunks with zstd, for archiving or sending; halves the size of point packets.
+        level: zstd level; 1 keeps pace with raw images, 3 is smaller.
+        max_bytes: file size at which a new file starts; 0 sets no limit.
+        max_duration_s: duration by message stamps after which a new file starts; 0 sets no limit.
 
     Raises:
-        BagError: it exists, or cannot be made.
+        BagError: the folder exists, or cannot be created.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class BagWriter:
         self.max_duration_ns = int(max_duration_s * 1e9)
         self.bytes = 0
         self.unknown_types: dict[str, str] = {}
-        """Type → topic of what is recorded without its definition, which nobody here knows."""
+        """Type → topic recorded without a definition because the type is unknown."""
         self._topics: dict[Topic, tuple[QoS, Schema]] = {}
         self._latched = LatchedValues()
         self._unsure = False
@@ -83,13 +83,12 @@ class BagWriter:
         self._open_part()
 
     def __enter__(self) -> BagWriter:
-        """The writer itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes the bag properly, also when something else went wrong: half a recording is worth having."""
+        """Close the bag, also after an exception: a partial recording is still useful."""
         self.close()
 
     @property
@@ -105,7 +104,7 @@ class BagWriter:
 
     @property
     def part_is_empty(self) -> bool:
-        """Whether the present file has no message yet."""
+        """Whether the current file has no messages yet."""
         return self._part is None or self._part.given == 0
 
     def write(
@@ -118,19 +117,19 @@ class BagWriter:
         schema: Schema | None = None,
         publisher: str = "",
     ) -> None:
-        """Appends one message.
+        """Append one message.
 
         Args:
             topic: its topic.
             type_name: its type.
             payload: CDR bytes, which must not change until they are on the disk.
             stamp_ns: nanoseconds since the epoch.
-            qos: told with the topic, the first time that it comes.
-            schema: definition of the type; default ours. Where there is none, the bytes are kept all the same.
-            publisher: who sent it: each publisher of a latched topic has its own present value.
+            qos: QoS of the topic; used the first time that the topic appears.
+            schema: definition of the type; default ours. Without one, the bytes are still recorded.
+            publisher: name of the publisher; each publisher of a latched topic has its own current value.
 
         Raises:
-            DiskFullError: what did not fit is counted; the bag can be ended, or written on when there is room.
+            DiskFullError: lost messages are counted; the bag can be closed, or continued once there is room.
             BagError: the file cannot be written.
         """
         if self._closed:
@@ -156,7 +155,7 @@ class BagWriter:
         self.bytes += len(payload)
 
     def add_topic(self, topic: str, type_name: str, qos: QoS, schema: Schema | None = None) -> None:
-        """Notes a topic that may never carry a message."""
+        """Add a topic that may never carry a message."""
         if (topic, type_name) in self._topics:
             return
         schema = schema or schema_or_unknown(type_name)
@@ -167,11 +166,11 @@ class BagWriter:
             self._channel(self._part, (topic, type_name))
 
     def set_custom(self, key: str, value: str) -> None:
-        """Puts text into the metadata (``custom_data``)."""
+        """Set text in the metadata (``custom_data``)."""
         self._custom[key] = value
 
     def keep_custom(self) -> None:
-        """Writes the present ``custom_data`` into the file itself, from where a recovery takes it.
+        """Write the current ``custom_data`` into the file itself, for a recovery to read.
 
         Raises:
             BagError: the disk is full.
@@ -183,7 +182,7 @@ class BagWriter:
                 raise self._failed(error, "metadata") from error
 
     def flush(self) -> None:
-        """Hands to the system what has come so far: from here on it survives the end of this process.
+        """Pass all messages so far to the operating system. They then survive the end of this process.
 
         Raises:
             BagError: the disk is full.
@@ -195,15 +194,15 @@ class BagWriter:
                 raise self._failed(error, "flush") from error
 
     def end_part(self) -> None:
-        """Completes the present file and tells it in ``metadata.yaml``; the next message begins another.
+        """Complete the current file and list it in ``metadata.yaml``; the next message starts another.
 
         Raises:
-            BagError: the disk does not take it.
+            BagError: the file cannot be completed.
         """
         part, self._part = self._part, None
         if part is not None:
             try:
-                with suppress(OSError):  # no room: finish() finds some, and metadata.yaml tells the same
+                with suppress(OSError):  # no room: finish() makes some, and metadata.yaml holds the same values
                     part.file.add_metadata(CUSTOM_RECORD, self._custom)
                 full = part.file.finish()
             except OSError as error:
@@ -217,11 +216,11 @@ class BagWriter:
         self._write_metadata()
 
     def close(self) -> None:
-        """Writes index and metadata; twice does no harm.
+        """Write index and metadata. Idempotent.
 
         Raises:
-            DiskFullError: the last messages did not fit; the bag is whole without them.
-            BagError: the disk does not take it.
+            DiskFullError: the last messages did not fit; the bag is complete without them.
+            BagError: the bag cannot be completed.
         """
         if not self._closed:
             self._closed = True
@@ -234,7 +233,7 @@ class BagWriter:
             return False
         if self.max_bytes and part.file.size >= self.max_bytes:
             return True
-        # A clock that was set back ends a file as one that ran on.
+        # A step of the clock ends a file in either direction.
         return 0 < self.max_duration_ns <= abs(stamp_ns - part.first_ns)
 
     def _open_part(self) -> None:
@@ -254,7 +253,7 @@ class BagWriter:
             return
         assert self._part is not None
         for value in self._latched.values(but, publisher):
-            if self._unsure:  # it may have been in what a full disk did not take: better twice than never
+            if self._unsure:  # a full disk may have dropped it: better twice than never
                 self._put(value.topic, value.type_name, value.payload, stamp_ns, stamp_ns)
                 continue
             self._put(value.topic, value.type_name, value.payload, stamp_ns, value.publish_ns)
@@ -278,7 +277,7 @@ class BagWriter:
         return part.channels[topic]
 
     def _failed(self, error: OSError, what: str) -> BagError:
-        """Ends the file at its last whole chunk, in words."""
+        """End the file at its last complete chunk and return the error to raise."""
         words = f"bag {self.path}, {what}: {error.strerror}"
         try:
             self.end_part()
