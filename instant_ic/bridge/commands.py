@@ -1,4 +1,4 @@
-"""The gate for commands that come from outside a run directory: fresh, sane, of one sender at a time."""
+"""Checks commands from outside the run directory: they must be recent, plausible and from one sender at a time."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ class CommandRefused(ValueError):
 
 @dataclass(frozen=True)
 class CommandLimits:
-    """What a command from outside must keep to.
+    """Limits for commands from outside.
 
     Attributes:
-        max_age_s: s; an older command is refused. The clocks of both machines must agree better than that.
-        lease_s: s; while one sender's commands come, another's are refused until it has been silent for this long.
-        max_linear_mps: m/s; a faster command is refused. The arbiter limits what passes.
-        max_angular_rps: rad/s, the same.
+        max_age_s: s; an older command is refused. The clocks of both machines must agree better than this.
+        lease_s: s; while one sender drives, commands of others are refused until it has been silent for this long.
+        max_linear_mps: m/s; a faster command is refused. The arbiter limits the commands that pass.
+        max_angular_rps: rad/s; a faster command is refused.
     """
 
     max_age_s: Positive = 0.3
@@ -29,15 +29,14 @@ class CommandLimits:
     max_angular_rps: Positive = 4.0
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
 
 
 class CommandGate:
-    """Decides on each command; knows no bus and no clock.
+    """Accepts or refuses each command; independent of bus and clock.
 
     Attributes:
-        refused: reason → how many.
+        refused: reason → number of refused commands.
     """
 
     def __init__(self, limits: CommandLimits) -> None:
@@ -47,10 +46,10 @@ class CommandGate:
         self._driver_ns = 0
 
     def check_age(self, source_ns: int, now_ns: int) -> None:
-        """Refuses what is old, or from the future, which would hide its age.
+        """Refuse an old command, or one from the future, whose age is unknown.
 
         Raises:
-            CommandRefused: see above.
+            CommandRefused: the stamp is too old or too far ahead.
         """
         age_s = (now_ns - source_ns) / 1e9
         if age_s > self.limits.max_age_s:
@@ -59,12 +58,12 @@ class CommandGate:
             raise self.refuse("future", f"stamped {-age_s:.2f} s ahead of this machine's clock: set both by NTP")
 
     def check_drive(self, sender: str, v: float, w: float, steady_ns: int) -> None:
-        """Refuses what no sane operator sends (m/s, rad/s), and a second driver.
+        """Refuse implausible values (m/s, rad/s), and a second driver.
 
-        ``steady_ns`` is of a clock that is never set, as it measures the lease.
+        ``steady_ns`` comes from a clock that is never set, since it measures the lease.
 
         Raises:
-            CommandRefused: see above.
+            CommandRefused: a value is not finite or beyond the limits, or another sender drives.
         """
         if not (math.isfinite(v) and math.isfinite(w)):
             raise self.refuse("not finite", f"v {v}, w {w}: not finite")
@@ -76,22 +75,22 @@ class CommandGate:
         self._driver, self._driver_ns = sender, steady_ns
 
     def check_release(self, sender: str, steady_ns: int) -> None:
-        """Refuses to release the emergency stop for anybody but the driver, while its commands come.
+        """Refuse to release the emergency stop unless the sender is the driver and its commands are current.
 
         Raises:
-            CommandRefused: see above.
+            CommandRefused: the sender does not drive.
         """
         if self._driver != sender or steady_ns - self._driver_ns > self.limits.lease_s * 1e9:
             raise self.refuse("release", f"{sender} does not drive; only the driver may release the emergency stop")
 
     def release(self, sender: str) -> bool:
-        """Notes that a sender has left; true if it was the driver."""
+        """End a sender's lease; return True if it was the driver."""
         if self._driver != sender:
             return False
         self._driver = None
         return True
 
     def refuse(self, reason: str, words: str) -> CommandRefused:
-        """Counts a refusal by its reason and gives the error to raise."""
+        """Count a refusal by its reason and return the error to raise."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
         return CommandRefused(words)

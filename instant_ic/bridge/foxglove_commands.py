@@ -1,4 +1,4 @@
-"""Commands of Foxglove's clients."""
+"""Commands from Foxglove clients."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _COMMAND_TYPES = {DRIVE: ("TwistStamped", "Twist"), STOP: ("Bool",)}
 
 
 class Commands:
-    """Commands of clients: checked, then published as the console's would be. Called on the server's thread.
+    """Checks the commands of clients and publishes them as the console does. Called on the server's thread.
 
     Args:
-        node: publishes them.
-        gate: what they have to pass.
-        tell: number of a client, words for it, and their level.
+        node: publishes the commands.
+        gate: checks them.
+        tell: called with a client's number, a text for that client, and its level.
     """
 
     def __init__(self, node: Node[Any], gate: CommandGate, tell: Callable[[int, str, int], None]) -> None:
@@ -35,7 +35,7 @@ class Commands:
         self._stop: Publisher = node.publisher(STOP, message_type("Bool"), LATCHED)
 
     def advertised(self, client: int, channel: ClientChannel) -> None:
-        """A client is going to publish."""
+        """Handle a client's ``advertise``."""
         kinds = _COMMAND_TYPES.get(channel.topic)
         name = channel.schema_name.rsplit("/", 1)[-1]
         if kinds is None or name not in kinds or channel.encoding not in ("cdr", "json"):
@@ -46,21 +46,21 @@ class Commands:
         self._channels[client, channel.id] = channel
 
     def unadvertised(self, client: int, channel_id: int) -> None:
-        """A client publishes no more: the robot it drove stands at once."""
+        """Handle a client's ``unadvertise``. If the client drove, stop the robot immediately."""
         channel = self._channels.pop((client, channel_id), None)
         if channel is not None and channel.topic == DRIVE and self._gate.release(_name(client)):
             self._drive.publish(twist_stamped(0.0, 0.0, self._node.clock.now_ns()))
 
     def left(self, client: int) -> None:
-        """A client has left."""
+        """Release the channels of a disconnected client."""
         for number, channel_id in [key for key in self._channels if key[0] == client]:
             self.unadvertised(number, channel_id)
         self._told.pop(client, None)
 
     def message(self, client: int, channel_id: int, data: bytes) -> None:
-        """A client's message."""
+        """Handle a client's message."""
         channel = self._channels.get((client, channel_id))
-        if channel is None:  # told at its advertisement
+        if channel is None:  # reported when it was advertised
             return
         try:
             if channel.topic == STOP:
@@ -93,7 +93,7 @@ class Commands:
             v, w = float(twist["linear"]["x"]), float(twist["angular"]["z"])
             stamp = content.get("header", {}).get("stamp", {})
             sent_ns = int(stamp.get("sec", 0)) * 1_000_000_000 + int(stamp.get("nanosec", stamp.get("nsec", 0)))
-        if sent_ns:  # a client without a clock (Foxglove's teleop panel) stamps nothing: its arrival counts
+        if sent_ns:  # Foxglove's Teleop panel has no clock and sends no stamp: the time of arrival counts
             self._gate.check_age(sent_ns, now_ns)
         self._gate.check_drive(_name(client), v, w, time.monotonic_ns())
         self._drive.publish(twist_stamped(v, w, sent_ns or now_ns))
@@ -101,7 +101,7 @@ class Commands:
             self._node.call_soon(self._node.diagnose, "commands", OK, "commands come in")
 
     def _refused(self, client: int, words: str) -> None:
-        """Sends a refusal to the client, once until its text changes."""
+        """Send a refusal to the client, once until its text changes."""
         words = words[:300]
         if self._told.get(client) == words:
             return

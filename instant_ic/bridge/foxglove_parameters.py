@@ -1,4 +1,4 @@
-"""Parameters of all nodes of a run directory under one roof."""
+"""Parameters of all nodes of a run directory in one namespace."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TIMEOUT_S = 1.0
 
 
 class Parameters:
-    """Parameters of all nodes of a run directory, as ``/node.key``; asked of the nodes themselves.
+    """Parameters of all nodes of a run directory, as ``/node.key``; read from the nodes themselves.
 
     Args:
         run_dir: the run directory.
@@ -30,7 +30,7 @@ class Parameters:
         return NodeControl(self._run_dir, node, _TIMEOUT_S)
 
     def _of(self, node: str) -> tuple[dict[str, Any], str]:
-        if node not in self.nodes:  # its name becomes part of a path
+        if node not in self.nodes:  # the name becomes part of a path
             return {}, f"node {node!r:.100} does not run"
         try:
             return {f"/{node}.{key}": value for key, value in self._control(node).get().items()}, ""
@@ -38,7 +38,7 @@ class Parameters:
             return {}, str(error)
 
     def get(self, names: Sequence[str]) -> tuple[dict[str, Any], list[str]]:
-        """Values by name, of all parameters of all nodes without names; and which nodes did not answer, in words."""
+        """Return values by name (without names: all parameters of all nodes), and an error text per failed node."""
         nodes = {_split(name)[0] for name in names} if names else set(self.nodes)
         values: dict[str, Any] = {}
         silent = []
@@ -48,9 +48,9 @@ class Parameters:
         return {name: values[name] for name in names if name in values} if names else values, silent
 
     def set(self, wanted: Mapping[str, Any]) -> list[str]:
-        """Changes parameters, those of one node together; returns what was refused, in words.
+        """Change parameters, those of one node together; return an error text for each refused change.
 
-        Safety parameters (:mod:`.parameter_guard`) are always refused, and with them the whole change of their node.
+        A safety parameter (:mod:`.parameter_guard`) is always refused, and with it the whole change of its node.
         """
         by_node: dict[str, dict[str, Any]] = {}
         for name, value in wanted.items():
@@ -70,15 +70,15 @@ class Parameters:
         return refused
 
     def close(self) -> None:
-        """Ends the threads."""
+        """End the threads."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _check(executable: str, key: str, value: Any) -> None:
-    """Refuses a safety parameter, also as part of a group.
+    """Refuse a safety parameter, also as part of a group.
 
     Raises:
-        ParameterError: see above.
+        ParameterError: the key is a safety parameter, or the value has an unsupported type.
     """
     items = value if isinstance(value, list) else [value]
     if not all(isinstance(item, (bool, int, float, str)) for item in items):
@@ -90,6 +90,6 @@ def _check(executable: str, key: str, value: Any) -> None:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """``/node.group.key`` as node and key."""
+    """Split ``/node.group.key`` into node and key."""
     node, _, key = name.strip("/").partition(".")
     return node, key

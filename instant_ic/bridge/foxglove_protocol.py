@@ -1,4 +1,4 @@
-"""Foxglove's WebSocket protocol as strings and bytes (foxglove/ws-protocol, docs/spec.md); no socket, no bus."""
+"""Encodes and decodes Foxglove's WebSocket protocol (foxglove/ws-protocol, docs/spec.md); no socket, no bus."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Names of the protocol: since foxglove-sdk 0.14, and before. The messages used here are the same in both."""
+"""Names of the protocol: since foxglove-sdk 0.14, and earlier. The messages used here are the same in both."""
 
 INFO, WARNING, ERROR = range(3)
-"""Levels of a status."""
+"""Levels of a status message."""
 
 _Names = Mapping[str, Sequence[str]]
 
@@ -24,7 +24,7 @@ _MAX_NUMBER = (1 << 32) - 1
 
 
 class ProtocolError(ValueError):
-    """A client's frame that the protocol does not know; the message says what is wrong in it."""
+    """A client's frame violates the protocol; the message says how."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +41,23 @@ class ClientChannel:
 
 
 def text(op: str, **content: Any) -> str:
-    """A text message; fields that are None are left out."""
+    """Return a text message; fields that are None are omitted."""
     fields = {key: value for key, value in content.items() if value is not None}
     return json.dumps({"op": op, **fields}, separators=(",", ":"), allow_nan=False)
 
 
 def message_data(subscription: int, log_ns: int, payload: bytes | memoryview) -> bytes:
-    """A message of a channel to one subscription."""
+    """Return a channel's message for one subscription."""
     return _MESSAGE_DATA.pack(1, subscription, log_ns) + payload
 
 
 def time_data(now_ns: int) -> bytes:
-    """The server's time."""
+    """Return a message with the server's time."""
     return _TIME.pack(2, now_ns)
 
 
 def parameters(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Parameters as the protocol writes them; those without a value are left out."""
+    """Return parameters in the protocol's form; those without a value are omitted."""
     found = []
     for name, value in values.items():
         if value is None:
@@ -67,14 +67,14 @@ def parameters(values: Mapping[str, Any]) -> list[dict[str, Any]]:
             entry["type"] = "float64"
         elif isinstance(value, (list, tuple)) and all(isinstance(item, float) for item in value):
             entry["type"] = "float64_array"
-        if entry["value"] != value:  # text now
+        if entry["value"] != value:  # converted to text
             entry.pop("type", None)
         found.append(entry)
     return found
 
 
 def _finite(value: Any) -> Any:
-    """The value as JSON can carry it: infinity and NaN become text."""
+    """Return a value that JSON can carry: infinity and NaN become text."""
     if isinstance(value, float) and not math.isfinite(value):
         return str(value)
     if isinstance(value, (list, tuple)):
@@ -83,7 +83,7 @@ def _finite(value: Any) -> Any:
 
 
 def graph_update(before: Graph, now: Graph) -> str | None:
-    """The change from one connection graph to another; None without one."""
+    """Return the difference of two connection graphs; None if they are equal."""
     removed = sorted(before.topics - now.topics)
     published = _changed(before.published, now.published, removed)
     subscribed = _changed(before.subscribed, now.subscribed, removed)
@@ -93,7 +93,7 @@ def graph_update(before: Graph, now: Graph) -> str | None:
 
 
 def _changed(before: _Names, now: _Names, removed: Sequence[str]) -> _Names:
-    """Topics with other names than before, except those that are removed altogether."""
+    """Return the topics whose names changed, except removed topics."""
     return {
         topic: now.get(topic, ())
         for topic in {*before, *now}
@@ -103,18 +103,18 @@ def _changed(before: _Names, now: _Names, removed: Sequence[str]) -> _Names:
 
 @dataclass(frozen=True)
 class Graph:
-    """Who publishes and who subscribes, by topic."""
+    """Publishers and subscribers by topic."""
 
     published: _Names
     subscribed: _Names
 
     @property
     def topics(self) -> set[str]:
-        """All topics in it."""
+        """All topics of the graph."""
         return {*self.published, *self.subscribed}
 
     def encode(self) -> str:
-        """The whole graph, for a client that asks for it."""
+        """Return the whole graph as a message for a new subscriber."""
         return _graph_text(self.published, self.subscribed, [])
 
 
@@ -133,10 +133,10 @@ def _graph_text(published: _Names, subscribed: _Names, removed: Sequence[str]) -
 
 
 def parse_text(data: str) -> dict[str, Any]:
-    """A client's text message: an object with the text ``op``.
+    """Parse a client's text message: a JSON object with a text field ``op``.
 
     Raises:
-        ProtocolError: it is none.
+        ProtocolError: the message is anything else.
     """
     try:
         content = json.loads(data, parse_constant=_no_constant)
@@ -152,10 +152,10 @@ def _no_constant(name: str) -> Any:
 
 
 def parse_data(data: bytes) -> tuple[int, bytes]:
-    """Channel and payload of a client's message.
+    """Return channel and payload of a client's message.
 
     Raises:
-        ProtocolError: another kind of frame, or too short.
+        ProtocolError: the frame is of another kind, or too short.
     """
     if len(data) < _CLIENT_DATA.size or data[0] != 1:
         raise ProtocolError(f"unknown binary message ({data[:1].hex() or 'empty'}, {len(data)} bytes)")
@@ -163,10 +163,10 @@ def parse_data(data: bytes) -> tuple[int, bytes]:
 
 
 def objects(content: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
-    """A field that must be a list of objects.
+    """Return a field that must be a list of objects.
 
     Raises:
-        ProtocolError: it is something else.
+        ProtocolError: the field is missing or of another type.
     """
     value = content.get(key)
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
@@ -175,10 +175,10 @@ def objects(content: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 def numbers(content: Mapping[str, Any], key: str) -> list[int]:
-    """A field that must be a list of channel or subscription numbers.
+    """Return a field that must be a list of channel or subscription numbers.
 
     Raises:
-        ProtocolError: it is something else.
+        ProtocolError: the field is missing or of another type.
     """
     value = content.get(key)
     if not isinstance(value, list):
@@ -187,10 +187,10 @@ def numbers(content: Mapping[str, Any], key: str) -> list[int]:
 
 
 def number(content: Mapping[str, Any], key: str) -> int:
-    """A field that must be a number of 32 bits.
+    """Return a field that must be a 32-bit number.
 
     Raises:
-        ProtocolError: it is something else.
+        ProtocolError: the field is missing or of another type.
     """
     value = content.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_NUMBER:
@@ -199,10 +199,10 @@ def number(content: Mapping[str, Any], key: str) -> int:
 
 
 def strings(content: Mapping[str, Any], key: str) -> list[str]:
-    """A field that must be a list of texts.
+    """Return a field that must be a list of texts.
 
     Raises:
-        ProtocolError: it is something else.
+        ProtocolError: the field is missing or of another type.
     """
     value = content.get(key)
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
@@ -211,7 +211,7 @@ def strings(content: Mapping[str, Any], key: str) -> list[str]:
 
 
 def client_channel(content: Mapping[str, Any]) -> ClientChannel:
-    """One entry of a client's ``advertise``.
+    """Parse one entry of a client's ``advertise``.
 
     Raises:
         ProtocolError: a field is missing or wrong.

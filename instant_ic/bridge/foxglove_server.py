@@ -1,7 +1,7 @@
-"""A Foxglove server that follows a run directory: its topics, its nodes' parameters, its graph.
+"""A Foxglove server for a run directory: its topics, its nodes' parameters, its graph.
 
-Bytes go through unchanged. The WebSockets live on an event loop in a thread of its own; what the node's thread gives it
-waits in queues of a fixed size, so neither a slow viewer nor a stalled loop holds the node up.
+Payloads pass unchanged. The WebSockets run on an event loop in their own thread. The node's thread passes data to it
+through bounded queues, so neither a slow viewer nor a stalled loop blocks the node.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ _END_S = 2.0
 _HANDSHAKE_S = 5.0
 _HEARTBEAT_S = 30.0
 _MAX_CLIENT_FRAME = 64 * 1024
-_MAX_TEXTS = 1000  # answers that wait for a client; one that reads none of them is let go
+_MAX_TEXTS = 1000  # unread answers of a client; above this it is disconnected
 _MAX_BACKLOG_BYTES = 32 << 20
-_MAX_CHANNELS = 16  # that one client may publish on
+_MAX_CHANNELS = 16  # channels that one client may publish on
 _MAX_PARAMETER_REQUESTS = 16
 _MAX_MESSAGES_PER_S = 200.0
-_WAITING_CONNECTIONS = 16  # connections beside the clients', until they have asked for a WebSocket
+_WAITING_CONNECTIONS = 16  # connections that have not become a WebSocket yet, in addition to the clients'
 _UNSUPPORTED = ("subscribeParameterUpdates", "unsubscribeParameterUpdates", "fetchAsset")
 _STATUS = {OK: protocol.INFO, WARN: protocol.WARNING}
 
 log = logging.getLogger(__name__)
 _http_log = logging.getLogger(f"{__name__}.http")
-_http_log.setLevel(logging.CRITICAL)  # a line for each malformed request would let strangers fill the disk
+_http_log.setLevel(logging.CRITICAL)  # a line per malformed request would let strangers fill the disk
 
 
 class FoxgloveError(RuntimeError):
@@ -55,10 +55,10 @@ class FoxgloveError(RuntimeError):
 
 
 def schema_text(type_name: str) -> str:
-    """Definition of a type with all that it holds, as ``ros2msg`` has it.
+    """Return the ``ros2msg`` definition of a type, including nested types.
 
     Raises:
-        MessageError: the type is not known.
+        MessageError: the type is unknown.
     """
     try:
         return typestore().generate_msgdef(type_name, ros_version=2)[0]
@@ -68,18 +68,18 @@ def schema_text(type_name: str) -> str:
 
 @dataclass(frozen=True)
 class ServerSettings:
-    """What the server is started with.
+    """Settings of the server.
 
     Attributes:
-        title: shown by Foxglove.
-        host, port: where to listen; port 0 takes a free one.
-        tls_cert, tls_key: files in PEM; with them the server speaks wss:// only.
-        backlog: messages kept for a client that does not keep up; the oldest goes first.
-        max_clients: most clients at a time.
+        title: name shown by Foxglove.
+        host, port: address to listen on; port 0 takes a free one.
+        tls_cert, tls_key: PEM files; with them the server accepts wss:// only.
+        backlog: messages queued for a slow client; the oldest are dropped first.
+        max_clients: largest number of clients.
         allowed_origins, allowed_hosts: see :func:`.web_access.refusal`.
         accept_operator: whether clients may drive and stop the robot.
-        set_parameters: whether clients may change parameters that are no safety parameters.
-        server_time: whether to tell clients the time (for simulated time).
+        set_parameters: whether clients may change parameters, except safety parameters.
+        server_time: whether to send the time to clients (for simulated time).
     """
 
     title: str
@@ -100,19 +100,19 @@ class FoxgloveServer:
     """Channels, parameters, graph and commands of one run directory.
 
     Args:
-        node: the bridge's node; its bus is listened to.
+        node: the bridge's node, on whose bus the server subscribes.
         run_dir: its run directory.
-        settings: see there.
-        takes: which topics to offer.
-        gate: what commands have to pass.
+        settings: see :class:`ServerSettings`.
+        takes: whether to offer a topic.
+        gate: checks the clients' commands.
 
     Attributes:
-        count, bytes: messages of the bus that were handed to clients.
-        refused: requests that were turned away: wrong Origin or Host, or too many clients.
-        refusal: why the last of them was.
+        count, bytes: messages of the bus that were passed to clients, and their size.
+        refused: rejected requests: wrong Origin or Host, or too many clients.
+        refusal: reason of the last rejection.
 
     Raises:
-        FoxgloveError: see there.
+        FoxgloveError: the server cannot start.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class FoxgloveServer:
         self._node = node
         self._takes = takes
         self._settings = settings
-        self._lock = threading.Lock()  # over channels, watchers, clients and their queues; held for moments only
+        self._lock = threading.Lock()  # guards channels, watchers, clients and their queues; held only briefly
         self._channels: dict[str, _Channel] = {}
         self._next_channel = 1
         self._clients: list[_Client] = []
@@ -161,7 +161,7 @@ class FoxgloveServer:
 
     @property
     def watched(self) -> list[str]:
-        """Topics that somebody watches now."""
+        """Topics with at least one viewer."""
         return sorted(topic for topic, channel in self._channels.items() if channel.subscription is not None)
 
     @property
@@ -171,12 +171,12 @@ class FoxgloveServer:
 
     @property
     def dropped(self) -> int:
-        """Messages that were dropped because a client did not keep up."""
+        """Messages dropped because a client was too slow."""
         with self._lock:
             return self._dropped_before + sum(client.dropped for client in self._clients)
 
     def reconcile(self, present: Sequence[TopicInfo], nodes: Sequence[NodeInfo]) -> None:
-        """Offers what has appeared, takes back what has left, listens to what is watched and to nothing else."""
+        """Offer new topics, withdraw those that are gone, and subscribe only to topics with viewers."""
         with self._lock:
             newcomers, self._newcomers = self._newcomers, set()
         for topic in newcomers & self._channels.keys():
@@ -229,7 +229,7 @@ class FoxgloveServer:
                 self._to_all(update, lambda client: client.wants_graph)
 
     def hand_out(self, channel: _Channel, received: Received) -> None:
-        """Queues a message for everybody who watches its channel."""
+        """Queue a message for every viewer of its channel."""
         self.count += 1
         self.bytes += len(received.payload)
         with self._lock:
@@ -240,7 +240,7 @@ class FoxgloveServer:
     # -- from any thread -------------------------------------------------------------------------
 
     def tell_time(self, now_ns: int) -> None:
-        """Tells clients the simulated time."""
+        """Send the simulated time to the clients."""
         with self._lock:
             self._time_ns = now_ns
             for client in self._clients:
@@ -248,29 +248,29 @@ class FoxgloveServer:
             self._flush_soon()
 
     def _tell_client(self, number: int, words: str, level: int) -> None:
-        """Shows words in one client's list of problems."""
+        """Show a text in one client's list of problems."""
         with self._lock:
             self._to_all(_status(words, level), lambda client: client.number == number)
 
     def _to_all(self, text: str, which: Callable[[_Client], bool] = lambda client: True) -> None:
-        """Queues a text for clients; under the lock."""
+        """Queue a text for clients. The caller holds the lock."""
         for client in self._clients:
             if which(client):
                 client.texts.append(text)
         self._flush_soon()
 
     def _flush_soon(self) -> None:
-        """Wakes the senders, at most once until they have been; under the lock."""
+        """Wake the senders, at most once until they have run. The caller holds the lock."""
         if not self._flush_due and not self._loop.is_closed():
             self._flush_due = True
             self._loop.call_soon_threadsafe(self._flush)
 
     def close(self) -> None:
-        """Ends the server and every listening; twice does no harm."""
+        """Stop the server and all subscriptions. Idempotent."""
         for topic in list(self._channels):
             self._withdraw(topic)
         if self._thread.is_alive():
-            with contextlib.suppress(RuntimeError):  # it ends by itself in this moment
+            with contextlib.suppress(RuntimeError):  # the loop is just ending by itself
                 self._loop.call_soon_threadsafe(self._finish.set)
             self._thread.join(2 * _END_S)
             if self._thread.is_alive():
@@ -290,9 +290,9 @@ class FoxgloveServer:
             self._start_error = error
             if self._started.is_set():
                 log.exception("Foxglove: the server's thread failed")
-                self._node.stop()  # the launcher starts it again
+                self._node.stop()  # the launcher restarts it
         finally:
-            with self._lock:  # from here on nobody wakes the loop
+            with self._lock:  # from here on no thread wakes the loop
                 self._loop.close()
             self._started.set()
 
@@ -326,7 +326,7 @@ class FoxgloveServer:
                 await asyncio.wait_for(server.shutdown(_END_S / 2), _END_S)
 
     def _end_idle(self, connection: web.RequestHandler) -> None:
-        """Ends a connection that has not become a client's in time."""
+        """Close a connection that has not become a client in time."""
         if all(client.connection is not connection for client in self._clients):
             connection.force_close()
 
@@ -335,7 +335,7 @@ class FoxgloveServer:
         self.refusal = why
 
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
-        """One request: a client's whole life, if it may come in."""
+        """Serve one request; for an accepted client, until it disconnects."""
         settings = self._settings
         why = refusal(
             request.headers.get("Origin"), request.headers.get("Host"), settings.allowed_origins, settings.allowed_hosts
@@ -405,7 +405,7 @@ class FoxgloveServer:
             client.awake.set()
 
     async def _send(self, client: _Client) -> None:
-        """Sends what waits for a client; texts before time before messages."""
+        """Send a client's queued data: texts first, then time, then messages."""
         try:
             while True:
                 await client.awake.wait()
@@ -419,7 +419,7 @@ class FoxgloveServer:
                         await client.socket.send_str(frame)
                     else:
                         await client.socket.send_bytes(frame)
-        except (ConnectionError, RuntimeError):  # it has left; the receiving side cleans up
+        except (ConnectionError, RuntimeError):  # the client is gone; the receiving side cleans up
             client.abort()
 
     def _next_frame(self, client: _Client) -> str | bytes | None:
@@ -432,7 +432,7 @@ class FoxgloveServer:
             return client.take()
 
     async def _receive(self, client: _Client) -> None:
-        """Takes a client's messages until it leaves, sends too many, or too long ones."""
+        """Receive a client's messages until it leaves, or exceeds the message rate or size."""
         tokens, at_s = _MAX_MESSAGES_PER_S, time.monotonic()
         while True:
             message = await client.socket.receive()
@@ -532,7 +532,7 @@ class FoxgloveServer:
     # -- parameters: asked on a thread, as a node may take its time ------------------------------
 
     async def _answer_parameters(self, client: _Client) -> None:
-        """Answers one request after the other, beside the client's other messages."""
+        """Answer parameter requests one at a time, concurrently with the client's other messages."""
         while True:
             await client.asked.wait()
             client.asked.clear()
@@ -561,7 +561,7 @@ class FoxgloveServer:
             problems += [(ERROR, words) for words in refused]
         else:
             names = protocol.strings(request, "parameterNames")
-        # An empty list asks for everything: after an empty change there is nothing to tell.
+        # An empty list requests everything, so an empty change must not be looked up.
         values, silent = ({}, []) if not names and request["op"] == "setParameters" else self.parameters.get(names)
         problems += [(WARN, words) for words in silent]
         request_id = request.get("id")
@@ -571,7 +571,7 @@ class FoxgloveServer:
 
 
 class _Client:
-    """A viewer; its queues are under the server's lock."""
+    """A viewer; the server's lock guards its queues."""
 
     def __init__(self, number: int, socket: web.WebSocketResponse, request: web.BaseRequest, backlog: int) -> None:
         self.number = number
@@ -592,7 +592,7 @@ class _Client:
         self._bytes = 0
 
     def put(self, frame: bytes) -> None:
-        """Queues a message; the oldest make room."""
+        """Queue a message; drop the oldest to make room."""
         while self._messages and (
             len(self._messages) >= self._backlog or self._bytes + len(frame) > _MAX_BACKLOG_BYTES
         ):
@@ -602,7 +602,7 @@ class _Client:
         self._bytes += len(frame)
 
     def take(self) -> bytes | None:
-        """The oldest message that waits."""
+        """Remove and return the oldest queued message."""
         if not self._messages:
             return None
         frame = self._messages.popleft()
@@ -610,19 +610,19 @@ class _Client:
         return frame
 
     def unsubscribe(self, subscription: int) -> None:
-        """Ends a subscription, if there is one of that number."""
+        """End a subscription, if there is one with this number."""
         channel = self.subscriptions.pop(subscription, None)
         if channel is not None:
             channel.watchers.pop(self, None)
 
     def abort(self) -> None:
-        """Cuts the connection; whoever waits to send or to receive on it is woken."""
+        """Abort the connection and wake all tasks that wait on it."""
         if self._transport is not None:
             self._transport.abort()
 
 
 class _Channel:
-    """One topic on offer; ``watchers`` is under the server's lock, the rest belongs to the node's thread."""
+    """One offered topic. The server's lock guards ``watchers``; everything else belongs to the node's thread."""
 
     def __init__(
         self, server: FoxgloveServer, node: Node[Any], number: int, topic: str, type_name: str, schema: str
@@ -645,19 +645,19 @@ class _Channel:
         self._latched = False
 
     def watch(self, info: TopicInfo) -> None:
-        """Listens on our bus if somebody watches, else lets go."""
+        """Subscribe on the bus while there are viewers, otherwise unsubscribe."""
         if self.watchers and self.subscription is None:
             qos = max(
                 (PRESETS.get(p.qos, RELIABLE) for p in info.publishers), key=lambda qos: (qos.latched, qos.reliable)
             )
             self._latched = qos.latched
-            # With ``sensor`` the bus keeps the newest only: a stall of this process cannot end in a flood of old ones.
+            # ``sensor`` keeps only the newest message: after a stall of this process no backlog arrives.
             self.subscription = self._node.subscribe_received(info.topic, self._forward, qos)
         elif not self.watchers:
             self.drop()
 
     def renew(self) -> None:
-        """Subscribes anew, which brings newcomers the latched value of every publisher; the others get it once more."""
+        """Subscribe again to a latched topic: all viewers, also new ones, get every publisher's value."""
         if self._latched and (old := self.subscription) is not None:
             self.subscription = self._node.subscribe_received(old.raw.topic, self._forward, old.raw.qos)
             self._node.drop(old)
@@ -667,7 +667,7 @@ class _Channel:
             self._server.hand_out(self, received)
 
     def drop(self) -> None:
-        """Listens no more."""
+        """End the subscription."""
         if self.subscription is not None:
             self._node.drop(self.subscription)
             self.subscription = None
@@ -682,7 +682,7 @@ class _Refusing(asyncio.Protocol):
 
 
 class _Quiet:
-    """What goes wrong on a connection is logged at most once a second: strangers must not fill the disk."""
+    """Logs connection errors at most once a second, so that strangers cannot fill the disk."""
 
     def __init__(self) -> None:
         self._next_s = 0.0
@@ -727,7 +727,7 @@ def _status(words: str, level: int) -> str:
 
 
 def _value(entry: dict[str, Any]) -> Any:
-    """A parameter's value; a whole number may stand for a float."""
+    """Return a parameter's value; a whole number is accepted for a float."""
     value = entry.get("value")
     if entry.get("type") == "float64" and type(value) is int:
         return float(value)

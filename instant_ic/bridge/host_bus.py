@@ -1,4 +1,4 @@
-"""Topics of this host's bus into a link, and out of it: discovery, types, QoS, late readers, no echo."""
+"""Passes topics between this host's bus and a link: discovery, types, QoS, late subscribers, no echo."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from instant_ic.bus.transport import Received, TransportError
 from instant_ic.msg import MessageError, deserialize
 
 BRIDGES = ("host_bridge", "zenoh_gateway")
-"""Nodes that publish here what was published elsewhere: it is not sent on, or it would come back."""
+"""Nodes that republish messages from elsewhere. Their messages are not exported, to avoid echoes."""
 
 OLD_NEWS_NS = 1_000_000_000
-"""Words on a shared state older than the latest by more than this are not taken; no clock error is so large. A false
-Bool has no such grace: which of a release and a stop came first is then uncertain, and the stop must hold.
+"""A message on a shared state that is older than the latest by more than this is dropped; clock errors are smaller. A
+false Bool gets no such tolerance: the order of a release and a stop is then uncertain, and the stop must hold.
 """
 
 MAX_LATCHED = 64
-"""Publishers of one latched topic whose last values are kept for late readers."""
+"""Largest number of publishers per latched topic whose last values are kept for late subscribers."""
 
 
 class ExportedTopics:
-    """What this host's nodes publish, given to the link; not what a bridge publishes here.
+    """Exports topics of this host's nodes to the link, except messages republished by a bridge.
 
     Args:
         node: the bridge's node.
-        rules: topics to give, by name without namespace.
-        link: where they go.
-        on_trouble: called with topic and words when a topic cannot go.
+        rules: topics to export, by name without namespace.
+        link: their destination.
+        on_trouble: called with topic and error text when a topic cannot be exported.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class ExportedTopics:
         self._bridges: set[str] = {node.node_name}
         self._offered: dict[tuple[str, str], QoS] = {}
         for name in rules:
-            # Every message is handed to the link, which knows what of it is to wait, be replaced, or go at once.
+            # Pass every message to the link, which decides what waits, is replaced or leaves immediately.
             node.subscribe_received(name, functools.partial(self._export, name), RELIABLE)
 
     def look(self) -> None:
-        """Finds publishers that came, went, or offer another QoS than before."""
+        """Detect publishers that are new, gone, or offer a different QoS."""
         run_dir = self._node.run_dir
         assert run_dir is not None
         nodes = registry.list_nodes(run_dir)
@@ -70,9 +70,9 @@ class ExportedTopics:
 
     def _export(self, name: str, received: Received) -> None:
         origin = received.publisher
-        if (name, origin) not in self._offered:  # it started this moment: what does it offer, and is it a bridge?
+        if (name, origin) not in self._offered:  # just started: look up its QoS and whether it is a bridge
             self.look()
-            self._offered.setdefault((name, origin), SENSOR)  # gone again already
+            self._offered.setdefault((name, origin), SENSOR)  # already gone
         if origin in self._bridges:
             return
         qos = self._offered[name, origin]
@@ -84,7 +84,7 @@ class ExportedTopics:
 
     @contextmanager
     def _told(self, name: str) -> Iterator[None]:
-        """A type that this host does not know is told once, not with a trace for each message."""
+        """Report a type unknown to this host once, instead of a traceback per message."""
         try:
             yield
         except ValueError as error:
@@ -92,11 +92,11 @@ class ExportedTopics:
 
 
 def _releases(arrived: Arrived) -> bool:
-    """Whether a word on a shared state is that of a released emergency stop."""
+    """Whether a message on a shared state releases the emergency stop."""
     kind = arrived.announce.type_name
     try:
         return kind == "std_msgs/msg/Bool" and not deserialize(arrived.payload, kind).data
-    except MessageError:  # no word at all; who reads it here refuses it and tells
+    except MessageError:  # not a readable message; the subscriber refuses and reports it
         return False
 
 
@@ -117,12 +117,12 @@ class _Imported:
 
 
 class ImportedTopics:
-    """What comes over the link, published on this host as it was on the other.
+    """Publishes the messages of the link on this host, as on the other host.
 
     Args:
         node: the bridge's node.
-        rules: topics to take, by name without namespace.
-        on_trouble: called with topic and words when a topic cannot be published here.
+        rules: topics to import, by name without namespace.
+        on_trouble: called with topic and error text when a topic cannot be published here.
     """
 
     def __init__(self, node: Node[Any], rules: dict[str, TopicRule], on_trouble: Callable[[str, str], None]) -> None:
@@ -130,7 +130,7 @@ class ImportedTopics:
         self._topics: dict[str, _Imported] = {}
 
     def open(self, announce: Announce) -> _Imported:
-        """Makes the publisher, so that readers find it before the first message; called on the link's thread."""
+        """Create the publisher, so that subscribers find it before the first message; called on the link's thread."""
         topic = self._topics.get(announce.topic)
         if topic is None:
             topic = _Imported(announce.type_name, PRESETS.get(announce.qos, SENSOR))
@@ -139,7 +139,7 @@ class ImportedTopics:
         return topic
 
     def take(self, arrived: Arrived) -> None:
-        """Publishes a message; called on the link's thread, so that a command does not wait for the node's."""
+        """Publish a message; called on the link's thread, so that commands do not wait for the node's thread."""
         announce = arrived.announce
         topic = self.open(announce)
         if topic.type_name != announce.type_name:
@@ -151,7 +151,7 @@ class ImportedTopics:
             return
         with topic.lock:
             if topic.qos.latched:
-                if self._rules[announce.topic].shared:  # one state that several hosts set: only the latest word holds
+                if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
                     grace_ns = 0 if _releases(arrived) else OLD_NEWS_NS
                     if arrived.born_ns < topic.newest_ns - grace_ns:
                         self._node.log.warning("%s of %s is old news: left out", announce.topic, announce.origin)
@@ -184,9 +184,9 @@ class ImportedTopics:
             topic.publisher = publisher
 
     def serve_late_readers(self) -> None:
-        """Gives readers that came the latched values of all who publish a topic there, as ``/tf_static`` has several.
+        """Send new subscribers the latched values of all publishers of a topic, such as ``/tf_static``.
 
-        The bus itself keeps one latched value for a publisher, and here all of them come through this one.
+        The bus keeps one latched value per publisher, and all values of the link go through this one publisher.
         """
         for topic in list(self._topics.values()):
             if topic.publisher is None or len(topic.last) < 2:
@@ -201,5 +201,5 @@ class ImportedTopics:
     def _publish(self, publisher: Publisher, arrived: Arrived) -> None:
         try:
             publisher.publish_bytes(arrived.payload, arrived.publish_ns)
-        except (TransportError, OSError) as error:  # one message that this bus cannot carry must not end the link
+        except (TransportError, OSError) as error:  # a message that this bus cannot carry must not end the link
             self._on_trouble(arrived.announce.topic, str(error))

@@ -1,4 +1,4 @@
-"""How far another host's clock is from ours: the exchange of NTP (RFC 5905), the shortest round trip wins."""
+"""Estimates another host's clock offset by NTP's exchange (RFC 5905), using the shortest round trip."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ClockSample:
-    """One exchange; nanoseconds.
+    """One exchange of time stamps; nanoseconds.
 
     Attributes:
-        offset_ns: the other's clock minus ours.
-        rtt_ns: time on the way there and back, without the other's time to answer.
-        at_ns: our clock when it ended.
+        offset_ns: the other clock minus ours.
+        rtt_ns: round-trip time, without the other host's processing time.
+        at_ns: our clock at the end of the exchange.
     """
 
     offset_ns: int
@@ -23,14 +23,13 @@ class ClockSample:
 
 
 class ClockFilter:
-    """Offset of a clock out of exchanges of time stamps.
+    """Clock offset from exchanges of time stamps.
 
-    Of the exchanges of the last ``window_s`` the one with the shortest round trip counts: it waited least in queues,
-    and its offset is wrong by half its round trip at most. Both clocks must be of the kind that never steps
-    (``CLOCK_MONOTONIC``).
+    The estimate uses the exchange with the shortest round trip in the last ``window_s``: it waited least in queues, and
+    its offset is wrong by at most half its round trip. Both clocks must never step (``CLOCK_MONOTONIC``).
 
     Args:
-        window_s: long enough to meet a quiet moment, short enough that quartz drift (50 ppm) does not matter.
+        window_s: long enough to include an idle moment, short enough that quartz drift (50 ppm) does not matter.
     """
 
     def __init__(self, window_s: float = 10.0) -> None:
@@ -38,11 +37,11 @@ class ClockFilter:
         self._samples: deque[ClockSample] = deque(maxlen=400)
 
     def add(self, sent_ns: int, arrived_ns: int, answered_ns: int, returned_ns: int) -> ClockSample | None:
-        """Takes one exchange; None if its stamps cannot be true.
+        """Add one exchange; return None if its stamps are inconsistent.
 
         Args:
-            sent_ns, returned_ns: our clock at both ends of it.
-            arrived_ns, answered_ns: the other's clock in between.
+            sent_ns, returned_ns: our clock at the start and end.
+            arrived_ns, answered_ns: the other clock when the request arrived and the answer left.
         """
         rtt = (returned_ns - sent_ns) - (answered_ns - arrived_ns)
         if rtt < 0 or answered_ns < arrived_ns or returned_ns < sent_ns:
@@ -60,10 +59,10 @@ class ClockFilter:
 
     @property
     def best(self) -> ClockSample:
-        """The exchange that counts.
+        """The exchange with the shortest round trip.
 
         Raises:
-            ValueError: there was none yet.
+            ValueError: there was no exchange yet.
         """
         if not self._samples:
             raise ValueError("no exchange of time stamps yet")
@@ -71,7 +70,7 @@ class ClockFilter:
 
     @property
     def offset_ns(self) -> int:
-        """The other's clock minus ours."""
+        """The other clock minus ours."""
         return self.best.offset_ns
 
     @property
@@ -86,7 +85,7 @@ class ClockFilter:
 
     @property
     def jitter_ns(self) -> float:
-        """Root mean square of the round trips over the shortest one (as RFC 5905 does with offsets)."""
+        """Root mean square of the round trips above the shortest one (RFC 5905 does the same with offsets)."""
         if not self._samples:
             return 0.0
         least = self.min_rtt_ns

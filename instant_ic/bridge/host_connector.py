@@ -1,4 +1,4 @@
-"""The station's end of the link: it connects, says why it cannot, and comes back by itself."""
+"""The station's end of the link: connects, reports why it cannot, and reconnects."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _REFUSED_RETRY_S = 2.0
 
 
 class ConnectingLink(HostLink):
-    """The station's end: one robot, to which it comes back by itself.
+    """The station's end of the link; reconnects to its robot by itself.
 
     Args:
         endpoint: ``tcp://192.168.1.20:7450``.
-        peer: the robot in the allow-list, which says the key that it must prove.
+        peer: the robot's entry in the allow-list, with the key that the robot must prove.
 
-    See :class:`HostLink` for the others.
+    See :class:`HostLink` for the other arguments.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class ConnectingLink(HostLink):
         dealer = self._socket(zmq.DEALER)
         dealer.setsockopt(zmq.CURVE_SERVERKEY, z85.encode(self.peer.public_key))
         dealer.setsockopt(zmq.RECONNECT_IVL, int(_RETRY_S * 1000))
-        dealer.setsockopt(zmq.CONNECT_TIMEOUT, 1000)  # a try that fell into a hole of the link is not waited for
+        dealer.setsockopt(zmq.CONNECT_TIMEOUT, 1000)  # do not wait longer for an attempt made during an outage
         dealer.setsockopt(zmq.IPV6, int("[" in self.endpoint))
         self._monitor = dealer.get_monitor_socket()
         dealer.connect(self.endpoint)
@@ -84,7 +84,7 @@ class ConnectingLink(HostLink):
         self._flush()
 
     def _hang_up(self, wait_s: float) -> None:
-        """Nothing of the old connection is kept: what it still held would only be old."""
+        """Drop the connection with everything queued in it, which would be outdated later."""
         if self._dealer is not None:
             with contextlib.suppress(zmq.ZMQError):
                 self._dealer.disable_monitor()
@@ -123,7 +123,7 @@ class ConnectingLink(HostLink):
                 self._dealer.disable_monitor()
 
     def _watch(self) -> None:
-        """What libzmq tells of the connection: why it is refused is known only here."""
+        """Handle libzmq's connection events; only they give the reason for a refusal."""
         while self._monitor is not None and int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             report = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
             kind, value = report["event"], report["value"]
@@ -142,7 +142,7 @@ class ConnectingLink(HostLink):
                 self._hang_up(_REFUSED_RETRY_S)
             elif kind in (zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL):
                 self._failures += 1
-                if self._failures < 2:  # once may be a connection that broke in the middle of it
+                if self._failures < 2:  # a single failure may be a connection that broke during the handshake
                     self._hang_up(_RETRY_S)
                     return
                 self._say(
@@ -185,7 +185,7 @@ class ConnectingLink(HostLink):
                 self._say("")
             self._emit(connection.peer.name, event)
             if isinstance(event, Ended):
-                self._flush()  # a last word, where there is one
+                self._flush()  # send a final message, if there is one
                 self._say(f"{connection.peer.name}: {event.reason}")
                 self._hang_up(_REFUSED_RETRY_S if event.code in ("version", "revoked", "replaced") else _RETRY_S)
                 return

@@ -1,7 +1,7 @@
-"""What waits to go out to one host, in which order, and how much of it may be on its way at a time.
+"""Queues messages to one host: in which order they leave, and how many bytes may be in flight.
 
-A slow or stalled link must never be filled with pictures that are old when they arrive, nor hold up a command: so only
-as much is handed to it as it carries in a few hundredths of a second, and what waits here is replaced by what is newer.
+A slow or stalled link must neither fill with images that are outdated on arrival nor delay a command. Therefore the
+link gets only as much as it carries in a few hundredths of a second, and newer messages replace those that wait.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from instant_ic.bridge.host_protocol import DATA_OVERHEAD, LANES, MAX_CHUNK, Ann
 from instant_ic.bridge.host_topics import TopicCounts, TopicRule
 
 QUEUE_DEPTH = 1000
-"""Messages of a reliable topic that wait for the link; then the oldest is dropped and counted."""
+"""Messages of a reliable topic that may wait for the link; above this the oldest is dropped and counted."""
 
-_COMMAND_IN_FLIGHT = 4 * 1024  # some 20 commands: more would arrive only to be too old
-_STATE_EXTRA = 16 * 1024  # state may go beyond the window, which pictures have filled
+_COMMAND_IN_FLIGHT = 4 * 1024  # some 20 commands: more would be outdated on arrival
+_STATE_EXTRA = 16 * 1024  # state may exceed the window when images fill it
 _LEAST_CHUNK = 4 * 1024
 _COMMAND, _STATE, _BULK = range(3)
 
@@ -29,10 +29,10 @@ class Item:
 
     Attributes:
         payload: CDR bytes.
-        publish_ns: when it was published first.
-        born_ns: when it was published, by this host's monotonic clock, which no setting of the time moves.
-        sequence: its number, where the channel is queued; others get theirs when they leave.
-        wall_time: ``publish_ns`` is the machine's time.
+        publish_ns: time of the first publication.
+        born_ns: the same by this host's monotonic clock, which is never set.
+        sequence: sequence number on a queued channel; on other channels it is assigned when the message leaves.
+        wall_time: whether ``publish_ns`` is the machine's time.
     """
 
     payload: bytes = field(repr=False)
@@ -44,15 +44,15 @@ class Item:
 
 @dataclass
 class Channel:
-    """One topic of one publisher, as the sending side knows it.
+    """One publisher's topic on the sending side.
 
     Attributes:
-        number: by which its messages name it.
+        number: number that identifies the channel in messages.
         rule: how it goes over the link.
         origin: the node that publishes it.
         type_name, digest, qos: of the topic, for the other side.
-        latched: the last value goes to every host that comes.
-        queued: every message counts; otherwise the newest.
+        latched: send the last value to every host that connects.
+        queued: send every message; otherwise only the newest.
         sequence: number of the newest message of a queued channel.
         last: newest message of a latched channel.
     """
@@ -69,19 +69,19 @@ class Channel:
     last: Item | None = None
 
     def announce(self) -> Announce:
-        """The words that introduce it."""
+        """Return the message that announces it."""
         return Announce(self.number, self.rule.topic, self.origin, self.type_name, self.digest, self.qos)
 
 
 class Window:
-    """How many bytes may be on their way, so that the link is used and its queues stay short.
+    """Limits the bytes in flight, so that the link is used and its queues stay short.
 
-    Delay-based as LEDBAT (RFC 6817): more while the round trip is close to the shortest known, less when it shows that
-    a queue has formed.
+    Delay-based, as LEDBAT (RFC 6817): the window grows while the round trip is close to the shortest known, and shrinks
+    when the round trip shows that a queue has formed.
 
     Args:
         target_s: time that a chunk may wait in queues.
-        least, most, start: bytes.
+        least, most, start: smallest, largest and initial window in bytes.
     """
 
     def __init__(
@@ -97,28 +97,28 @@ class Window:
 
     @property
     def base_ns(self) -> int:
-        """Shortest round trip of the last half minute or so."""
+        """Shortest round trip of about the last half minute."""
         return min(rtt for _, rtt in self._base)
 
     def observe(self, rtt_ns: int, now_ns: int) -> None:
-        """Takes a round trip of any kind."""
+        """Add a round trip of any kind."""
         begun, least = self._base[-1]
-        if now_ns - begun > 10_000_000_000:  # the way may have become longer for good
+        if now_ns - begun > 10_000_000_000:  # the path may have become longer for good
             self._base.append((now_ns, rtt_ns))
         else:
             self._base[-1] = (begun, min(least, rtt_ns))
 
     def acked(self, taken: int, rtt_ns: int, in_flight: int, now_ns: int) -> None:
-        """Takes an answer: ``taken`` more bytes have arrived, of ``in_flight``."""
+        """Process an acknowledgement: ``taken`` more bytes have arrived, of ``in_flight``."""
         self.observe(rtt_ns, now_ns)
-        # A queue lasts; a process that had to wait for its turn delays one answer, and that must not cost pictures.
+        # A queue delays several answers. A process that waits for the CPU delays only one, which must not cost images.
         self._newest.append(rtt_ns)
         self.queue_ns = min(self._newest) - self.base_ns
         if self.queue_ns > self.target_ns:
-            if now_ns >= self._next_cut_ns:  # once a round trip: the next answers still tell of the same queue
+            if now_ns >= self._next_cut_ns:  # once per round trip: the next answers still reflect the same queue
                 self._next_cut_ns = now_ns + rtt_ns
                 self.size *= max(0.5, self.target_ns / self.queue_ns)
-        elif in_flight * 2 >= self.size:  # it was this window that held the sender back
+        elif in_flight * 2 >= self.size:  # the window limited the sender
             if self.queue_ns * 2 < self.target_ns:
                 self.size += taken
             else:
@@ -127,13 +127,13 @@ class Window:
 
     @property
     def chunk(self) -> int:
-        """Bytes of a chunk: small on a slow link, where a command has to wait for its end."""
+        """Bytes per chunk: small on a slow link, where a command waits for the end of a chunk."""
         return int(min(max(self.size / 4, _LEAST_CHUNK), MAX_CHUNK))
 
 
 @dataclass
 class _Outgoing:
-    """A channel on its way to one host."""
+    """State of a channel for one host."""
 
     channel: Channel
     period_ns: int
@@ -145,7 +145,7 @@ class _Outgoing:
 
     @property
     def queued(self) -> bool:
-        """Whether every message counts; not where the other side asked for fewer."""
+        """Whether every message is sent; not where the other side requested a lower rate."""
         return self.channel.queued and not self.period_ns
 
 
@@ -153,10 +153,10 @@ class Outbox:
     """Everything that waits for one host.
 
     Args:
-        wants: topic → most messages a second that the other takes (0: all); others are not sent.
-        window: how much may be on its way.
-        sequences: channel → number of the last message that left, kept over the links with one host, so that it sees
-            what a broken link swallowed.
+        wants: topic → most messages per second that the other host takes (0: all); others are not sent.
+        window: limits the bytes in flight.
+        sequences: channel → number of the last message sent. It is kept across the links with one host, so that the
+            host can detect the messages that a broken link lost.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Outbox:
     # -- in ---------------------------------------------------------------------------------------
 
     def offer(self, channel: Channel, item: Item, now_ns: int) -> None:
-        """Takes a message that the other host may want."""
+        """Queue a message that the other host may take."""
         out = self._outgoing(channel)
         if out is None or out.refused:
             return
@@ -188,21 +188,21 @@ class Outbox:
             out.waiting.append(item)
             return
         if out.period_ns and not channel.latched:
-            # On the grid of periods, with room for a source that comes a little early.
+            # Keep a fixed grid of periods, with tolerance for a source that is slightly early.
             if now_ns < out.due_ns - out.period_ns // 4:
                 counts.thinned += 1
                 return
             late = now_ns - out.due_ns
             out.due_ns = out.due_ns + out.period_ns if late < out.period_ns else now_ns + out.period_ns
         if out.waiting:
-            held = channel.latched and out.period_ns and now_ns < out.due_ns  # it waited for its turn, not for the link
+            held = channel.latched and out.period_ns and now_ns < out.due_ns  # waits for its period, not for the link
             counts.thinned += bool(held)
             counts.superseded += not held
             out.waiting.clear()
         out.waiting.append(item)
 
     def open(self, channel: Channel) -> None:
-        """Tells the other host of a channel before it has a message: its readers shall be there in time."""
+        """Announce a channel before its first message, so that subscribers on the other host exist in time."""
         self._outgoing(channel)
 
     def _outgoing(self, channel: Channel) -> _Outgoing | None:
@@ -219,7 +219,7 @@ class Outbox:
         return out
 
     def refuse(self, number: int, reason: str) -> Channel | None:
-        """The other host does not take this channel; None if it was never announced."""
+        """Mark a channel as refused by the other host; return None if it was never announced."""
         out = self._channels.get(number)
         if out is None or not out.announced:
             return None
@@ -228,7 +228,7 @@ class Outbox:
         return out.channel
 
     def acked(self, taken: tuple[int, ...], rtt_ns: int, now_ns: int) -> bool:
-        """The other host tells what it has got; false if that cannot be."""
+        """Process the other host's byte counts; return False if they are impossible."""
         if any(not old <= new <= sent for old, new, sent in zip(self.taken, taken, self.sent, strict=True)):
             return False
         in_flight = self._in_flight(_STATE) + self._in_flight(_BULK)
@@ -243,7 +243,7 @@ class Outbox:
     # -- out --------------------------------------------------------------------------------------
 
     def next(self, now_ns: int) -> Data | Announce | None:
-        """What leaves next; None when nothing waits or the link has no room."""
+        """Return the next message to send; None when nothing waits or the window is full."""
         if self._new:
             out = self._new.popleft()
             out.announced = True
@@ -257,7 +257,7 @@ class Outbox:
         return None
 
     def next_due_ns(self) -> int | None:
-        """When a message that waits for its turn may leave."""
+        """Earliest time at which a message that waits for its period may leave."""
         dues = [out.due_ns for out in self._channels.values() if out.waiting and out.period_ns and out.channel.latched]
         return min(dues, default=None)
 
@@ -271,7 +271,7 @@ class Outbox:
         return filled < self.window.size + (_STATE_EXTRA if lane == _STATE else 0)
 
     def _begin(self, lane: int, now_ns: int) -> tuple[_Outgoing, Item, int] | None:
-        """The message of the lane that has waited for its turn the longest."""
+        """Return the message of the lane that has waited for its turn the longest."""
         name = LANES[lane]
         for out in sorted(self._ready(name, now_ns), key=lambda out: out.turn):
             rule = out.channel.rule

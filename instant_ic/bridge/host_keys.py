@@ -1,11 +1,11 @@
-"""Keys of the link between two hosts: this host's own, and the list of those that are allowed.
+"""Keys of the link between two hosts: this host's key pair, and the list of allowed hosts.
 
-A folder (default ``$XDG_CONFIG_HOME/instant_ic/keys``) holds two files of plain text::
+A folder (default ``$XDG_CONFIG_HOME/instant_ic/keys``) holds two text files::
 
     identity    name and secret key of this host, mode 0600
-    allowed     one host a line: NAME ROLE KEY
+    allowed     one host per line: NAME ROLE KEY
 
-A key is written as one word, ``ick_`` and 48 letters, with a check sum in it: a slip in copying is found at once.
+A key is written as ``ick_`` and 48 letters, including a checksum that detects copying errors.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import NoReturn
 from instant_ic.private import make_folder, open_file
 
 ROLES = ("driver", "viewer")
-"""What an allowed host may do: a driver's topics are taken in, a viewer only watches."""
+"""Roles of allowed hosts: a driver's topics are accepted; a viewer only watches."""
 
 _PREFIX = "ick_"
 _KEY_SIZE = 32
@@ -33,15 +33,15 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,62}\Z")
 
 
 class KeyFileError(RuntimeError):
-    """A key, or a file of keys, that cannot be used; the message says where and what to do."""
+    """A key or key file cannot be used; the message says where and what to do."""
 
 
 @dataclass(frozen=True)
 class Peer:
-    """A host of the allow-list.
+    """An entry of the allow-list.
 
     Attributes:
-        name: what it is called here.
+        name: its name on this host.
         role: one of :data:`ROLES`.
         public_key: 32 bytes (Curve25519).
     """
@@ -58,7 +58,7 @@ class Peer:
 
 @dataclass(frozen=True)
 class Identity:
-    """This host's own key pair; 32 bytes each."""
+    """This host's key pair; 32 bytes each."""
 
     name: str
     public_key: bytes
@@ -71,28 +71,28 @@ class Identity:
 
 
 def key_dir() -> Path:
-    """The folder of keys: ``$XDG_CONFIG_HOME/instant_ic/keys``, else ``~/.config/instant_ic/keys``."""
+    """Return the key folder: ``$XDG_CONFIG_HOME/instant_ic/keys``, or ``~/.config/instant_ic/keys``."""
     base = os.environ.get("XDG_CONFIG_HOME")
     return (Path(base) if base else Path.home() / ".config") / "instant_ic" / "keys"
 
 
 def fingerprint(public_key: bytes) -> str:
-    """Short name of a key for logs and for reading aloud: 64 bits of its SHA-256, ``1f3a-9c02-77be-d410``."""
+    """Return 64 bits of a key's SHA-256 for logs and reading aloud: ``1f3a-9c02-77be-d410``."""
     digits = hashlib.sha256(public_key).hexdigest()[:16]
     return "-".join(digits[i : i + 4] for i in range(0, 16, 4))
 
 
 def key_text(public_key: bytes) -> str:
-    """A public key as one word."""
+    """Return a public key as text."""
     check = hashlib.sha256(public_key).digest()[-_CHECK_SIZE:]
     return _PREFIX + base64.urlsafe_b64encode(public_key + check).decode()
 
 
 def parse_key(text: str) -> bytes:
-    """The 32 bytes of a public key.
+    """Return the 32 bytes of a public key.
 
     Raises:
-        KeyFileError: it is no key, or not all of it, or a letter is wrong.
+        KeyFileError: the text is not a key, is incomplete, or contains a copying error.
     """
     word = text.strip()
     try:
@@ -108,10 +108,10 @@ def parse_key(text: str) -> bytes:
 
 
 def check_name(name: str) -> str:
-    """A host's name, if it is legal.
+    """Return a host's name if it is valid.
 
     Raises:
-        KeyFileError: otherwise.
+        KeyFileError: the name is not valid.
     """
     if not _NAME.match(name):
         raise KeyFileError(f"name {name!r} is not legal: letters, digits, _ and - only, a letter first")
@@ -119,10 +119,10 @@ def check_name(name: str) -> str:
 
 
 class KeyStore:
-    """The files of one folder.
+    """The key files of one folder.
 
     Args:
-        folder: where they are; None takes :func:`key_dir`.
+        folder: the folder; None takes :func:`key_dir`.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -133,10 +133,10 @@ class KeyStore:
     # -- this host -------------------------------------------------------------------------------
 
     def identity(self) -> Identity:
-        """This host's key pair.
+        """Return this host's key pair.
 
         Raises:
-            KeyFileError: there is none yet, others can read it, or it is damaged.
+            KeyFileError: the file is missing or damaged, or others can read it.
         """
         path = self.identity_path
         try:
@@ -156,7 +156,7 @@ class KeyStore:
             raise KeyFileError(f"{path} is damaged: make a new key with `ic keys new --force`") from None
 
     def create(self, name: str, force: bool = False) -> Identity:
-        """Makes this host's key pair.
+        """Create this host's key pair.
 
         Raises:
             KeyFileError: there is one already (and not ``force``), or the folder cannot be written.
@@ -176,10 +176,10 @@ class KeyStore:
     # -- the others ------------------------------------------------------------------------------
 
     def peers(self) -> list[Peer]:
-        """The allowed hosts; none when the file is not there.
+        """Return the allowed hosts; empty if the file is missing.
 
         Raises:
-            KeyFileError: the file cannot be read, others can write it, or a line of it is wrong.
+            KeyFileError: the file cannot be read, others can write it, or one of its lines is wrong.
         """
         path = self.allowed_path
         try:
@@ -210,10 +210,10 @@ class KeyStore:
         return peers
 
     def peer(self, name: str = "") -> Peer:
-        """The allowed host of a name, or the only one there is.
+        """Return the allowed host with a name, or the only allowed host.
 
         Raises:
-            KeyFileError: there is no such host, or no name was given and there are several.
+            KeyFileError: there is no such host, or several hosts and no name.
         """
         peers = self.peers()
         found = [peer for peer in peers if not name or peer.name == name]
@@ -228,10 +228,10 @@ class KeyStore:
         )
 
     def allow(self, peer: Peer) -> str:
-        """Puts a host on the list; one of the same name is replaced. Returns what was done.
+        """Add a host to the list, or replace the one with the same name. Return what was done.
 
         Raises:
-            KeyFileError: the name is not legal, or the key is there under another name.
+            KeyFileError: the name is not valid, or the key is listed under another name.
         """
         check_name(peer.name)
         with self._locked():
@@ -246,10 +246,10 @@ class KeyStore:
             return "added" if before is None else "replaced"
 
     def revoke(self, name: str) -> Peer:
-        """Takes a host off the list; a running bridge cuts it off at once.
+        """Remove a host from the list; a running bridge disconnects it immediately.
 
         Raises:
-            KeyFileError: there is none of this name.
+            KeyFileError: there is no host of this name.
         """
         with self._locked():
             peer = self.peer(name)
@@ -262,7 +262,7 @@ class KeyStore:
         self._write(self.allowed_path, "\n".join([head, *lines]) + "\n")
 
     def _write(self, path: Path, text: str) -> None:
-        """Replaces a file in one step, readable by its owner alone from its first byte on."""
+        """Replace a file atomically; only its owner can ever read it."""
         self._make_folder()
         scratch = path.with_name(f".{path.name}.{os.getpid()}")
         try:
@@ -285,7 +285,7 @@ class KeyStore:
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Two commands at a time must not lose each other's line."""
+        """Lock the folder, so that concurrent commands do not lose each other's entry."""
         self._make_folder()
         try:
             fd = open_file(self.folder / ".lock", os.O_RDWR | os.O_CREAT)
@@ -302,9 +302,9 @@ class KeyStore:
 
 
 class AllowList:
-    """The allow-list as it stands now: read again when the file has changed.
+    """The current allow-list, read again when the file changes.
 
-    A file that is gone allows nobody. One that cannot be understood leaves the list as it was, and ``problem`` tells.
+    A missing file allows nobody. An invalid file leaves the list unchanged, and ``problem`` says why.
     """
 
     def __init__(self, store: KeyStore) -> None:
@@ -315,7 +315,7 @@ class AllowList:
         self._read = False
 
     def refresh(self) -> bool:
-        """Looks whether the file has changed; true if the list is another one now."""
+        """Read the file if it changed; return True if the list is different."""
         try:
             stat = self._store.allowed_path.stat()
             seen = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
@@ -335,9 +335,9 @@ class AllowList:
         return changed
 
     def get(self, public_key: bytes) -> Peer | None:
-        """The allowed host with this key."""
+        """Return the allowed host with this key."""
         return self._peers.get(public_key)
 
     def __len__(self) -> int:
-        """How many hosts are allowed."""
+        """Number of allowed hosts."""
         return len(self._peers)
