@@ -109,7 +109,7 @@ class BagPlayer:
         self._now_s: Callable[[], float] = time.monotonic
 
     def close(self) -> None:
-        """Closes the bag."""
+        """Close the bag."""
         self._reader.close()
 
     def _why_not(self, topic: TopicSummary) -> str:

@@ -1,4 +1,4 @@
-"""What both ends of the link share: topics out, events in, the thread that moves the bytes."""
+"""Common base of both ends of the link: exports topics, emits events, runs the I/O thread."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ log = logging.getLogger(__name__)
 
 
 class LinkError(RuntimeError):
-    """The link cannot be made as it is set; the message says what to change."""
+    """The link cannot be set up as configured; the message says what to change."""
 
 
 @dataclass(frozen=True)
 class Stranger:
-    """Somebody was turned away at the door."""
+    """A host was rejected because its key is not allowed."""
 
     address: str
     fingerprint: str
@@ -44,25 +44,25 @@ class Stranger:
 
 @dataclass(frozen=True)
 class Problem:
-    """Why there is no link, in words; empty when the trouble is over."""
+    """Why there is no link; empty once there is one again."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Failed:
-    """The link's thread has ended by a fault of its own: nothing goes over the link any more."""
+    """The link's thread has ended because of an internal error; the link no longer works."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class LinkEvent:
-    """Something that happened on a link.
+    """An event on a link.
 
     Attributes:
         peer: name of the other host in this host's allow-list; empty for the link as a whole.
-        event: what.
+        event: the event.
     """
 
     peer: str
@@ -71,7 +71,7 @@ class LinkEvent:
 
 @dataclass(frozen=True)
 class PeerStatus:
-    """How the link with one host stands now."""
+    """Current state of the link with one host."""
 
     name: str
     role: str
@@ -88,7 +88,7 @@ class PeerStatus:
 
 @dataclass
 class Connection:
-    """A session and the way to it."""
+    """A session and its connection."""
 
     peer: Peer
     session: Session
@@ -99,14 +99,14 @@ class Connection:
 
 
 class HostLink(ABC):
-    """What both ends share: topics out, events in, the thread.
+    """Common base of both ends of the link: exports topics, emits events, runs the I/O thread.
 
     Args:
-        side: this host's name and the topics that it takes.
-        exports: topics that it gives, by name.
+        side: this host's name and the topics that it imports.
+        exports: topics that it exports, by name.
         store: the keys.
-        on_event: called on the link's thread with everything that happens.
-        times: pings and timeouts.
+        on_event: called on the link's thread with every event.
+        times: ping period and timeouts.
 
     Raises:
         LinkError: the keys or the address cannot be used.
@@ -144,11 +144,11 @@ class HostLink(ABC):
     # -- for the node ------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Starts the thread."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self, timeout_s: float = 3.0) -> None:
-        """Says goodbye to the other hosts and ends the thread; twice does no harm."""
+        """Say goodbye to the other hosts and end the thread. Idempotent."""
         if self._context.closed:
             return
         with self._lock:
@@ -173,19 +173,19 @@ class HostLink(ABC):
         publish_ns: int,
         wall_time: bool = True,
     ) -> None:
-        """Gives a message to every host that takes its topic; never waits.
+        """Offer a message to every host that takes its topic; never waits.
 
         Args:
             topic: one of ``exports``.
             origin: node that published it.
             type_name: its type.
-            qos: preset's name, whether latched, whether reliable.
-            payload: CDR bytes; copied where anybody takes them.
-            publish_ns: when it was published.
-            wall_time: whether that is the machine's time, not a simulated one.
+            qos: name of the preset, whether latched, whether reliable.
+            payload: CDR bytes; copied if a host takes them.
+            publish_ns: time of publication.
+            wall_time: whether that is the machine's time, not simulated time.
 
         Raises:
-            ValueError: the type is not known here.
+            ValueError: the type is unknown on this host.
         """
         with self._lock:
             channel = self._channel(topic, origin, type_name, qos)
@@ -193,7 +193,7 @@ class HostLink(ABC):
             connections = self._connections()
             if not connections and not channel.latched:
                 return
-            # Both clocks of this host, at one moment: later its time of day may be set anew.
+            # Read both clocks now: the time of day may be set later.
             age_ns = max(0, time.time_ns() - publish_ns) if wall_time else 0
             item = Item(bytes(payload), publish_ns, time.monotonic_ns() - age_ns, channel.sequence, wall_time)
             if channel.latched:
@@ -203,7 +203,7 @@ class HostLink(ABC):
             self._wake()
 
     def open(self, topic: str, origin: str, type_name: str, qos: tuple[str, bool, bool]) -> None:
-        """Tells the other hosts of a publisher before its first message; see :meth:`offer`."""
+        """Announce a publisher to the other hosts before its first message; see :meth:`offer`."""
         with self._lock:
             channel = self._channel(topic, origin, type_name, qos)
             for connection in self._connections():
@@ -211,7 +211,7 @@ class HostLink(ABC):
             self._wake()
 
     def forget(self, topic: str, origin: str) -> None:
-        """A publisher has gone: hosts that come later are told nothing of it, nor given its latched value."""
+        """Drop a publisher that is gone: new hosts get neither its announcement nor its latched value."""
         with self._lock:
             self._channels.pop((topic, origin), None)
 
@@ -230,7 +230,7 @@ class HostLink(ABC):
         return channel
 
     def peers(self) -> list[PeerStatus]:
-        """The links that stand now."""
+        """State of all current links."""
         with self._lock:
             return [self._status(connection) for connection in self._connections() if connection.session.up]
 
@@ -252,7 +252,7 @@ class HostLink(ABC):
         )
 
     def counts(self) -> tuple[dict[str, TopicCounts], dict[str, TopicCounts]]:
-        """Numbers by topic, out and in, over all hosts and all links since the start."""
+        """Return the counts by topic, out and in, summed over all hosts and links since the start."""
         out: dict[str, TopicCounts] = {}
         into: dict[str, TopicCounts] = {}
         with self._lock:
@@ -271,18 +271,18 @@ class HostLink(ABC):
 
     @abstractmethod
     def _open(self) -> None:
-        """Makes what the loop needs, on its thread."""
+        """Create what the loop needs, on its thread."""
 
     @abstractmethod
     def _step(self) -> float:
-        """Receives, decides and sends; gives the seconds until it must be called again."""
+        """Receive, process and send; return the seconds until the next call is due."""
 
     @abstractmethod
     def _sockets(self) -> list[zmq.Socket[bytes]]: ...
 
     @abstractmethod
     def _farewell(self) -> None:
-        """Says goodbye."""
+        """Say goodbye to the other hosts."""
 
     def _run(self) -> None:
         try:
@@ -319,7 +319,7 @@ class HostLink(ABC):
         return Session(self.side, connecting, memory, None, self.times, may_send)
 
     def _give_latched(self, session: Session) -> None:
-        """The topics and the last values for a host that has just come."""
+        """Send the topics and latched values to a host that has just connected."""
         for channel in self._channels.values():
             session.open(channel)
         for channel in self._channels.values():
@@ -329,7 +329,7 @@ class HostLink(ABC):
     def _socket(self, kind: int) -> zmq.Socket[bytes]:
         made: zmq.Socket[bytes] = self._context.socket(kind)
         made.setsockopt(zmq.LINGER, 0)
-        made.setsockopt(zmq.SNDHWM, 10_000)  # bytes on their way are limited by the sessions; this is for small answers
+        made.setsockopt(zmq.SNDHWM, 10_000)  # sessions limit the bytes in flight; this is for small replies
         made.setsockopt(zmq.RCVHWM, 10_000)
         made.setsockopt(zmq.MAXMSGSIZE, MAX_FRAME)
         made.setsockopt(zmq.HANDSHAKE_IVL, int(GREETING_S * 1000))
@@ -345,10 +345,10 @@ class HostLink(ABC):
 
 
 def check_endpoint(endpoint: str, listening: bool) -> tuple[str, int]:
-    """Host and port of ``tcp://HOST:PORT``.
+    """Return host and port of ``tcp://HOST:PORT``.
 
     Raises:
-        LinkError: it has another form.
+        LinkError: the endpoint has another form.
     """
     match = _ENDPOINT.match(endpoint)
     port = int(match[3]) if match else -1

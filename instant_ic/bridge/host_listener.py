@@ -1,4 +1,4 @@
-"""The robot's end of the link: one TCP port, CURVE on it, the allow-list at its door."""
+"""The robot's end of the link: one TCP port with CURVE encryption, open to the hosts of the allow-list."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _STRANGERS_A_MINUTE = 10
 
 
 class ListeningLink(HostLink):
-    """The robot's end: many hosts may come, those of the allow-list are let in, one of them drives.
+    """The robot's end: accepts all hosts of the allow-list; one of them drives.
 
     Args:
-        endpoint: ``tcp://0.0.0.0:7450``; port 0 takes a free one, told by ``port``.
+        endpoint: ``tcp://0.0.0.0:7450``; port 0 takes a free one, available as ``port``.
 
-    See :class:`HostLink` for the others. ``wanted_driver`` names the host that is to drive; empty leaves it to who came
-    first.
+    See :class:`HostLink` for the other arguments. ``wanted_driver`` names the host that is to drive; if it is empty,
+    the first driver that connected drives.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class ListeningLink(HostLink):
         self._list_problem = ""
         self._leaving: list[tuple[float, Connection]] = []
         self._zap = self._context.socket(zmq.ROUTER)
-        self._zap.bind(_ZAP)  # before the door opens: without a keeper everybody would be let in
+        self._zap.bind(_ZAP)  # bind before the port opens: without the ZAP handler every host would be accepted
         self._router = self._socket(zmq.ROUTER)
         self._router.setsockopt(zmq.ROUTER_MANDATORY, 1)
         self._router.setsockopt(zmq.CURVE_SERVER, 1)
@@ -113,7 +113,7 @@ class ListeningLink(HostLink):
     # -- the door ----------------------------------------------------------------------------------
 
     def _answer_door(self) -> None:
-        """The keeper (ZAP, RFC 27): libzmq asks it about everybody who proves a key."""
+        """Answer libzmq's authentication requests (ZAP, RFC 27), one for each host that proves a key."""
         while int(self._zap.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             frames = self._zap.recv_multipart(zmq.NOBLOCK)
             if len(frames) < 8:
@@ -128,7 +128,7 @@ class ListeningLink(HostLink):
             self._zap.send_multipart([back, empty, version, request, code, text, user, b""])
 
     def _turn_away(self, address: str, key: bytes) -> None:
-        """Told once a minute for each address and key, and ten times a minute in all, with the tries in between."""
+        """Report a rejected host with its tries: once a minute per address and key, ten times a minute in all."""
         self.strangers += 1
         who = (address, fingerprint(key) if key else "without a key")
         told_s, times = self._told.get(who, (-_STRANGER_S, 0))
@@ -148,7 +148,7 @@ class ListeningLink(HostLink):
             if peer == connection.peer:
                 continue
             reason = f"{self.side.name} no longer allows this host's key"
-            if peer is not None:  # its role or name is another one now: it comes back with it
+            if peer is not None:  # its role or name has changed: it reconnects with the new one
                 reason = f"{self.side.name} has changed what this host may do"
             events = connection.session.end("replaced" if peer else "revoked", reason, tell=True)
             self._handle(connection, events)
@@ -178,8 +178,8 @@ class ListeningLink(HostLink):
                 self._handle(connection, connection.session.receive(frame.buffer))
 
     def _greet(self, route: bytes, frame: zmq.Frame) -> Connection | None:
-        """A connection that has said nothing yet: it must say Hello."""
-        # libzmq has proved the key; the list may have changed since it asked.
+        """Create the connection of a new route, whose first frame must be Hello."""
+        # libzmq has verified the key, but the list may have changed since.
         peer = self.allowed.get(z85.decode(str(frame.get("User-Id")).encode()))
         try:
             hello = isinstance(decode(frame.buffer), Hello)
@@ -190,12 +190,12 @@ class ListeningLink(HostLink):
             self._send_frame(route, word.encode())
             return None
         for old_route, old in list(self._by_route.items()):
-            if old.peer.public_key == peer.public_key:  # it has started anew, or lost a link that we had not missed yet
+            if old.peer.public_key == peer.public_key:  # it restarted, or lost a link before we noticed
                 self._handle(old, old.session.end("replaced", "this key has made a newer link", tell=True))
                 self._send(old_route, old)
         connection = Connection(peer, self._new_session(peer, connecting=False, may_send=peer.role == "driver"))
         connection.address = str(frame.get("Peer-Address"))
-        with contextlib.suppress(zmq.ZMQError):  # libzmq may be built without it: then its own heartbeats end the rest
+        with contextlib.suppress(zmq.ZMQError):  # libzmq may be built without it: its own heartbeats then end the rest
             connection.file = int(frame.get(zmq.SRCFD))
             connection.remote = _remote_of(connection.file)
         self._by_route[route] = connection
@@ -207,7 +207,7 @@ class ListeningLink(HostLink):
                 self._handle(connection, connection.session.end("gone", "the connection broke"))
                 break
         if connection.session.ended is not None and self._by_route.pop(route, None) is not None:
-            # The last word gets a moment to leave; nothing else goes in or out from now on.
+            # Leave a moment for the final message; nothing else is sent or received.
             self._leaving.append((time.monotonic() + 0.1, connection))
 
     def _send_frame(self, route: bytes, data: bytes) -> bool:
@@ -230,7 +230,7 @@ class ListeningLink(HostLink):
     # -- who drives --------------------------------------------------------------------------------
 
     def _choose_driver(self) -> None:
-        """One host's commands at a time: the one that is wanted, else the first that came, until it leaves."""
+        """Choose the host that drives: the configured one, otherwise the first that connected, until it leaves."""
         drivers = [c for c in self._connections() if c.session.up and c.peer.role == "driver"]
         wanted = [c for c in drivers if c.peer.name == (self.wanted_driver or c.peer.name)]
         holder = min(wanted, key=lambda c: (not c.session.drives, c.session.up_ns), default=None)
@@ -245,13 +245,13 @@ class ListeningLink(HostLink):
 
     @property
     def driver(self) -> str:
-        """Name of the host whose commands are taken; empty when there is none."""
+        """Name of the host whose commands are accepted; empty if there is none."""
         with self._lock:
             return next((c.peer.name for c in self._connections() if c.session.up and c.session.drives), "")
 
 
 def _remote_of(file: int) -> Any:
-    """The other end of a connection's file; None when it is gone."""
+    """Return the remote address of a socket file; None if it is closed."""
     try:
         with socket.socket(fileno=os.dup(file)) as copy:
             return copy.getpeername()
@@ -260,10 +260,10 @@ def _remote_of(file: int) -> Any:
 
 
 def _shut(connection: Connection) -> None:
-    """Cuts a connection off, so that its host hears of it at once and does not wait for its timeout."""
+    """Shut down a connection, so that its host notices immediately instead of waiting for its timeout."""
     try:
         with socket.socket(fileno=os.dup(connection.file)) as copy:
-            # libzmq may have closed it and the number may be somebody else's by now.
+            # libzmq may have closed the file, and the number may belong to another connection.
             if connection.remote is not None and copy.getpeername() == connection.remote:
                 copy.shutdown(socket.SHUT_RDWR)
     except OSError:

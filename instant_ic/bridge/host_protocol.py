@@ -1,6 +1,6 @@
-"""Messages between two bridges: one kind byte and a body; JSON where it is rare, fixed fields where it is often.
+"""Messages between two bridges: one kind byte and a body; JSON for rare messages, fixed fields for frequent ones.
 
-A message of a topic travels in chunks, so that a command never waits for the end of a picture.
+A topic's message is sent in chunks, so that a command never waits for the end of an image.
 """
 
 from __future__ import annotations
@@ -11,15 +11,15 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, ClassVar, TypeVar, get_origin, get_type_hints
 
 VERSION = 1
-"""Grows with every change that an older bridge would misunderstand; the handshake compares it."""
+"""Protocol version, compared in the handshake. Increase it with every incompatible change."""
 
 MAX_CHUNK = 64 * 1024
 MAX_JSON = 64 * 1024
 MAX_FRAME = MAX_CHUNK + 1024
-"""No frame is longer; the socket drops who sends one."""
+"""Largest frame; the socket disconnects a host that sends more."""
 
 LANES = ("command", "state", "bulk")
-"""Ways through the link by rank: a later one never holds up an earlier one."""
+"""Priority classes on the link; a later lane never delays an earlier one."""
 
 _DATA = struct.Struct("<BBHIIQqqq")
 _PING = struct.Struct("<BIqq")
@@ -28,16 +28,15 @@ _ACK = struct.Struct("<Bq3Q")
 
 
 class ProtocolError(ValueError):
-    """Bytes that this protocol does not know."""
+    """Bytes that violate this protocol."""
 
 
 class _Json:
-    """A message whose body is a JSON object with exactly its fields."""
+    """A message with a JSON object as body, which has exactly the fields of the class."""
 
     KIND: ClassVar[int]
 
     def encode(self) -> bytes:
-        """Bytes of the message."""
         body = json.dumps(asdict(self), separators=(",", ":")).encode()  # type: ignore[call-overload]
         if len(body) > MAX_JSON:
             raise ProtocolError(f"{type(self).__name__} of {len(body)} bytes is longer than {MAX_JSON}")
@@ -45,7 +44,6 @@ class _Json:
 
     @classmethod
     def decode(cls, data: memoryview) -> Any:
-        """The message of these bytes."""
         try:
             content = json.loads(bytes(data[1:]))
         except (ValueError, RecursionError) as error:
@@ -53,7 +51,7 @@ class _Json:
         hints = get_type_hints(cls)
         names = [f.name for f in fields(cls)]  # type: ignore[arg-type]
         if isinstance(content, dict) and "version" in names and content.get("version") != VERSION:
-            # Another version greets with other fields: only who it is matters, for the answer.
+            # Another version may greet with other fields; the reply needs only the ones known here.
             content = {name: content.get(name) for name in names}
             kinds = {name: get_origin(hints[name]) or hints[name] for name in names}
             content = {n: value if isinstance(value, kinds[n]) else kinds[n]() for n, value in content.items()}
@@ -69,13 +67,13 @@ class _Json:
 
 @dataclass(frozen=True)
 class Hello(_Json):
-    """First word of the host that connects; the answer is :class:`Welcome` or :class:`Bye`.
+    """First message of the host that connects; the answer is :class:`Welcome` or :class:`Bye`.
 
     Attributes:
         version: :data:`VERSION`.
-        name: what the host calls itself.
+        name: the host's own name.
         instance: new with every start of the bridge.
-        wants: topic → most messages a second that it takes (0: all), of what the other sends.
+        wants: topic → most messages per second that this host takes from the other (0: all).
     """
 
     KIND: ClassVar[int] = 1
@@ -87,7 +85,7 @@ class Hello(_Json):
 
 @dataclass(frozen=True)
 class Welcome(_Json):
-    """Answer to :class:`Hello`; the fields are the same."""
+    """Answer to :class:`Hello`, with the same fields."""
 
     KIND: ClassVar[int] = 2
     version: int
@@ -98,11 +96,11 @@ class Welcome(_Json):
 
 @dataclass(frozen=True)
 class Bye(_Json):
-    """Last word: why the link ends.
+    """Last message of a link.
 
     Attributes:
         code: version, revoked, replaced, unknown, protocol or closing.
-        reason: in words, for the other's user.
+        reason: text for the other host's user.
     """
 
     KIND: ClassVar[int] = 3
@@ -112,15 +110,15 @@ class Bye(_Json):
 
 @dataclass(frozen=True)
 class Announce(_Json):
-    """A topic of one publisher is coming.
+    """Announces one publisher's topic.
 
     Attributes:
-        channel: number by which :class:`Data` names it.
-        topic: without the sender's namespace.
-        origin: node that publishes it there.
+        channel: number that identifies the topic in :class:`Data`.
+        topic: name without the sender's namespace.
+        origin: node that publishes it on the sending host.
         type_name: message type.
-        digest: of name and fields of the type (ROS 2's RIHS01).
-        qos: preset's name.
+        digest: hash of the type's name and fields (ROS 2's RIHS01).
+        qos: name of the preset.
     """
 
     KIND: ClassVar[int] = 4
@@ -134,11 +132,11 @@ class Announce(_Json):
 
 @dataclass(frozen=True)
 class Refuse(_Json):
-    """An announced topic is not taken.
+    """Refuses an announced topic.
 
     Attributes:
-        channel: of the announcement.
-        reason: in words, for the other's user.
+        channel: channel of the announcement.
+        reason: text for the other host's user.
     """
 
     KIND: ClassVar[int] = 5
@@ -148,11 +146,11 @@ class Refuse(_Json):
 
 @dataclass(frozen=True)
 class Notice(_Json):
-    """Something that the other's user should know; empty when it is over.
+    """Information for the other host's user; an empty text withdraws it.
 
     Attributes:
-        name: what it is about.
-        text: in words.
+        name: subject.
+        text: the information.
     """
 
     KIND: ClassVar[int] = 6
@@ -162,10 +160,10 @@ class Notice(_Json):
 
 @dataclass(frozen=True)
 class Ping:
-    """Sign of life and question for the time.
+    """Heartbeat and time request.
 
     Attributes:
-        number: grows by one.
+        number: increases by one.
         mono_ns: the sender's monotonic clock.
         epoch_ns: time of day at which that clock was zero.
     """
@@ -176,18 +174,16 @@ class Ping:
     epoch_ns: int
 
     def encode(self) -> bytes:
-        """Bytes of the message."""
         return _PING.pack(self.KIND, self.number & 0xFFFFFFFF, self.mono_ns, self.epoch_ns)
 
     @classmethod
     def decode(cls, data: memoryview) -> Ping:
-        """The message of these bytes."""
         return cls(*_unpack(_PING, data)[1:])
 
 
 @dataclass(frozen=True)
 class Pong:
-    """Answer to a ping: its number and ``mono_ns``, when it came, and when this leaves, by the answerer's clock."""
+    """Answer to a ping: its number and ``mono_ns``, and the answering host's clock at arrival and departure."""
 
     KIND: ClassVar[int] = 17
     number: int
@@ -197,23 +193,21 @@ class Pong:
     epoch_ns: int
 
     def encode(self) -> bytes:
-        """Bytes of the message."""
         number = self.number & 0xFFFFFFFF
         return _PONG.pack(self.KIND, number, self.echo_ns, self.arrived_ns, self.mono_ns, self.epoch_ns)
 
     @classmethod
     def decode(cls, data: memoryview) -> Pong:
-        """The message of these bytes."""
         return cls(*_unpack(_PONG, data)[1:])
 
 
 @dataclass(frozen=True)
 class Ack:
-    """What came so far: bytes of each lane since the session began.
+    """Bytes received so far in each lane since the session began.
 
     Attributes:
-        echo_ns: ``sent_ns`` of the newest chunk that came.
-        taken: bytes by lane, as :data:`LANES`.
+        echo_ns: ``sent_ns`` of the newest chunk received.
+        taken: bytes by lane, in the order of :data:`LANES`.
     """
 
     KIND: ClassVar[int] = 18
@@ -221,12 +215,10 @@ class Ack:
     taken: tuple[int, ...]
 
     def encode(self) -> bytes:
-        """Bytes of the message."""
         return _ACK.pack(self.KIND, self.echo_ns, *self.taken)
 
     @classmethod
     def decode(cls, data: memoryview) -> Ack:
-        """The message of these bytes."""
         _, echo_ns, *taken = _unpack(_ACK, data)
         return cls(echo_ns, tuple(taken))
 
@@ -237,15 +229,15 @@ class Data:
 
     Attributes:
         channel: see :class:`Announce`.
-        sequence: of the message, from 1; a gap is a loss.
-        publish_ns: when it was published first.
+        sequence: number of the message, from 1; a gap is a loss.
+        publish_ns: time of the first publication.
         born_ns: the same by the sending host's monotonic clock.
-        sent_ns: when this chunk leaves, by the same clock.
+        sent_ns: time at which this chunk leaves, by the same clock.
         total: bytes of the message.
-        offset: where this chunk begins.
+        offset: position of this chunk in the message.
         chunk: the bytes.
-        lane: the sender's, as an index of :data:`LANES`; a lane carries one message after the other.
-        wall_time: ``publish_ns`` is the machine's time (a simulated clock is the same on both hosts).
+        lane: the sender's lane, as an index of :data:`LANES`; the messages of a lane do not overlap.
+        wall_time: whether ``publish_ns`` is the machine's time (a simulated clock is the same on both hosts).
     """
 
     KIND: ClassVar[int] = 19
@@ -261,7 +253,6 @@ class Data:
     wall_time: bool = True
 
     def encode(self) -> bytes:
-        """Bytes of the message."""
         flags = self.lane << 1 | self.wall_time
         head = _DATA.pack(
             self.KIND,
@@ -278,7 +269,6 @@ class Data:
 
     @classmethod
     def decode(cls, data: memoryview) -> Data:
-        """The message of these bytes."""
         if len(data) < _DATA.size:
             raise ProtocolError(f"Data of {len(data)} bytes is too short")
         _, flags, channel, total, offset, sequence, publish, born, sent = _DATA.unpack(data[: _DATA.size])
@@ -301,10 +291,10 @@ _T = TypeVar("_T")
 
 
 def decode(data: bytes | memoryview) -> Message:
-    """The message of these bytes; a ``Data``'s chunk is a view of them.
+    """Decode a message; the chunk of a ``Data`` is a view of ``data``.
 
     Raises:
-        ProtocolError: they are none.
+        ProtocolError: the bytes are not a message.
     """
     view = memoryview(data)
     kind = _KINDS.get(view[0]) if len(view) else None

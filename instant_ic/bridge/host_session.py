@@ -1,4 +1,4 @@
-"""One link between two hosts as a state machine: bytes in, bytes and events out; no sockets, no threads."""
+"""State machine of one link between two hosts: bytes in, bytes and events out; no sockets, no threads."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from instant_ic.bridge.host_topics import TopicCounts, TopicRule
 from instant_ic.config.ranges import Range, check_ranges
 
 MAX_MESSAGE = 64 << 20
-"""Bytes of the longest message that is put together."""
+"""Largest message that is reassembled, in bytes."""
 
 MAX_CHANNELS = 1024
-"""Channels that a peer may announce on one link; a robot has some hundred."""
+"""Most channels that the other host may announce on one link; a robot has some hundred."""
 
 MAX_NAME = 128
 MAX_NOTICES = 16
@@ -49,20 +49,18 @@ _CLOCK_STEP_NS = 20_000_000
 
 
 class Clocks:
-    """The machine's two clocks: one that never steps, and the time of day."""
+    """The machine's two clocks: the monotonic clock, and the time of day."""
 
     def mono_ns(self) -> int:
-        """Nanoseconds of the monotonic clock."""
         return time.monotonic_ns()
 
     def wall_ns(self) -> int:
-        """Nanoseconds since the epoch."""
         return time.time_ns()
 
     def epoch_ns(self) -> int:
-        """The time of day at which the monotonic clock was zero; changes only when the time of day is set."""
+        """Return the time of day at which the monotonic clock was zero; it changes only when the time of day is set."""
         reads = []
-        for _ in range(3):  # a busy machine may stop us between two clocks: the reading that took least counts
+        for _ in range(3):  # a busy machine may pause between the two clocks: keep the fastest reading
             before, wall, after = self.mono_ns(), self.wall_ns(), self.mono_ns()
             reads.append((after - before, wall - (before + after) // 2))
         return min(reads)[1]
@@ -70,12 +68,12 @@ class Clocks:
 
 @dataclass(frozen=True)
 class LinkTimes:
-    """When a link counts as what; seconds.
+    """Timing of a link; seconds.
 
     Attributes:
-        ping_s: time between two signs of life.
-        timeout_s: nothing heard for this long: the link is lost.
-        queue_s: time that a picture may wait in the link's queues.
+        ping_s: ping period.
+        timeout_s: time without any message after which the link is lost.
+        queue_s: time that an image may wait in the link's queues.
     """
 
     ping_s: Annotated[float, Range(0.02, 5)] = 0.25
@@ -83,7 +81,6 @@ class LinkTimes:
     queue_s: Annotated[float, Range(0.005, 1)] = 0.05
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         check_ranges(self)
         if self.timeout_s < 2 * self.ping_s:
             raise ValueError(f"timeout_s must be at least two ping_s (got {self.timeout_s} and {self.ping_s})")
@@ -91,13 +88,13 @@ class LinkTimes:
 
 @dataclass(frozen=True)
 class Side:
-    """What one host brings into a link.
+    """One host's side of a link.
 
     Attributes:
-        name: what it calls itself.
+        name: the host's own name.
         instance: new with every start.
-        imports: topics that it takes, by name.
-        digest: RIHS01 hash of a message type; raises ValueError where the type is not known.
+        imports: topics that it imports, by name.
+        digest: returns the RIHS01 hash of a message type; raises ValueError for an unknown type.
     """
 
     name: str
@@ -108,14 +105,14 @@ class Side:
 
 @dataclass(frozen=True)
 class Up:
-    """The link stands; the other host is called ``name``."""
+    """The link is up; ``name`` is the other host's own name."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Ended:
-    """The link is over; ``code`` is that of :class:`Bye`, or timeout, or gone."""
+    """The link has ended; ``code`` is that of :class:`Bye`, or timeout, or gone."""
 
     code: str
     reason: str
@@ -123,21 +120,21 @@ class Ended:
 
 @dataclass(frozen=True)
 class Announced:
-    """A topic is coming, and is taken."""
+    """A topic was announced and accepted."""
 
     announce: Announce
 
 
 @dataclass(frozen=True)
 class Arrived:
-    """A whole message of a topic.
+    """A complete message of a topic.
 
     Attributes:
-        announce: topic, type, QoS, and who published it.
+        announce: topic, type, QoS and publisher.
         payload: CDR bytes.
-        publish_ns: when it was published, by this host's time of day.
-        age_ns: since it was published.
-        born_ns: the same by this host's monotonic clock; never in the future.
+        publish_ns: time of publication, by this host's time of day.
+        age_ns: time since publication.
+        born_ns: time of publication by this host's monotonic clock; never in the future.
     """
 
     announce: Announce
@@ -149,7 +146,7 @@ class Arrived:
 
 @dataclass(frozen=True)
 class Refused:
-    """A topic is not taken, by this host (``here``) or the other."""
+    """A topic was refused, by this host (``here``) or by the other."""
 
     topic: str
     reason: str
@@ -158,7 +155,7 @@ class Refused:
 
 @dataclass(frozen=True)
 class ClockStepped:
-    """The other host's clock jumped by ``step_ns``."""
+    """The other host's clock stepped by ``step_ns``."""
 
     step_ns: int
 
@@ -168,14 +165,14 @@ Event = Up | Ended | Announced | Arrived | Refused | ClockStepped
 
 @dataclass
 class Memory:
-    """What outlives a link, kept for each host: it comes back and must see what it missed.
+    """State kept for each host across links, so that lost messages are detected after a reconnect.
 
     Attributes:
-        sent: channel → number of the last message that left.
-        received: (the other's start, topic, publisher) → number of the last message that came.
-        latched: (the other's start, topic, publisher) → ``born_ns`` of the last latched value that was passed on; a
-            new link brings it again.
-        counts_out, counts_in: by topic, over all links with this host.
+        sent: channel → number of the last message sent.
+        received: (the other host's instance, topic, publisher) → number of the last message received.
+        latched: (the other host's instance, topic, publisher) → ``born_ns`` of the last latched value passed on, since
+            a new link sends it again.
+        counts_out, counts_in: counts by topic, over all links with this host.
     """
 
     sent: dict[int, int] = field(default_factory=dict)
@@ -191,19 +188,19 @@ class _Incoming:
     rule: TopicRule
     counts: TopicCounts
     refused: str = ""
-    kept: tuple[Arrived, int] | None = None  # latched, from a host that does not drive yet; with its born_ns
+    kept: tuple[Arrived, int] | None = None  # latched value of a host that does not drive yet, with its born_ns
 
 
 class Session:
-    """One side of one link, from the first word to the last.
+    """One side of one link, from the first message to the last.
 
     Args:
         side: this host.
-        connecting: whether this side says :class:`Hello`.
-        memory: what is known of the other host from earlier links.
-        clocks: the machine's, or simulated ones.
-        times: pings and timeouts.
-        may_send: whether the other's topics are taken at all; a viewer's are not.
+        connecting: whether this side sends :class:`Hello`.
+        memory: state of earlier links with the other host.
+        clocks: the machine's clocks, or simulated ones.
+        times: ping period and timeouts.
+        may_send: whether the other host's topics are accepted; a viewer's are not.
     """
 
     def __init__(
@@ -220,7 +217,7 @@ class Session:
         self.times = times or LinkTimes()
         self.memory = memory or Memory()
         self.may_send = may_send
-        self.drives = connecting  # who connects takes all that the robot sends; the robot's link decides who drives
+        self.drives = connecting  # the connecting side accepts all topics; the robot's link decides who drives
         self.up = False
         self.ended: Ended | None = None
         self.peer_name = ""
@@ -252,17 +249,17 @@ class Session:
     # -- out --------------------------------------------------------------------------------------
 
     def offer(self, channel: Channel, item: Item) -> None:
-        """A message for the other host."""
+        """Queue a message for the other host."""
         if self.up:
             self.outbox.offer(channel, item, self.clocks.mono_ns())
 
     def open(self, channel: Channel) -> None:
-        """A topic that will have messages for the other host."""
+        """Announce a topic before its first message."""
         if self.up:
             self.outbox.open(channel)
 
     def outgoing(self) -> Iterator[bytes]:
-        """What is to be sent now."""
+        """Yield the frames to send now."""
         now = self.clocks.mono_ns()
         while self._replies:
             yield self._replies.popleft().encode()
@@ -280,7 +277,7 @@ class Session:
             yield message.encode()
 
     def next_due_ns(self) -> int:
-        """When :meth:`outgoing` or :meth:`check` has to be called next, if nothing happens before."""
+        """Return when :meth:`outgoing` or :meth:`check` must be called next if nothing happens before."""
         dues = [self.heard_ns + int(self.times.timeout_s * 1e9)]
         if self.up:
             dues.append(self._next_ping_ns)
@@ -290,14 +287,14 @@ class Session:
         return min(dues)
 
     def check(self) -> list[Event]:
-        """Ends a link on which nothing was heard for too long."""
+        """End a link that has timed out."""
         silent_s = (self.clocks.mono_ns() - self.heard_ns) / 1e9
         if self.ended is None and silent_s > self.times.timeout_s:
             return self.end("timeout", f"nothing heard for {silent_s:.1f} s")
         return []
 
     def end(self, code: str, reason: str, tell: bool = False) -> list[Event]:
-        """Ends the link from this side; ``tell`` says so to the other."""
+        """End the link from this side; ``tell`` sends the reason to the other host."""
         if self.ended is not None:
             return []
         self.up = False
@@ -311,11 +308,11 @@ class Session:
         return [self.ended]
 
     def notify(self, name: str, text: str) -> None:
-        """Tells the other host's user something; an empty text takes it back."""
+        """Send a notice to the other host's user; an empty text withdraws it."""
         self._replies.append(Notice(name, text))
 
     def set_drives(self, drives: bool) -> list[Event]:
-        """Whether the other host's commands are taken; its latched values, held back so far, come now."""
+        """Set whether the other host's commands are accepted; if so, return its latched values held back so far."""
         self.drives = drives
         if not drives:
             return []
@@ -330,7 +327,7 @@ class Session:
 
     @property
     def wall_offset_ns(self) -> int | None:
-        """The other's time of day minus ours; None before the first exchange."""
+        """The other host's time of day minus ours; None before the first exchange."""
         if self._peer_epoch_ns is None or not self.clock.ready:
             return None
         return self._peer_epoch_ns - self.clocks.epoch_ns() + self.clock.offset_ns
@@ -344,7 +341,7 @@ class Session:
     # -- in ---------------------------------------------------------------------------------------
 
     def receive(self, data: bytes | memoryview) -> list[Event]:
-        """Takes one frame of the other host; what cannot be understood ends the link."""
+        """Process one frame of the other host; an invalid frame ends the link."""
         if self.ended is not None:
             return []
         self.heard_ns = self.clocks.mono_ns()
@@ -418,7 +415,7 @@ class Session:
         if not self.may_send:
             self.notify("role", f"this host may only watch {self.side.name} (role viewer)")
         self._next_ping_ns = self.up_ns
-        # Starts of the other that are over: their numbers say nothing any more.
+        # Drop entries of the other host's earlier instances: their numbers mean nothing now.
         for known in (self.memory.received, self.memory.latched):
             for key in [key for key in known if key[0] != self.peer_instance]:
                 del known[key]
@@ -452,7 +449,7 @@ class Session:
         return self.refuse(announce, reason)
 
     def refuse(self, announce: Announce, reason: str) -> list[Event]:
-        """Tells the other host that a topic of its is not taken."""
+        """Tell the other host that one of its topics is refused."""
         self._incoming[announce.channel].refused = reason
         self._replies.append(Refuse(announce.channel, reason))
         return [Refused(announce.topic, reason, here=True)]
@@ -461,7 +458,7 @@ class Session:
         incoming = self._incoming.get(data.channel)
         if incoming is None:
             raise ProtocolError(f"data of channel {data.channel}, which was not announced")
-        lane = data.lane  # the sender's: its list may rank the topic otherwise
+        lane = data.lane  # the sender's lane: its list may assign another one
         self._taken[lane] += len(data.chunk) + DATA_OVERHEAD
         self._ack = data.sent_ns
         if incoming.refused:
@@ -471,7 +468,7 @@ class Session:
             return []
         if self.clock.ready:
             return self._whole(incoming, data, payload, now)
-        self._early.append((incoming, data, payload))  # its age is not known yet; the answer to our ping is on its way
+        self._early.append((incoming, data, payload))  # its age is unknown until our ping is answered
         self._early_bytes += len(payload) + DATA_OVERHEAD
         if self._early_bytes > MAX_MESSAGE:
             raise ProtocolError(f"{self._early_bytes} bytes came and no answer to a ping")
@@ -482,7 +479,7 @@ class Session:
         return [event for incoming, data, payload in early for event in self._whole(incoming, data, payload, now)]
 
     def _assemble(self, lane: int, data: Data) -> bytes | bytearray | None:
-        """The whole message, when this was its last chunk."""
+        """Return the complete message after its last chunk, otherwise None."""
         if data.offset == 0:
             if len(data.chunk) == data.total:
                 return bytes(data.chunk)
@@ -532,8 +529,8 @@ class Session:
     def _deliver(self, incoming: _Incoming, arrived: Arrived, born_ns: int) -> list[Event]:
         announce, counts = incoming.announce, incoming.counts
         if announce.qos == "latched":
-            # What a new link only brings again is no news: an emergency stop that was released long ago must not
-            # release the one that somebody else has set since.
+            # A value that a new link repeats is not new: an emergency stop released long ago must not release one that
+            # another host has set since.
             key = (self.peer_instance, announce.topic, announce.origin)
             if self.memory.latched.get(key) == born_ns:
                 return []
@@ -545,10 +542,10 @@ class Session:
 
 
 def _checked(what: str, name: str) -> str:
-    """A name that the other host makes, if it may be kept here.
+    """Return a name received from the other host, if it is valid.
 
     Raises:
-        ProtocolError: it is too long, or has other characters than names have.
+        ProtocolError: the name is too long, or has characters that names may not contain.
     """
     if not _NAME.match(name):
         raise ProtocolError(
@@ -558,12 +555,12 @@ def _checked(what: str, name: str) -> str:
 
 
 def _text(text: str) -> str:
-    """The other host's words as they may be logged: one line, not long."""
+    """Return the other host's text in a form fit for logs: one line, limited length."""
     return "".join(c if c.isprintable() else " " for c in text[:_MAX_TEXT])
 
 
 def _remember(memory: dict[tuple[str, str, str], int], key: tuple[str, str, str], value: int) -> None:
-    """Keeps a number for a publisher; of too many the one that was silent for the longest is forgotten."""
+    """Store a number for a publisher; when there are too many, drop the one updated longest ago."""
     memory.pop(key, None)
     memory[key] = value
     if len(memory) > MAX_CHANNELS:

@@ -1,4 +1,4 @@
-"""Which topics go over the link, at which rate and rank; what is counted of them."""
+"""Rules for topics on the link (rate, lane, age), and the counts of their messages."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class TopicRule:
 
     Attributes:
         topic: its name, without namespace.
-        rate_hz: most messages a second, newest first; 0 sends all.
-        lane: rank, one of :data:`~.host_protocol.LANES`.
-        max_age_s: older than this since it was published it is dropped, on either side, and counted; 0 keeps it.
-        shared: taken from every driver's host, not only from the one that drives.
+        rate_hz: most messages per second, keeping the newest; 0 sends all.
+        lane: priority class, one of :data:`~.host_protocol.LANES`.
+        max_age_s: messages older than this since publication are dropped and counted, on either side; 0 keeps all.
+        shared: accept the topic from every driver's host, not only from the one that drives.
     """
 
     topic: str
@@ -31,7 +31,6 @@ class TopicRule:
     shared: bool = False
 
     def __post_init__(self) -> None:
-        """Checks the values."""
         if not _TOPIC.match(self.topic):
             raise ValueError(f"{self.topic!r} is no topic: it must look like /camera/image")
         if self.lane not in LANES:
@@ -43,10 +42,10 @@ class TopicRule:
 
     @classmethod
     def parse(cls, text: str) -> TopicRule:
-        """The rule of a line.
+        """Parse the rule in one line.
 
         Raises:
-            ValueError: with what is wrong in it.
+            ValueError: the line is wrong; the message says how.
         """
         words = text.split()
         if not words:
@@ -74,10 +73,10 @@ _READERS: dict[str, Callable[[str], object]] = {"float": float, "str": str, "boo
 
 
 def parse_rules(lines: tuple[str, ...]) -> dict[str, TopicRule]:
-    """Rules by topic.
+    """Parse rules; return them by topic.
 
     Raises:
-        ValueError: a line is wrong, or a topic stands twice.
+        ValueError: a line is wrong, or a topic is listed twice.
     """
     rules: dict[str, TopicRule] = {}
     for line in lines:
@@ -90,17 +89,17 @@ def parse_rules(lines: tuple[str, ...]) -> dict[str, TopicRule]:
 
 @dataclass
 class TopicCounts:
-    """What became of a topic's messages in one direction of one link.
+    """Counts of a topic's messages in one direction of one link.
 
     Attributes:
-        messages, bytes: that went out, or came in and were passed on.
-        thinned: left out for the rate limit, as asked.
-        superseded: a newer one took its place before the link had room: the link is too slow for the rate.
+        messages, bytes: sent, or received and passed on.
+        thinned: dropped by the rate limit, as configured.
+        superseded: replaced by a newer message before the link had room: the link is too slow for the rate.
         expired: older than ``max_age_s``.
-        overflowed: a full queue of a reliable topic.
+        overflowed: dropped from the full queue of a reliable topic.
         lost: gaps in the sequence, on the receiving side.
-        not_driving: from a host that does not drive now.
-        newest_age_ns: age of the newest message when it came.
+        not_driving: from a host that does not drive.
+        newest_age_ns: age of the newest message on arrival.
     """
 
     messages: int = 0
@@ -115,11 +114,11 @@ class TopicCounts:
 
     @property
     def bad(self) -> int:
-        """Messages that somebody may miss; thinning was asked for, and a newer picture is no loss."""
+        """Messages whose loss may matter; thinning is configured, and a newer image replaces an older one."""
         return self.expired + self.overflowed + self.lost
 
     def add(self, other: TopicCounts) -> None:
-        """Adds another's numbers."""
+        """Add the counts of ``other``."""
         for name in ("messages", "bytes", "thinned", "superseded", "expired", "overflowed", "lost", "not_driving"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.newest_age_ns = other.newest_age_ns or self.newest_age_ns

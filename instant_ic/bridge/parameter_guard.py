@@ -1,29 +1,29 @@
-"""Parameters that nobody outside may set, by whatever bridge: one rule for all of them."""
+"""Parameters that no bridge may set: one rule for all bridges."""
 
 from __future__ import annotations
 
 import fnmatch
 
 NEVER_SET = (
-    # nodes between a command and the tracks, and what they measure the world with
+    # nodes between a command and the tracks, and the sensors they rely on
     *("arbiter.*", "crawler_base.*", "virtual_robot.*", "navigator.*"),
     *("vlp16_driver.*", "theta_camera.*", "grid_slam.*"),
-    # ways in, and what stands in for the world
+    # command inputs, and sources of simulated or recorded data
     *("console.*", "host_bridge.*", "foxglove_bridge.*", "zenoh_*.*", "bag_player.*", "simulator.*"),
-    # of any node, also of one that is not ours
+    # any node, including those of other projects
     *("*timeout*", "*time_out*", "*max_age*", "*silence*", "*limit*", "*footprint*", "*collision*", "*estop*"),
     *("*e_stop*", "*emergency*", "*command*", "*cmd_vel*", "*watchdog*", "*max_speed*", "*max_vel*", "*max_acc*"),
     *("*deceleration*", "*use_sim_time"),
 )
-"""Patterns of ``NODE.KEY``, where NODE is the node's executable: a node keeps it under any name."""
+"""Patterns of ``NODE.KEY``. NODE is the node's executable, which does not change when the node is renamed."""
 
 
 def never_set(executable: str, key: str) -> bool:
     """Whether a parameter can be changed only on this machine (``ic param set``).
 
     Args:
-        executable: of the node, ``arbiter``; its own name may be another.
-        key: of the parameter, groups with dots.
+        executable: executable of the node (``arbiter``); the node's name may differ.
+        key: parameter key, with dots between groups.
     """
     name = f"{executable}.{key}".lower()
     return any(fnmatch.fnmatchcase(name, pattern) for pattern in NEVER_SET)

@@ -1,4 +1,4 @@
-"""Looks at a run directory's topics often and cheaply."""
+"""Polls the topics of a run directory at low cost."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 from instant_ic.bus import registry
 
-_FULL_LOOK_S = 1.0  # what a killed process leaves behind changes no folder
+_FULL_LOOK_S = 1.0  # the leftovers of a killed process change no folder
 
 
 class TopicWatch:
-    """The topics of a run directory, read anew only when a folder of theirs has changed, and once a second.
+    """Topics of a run directory, read again when one of their folders changes, and once a second.
 
     Args:
         run_dir: the run directory.
@@ -25,7 +25,7 @@ class TopicWatch:
         self._topics: list[registry.TopicInfo] = []
 
     def topics(self) -> list[registry.TopicInfo]:
-        """Topics with a live publisher, by name."""
+        """Return the topics with a live publisher, by name."""
         now = time.monotonic()
         with os.scandir(self._run_dir / "topics") as folders:
             seen = sorted((folder.name, folder.stat().st_mtime_ns) for folder in folders)

@@ -1,4 +1,4 @@
-"""Which web pages may speak to a server of this machine: a browser names the page in Origin, the server in Host."""
+"""Decides which web pages may access a server of this machine, by the browser's Origin and Host headers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a host name or address; names other than localhost are never looked up."""
+    """Whether a host name or address is reachable only from this machine; only localhost is recognised by name."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -16,14 +16,14 @@ def is_loopback(host: str) -> bool:
 
 
 def refusal(origin: str | None, host: str | None, origins: Sequence[str], hosts: Sequence[str]) -> str:
-    """Why a request is refused; empty where it may pass.
+    """Return why a request is refused; empty if it is allowed.
 
     Args:
-        origin: the header; None where there is none, as programs that are no browsers send it.
-        host: the header.
-        origins: pages that may connect beside those of this machine; ``*`` lets every page in.
-        hosts: names by which the server may be reached beside localhost; an address is always one. A foreign page
-            can point a name of its own at this machine (DNS rebinding), never an address.
+        origin: Origin header; None if there is none, as for programs other than browsers.
+        host: Host header.
+        origins: pages that may connect in addition to those of this machine; ``*`` allows every page.
+        hosts: names of the server in addition to localhost; addresses are always allowed. A foreign page can point its
+            own name at this machine (DNS rebinding), but never an address.
     """
     name = _hostname(f"//{host or ''}")
     if name is None or not (name in ("localhost", *hosts) or _is_address(name)):

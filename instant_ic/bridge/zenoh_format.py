@@ -1,7 +1,7 @@
 """rmw_zenoh's conventions as strings and bytes: data keys, attachments, liveliness tokens (rmw_zenoh, docs/design.md).
 
-ROS 2 nodes (Jazzy and newer) that run on rmw_zenoh carry CDR, as our bus does. Whoever keeps these conventions is one
-of them. Nothing here needs Zenoh itself.
+ROS 2 nodes (Jazzy and newer) on rmw_zenoh exchange CDR, as our bus does. A program that follows these conventions
+takes part in their graph. Nothing here needs Zenoh itself.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ GID_SIZE = 16
 """Bytes of a publisher's id."""
 
 SENDER_SIZE = 8
-"""Bytes at its head that all publishers of one session of ours share: by them a drive command and the release of an
-emergency stop are known to be of one sender. Publishers of ROS 2 have ids of their own throughout."""
+"""Leading bytes of the id that all publishers of one of our sessions share. They show that a drive command and the
+release of an emergency stop come from the same sender. In ids of ROS 2 publishers all bytes are individual."""
 
 _ATTACHMENT = struct.Struct("<qqB16s")
 _DDS_TYPE = re.compile(r"(\w+)::(\w+)::dds_::(\w+)_\Z")
@@ -30,17 +30,17 @@ Kind = Literal["NN", "MP", "MS"]
 
 
 class FormatError(ValueError):
-    """Bytes or a key that rmw_zenoh would not have made."""
+    """Bytes or a key that do not follow rmw_zenoh's conventions."""
 
 
 @dataclass(frozen=True)
 class Attachment:
-    """What goes with every message.
+    """Metadata of a message.
 
     Attributes:
-        sequence: grows by one with each message of a publisher, from 1.
+        sequence: increases by one with each message of a publisher, from 1.
         source_ns: time of publication by the sender's clock.
-        gid: 16 bytes that name the publisher, new with every start.
+        gid: 16-byte id of the publisher, new with every start.
     """
 
     sequence: int
@@ -49,14 +49,14 @@ class Attachment:
 
     @property
     def sender(self) -> str:
-        """The head of the publisher's id, hex digits."""
+        """First bytes of the publisher's id, in hex; shared by one session of ours."""
         return self.gid[:SENDER_SIZE].hex()
 
     def pack(self) -> bytes:
-        """The 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``.
+        """Return the 33 bytes, as Zenoh's serializer writes ``(i64, i64, bytes)``.
 
         Raises:
-            FormatError: the id has another length, or a number does not fit.
+            FormatError: the id has another length, or a number is out of range.
         """
         if len(self.gid) != GID_SIZE:
             raise FormatError(f"publisher id of {len(self.gid)} bytes, {GID_SIZE} expected")
@@ -67,10 +67,10 @@ class Attachment:
 
     @classmethod
     def unpack(cls, data: bytes) -> Attachment:
-        """Reads the 33 bytes.
+        """Decode the 33 bytes.
 
         Raises:
-            FormatError: another length, outside or of the id.
+            FormatError: the data or the id have another length.
         """
         if len(data) != _ATTACHMENT.size:
             raise FormatError(f"attachment of {len(data)} bytes, {_ATTACHMENT.size} expected")
@@ -81,10 +81,10 @@ class Attachment:
 
 
 def dds_type(type_name: str) -> str:
-    """``std_msgs/msg/String`` as ``std_msgs::msg::dds_::String_``.
+    """Return the DDS name of a type: ``std_msgs::msg::dds_::String_`` for ``std_msgs/msg/String``.
 
     Raises:
-        FormatError: not a full type name.
+        FormatError: the name is not a full type name.
     """
     if not (match := _ROS_TYPE.match(type_name)):
         raise FormatError(f"type name {type_name!r} does not look like std_msgs/msg/String")
@@ -92,10 +92,10 @@ def dds_type(type_name: str) -> str:
 
 
 def ros_type(dds_name: str) -> str:
-    """The way back from :func:`dds_type`.
+    """Return the ROS name of a type; the inverse of :func:`dds_type`.
 
     Raises:
-        FormatError: not such a name.
+        FormatError: the name is not a DDS type name.
     """
     if not (match := _DDS_TYPE.match(dds_name)):
         raise FormatError(f"type name {dds_name!r} does not look like std_msgs::msg::dds_::String_")
@@ -103,22 +103,22 @@ def ros_type(dds_name: str) -> str:
 
 
 def data_key(domain: int, topic: str, type_name: str, type_hash: str) -> str:
-    """Key that a topic's messages are put under."""
+    """Return the key of a topic's messages."""
     return f"{domain}/{topic.strip('/')}/{dds_type(type_name)}/{type_hash}"
 
 
 def mangled(name: str) -> str:
-    """A name as one part of a token: ``/`` becomes ``%``, an empty name ``%``."""
+    """Return a name as one part of a token: ``/`` becomes ``%``, an empty name ``%``."""
     return name.replace("/", "%") or "%"
 
 
 @dataclass(frozen=True)
 class TopicQoS:
-    """The part of ROS 2's quality of service that a token tells of here; the rest is the default.
+    """The fields of ROS 2's quality of service that tokens carry here; all others have defaults.
 
     Attributes:
-        reliable: else best effort.
-        latched: transient local: a late joiner gets the last ``depth`` messages; else volatile.
+        reliable: reliable if true, otherwise best effort.
+        latched: transient local if true (a late subscriber gets the last ``depth`` messages), otherwise volatile.
         depth: messages kept; 0 keeps all.
     """
 
@@ -127,7 +127,7 @@ class TopicQoS:
     depth: int = _DEFAULT_DEPTH
 
     def encode(self) -> str:
-        """``<reliability>:<durability>:<history>,<depth>:<deadline>:<lifespan>:<liveliness>``; empty where default."""
+        """Encode as ``<reliability>:<durability>:<history>,<depth>:<deadline>:<lifespan>:<liveliness>``; empty: default."""
         reliability = "" if self.reliable else "2"
         durability = "1" if self.latched else ""
         depth = "" if self.depth == _DEFAULT_DEPTH else str(self.depth)
@@ -136,10 +136,10 @@ class TopicQoS:
 
     @classmethod
     def decode(cls, text: str) -> TopicQoS:
-        """Reads a token's part.
+        """Parse the QoS part of a token.
 
         Raises:
-            FormatError: not six parts, or a depth that is no number.
+            FormatError: the text does not have six parts, or the depth is not a number.
         """
         parts = text.split(":")
         if len(parts) != 6:
@@ -157,15 +157,15 @@ class TopicQoS:
 
 @dataclass(frozen=True)
 class Token:
-    """One entity of the ROS graph, as its liveliness token tells it.
+    """One entity of the ROS graph, as described by its liveliness token.
 
     Attributes:
         kind: node, publisher or subscription.
         domain: ROS domain.
-        session: id of the Zenoh session, hex digits.
-        node_id, entity_id: numbers within the session; the same for a node.
-        namespace: of the node, ``/robot1``; ``/`` is the root.
-        node: its name.
+        session: id of the Zenoh session, in hex.
+        node_id, entity_id: numbers within the session; equal for a node.
+        namespace: the node's namespace, ``/robot1``; ``/`` is the root.
+        node: the node's name.
         topic, type_name, type_hash, qos: empty for a node.
     """
 
@@ -182,7 +182,7 @@ class Token:
     qos: TopicQoS = TopicQoS()
 
     def key(self) -> str:
-        """The token's key."""
+        """Return the token's key."""
         head = f"{ADMIN_SPACE}/{self.domain}/{self.session}/{self.node_id}/{self.entity_id}/{self.kind}"
         node = f"{head}/%/{mangled(self.namespace)}/{mangled(self.node)}"
         if self.kind == "NN":
@@ -191,10 +191,10 @@ class Token:
 
     @classmethod
     def parse(cls, key: str) -> Token | None:
-        """Reads a node's, publisher's or subscription's token; None for a service's, which nobody here asks for.
+        """Parse the token of a node, publisher or subscription; return None for a service's, which is not used here.
 
         Raises:
-            FormatError: not a token of rmw_zenoh.
+            FormatError: the key is not an rmw_zenoh token.
         """
         parts = key.split("/")
         if len(parts) < 9 or parts[0] != ADMIN_SPACE or not all(parts):

@@ -1,4 +1,4 @@
-"""Topics of the ROS graph over Zenoh in a run directory."""
+"""Imports topics of the ROS graph over Zenoh into a run directory."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from instant_ic.msg import MessageError, deserialize, message_type, serialize, t
 
 _TF = "tf2_msgs/msg/TFMessage"
 MAX_TOPICS, MAX_SOURCES, MAX_NAME = 512, 64, 200
-"""Most topics that come in, publishers of one of them, and characters of a name: the graph belongs to others."""
+"""Most imported topics, publishers per topic, and characters of a name: limits against a hostile ROS graph."""
 
 
 class StaticTransforms:
-    """The union of ``/tf_static`` messages: a publisher keeps one latched value, the robot's nodes send one each."""
+    """Union of ``/tf_static`` messages: several nodes send one each, but our publisher keeps one latched value."""
 
     def __init__(self) -> None:
         self._transforms: dict[str, Any] = {}
 
     def merge(self, payload: bytes) -> bytes | memoryview:
-        """All transforms so far as one message, the newest of each child frame.
+        """Return all transforms so far as one message, with the newest of each child frame.
 
         Raises:
-            MessageError: the bytes are no TFMessage.
+            MessageError: the bytes are not a TFMessage.
         """
         for transform in deserialize(payload, _TF).transforms:
             self._transforms[transform.child_frame_id] = transform
@@ -50,7 +50,7 @@ class StaticTransforms:
 
 @dataclass
 class _In:
-    """A topic that comes in."""
+    """An imported topic."""
 
     type_name: str
     qos: TopicQoS
@@ -63,20 +63,20 @@ class _In:
 
 
 class Incoming:
-    """Topics of the ROS graph, byte for byte, with the time at which they were published there.
+    """Imports topics of the ROS graph unchanged, with their original time of publication.
 
     Args:
         node: the gateway's node.
-        namespace: where the topics stand there.
+        namespace: namespace of the topics in the ROS graph.
         own: the gateway itself in the ROS graph.
-        subscribe: ``TOPIC``, ``PATTERN`` or ``TOPIC TYPE`` by the names here. With a type the topic is there at once;
-            else when a publisher of it appears.
-        commands: which of :data:`COMMANDS` may come in.
-        gate: what commands have to pass.
-        no_commands: why no command is taken but an emergency stop; empty where the link is secure enough.
+        subscribe: ``TOPIC``, ``PATTERN`` or ``TOPIC TYPE``, by local names. With a type the topic exists immediately,
+            otherwise once a publisher appears.
+        commands: those of :data:`COMMANDS` that are accepted.
+        gate: checks commands.
+        no_commands: why only an emergency stop is accepted as a command; empty if the link is secure.
 
     Raises:
-        ValueError: a type or a topic in the lists is wrong.
+        ValueError: a type or topic in the lists is wrong.
     """
 
     def __init__(
@@ -106,26 +106,26 @@ class Incoming:
 
     @property
     def topics(self) -> list[str]:
-        """Topics that come in now, by the names here."""
+        """Imported topics, by local name."""
         return sorted(self._topics)
 
     @property
     def count(self) -> int:
-        """Messages that came in, refused commands among them."""
+        """Messages received, including refused commands."""
         held = [entry.subscription for entry in self._topics.values() if entry.subscription is not None]
         return self._count_before + sum(subscription.count for subscription in held)
 
     def lost_by(self) -> dict[str, dict[str, int]]:
-        """Topic → publisher's id → messages that never came."""
+        """Return the lost messages: topic → publisher's id → count."""
         held = {topic: entry.subscription for topic, entry in self._topics.items()}
         return {topic: dict(s.lost_by) for topic, s in held.items() if s is not None and s.lost_by}
 
     def malformed(self) -> int:
-        """Messages without a readable attachment."""
+        """Return the number of messages without a readable attachment."""
         return sum(entry.subscription.malformed for entry in self._topics.values() if entry.subscription is not None)
 
     def on_token(self, token: Token, alive: bool) -> None:
-        """Follows the ROS graph; may be called from any thread."""
+        """Follow the ROS graph; may be called from any thread."""
         if token.kind == "MP":
             self._node.call_soon(self._follow, token, alive)
 
@@ -160,13 +160,13 @@ class Incoming:
         entry.gone_s = None
 
     def wants(self, topic: str) -> bool:
-        """Whether a topic comes in as soon as somebody there publishes it."""
+        """Whether a topic is imported once it has a publisher in the ROS graph."""
         if topic in self._commands:
             return True
         return takes(self._patterns, topic) and not takes(ACTED_ON, topic)
 
     def _same_type(self, topic: str, token: Token, entry: _In | None) -> bool:
-        """Whether a publisher there sends what its topic carries here; tells if not."""
+        """Whether a ROS publisher's type matches the local topic; report a mismatch."""
         wanted = entry.type_name if entry is not None else token.type_name
         who = f"{token.node} there sends {token.type_name}"
         if token.type_name != wanted:
@@ -183,13 +183,13 @@ class Incoming:
         return True
 
     def _open(self, topic: str, type_name: str, qos: TopicQoS, always: bool) -> _In:
-        """Brings a topic in, anew where it was in by another quality of service."""
+        """Import a topic; if it is already imported, replace it with the new quality of service."""
         sources: set[tuple[str, int]] = set()
         if (old := self._topics.pop(topic, None)) is not None:
             sources = old.sources
             self._shut(old)
         name = message_type(type_name).__msgtype__
-        # /heartbeat and its like the gateway sends itself; others' go out by the same publisher.
+        # The gateway itself publishes /heartbeat and the like; other nodes' messages share that publisher.
         publisher = next((p for p in self._node.publishers if p.topic == topic), None)
         own = publisher is not None
         if publisher is None:
@@ -236,7 +236,7 @@ class Incoming:
         except MessageError as error:
             raise self._gate.refuse("not readable", str(error)) from None
         if topic == STOP:
-            # A stop is never too old, and anybody may stop; the release is the driver's alone, and has to be fresh.
+            # A stop is never too old, and every sender may stop. Only the driver may release, with a recent message.
             if not message.data:
                 if self._no_commands:
                     raise self._gate.refuse("link not secure", f"release: {self._no_commands}")
@@ -252,18 +252,18 @@ class Incoming:
         self._node.call_soon(self._node.diagnose, f"in {topic}", level, words)
 
     def _left(self, topic: str, entry: _In, source: tuple[str, int]) -> None:
-        """A publisher there has left; with the last driver the robot stops."""
-        with self._gate_lock:  # a command of its that is still on its way must not come after the zero
+        """Handle a ROS publisher that is gone; if it was the last driver, stop the robot."""
+        with self._gate_lock:  # its command in transit must not follow the zero
             entry.sources.remove(source)
             if entry.sources:
                 return
             entry.gone_s = time.monotonic()
             if topic == "/operator/cmd_vel" and topic in self._commands:
-                # Not after the arbiter's time-out: at once.
+                # Stop immediately instead of after the arbiter's timeout.
                 entry.publisher.publish(twist_stamped(0.0, 0.0, time.time_ns()))
 
     def reconcile(self) -> None:
-        """Lets go of topics whose publishers have left for a while."""
+        """Drop topics whose publishers have been gone for a while."""
         now = time.monotonic()
         for topic, entry in list(self._topics.items()):
             if not entry.always and entry.gone_s is not None and now - entry.gone_s > GRACE_S:

@@ -1,4 +1,4 @@
-"""Topics of a run directory in the ROS graph over Zenoh."""
+"""Exports topics of a run directory to the ROS graph over Zenoh."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from instant_ic.bus.transport import Received
 
 @dataclass
 class _Out:
-    """A topic that goes out: one subscription here, a publisher there for each of its publishers."""
+    """An exported topic: one subscription on the bus, and one ROS publisher for each of its publishers."""
 
     period_ns: int
     subscription: Subscription | None = None
@@ -27,21 +27,21 @@ class _Out:
 
 
 class Outgoing:
-    """Topics of the run directory, byte for byte, under the names of the nodes that publish them.
+    """Exports topics unchanged, under the names of the nodes that publish them.
 
-    Each publisher here has its own publisher there, so latched values of several nodes (``/tf_static``) are all kept
-    for late joiners, and ``ros2 node list`` shows the nodes themselves.
+    Each publisher on the bus has its own ROS publisher. Latched values of several nodes (``/tf_static``) are therefore
+    all kept for late subscribers, and ``ros2 node list`` shows the nodes themselves.
 
     Args:
         node: the gateway's node.
         session: the Zenoh session.
-        namespace: where the topics stand there.
+        namespace: namespace of the topics in the ROS graph.
         own: the gateway itself in the ROS graph.
-        publish: see :func:`parse_publish`; of several patterns that match, the first holds.
+        publish: see :func:`parse_publish`; the first matching pattern applies.
 
     Attributes:
-        brought_in: tells whether a topic may come in by the same gateway; what it hands on does not go out again.
-        count, thinned: messages that went out, and that a rate limit left out.
+        brought_in: returns whether the same gateway imports a topic; messages that it imported are not exported again.
+        count, thinned: messages sent, and messages dropped by a rate limit.
 
     Raises:
         ValueError: a line of ``publish`` is wrong.
@@ -63,11 +63,11 @@ class Outgoing:
 
     @property
     def topics(self) -> list[str]:
-        """Topics that go out now."""
+        """Exported topics."""
         return sorted(self._topics)
 
     def reconcile(self, present: Sequence[TopicInfo]) -> None:
-        """Takes up what has appeared and lets go of what has left for a while."""
+        """Export new topics, and drop those whose publishers have been gone for a while."""
         now = time.monotonic()
         live: dict[str, list[PublisherInfo]] = {}
         for info in present:
@@ -100,7 +100,7 @@ class Outgoing:
             self._nodes.pop(name).close()
 
     def _mirror(self, topic: str, node: str, type_name: str, qos: QoS) -> RosPublisher | None:
-        """The publisher there that stands for a node's publisher here."""
+        """Return the ROS publisher that represents a node's publisher; create it if needed."""
         out = self._topics[topic]
         if node not in out.publishers:
             if (hash_ := known_hash(type_name)) is None:
@@ -115,7 +115,7 @@ class Outgoing:
         return out.publishers[node]
 
     def _came_in(self, topic: str, publisher: str) -> bool:
-        """Whether a publisher here only hands on what came from there: that must not go out again."""
+        """Whether a publisher only republishes imported messages, which must not be exported again."""
         return publisher == self._node.node_name and self.brought_in(topic)
 
     def _forward(self, received: Received) -> None:
@@ -123,7 +123,7 @@ class Outgoing:
         if out is None or self._came_in(received.topic, received.publisher):
             return
         publisher = out.publishers.get(received.publisher)
-        if publisher is None and out.subscription is not None:  # heard before the next look at the registry
+        if publisher is None and out.subscription is not None:  # received before the next look at the registry
             publisher = self._mirror(received.topic, received.publisher, received.type_name, out.subscription.raw.qos)
         if publisher is None or self._early(out, received):
             return
@@ -131,14 +131,14 @@ class Outgoing:
         self.count += 1
 
     def _early(self, out: _Out, received: Received) -> bool:
-        """Whether the rate limit leaves a message out; each publisher has its own."""
+        """Whether the rate limit drops a message; each publisher has its own limit."""
         if not out.period_ns:
             return False
         due_ns = out.due_ns.get(received.publisher, 0)
         if received.received_ns < due_ns:
             self.thinned += 1
             return True
-        # On the grid of periods, so that a limit of 3 Hz gives 3 Hz of a topic of 10 Hz; no burst after a pause.
+        # Keep a fixed grid of periods, so that a limit of 3 Hz on a 10 Hz topic gives 3 Hz; no burst after a pause.
         start_ns = due_ns if received.received_ns - due_ns < out.period_ns else received.received_ns
         out.due_ns[received.publisher] = start_ns + out.period_ns
         return False

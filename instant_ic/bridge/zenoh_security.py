@@ -1,4 +1,4 @@
-"""Whether a Zenoh configuration lets only hosts in that prove who they are."""
+"""Checks that a Zenoh configuration accepts only authenticated hosts."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LOOPBACK_LINKS = ("tcp", *_TLS_LINKS)
 
 
 def insecurity(config: Any) -> str:
-    """Why a stranger could send over the links of a session; empty where none can.
+    """Return why a stranger could send over the links of a session; empty if none can.
 
-    Each endpoint must be ``tls/`` or ``quic/`` with certificates on both sides (``enable_mtls``), and no other link may
-    come about by discovery. The router decides for itself whom it lets in: its file must say ``enable_mtls`` too.
+    Each endpoint must be ``tls/`` or ``quic/`` with certificates on both sides (``enable_mtls``), and discovery must
+    not add other links. The router decides itself which hosts it accepts: its file must set ``enable_mtls`` too.
     """
     if why := _other_links(config):
         return why
@@ -39,7 +39,7 @@ def insecurity(config: Any) -> str:
 
 
 def beyond_loopback(config: Any) -> str:
-    """Why a link of a session could leave this machine; empty where none can."""
+    """Return why a link of a session could leave this machine; empty if none can."""
     if why := _other_links(config):
         return why
     for endpoint in [*_endpoints(config, "connect"), *_endpoints(config, "listen")]:
@@ -50,7 +50,7 @@ def beyond_loopback(config: Any) -> str:
 
 
 def _other_links(config: Any) -> str:
-    """Why links may come about that no endpoint names."""
+    """Return why links other than the configured endpoints may form."""
     if not _endpoints(config, "connect") and not _endpoints(config, "listen"):
         return "no endpoint is set, so Zenoh looks for others by itself"
     if _value(config, "scouting/multicast/enabled") is not False:

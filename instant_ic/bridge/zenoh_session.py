@@ -1,6 +1,6 @@
-"""A Zenoh session in which our topics are topics of ROS 2: nodes, publishers and subscriptions as rmw_zenoh makes them.
+"""A Zenoh session that provides our topics as ROS 2 nodes, publishers and subscriptions, as rmw_zenoh does.
 
-Knows nothing of our bus: bytes in, bytes out. Zenoh is an extra, imported when a session is opened.
+Independent of our bus: bytes in, bytes out. Zenoh is an extra, imported when a session is opened.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from instant_ic.paths import shipped_file
 
 DEFAULT_ROUTER = "tcp/localhost:7447"
 MAX_PUBLISHERS = 256
-"""Publishers of one topic whose gaps are counted; ids are the senders' own to choose."""
+"""Most publishers per topic whose gaps are counted; needed because senders choose their ids freely."""
 
 _OPEN_S = 10.0
-_HEARTBEAT_S = 0.5  # by which a late or unlucky reader of a latched topic finds what it missed, as in rmw_zenoh
+_HEARTBEAT_S = 0.5  # lets a late reader of a latched topic, or one with losses, find what it missed, as in rmw_zenoh
 
 SESSION_DEFAULTS = {
     "mode": '"peer"',
@@ -43,13 +43,13 @@ SESSION_DEFAULTS = {
     "listen/endpoints": '["tcp/localhost:0"]',
     "scouting/multicast/enabled": "false",
     "scouting/gossip/enabled": "true",
-    # The cache of a latched topic orders by time.
+    # The cache of a latched topic sorts by time.
     "timestamping/enabled": "{router: true, peer: true, client: true}",
 }
-"""What rmw_zenoh's sessions have: peers of the router on their host, which tells them of each other; no multicast."""
+"""Configuration of rmw_zenoh's sessions: peers of the router on their host, which introduces them; no multicast."""
 
 CLIENT_DEFAULTS = {**SESSION_DEFAULTS, "mode": '"client"', "listen/endpoints": "[]"}
-"""For a router on another host: Zenoh's routers do not carry messages between peers that have no link of their own."""
+"""For a router on another host: Zenoh routers do not forward messages between peers without a direct link."""
 
 ROUTER_DEFAULTS = {
     **SESSION_DEFAULTS,
@@ -62,11 +62,11 @@ log = logging.getLogger(__name__)
 
 
 class ZenohError(RuntimeError):
-    """Zenoh is not installed, or refuses its configuration; the message says what to do."""
+    """Zenoh is not installed, or rejects its configuration; the message says what to do."""
 
 
 def zenoh() -> Any:
-    """The zenoh package.
+    """Return the zenoh package.
 
     Raises:
         ZenohError: the extra is not installed.
@@ -80,10 +80,10 @@ def zenoh() -> Any:
 
 
 def config_path(name: str) -> Path | None:
-    """A configuration by path, or by name among the files of config/; None for an empty name.
+    """Return a configuration file by path, or by name among the files of config/; None for an empty name.
 
     Raises:
-        FileNotFoundError: neither is there.
+        FileNotFoundError: there is no such file in either place.
     """
     if not name:
         return None
@@ -97,16 +97,16 @@ def load_config(
     listen: Sequence[str] = (),
     defaults: Mapping[str, str] = SESSION_DEFAULTS,
 ) -> Any:
-    """A Zenoh configuration.
+    """Load a Zenoh configuration.
 
     Args:
-        path: a Zenoh JSON5 file, taken as it is; None takes ``defaults``: keys of Zenoh's and JSON5 values.
-        connect: endpoints (``tcp/10.0.0.1:7447``) instead of the file's.
-        listen: the same for listening.
-        defaults: see ``path``.
+        path: a Zenoh JSON5 file, used unchanged; None uses ``defaults``.
+        connect: endpoints to connect to (``tcp/10.0.0.1:7447``), instead of those of the file.
+        listen: endpoints to listen on, instead of those of the file.
+        defaults: Zenoh configuration keys → JSON5 values.
 
     Raises:
-        ZenohError: the file cannot be read, is no Zenoh configuration, or an endpoint is none.
+        ZenohError: the file cannot be read or is not a Zenoh configuration, or an endpoint is invalid.
     """
     package = zenoh()
     try:
@@ -130,15 +130,15 @@ def load_config(
 
 
 def is_client(config: Any) -> bool:
-    """Whether a configuration is that of a client, which cannot be opened before its router is there."""
+    """Whether the configuration is a client's; a client cannot open before its router runs."""
     return bool(json.loads(config.get_json("mode")) == "client")
 
 
 def open_zenoh(config: Any) -> Any:
-    """A Zenoh session; in peer mode one whose router is not there yet looks for it in the background.
+    """Open a Zenoh session. In peer mode it searches for a missing router in the background.
 
     Raises:
-        ZenohError: an endpoint cannot be listened on, certificates cannot be read, a client finds no router.
+        ZenohError: an endpoint or certificate cannot be used, or a client finds no router.
     """
     package = zenoh()
     package.init_log_from_env_or("error")
@@ -155,7 +155,7 @@ def open_zenoh(config: Any) -> Any:
         if given_up.is_set():
             session.close()
 
-    # By its own configuration Zenoh may wait for ever.
+    # Depending on its configuration, Zenoh may wait forever.
     threading.Thread(target=work, name="zenoh open", daemon=True).start()
     try:
         session = opened.get(timeout=_OPEN_S)
@@ -170,7 +170,7 @@ def open_zenoh(config: Any) -> Any:
 
 
 def _words(error: Exception) -> str:
-    """An error of Zenoh without the places in its source code."""
+    """Return the text of a Zenoh error without source locations."""
     return re.sub(r"\s+at /\S+\.rs:\d+\.?", "", str(error)).strip()
 
 
@@ -194,30 +194,28 @@ class RosSession:
         self._watch: Any = None
 
     def __enter__(self) -> Self:
-        """The session itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes the session."""
         self.close()
 
     def close(self) -> None:
-        """Takes every token, publisher and subscription away."""
+        """Close the session with all its tokens, publishers and subscriptions."""
         if not self.zenoh.is_closed():
             self.zenoh.close()
 
     def routers(self) -> list[str]:
-        """Ids of the routers that the session is connected to."""
+        """Return the ids of the connected routers."""
         return [str(zid) for zid in self.zenoh.info.routers_zid()]
 
     def peers(self) -> list[str]:
-        """Ids of the peers that the session is connected to."""
+        """Return the ids of the connected peers."""
         return [str(zid) for zid in self.zenoh.info.peers_zid()]
 
     def token(self, kind: Kind, node: RosNode | None, namespace: str, name: str, *endpoint: Any) -> tuple[Token, Any]:
-        """A token of a new entity, and its declaration."""
+        """Create the token of a new entity; return it with its declaration."""
         entity = next(self._ids)
         token = Token(
             kind, self.domain, self.id, entity if node is None else node.id, entity, namespace, name, *endpoint
@@ -225,7 +223,7 @@ class RosSession:
         return token, self.zenoh.liveliness().declare_token(token.key())
 
     def watch(self, on_token: Callable[[Token, bool], None]) -> None:
-        """Calls ``on_token(token, alive)`` for what others have and will have, on a thread of Zenoh."""
+        """Call ``on_token(token, alive)`` for current and future entities of other sessions, on a Zenoh thread."""
         put = zenoh().SampleKind.PUT
 
         def heard(sample: Any) -> None:
@@ -241,10 +239,10 @@ class RosSession:
 
 
 class RosNode:
-    """A node of the ROS graph, as ``ros2 node list`` shows it.
+    """A node of the ROS graph, as shown by ``ros2 node list``.
 
     Args:
-        session: whose.
+        session: session of the node.
         namespace: ``/robot1``, or ``/``.
         name: the node's name.
     """
@@ -257,23 +255,23 @@ class RosNode:
         self.id = token.node_id
 
     def endpoint(self, kind: Kind, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> Any:
-        """Declares a token of one of the node's publishers or subscriptions."""
+        """Declare the token of one of the node's publishers or subscriptions."""
         return self.session.token(kind, self, self.namespace, self.name, topic, type_name, type_hash, qos)[1]
 
     def close(self) -> None:
-        """Takes the node out of the graph."""
+        """Remove the node from the graph."""
         self._declaration.undeclare()
 
 
 class RosPublisher:
-    """A publisher of the ROS graph; :meth:`put` may be called from any thread.
+    """A publisher in the ROS graph; :meth:`put` may be called from any thread.
 
     Args:
-        node: whose.
-        topic: full name, with the namespace.
+        node: node of the publisher.
+        topic: full name, including the namespace.
         type_name: ``std_msgs/msg/String``.
-        type_hash: its RIHS01 hash.
-        qos: latched topics keep their last ``depth`` messages for late joiners.
+        type_hash: RIHS01 hash of the type.
+        qos: quality of service; a latched topic keeps its last ``depth`` messages for late subscribers.
     """
 
     def __init__(self, node: RosNode, topic: str, type_name: str, type_hash: str, qos: TopicQoS) -> None:
@@ -281,7 +279,7 @@ class RosPublisher:
         session = node.session
         key = data_key(session.domain, topic, type_name, type_hash)
         reliability = package.Reliability.RELIABLE if qos.reliable else package.Reliability.BEST_EFFORT
-        # As rmw_zenoh: a link that cannot keep up loses messages, which the reader counts; it never holds us up.
+        # As in rmw_zenoh: a link that cannot keep up loses messages, which the reader counts, but never blocks us.
         options = {"congestion_control": package.CongestionControl.DROP, "reliability": reliability}
         if qos.latched:
             self._publisher = package.ext.declare_advanced_publisher(
@@ -300,7 +298,7 @@ class RosPublisher:
         self.count = 0
 
     def put(self, payload: bytes | memoryview, source_ns: int) -> None:
-        """Sends CDR bytes as they are, with their time of publication.
+        """Send CDR bytes unchanged, with their time of publication.
 
         Raises:
             ZenohError: the session is closed.
@@ -314,26 +312,26 @@ class RosPublisher:
                 raise ZenohError(f"Zenoh: {error}") from None
 
     def close(self) -> None:
-        """Takes the publisher out of the graph."""
+        """Remove the publisher from the graph."""
         self._token.undeclare()
         self._publisher.undeclare()
 
 
 class RosSubscription:
-    """A subscription of the ROS graph; hears others' sessions only, so nothing of ours comes back.
+    """A subscription in the ROS graph. It receives only from other sessions, so our own messages do not return.
 
     Args:
-        node: whose.
-        topic: full name, with the namespace.
+        node: node of the subscription.
+        topic: full name, including the namespace.
         type_name: ``std_msgs/msg/String``.
-        type_hash: its RIHS01 hash; messages of another definition have another key and never come.
-        qos: latched subscriptions ask publishers for what was sent before.
-        on_message: ``(payload, attachment)``, in order for each publisher, on a thread of Zenoh.
+        type_hash: RIHS01 hash of the type; messages of another definition have another key and are not received.
+        qos: quality of service; a latched subscription requests earlier messages from the publishers.
+        on_message: called with ``(payload, attachment)``, in order per publisher, on a Zenoh thread.
 
     Attributes:
-        count: messages handed on.
-        lost_by: publisher's id (hex digits) → messages of it that never came.
-        malformed: messages without a readable attachment; refused.
+        count: messages passed on.
+        lost_by: publisher's id (hex) → lost messages.
+        malformed: messages refused because they have no readable attachment.
     """
 
     def __init__(
@@ -371,7 +369,7 @@ class RosSubscription:
 
     @property
     def lost(self) -> int:
-        """Messages that never came, of all publishers together."""
+        """Lost messages of all publishers."""
         return sum(self.lost_by.values())
 
     def _heard(self, sample: Any) -> None:
@@ -386,7 +384,7 @@ class RosSubscription:
             return
         last = self._sequences.pop(attachment.gid, None)
         if last is not None:
-            if attachment.sequence <= last:  # sent again
+            if attachment.sequence <= last:  # duplicate
                 self._sequences[attachment.gid] = last
                 return
             missing = attachment.sequence - last - 1
@@ -394,7 +392,7 @@ class RosSubscription:
                 gid = attachment.gid.hex()
                 self.lost_by = {**self.lost_by, gid: self.lost_by.get(gid, 0) + missing}
         self._sequences[attachment.gid] = attachment.sequence
-        if len(self._sequences) > MAX_PUBLISHERS:  # the one that was silent for the longest
+        if len(self._sequences) > MAX_PUBLISHERS:  # the publisher not heard from for the longest time
             oldest = next(iter(self._sequences))
             del self._sequences[oldest]
             self.lost_by = {gid: lost for gid, lost in self.lost_by.items() if gid != oldest.hex()}
@@ -402,6 +400,6 @@ class RosSubscription:
         self._on_message(sample.payload.to_bytes(), attachment)
 
     def close(self) -> None:
-        """Takes the subscription out of the graph."""
+        """Remove the subscription from the graph."""
         self._token.undeclare()
         self._subscriber.undeclare()

@@ -1,4 +1,4 @@
-"""Names, types and quality of service of topics on both sides of the gateway to Zenoh."""
+"""Names, types and quality of service of topics on both sides of the Zenoh gateway."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from instant_ic.msg import MessageError, message_type, type_hash
 
 STOP = "/operator/estop"
 COMMANDS = {"/operator/cmd_vel": "geometry_msgs/msg/TwistStamped", STOP: "std_msgs/msg/Bool"}
-"""What an operator elsewhere may send, and its type."""
+"""Topics that a remote operator may send, with their types."""
 
 ACTED_ON = ("*/operator/*", "*/cmd_vel", "*/robot/estop", "*/parameter_events")
-"""Topics that move a robot, in any namespace, and what tells of its parameters: never brought in by `subscribe`."""
+"""Topics that move a robot, in any namespace, and parameter events: never imported by `subscribe`."""
 
 GRACE_S = 3.0
-"""A topic that leaves and comes back, as when its node restarts, keeps its place for so long."""
+"""Time in seconds that a vanished topic is kept, for example while its node restarts."""
 
 
 def ros_qos(qos: QoS) -> TopicQoS:
-    """Our preset as ROS 2 users know it: sensor data, reliable with a queue, transient local."""
+    """Return the ROS 2 QoS of a preset: sensor data, reliable with a queue, or transient local."""
     if qos.latched:
         return TopicQoS(latched=True, depth=1)
     return TopicQoS(depth=10) if qos.reliable else TopicQoS(reliable=False, depth=5)
 
 
 def bus_qos(qos: TopicQoS) -> QoS:
-    """The way back from :func:`ros_qos`."""
+    """Return the closest preset; the inverse of :func:`ros_qos`."""
     if qos.latched:
         return LATCHED
     return RELIABLE if qos.reliable else SENSOR
@@ -39,30 +39,29 @@ def bus_qos(qos: TopicQoS) -> QoS:
 
 @dataclass(frozen=True)
 class Namespace:
-    """Where a run directory's topics stand in the ROS graph.
+    """Maps topic names between a run directory and the ROS graph.
 
     Attributes:
-        name: ``robot1`` makes ``/scan`` here ``/robot1/scan`` there; empty leaves names as they are.
+        name: namespace in the ROS graph: ``robot1`` maps ``/scan`` to ``/robot1/scan``; empty keeps names unchanged.
     """
 
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Checks the name."""
         if self.name:
             check_topic(f"/{self.name}")
 
     @property
     def ros(self) -> str:
-        """As ROS 2 writes it: ``/robot1``, or ``/``."""
+        """The namespace as ROS 2 writes it: ``/robot1``, or ``/``."""
         return f"/{self.name}"
 
     def to_ros(self, topic: str) -> str:
-        """Name there of a topic here."""
+        """Return the ROS name of a topic."""
         return f"/{self.name}{topic}" if self.name else topic
 
     def to_local(self, topic: str) -> str | None:
-        """Name here of a topic there; None where it is outside the namespace."""
+        """Return the local name of a ROS topic; None if it is outside the namespace."""
         head = f"/{self.name}" if self.name else ""
         return topic[len(head) :] if topic.startswith(f"{head}/") else None
 
@@ -73,10 +72,10 @@ def takes(patterns: Sequence[str], topic: str) -> bool:
 
 
 def parse_publish(entries: Sequence[str]) -> dict[str, int]:
-    """Least time between messages in ns by pattern, of lines like ``/lidar/points rate_hz=3``; 0 sends all.
+    """Parse lines such as ``/lidar/points rate_hz=3``; return pattern → shortest period in ns (0: no limit).
 
     Raises:
-        ValueError: something else stands there.
+        ValueError: a line has another form.
     """
     periods = {}
     for entry in entries:
@@ -93,7 +92,7 @@ def parse_publish(entries: Sequence[str]) -> dict[str, int]:
 
 
 def known_hash(type_name: str) -> str | None:
-    """RIHS01 hash of a type; None for one that is not in ROS 2 Jazzy or among our own."""
+    """Return the RIHS01 hash of a type; None if the type is neither in ROS 2 Jazzy nor ours."""
     try:
         return type_hash(message_type(type_name).__msgtype__)
     except MessageError:
@@ -101,10 +100,10 @@ def known_hash(type_name: str) -> str | None:
 
 
 def parse_subscribe(entries: Sequence[str]) -> tuple[list[str], dict[str, str]]:
-    """Patterns, and types of those topics that have one, of lines like ``/scan`` and ``/x std_msgs/msg/String``.
+    """Parse lines such as ``/scan`` and ``/x std_msgs/msg/String``; return the patterns, and the types by topic.
 
     Raises:
-        RegistryError, MessageError: a topic's name is not legal, a type is not known, or the topic is of ACTED_ON.
+        RegistryError, MessageError: a name is invalid, a type is unknown, or the topic is one of ACTED_ON.
     """
     patterns, types = [], {}
     for entry in entries:
