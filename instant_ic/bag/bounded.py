@@ -37,19 +37,19 @@ def decompress(data: bytes | memoryview, compression: str, declared_bytes: int |
     """
     most_bytes = MOST_CHUNK_BYTES if declared_bytes is None else declared_bytes
     if most_bytes > MOST_CHUNK_BYTES:
-        raise ValueError(f"it declares {most_bytes} bytes; {MOST_CHUNK_BYTES} at most are decompressed")
+        raise ValueError(f"it declares {most_bytes} bytes; the limit is {MOST_CHUNK_BYTES}")
     if compression == "":
         return bytes(data)
     pieces = _PIECES.get(compression)
     if pieces is None:
-        raise ValueError(f"compression {compression[:40]!r} is not known")
+        raise ValueError(f"unknown compression {compression[:40]!r}")
     out: list[bytes] = []
     size = 0
     try:
         for piece in pieces(bytes(data)):
             size += len(piece)
             if size > most_bytes:
-                raise ValueError(f"it holds more than the {most_bytes} bytes that it declares or may have")
+                raise ValueError(f"it decompresses to more than {most_bytes} bytes, its declared or maximum size")
             out.append(piece)
     except (RuntimeError, OSError, EOFError) as error:  # raised by lz4 and bz2
         raise ValueError(str(error)) from None

@@ -171,7 +171,9 @@ class _Comparison:
                 missing = left or right
                 if self.tolerance.stamp_s is not None and missing is not None:
                     name = "first" if left is not None else "second"
-                    self.first = self.first or f"the message of {missing.stamp_ns / 1e9:.6f} s is only in the {name}"
+                    self.first = (
+                        self.first or f"the message at {missing.stamp_ns / 1e9:.6f} s is only in the {name} bag"
+                    )
                 continue
             number += 1
             differing += self._differ(left, right, number)
@@ -210,7 +212,7 @@ class _Comparison:
         try:
             decoded = [self._decode(which, message) for which, message in enumerate((left, right))]
         except BagError:
-            self.first = self.first or f"message {number}: the bytes differ; {left.type_name} is not known here"
+            self.first = self.first or f"message {number}: the bytes differ; {left.type_name} is unknown here"
             return True
         found = dict(self._values(decoded[0], decoded[1], ""))
         for path, (words, size) in found.items():
@@ -220,7 +222,7 @@ class _Comparison:
         if found:
             self.first = self.first or f"message {number}: {next(iter(found.values()))[0]}"
         elif self.tolerance.exact:
-            self.first = self.first or f"message {number}: bytes differ, yet no field does (padding)"
+            self.first = self.first or f"message {number}: the bytes differ, but no field does (padding)"
         return bool(found) or self.tolerance.exact
 
     def _decode(self, which: int, message: BagMessage) -> Any:

@@ -74,14 +74,14 @@ def convert(
         readers = [stack.enter_context(BagReader(source)) for source in sources]
         filled = [reader for reader in readers if reader.count]
         if not filled:
-            raise BagError(f"{', '.join(map(str, sources))}: there is no message in it")
+            raise BagError(f"{', '.join(map(str, sources))}: no messages to convert")
         begin_ns = min(reader.start_ns for reader in filled)
         last_ns = max(reader.end_ns for reader in filled)
         start_ns = begin_ns + int(options.start_s * 1e9)
         stop_ns = begin_ns + int(options.end_s * 1e9) if options.end_s else last_ns + 1
         chosen = [_chosen(reader, options, result) for reader in filled]
         if not any(chosen):
-            raise BagError("none of the topics that were asked for is in it")
+            raise BagError("none of the selected topics is in it")
         writer = stack.enter_context(BagWriter(target, options.compressed, options.max_bytes, options.max_duration_s))
         for reader in filled:
             for key, value in reader.custom.items():
@@ -121,7 +121,7 @@ def _chosen(reader: BagReader, options: ConvertOptions, result: Converted) -> di
     if unknown and not options.skip_unknown:
         named = ", ".join(f"{topic.type_name} ({topic.topic})" for topic in unknown)
         raise BagError(
-            f"bag {reader.path} holds no definition of {named}, and nobody here knows it: --skip-unknown leaves it out"
+            f"bag {reader.path} has no definition of {named}, and the type is unknown; use --skip-unknown to skip it"
         )
     for topic in unknown:
         result.skipped.setdefault(topic.type_name, []).append(topic.topic)

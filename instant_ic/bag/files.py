@@ -237,7 +237,7 @@ class BagReader:
         if own.encoding and topic.schema.type_hash in ("", own.type_hash):
             return lambda payload: deserialize(payload, topic.type_name)
         if topic.schema.encoding != "ros2msg":
-            raise BagError(f"bag {self.path}, topic {topic.topic}: its type {topic.type_name} is not known")
+            raise BagError(f"bag {self.path}, topic {topic.topic}: type {topic.type_name} is unknown")
         store = store_of(topic.schema)
         return lambda payload: store.deserialize_cdr(payload, topic.type_name)
 
@@ -285,10 +285,10 @@ class BagReader:
     def _why_no_metadata(self) -> str:
         if any(self.path.glob("*.mcap")):
             return (
-                f"{self.path} has no metadata.yaml: its recording was cut short, or the file was lost: "
-                f"ic bag recover {self.path}, or ic bag reindex {self.path} when its files are whole"
+                f"{self.path} has no metadata.yaml: the recording was interrupted, or the file was lost. Run "
+                f"ic bag recover {self.path}, or ic bag reindex {self.path} if its files are complete"
             )
-        return f"{self.path} has no metadata.yaml, so it is no bag"
+        return f"{self.path} has no metadata.yaml and no MCAP files: it is not a bag"
 
 
 def _qos(connection: Connection) -> QoS:

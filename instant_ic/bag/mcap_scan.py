@@ -77,26 +77,26 @@ class McapScan:
         except OSError as error:
             raise BagError(f"{path} cannot be read: {error.strerror}") from None
         if bytes(self._data[: len(MAGIC)]) != MAGIC[: len(self._data)]:
-            raise BagError(f"{path} is no MCAP file")
+            raise BagError(f"{path} is not an MCAP file")
 
     def messages(self) -> Iterator[ScannedMessage]:
         """Yield every readable message, in file order."""
         data, at = self._data, len(MAGIC)
         while at < len(data):
             if len(data) - at < 9:
-                self._stop(at, "the file ends in a record's head")
+                self._stop(at, "the file ends inside a record header")
                 return
             opcode, length = struct.unpack_from("<BQ", data, at)
             body, end = at + 9, at + 9 + length
             if opcode not in _KNOWN_OPCODES and opcode < 0x80:
-                self._stop(at, f"no record can begin with {opcode:#04x}")
+                self._stop(at, f"{opcode:#04x} is not a valid opcode")
                 return
             if opcode == CHUNK:
                 yield from self._chunk(data[body : min(end, len(data))], at, end <= len(data))
             elif opcode == DATA_END:
                 self.whole = end <= len(data) and bytes(data[-len(MAGIC) :]) == MAGIC
                 if not self.whole:
-                    self._stop(at, "the index after the messages is cut")
+                    self._stop(at, "the index after the messages is truncated")
                 return
             elif end <= len(data):
                 try:
@@ -107,7 +107,7 @@ class McapScan:
                 self._stop(at, "the file ends inside a record")
                 return
             at = end
-        self._stop(at, "the file ends without its index")
+        self._stop(at, "the file ends without an index")
 
     def _damage(self, text: str) -> None:
         if len(self.damaged) < _MOST_DAMAGED:
@@ -128,7 +128,7 @@ class McapScan:
                 self._damage(f"chunk at byte {at}: {error}")
             return
         if complete and (len(records) != size or (crc and zlib.crc32(records) != crc)):
-            self._damage(f"chunk at byte {at}: its check sum is wrong")
+            self._damage(f"chunk at byte {at}: wrong checksum")
             return
         inner = 0
         while len(records) - inner >= 9:
@@ -146,7 +146,7 @@ class McapScan:
         if opcode == MESSAGE:
             number, _, stamp_ns, publish_ns = struct.unpack_from("<HIQQ", body, 0)
             if number not in self._channels:
-                raise ValueError(f"a message of channel {number}, which is not known (its definition was damaged)")
+                raise ValueError(f"a message of unknown channel {number} (its definition was damaged)")
             topic, schema, encoding, metadata = self._channels[number]
             repeated = self.library == OWN_LIBRARY and publish_ns != stamp_ns
             known = self._schemas.get(schema, Schema("", "", "", ""))

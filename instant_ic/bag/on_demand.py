@@ -87,7 +87,7 @@ class OnDemand:
             return self.error
         told = self._recorder.status()
         if told["overflow"]:
-            return f"{told['path']}: the disk is too slow, left out: {sum(told['overflow'].values())} messages"
+            return f"{told['path']}: the disk is too slow; dropped: {sum(told['overflow'].values())} messages"
         return self._recorder.error
 
     def status(self) -> dict[str, Any]:
@@ -121,7 +121,7 @@ class OnDemand:
         try:
             recorder.close()
             if recorder.failed:
-                self.error = recorder.error or "not everything is in it"
+                self.error = recorder.error or "the recording is incomplete"
         except BagError as error:
             self.error = str(error)
         if self.error:

@@ -73,7 +73,7 @@ class BagPlayer:
         for topic in sorted(self._reader.topics, key=lambda topic: -topic.count):
             if topic.topic in NEVER_PLAYED or not options.choice.takes(topic.topic):
                 continue
-            if why := self._why_not(topic) or ("it has another type too" if topic.topic in chosen else ""):
+            if why := self._why_not(topic) or ("the topic also has another type" if topic.topic in chosen else ""):
                 self.left_out[f"{topic.topic} ({topic.type_name}, {topic.count} messages)"] = why
             else:
                 chosen[topic.topic] = topic
@@ -87,7 +87,7 @@ class BagPlayer:
         if not self.topics:
             self._reader.close()
             why = "".join(f"; {topic}: {words}" for topic, words in self.left_out.items())
-            raise BagError(f"bag {path} has none of the topics that were asked for{why}")
+            raise BagError(f"bag {path} has none of the selected topics{why}")
         if self.start_ns > self.end_ns:
             self._reader.close()
             raise BagError(f"bag {path} ends before start_offset_s = {options.start_offset_s}")
@@ -116,9 +116,9 @@ class BagPlayer:
         """Return why a topic cannot be sent; empty where it can."""
         own = schema_or_unknown(topic.type_name)
         if not own.encoding and topic.schema.encoding != "ros2msg":
-            return "its type is not known, and the bag holds no definition of it"
+            return "its type is unknown, and the bag has no definition of it"
         if own.encoding and topic.schema.type_hash not in ("", own.type_hash):
-            return "its type has another definition in the bag than here"
+            return "the bag defines its type differently"
         return ""
 
     # -- controls ----------------------------------------------------------------------------------

@@ -209,7 +209,7 @@ class Recorder:
             try:
                 make_folder(path, exist_ok=True)
             except OSError as error:
-                raise BagError(f"folder {path} for snapshots cannot be made: {error.strerror}") from None
+                raise BagError(f"folder {path} for snapshots cannot be created: {error.strerror}") from None
             self._cache = SnapshotCache(self.options.snapshot_s, self.options.cache_bytes)
         else:
             self._writer = BagWriter(
@@ -284,7 +284,7 @@ class Recorder:
             ValueError: snapshot mode has no file to split.
         """
         if self._writer is None:
-            raise ValueError("snapshots are kept: there is no file to split")
+            raise ValueError("snapshot mode has no file to split")
         self._queue.put(self._end_part)
 
     def snapshot(self, reason: str = "", after_s: float = 0.0) -> Snapshot:
@@ -294,7 +294,7 @@ class Recorder:
             ValueError: not in snapshot mode.
         """
         if self._cache is None:
-            raise ValueError("it does not keep snapshots: start it with --snapshot")
+            raise ValueError("the recorder is not in snapshot mode: start it with --snapshot")
         for waiting in self.snapshots:
             if waiting.state == "waiting":  # a pending snapshot will contain this moment too
                 return waiting
@@ -472,7 +472,7 @@ class Recorder:
         try:
             free = self._free_bytes(self.path)
         except OSError as error:
-            self._stop(FAILED, f"bag {self.path}: {error.strerror}: its folder was taken away")
+            self._stop(FAILED, f"bag {self.path}: {error.strerror}: its folder was removed")
             return
         reserve = self.options.reserve_bytes
         if self._state == RECORDING and free < reserve:
@@ -482,7 +482,7 @@ class Recorder:
                 self._writer.end_part()
             self._stop(DISK_FULL, f"{words}: not recording; the bag is complete up to here")
         elif self._state == DISK_FULL and free >= reserve + _ROOM_AGAIN:
-            log.warning("%s: there is room again, recording goes on in a new file", self.path)
+            log.warning("%s: space is available again; recording continues in a new file", self.path)
             self._state, self.error = RECORDING, ""
 
     def _stop(self, state: str, words: str) -> None:
@@ -493,7 +493,7 @@ class Recorder:
         """Write a snapshot. An error concerns this snapshot only; the next may succeed."""
         try:
             if not content:
-                raise BagError(f"snapshot {snapshot.path}: no message has come yet")
+                raise BagError(f"snapshot {snapshot.path}: no message has been received yet")
             with BagWriter(snapshot.path, self.options.compressed, level=_LEVEL) as writer:
                 for entry in content:
                     writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)

@@ -73,7 +73,7 @@ def recover(source: Path, target: Path, compressed: bool = False) -> Recovered:
         for left in (*target.glob("*.mcap"), *target.glob("*.yaml")):
             left.unlink()
         target.rmdir()
-        raise BagError(f"{source}: no message could be recovered ({why or '; '.join(damaged) or 'it holds none'})")
+        raise BagError(f"{source}: no message could be recovered ({why or '; '.join(damaged) or 'it contains none'})")
     return Recovered(count, why, damaged, skipped)
 
 
@@ -87,7 +87,7 @@ def reindex(folder: Path) -> tuple[int, int]:
         BagError: the folder has no MCAP files, or one is truncated (use :func:`recover`).
     """
     if not folder.is_dir():
-        raise BagError(f"{folder} is no folder; a single file needs no index beside it")
+        raise BagError(f"{folder} is not a folder; a single file needs no metadata.yaml")
     parts: list[PartInfo] = []
     topics: dict[Topic, tuple[QoS, Schema]] = {}
     custom: dict[str, str] = {}
@@ -95,7 +95,7 @@ def reindex(folder: Path) -> tuple[int, int]:
         try:
             parts.append(_part(file, topics, custom))
         except Exception as error:  # noqa: BLE001 - a parser may raise anything on bytes that are not a bag
-            raise BagError(f"{file} is not whole: {error}; ic bag recover {folder}") from None
+            raise BagError(f"{file} is incomplete: {error}; ic bag recover {folder}") from None
     try:
         write_metadata(folder, parts, topics, custom)
     except OSError as error:
@@ -137,7 +137,7 @@ def mcap_files(source: Path) -> list[Path]:
     """
     files = sorted(source.glob("*.mcap"), key=_number) if source.is_dir() else [source]
     if not files or not files[0].is_file():
-        raise BagError(f"{source}: there is no .mcap file")
+        raise BagError(f"{source}: no .mcap file found")
     return files
 
 

@@ -197,7 +197,7 @@ def _check_types(reader: BagReader, bus: LockstepBus) -> None:
     for topic in reader.topics:
         if topic.type_name in other and bus.subscriptions.get(topic.topic):
             raise ReplayError(
-                f"bag {reader.path}: {topic.topic} is of a {topic.type_name} with another definition than ours"
+                f"bag {reader.path}: {topic.topic} has type {topic.type_name} defined differently than here"
             )
 
 

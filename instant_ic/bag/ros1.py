@@ -47,7 +47,7 @@ class Ros1Source:
             self._bag.open()
         except (AnyReaderError, AssertionError) as error:
             raise BagError(
-                f"bag {self.path} cannot be read: {error}; a ROS 1 bag that was cut needs ROS 1's own rosbag reindex"
+                f"bag {self.path} cannot be read: {error}; for a truncated ROS 1 bag run ROS 1's rosbag reindex"
             ) from None
         self.is_open = True
         target = self._target_store()

@@ -77,9 +77,9 @@ class BagWriter:
         try:
             make_folder(path)
         except FileExistsError:
-            raise BagError(f"bag {path} cannot be made: {path} exists already, not overwriting") from None
+            raise BagError(f"bag {path} cannot be created: {path} already exists") from None
         except OSError as error:
-            raise BagError(f"bag {path} cannot be made: {error.strerror or error}") from None
+            raise BagError(f"bag {path} cannot be created: {error.strerror or error}") from None
         self._open_part()
 
     def __enter__(self) -> BagWriter:
@@ -245,7 +245,7 @@ class BagWriter:
         except OSError as error:
             if error.errno in _FULL:
                 raise DiskFullError(f"bag {self.path}: {error.strerror}") from error
-            raise BagError(f"bag {self.path} cannot be made: {error.strerror or error}") from None
+            raise BagError(f"bag {self.path} cannot be created: {error.strerror or error}") from None
         self._part = _Part(file, PartInfo(name))
 
     def _repeat(self, stamp_ns: int, but: LatchedValue | None, publisher: str) -> None:

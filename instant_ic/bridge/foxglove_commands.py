@@ -41,7 +41,7 @@ class Commands:
         if kinds is None or name not in kinds or channel.encoding not in ("cdr", "json"):
             known = "; ".join(f"{topic} ({' or '.join(names)})" for topic, names in _COMMAND_TYPES.items())
             what = f"{channel.topic:.100} {channel.schema_name:.100} {channel.encoding:.20}"
-            self._tell(client, f"{what} is not taken; only {known}, cdr or json", ERROR)
+            self._tell(client, f"{what} is not accepted; only {known}, cdr or json", ERROR)
             return
         self._channels[client, channel.id] = channel
 
@@ -98,7 +98,7 @@ class Commands:
         self._gate.check_drive(_name(client), v, w, time.monotonic_ns())
         self._drive.publish(twist_stamped(v, w, sent_ns or now_ns))
         if self._told.pop(client, None) is not None:
-            self._node.call_soon(self._node.diagnose, "commands", OK, "commands come in")
+            self._node.call_soon(self._node.diagnose, "commands", OK, "commands are accepted")
 
     def _refused(self, client: int, words: str) -> None:
         """Send a refusal to the client, once until its text changes."""

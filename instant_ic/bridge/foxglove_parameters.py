@@ -82,7 +82,7 @@ def _check(executable: str, key: str, value: Any) -> None:
     """
     items = value if isinstance(value, list) else [value]
     if not all(isinstance(item, (bool, int, float, str)) for item in items):
-        raise ParameterError(f"{key!r:.100} must be a number, a text, true or false, or a list of them")
+        raise ParameterError(f"{key!r:.100} must be a number, a string, true or false, or a list of these")
     if never_set(executable, key):
         raise ParameterError(
             f"{key!r:.100} is a safety parameter and cannot be set over a bridge; use `ic param set` on the robot"

@@ -148,7 +148,7 @@ def parse_text(data: str) -> dict[str, Any]:
 
 
 def _no_constant(name: str) -> Any:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 def parse_data(data: bytes) -> tuple[int, bytes]:
@@ -194,19 +194,19 @@ def number(content: Mapping[str, Any], key: str) -> int:
     """
     value = content.get(key)
     if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _MAX_NUMBER:
-        raise ProtocolError(f"{key} must be a number of 32 bits (got {value!r:.40})")
+        raise ProtocolError(f"{key} must be a 32-bit number (got {value!r:.40})")
     return value
 
 
 def strings(content: Mapping[str, Any], key: str) -> list[str]:
-    """Return a field that must be a list of texts.
+    """Return a field that must be a list of strings.
 
     Raises:
         ProtocolError: the field is missing or of another type.
     """
     value = content.get(key)
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise ProtocolError(f"{content.get('op')}: {key} must be a list of texts")
+        raise ProtocolError(f"{content.get('op')}: {key} must be a list of strings")
     return value
 
 
@@ -218,5 +218,5 @@ def client_channel(content: Mapping[str, Any]) -> ClientChannel:
     """
     fields = [content.get(key) for key in ("topic", "encoding", "schemaName")]
     if not all(isinstance(field, str) for field in fields):
-        raise ProtocolError("advertise: topic, encoding and schemaName must be texts")
+        raise ProtocolError("advertise: topic, encoding and schemaName must be strings")
     return ClientChannel(number(content, "id"), *(str(field) for field in fields))

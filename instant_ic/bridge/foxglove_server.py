@@ -274,9 +274,7 @@ class FoxgloveServer:
                 self._loop.call_soon_threadsafe(self._finish.set)
             self._thread.join(2 * _END_S)
             if self._thread.is_alive():
-                log.error(
-                    "Foxglove: the server's thread does not end within %g s; it goes with the process", 2 * _END_S
-                )
+                log.error("Foxglove: the server's thread did not end within %g s; it ends with the process", 2 * _END_S)
         self.parameters.close()
 
     # -- on the loop's thread --------------------------------------------------------------------
@@ -411,7 +409,7 @@ class FoxgloveServer:
                 await client.awake.wait()
                 client.awake.clear()
                 if len(client.texts) > _MAX_TEXTS:
-                    log.warning("Foxglove: client %d reads no answers; it is disconnected", client.number)
+                    log.warning("Foxglove: client %d does not read its replies; disconnected", client.number)
                     client.abort()
                     return
                 while (frame := self._next_frame(client)) is not None:
@@ -457,7 +455,7 @@ class FoxgloveServer:
                 return
 
     async def _end(self, client: _Client, why: str) -> None:
-        log.warning("Foxglove: client %d sends %s; it is disconnected", client.number, why)
+        log.warning("Foxglove: client %d sends %s; disconnected", client.number, why)
         with contextlib.suppress(TimeoutError, ConnectionError):
             await asyncio.wait_for(client.socket.close(code=WSCloseCode.POLICY_VIOLATION, message=why.encode()), _END_S)
         client.abort()
@@ -487,7 +485,7 @@ class FoxgloveServer:
             case "advertise" | "unadvertise" if self.commands is not None:
                 self._on_advertise(client, op, content)
             case "advertise" | "unadvertise":
-                raise protocol.ProtocolError("this server takes no messages (accept_operator: false)")
+                raise protocol.ProtocolError("this server accepts no messages (accept_operator: false)")
             case _ if op not in _UNSUPPORTED:
                 raise protocol.ProtocolError(f"unknown op {op!r:.40}")
 
@@ -557,7 +555,7 @@ class FoxgloveServer:
             if self.may_set:
                 refused = self.parameters.set({name: _value(e) for name, e in zip(names, entries, strict=True)})
             else:
-                refused = ["parameters can only be read here (set_parameters: false)"]
+                refused = ["parameters are read-only (set_parameters: false)"]
             problems += [(ERROR, words) for words in refused]
         else:
             names = protocol.strings(request, "parameterNames")
@@ -566,7 +564,7 @@ class FoxgloveServer:
         problems += [(WARN, words) for words in silent]
         request_id = request.get("id")
         if request_id is not None and not isinstance(request_id, str):
-            raise protocol.ProtocolError("id must be a text")
+            raise protocol.ProtocolError("id must be a string")
         return protocol.text("parameterValues", parameters=protocol.parameters(values), id=request_id), problems
 
 
@@ -712,7 +710,7 @@ def _tls(settings: ServerSettings) -> ssl.SSLContext | None:
         context.load_cert_chain(settings.tls_cert, settings.tls_key)
     except ssl.SSLError as error:
         raise FoxgloveError(
-            f"{settings.tls_cert} and {settings.tls_key}: no certificate with its key: {error}"
+            f"{settings.tls_cert} and {settings.tls_key}: not a certificate with its key: {error}"
         ) from None
     return context
 

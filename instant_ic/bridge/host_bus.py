@@ -145,7 +145,7 @@ class ImportedTopics:
         if topic.type_name != announce.type_name:
             self._on_trouble(
                 announce.topic,
-                f"{announce.origin} sends {announce.type_name}, but {topic.type_name} came before: refused; "
+                f"{announce.origin} sends {announce.type_name}, but {topic.type_name} was received before: refused; "
                 "restart the bridge if the new type is right",
             )
             return
@@ -154,7 +154,7 @@ class ImportedTopics:
                 if self._rules[announce.topic].shared:  # one state set by several hosts: only the latest message counts
                     grace_ns = 0 if _releases(arrived) else OLD_NEWS_NS
                     if arrived.born_ns < topic.newest_ns - grace_ns:
-                        self._node.log.warning("%s of %s is old news: left out", announce.topic, announce.origin)
+                        self._node.log.warning("dropped %s of %s: outdated", announce.topic, announce.origin)
                         return
                     topic.last.clear()
                 topic.newest_ns = max(arrived.born_ns, topic.newest_ns)
@@ -164,7 +164,7 @@ class ImportedTopics:
                     oldest = next(iter(topic.last))
                     del topic.last[oldest]
                     self._on_trouble(
-                        announce.topic, f"more than {MAX_LATCHED} nodes publish it: the value of {oldest} is forgotten"
+                        announce.topic, f"more than {MAX_LATCHED} nodes publish it: the value of {oldest} was dropped"
                     )
             if topic.publisher is None:
                 topic.waiting.append(arrived)

@@ -110,7 +110,7 @@ class ConnectingLink(HostLink):
                 self._handle(connection.session.check())
                 self._flush()
             elif self._connected_s is not None and now - self._connected_s > GREETING_S:
-                self._say(f"{self.endpoint} answers, but does not greet: is it a bridge?")
+                self._say(f"{self.endpoint} accepts connections but does not answer as a bridge: is the port right?")
                 self._hang_up(_RETRY_S)
             return self._wait_s(self._connections()) if connection.session.up else 0.05
 
@@ -137,7 +137,7 @@ class ConnectingLink(HostLink):
                 mine = fingerprint(self.identity.public_key)
                 self._say(
                     f"{self.peer.name} at {self.endpoint} does not allow this host's key {mine} (status {value}): "
-                    f"run there `ic keys allow {self.identity.name} KEY`, with the key that `ic keys list` shows here"
+                    f"run `ic keys allow {self.identity.name} KEY` there, with the key from `ic keys list` here"
                 )
                 self._hang_up(_REFUSED_RETRY_S)
             elif kind in (zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL, zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL):
@@ -146,9 +146,9 @@ class ConnectingLink(HostLink):
                     self._hang_up(_RETRY_S)
                     return
                 self._say(
-                    f"{self.endpoint} hangs up before it has proved the key of {self.peer.name} "
+                    f"{self.endpoint} closes the connection before it proves the key of {self.peer.name} "
                     f"({self.peer.fingerprint}): another machine, a new key (`ic keys list` there, "
-                    f"`ic keys allow {self.peer.name} KEY` here), or a network that breaks off"
+                    f"`ic keys allow {self.peer.name} KEY` here), or an unstable network"
                 )
                 self._hang_up(_UNPROVED_RETRY_S)
             elif kind == zmq.EVENT_CONNECT_RETRIED and not up:
@@ -172,7 +172,7 @@ class ConnectingLink(HostLink):
             try:
                 self._dealer.send(data, zmq.NOBLOCK)
             except zmq.Again:
-                self._handle(self._connection.session.end("gone", "the link takes nothing any more"))
+                self._handle(self._connection.session.end("gone", "the connection accepts no more data"))
                 return
 
     def _handle(self, events: list[Event]) -> None:

@@ -100,10 +100,10 @@ def parse_key(text: str) -> bytes:
     except ValueError:
         raw = b""
     if not word.startswith(_PREFIX) or len(raw) != _KEY_SIZE + _CHECK_SIZE:
-        raise KeyFileError(f"{word[:60]!r} is no key: it must be {_PREFIX} and 48 letters, as `ic keys list` shows it")
+        raise KeyFileError(f"{word[:60]!r} is not a key: it must be {_PREFIX} and 48 letters, see `ic keys list`")
     key = raw[:_KEY_SIZE]
     if hashlib.sha256(key).digest()[-_CHECK_SIZE:] != raw[_KEY_SIZE:]:
-        raise KeyFileError(f"key {word} has a wrong letter (its check sum does not fit): copy it again")
+        raise KeyFileError(f"key {word} has a wrong checksum: copy it again")
     return key
 
 
@@ -114,7 +114,7 @@ def check_name(name: str) -> str:
         KeyFileError: the name is not valid.
     """
     if not _NAME.match(name):
-        raise KeyFileError(f"name {name!r} is not legal: letters, digits, _ and - only, a letter first")
+        raise KeyFileError(f"name {name!r} is not valid: use letters, digits, _ and -, starting with a letter")
     return name
 
 
@@ -144,7 +144,7 @@ class KeyStore:
                 mode = os.fstat(file.fileno()).st_mode
                 words = file.read().split()
         except FileNotFoundError:
-            raise KeyFileError(f"{path} is not there: make this host's key with `ic keys new`") from None
+            raise KeyFileError(f"{path} does not exist: create this host's key with `ic keys new`") from None
         except OSError as error:
             raise KeyFileError(f"{path} cannot be read: {error.strerror}") from error
         if mode & 0o077:
@@ -153,7 +153,7 @@ class KeyStore:
             name, public, secret = words
             return Identity(check_name(name), parse_key(public), parse_key(secret))
         except (ValueError, KeyFileError):
-            raise KeyFileError(f"{path} is damaged: make a new key with `ic keys new --force`") from None
+            raise KeyFileError(f"{path} is damaged: create a new key with `ic keys new --force`") from None
 
     def create(self, name: str, force: bool = False) -> Identity:
         """Create this host's key pair.
@@ -167,7 +167,7 @@ class KeyStore:
         check_name(name)
         if self.identity_path.exists() and not force:
             raise KeyFileError(
-                f"{self.identity_path} is there already; --force makes a new key, which the other hosts must then allow"
+                f"{self.identity_path} already exists; --force replaces it; the other hosts must then allow the new key"
             )
         public, secret = (z85.decode(key) for key in zmq.curve_keypair())
         self._write(self.identity_path, f"{name}\n{key_text(public)}\n{key_text(secret)}\n")
@@ -203,7 +203,7 @@ class KeyStore:
                 peer = Peer(check_name(words[0]), words[1], parse_key(words[2]))
                 for other in peers:
                     if other.name == peer.name or other.public_key == peer.public_key:
-                        raise KeyFileError(f"{peer.name} stands twice, by name or by key (also as {other.name})")
+                        raise KeyFileError(f"{peer.name} is listed twice, by name or by key (also as {other.name})")
             except KeyFileError as error:
                 raise KeyFileError(f"{path}:{number}: {error}") from None
             peers.append(peer)
@@ -221,7 +221,7 @@ class KeyStore:
             return found[0]
         known = ", ".join(peer.name for peer in peers) or "none"
         if found:
-            raise KeyFileError(f"several hosts are allowed ({known}): say which is meant")
+            raise KeyFileError(f"several hosts are allowed ({known}): name one of them")
         raise KeyFileError(
             f"{self.allowed_path} has no host {name!r}".replace(" ''", "")
             + f" (allowed: {known}): run `ic keys list` there, and `ic keys allow NAME KEY` here"
@@ -238,7 +238,7 @@ class KeyStore:
             others = [other for other in self.peers() if other.name != peer.name]
             for other in others:
                 if other.public_key == peer.public_key:
-                    raise KeyFileError(f"this key is allowed already, as {other.name}: `ic keys revoke {other.name}`")
+                    raise KeyFileError(f"this key is already allowed as {other.name}: `ic keys revoke {other.name}`")
             before = next((other for other in self.peers() if other.name == peer.name), None)
             if peer == before:
                 return "as before"

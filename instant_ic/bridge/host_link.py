@@ -157,7 +157,7 @@ class HostLink(ABC):
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         if self._thread.is_alive():
-            log.error("the link's thread does not end within %g s; it goes with the process", timeout_s)
+            log.error("the link's thread did not end within %g s; it ends with the process", timeout_s)
             return
         self._wake_out.close(linger=0)
         self._wake_in.close(linger=0)
@@ -354,5 +354,5 @@ def check_endpoint(endpoint: str, listening: bool) -> tuple[str, int]:
     port = int(match[3]) if match else -1
     if match is None or not (0 if listening else 1) <= port <= 65535 or (match[1] == "*" and not listening):
         example = "tcp://0.0.0.0:7450" if listening else "tcp://192.168.1.20:7450"
-        raise LinkError(f"{endpoint!r} is no address: it must look like {example}")
+        raise LinkError(f"{endpoint!r} is not an address: it must look like {example}")
     return match[1], port

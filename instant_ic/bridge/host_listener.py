@@ -186,12 +186,12 @@ class ListeningLink(HostLink):
         except ProtocolError:
             hello = False
         if peer is None or not hello:
-            word = Bye("unknown", f"{self.side.name} knows no such link: greet again")
+            word = Bye("unknown", f"{self.side.name} does not know this link: reconnect")
             self._send_frame(route, word.encode())
             return None
         for old_route, old in list(self._by_route.items()):
             if old.peer.public_key == peer.public_key:  # it restarted, or lost a link before we noticed
-                self._handle(old, old.session.end("replaced", "this key has made a newer link", tell=True))
+                self._handle(old, old.session.end("replaced", "a newer link uses the same key", tell=True))
                 self._send(old_route, old)
         connection = Connection(peer, self._new_session(peer, connecting=False, may_send=peer.role == "driver"))
         connection.address = str(frame.get("Peer-Address"))
@@ -238,7 +238,7 @@ class ListeningLink(HostLink):
         for each in drivers:
             if each.session.drives != (each is holder):
                 self._handle(each, each.session.set_drives(each is holder))
-            text = "" if each is holder else f"{who} drives {self.side.name}; this host's commands are not taken"
+            text = "" if each is holder else f"{who} drives {self.side.name}; this host's commands are dropped"
             if each.told != text:
                 each.told = text
                 each.session.notify("driver", text)

@@ -274,7 +274,7 @@ class Data:
         _, flags, channel, total, offset, sequence, publish, born, sent = _DATA.unpack(data[: _DATA.size])
         chunk = data[_DATA.size :]
         if len(chunk) > MAX_CHUNK or offset + len(chunk) > total or (len(chunk) == 0 and total > 0):
-            raise ProtocolError(f"Data: {len(chunk)} bytes at {offset} of {total} cannot be")
+            raise ProtocolError(f"Data: {len(chunk)} bytes at {offset} of {total} are impossible")
         if flags >> 1 >= len(LANES):
             raise ProtocolError(f"Data: unknown lane {flags >> 1}")
         return cls(channel, sequence, publish, born, sent, total, offset, chunk, flags >> 1, bool(flags & 1))

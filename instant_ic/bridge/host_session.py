@@ -380,7 +380,7 @@ class Session:
                 return events
             case Ack():
                 if not self.outbox.acked(message.taken, now - message.echo_ns, now):
-                    raise ProtocolError(f"{message} acknowledges what was not sent")
+                    raise ProtocolError(f"{message} acknowledges data that were not sent")
                 return []
             case Notice():
                 if message.name not in self.notices and len(self.notices) >= MAX_NOTICES:
@@ -394,12 +394,12 @@ class Session:
                 return self._announced(message)
             case Data():
                 return self._data(message, now)
-        raise ProtocolError(f"{type(message).__name__} does not belong here")
+        raise ProtocolError(f"{type(message).__name__} is not expected here")
 
     def _wrong_version(self, message: Hello | Welcome) -> list[Event]:
         return self.end(
             "version",
-            f"{message.name} speaks version {message.version} of the bridge, {self.side.name} version {VERSION}: "
+            f"{message.name} uses bridge protocol version {message.version}, {self.side.name} version {VERSION}: "
             "install the same Instant IC on both",
             tell=True,
         )
@@ -429,14 +429,14 @@ class Session:
         rule = self.side.imports.get(announce.topic)
         reason = ""
         if rule is None:
-            reason = f"{announce.topic} is not on the list of {self.side.name}"
+            reason = f"{announce.topic} is not on the topic list of {self.side.name}"
         elif not self.may_send:
             reason = f"{self.peer_name} may only watch {self.side.name} (role viewer)"
         else:
             try:
                 if self.side.digest(announce.type_name) != announce.digest:
                     reason = (
-                        f"{announce.type_name} has other fields on {self.peer_name} than on {self.side.name}: "
+                        f"{announce.type_name} has different fields on {self.peer_name} and {self.side.name}: "
                         "install the same Instant IC on both"
                     )
             except ValueError as error:
@@ -471,7 +471,7 @@ class Session:
         self._early.append((incoming, data, payload))  # its age is unknown until our ping is answered
         self._early_bytes += len(payload) + DATA_OVERHEAD
         if self._early_bytes > MAX_MESSAGE:
-            raise ProtocolError(f"{self._early_bytes} bytes came and no answer to a ping")
+            raise ProtocolError(f"{self._early_bytes} bytes received before the answer to a ping")
         return []
 
     def _release_early(self, now: int) -> list[Event]:
@@ -493,7 +493,7 @@ class Session:
             or (first.channel, first.sequence, first.total) != (data.channel, data.sequence, data.total)
             or len(payload) != data.offset
         ):
-            raise ProtocolError(f"chunk at {data.offset} of channel {data.channel} has no beginning")
+            raise ProtocolError(f"chunk at {data.offset} of channel {data.channel} does not continue its message")
         payload += data.chunk
         if len(payload) < data.total:
             return None
@@ -517,7 +517,7 @@ class Session:
         if data.wall_time and (offset := self.wall_offset_ns) is not None:
             publish_ns -= offset
         if not 0 <= publish_ns < 1 << 63:
-            raise ProtocolError(f"{announce.topic}: published at {publish_ns} ns cannot be")
+            raise ProtocolError(f"{announce.topic}: time of publication {publish_ns} ns is impossible")
         arrived = Arrived(announce, payload, publish_ns, age_ns, born_ns)
         if not (self.drives or rule.shared):
             counts.not_driving += 1

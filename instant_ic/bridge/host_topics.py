@@ -32,7 +32,7 @@ class TopicRule:
 
     def __post_init__(self) -> None:
         if not _TOPIC.match(self.topic):
-            raise ValueError(f"{self.topic!r} is no topic: it must look like /camera/image")
+            raise ValueError(f"{self.topic!r} is not a topic: it must look like /camera/image")
         if self.lane not in LANES:
             raise ValueError(f"{self.topic}: lane must be {', '.join(LANES)} (got {self.lane!r})")
         for key in ("rate_hz", "max_age_s"):
@@ -49,7 +49,7 @@ class TopicRule:
         """
         words = text.split()
         if not words:
-            raise ValueError("an empty line is no topic")
+            raise ValueError("an empty line is not a topic")
         kinds = {f.name: f.type for f in fields(cls) if f.name != "topic"}
         values: dict[str, object] = {}
         for word in words[1:]:
@@ -82,7 +82,7 @@ def parse_rules(lines: tuple[str, ...]) -> dict[str, TopicRule]:
     for line in lines:
         rule = TopicRule.parse(line)
         if rule.topic in rules:
-            raise ValueError(f"{rule.topic} stands twice")
+            raise ValueError(f"{rule.topic} is listed twice")
         rules[rule.topic] = rule
     return rules
 

@@ -198,7 +198,7 @@ class Incoming:
         handle = self._handler(topic, entry)
         there = self._namespace.to_ros(topic)
         entry.subscription = RosSubscription(self._own, there, name, type_hash(name), qos, handle)
-        self._node.log.debug("%s comes in as %s", there, topic)
+        self._node.log.debug("%s is imported as %s", there, topic)
         return entry
 
     def _handler(self, topic: str, entry: _In) -> Callable[[bytes, Attachment], None]:
@@ -224,7 +224,7 @@ class Incoming:
                     return
                 if topic in self._refusing:
                     self._refusing.discard(topic)
-                    self._tell(topic, OK, "commands come in")
+                    self._tell(topic, OK, "commands are accepted")
                 publish(payload, attachment.source_ns)
 
         return command if topic in self._commands else plain
@@ -244,7 +244,7 @@ class Incoming:
                 self._gate.check_release(attachment.sender, time.monotonic_ns())
             return
         if not entry.sources:
-            raise self._gate.refuse("no sender", "nobody in the ROS graph sends this topic, or not any more")
+            raise self._gate.refuse("no sender", "the ROS graph has no publisher of this topic")
         self._gate.check_age(attachment.source_ns, now_ns)
         self._gate.check_drive(attachment.sender, *twist_values(message), time.monotonic_ns())
 
@@ -268,7 +268,7 @@ class Incoming:
         for topic, entry in list(self._topics.items()):
             if not entry.always and entry.gone_s is not None and now - entry.gone_s > GRACE_S:
                 self._shut(self._topics.pop(topic))
-                self._node.diagnose(f"in {topic}", OK, "has left")
+                self._node.diagnose(f"in {topic}", OK, "its publishers are gone")
 
     def _shut(self, entry: _In) -> None:
         if entry.subscription is not None:

@@ -104,14 +104,14 @@ class Outgoing:
         out = self._topics[topic]
         if node not in out.publishers:
             if (hash_ := known_hash(type_name)) is None:
-                self._node.diagnose(f"out {topic}", ERROR, f"{type_name} is not known here: it cannot go out")
+                self._node.diagnose(f"out {topic}", ERROR, f"{type_name} is unknown here: not exported")
                 return None
             there = self._own if node == self._own.name else self._nodes.get(node)
             if there is None:
                 there = self._nodes[node] = RosNode(self._session, self._namespace.ros, node)
             name = self._namespace.to_ros(topic)
             out.publishers[node] = RosPublisher(there, name, type_name, hash_, ros_qos(qos))
-            self._node.log.debug("%s of %s goes out as %s", topic, node, name)
+            self._node.log.debug("%s of %s is exported as %s", topic, node, name)
         return out.publishers[node]
 
     def _came_in(self, topic: str, publisher: str) -> bool:

@@ -52,7 +52,7 @@ def beyond_loopback(config: Any) -> str:
 def _other_links(config: Any) -> str:
     """Return why links other than the configured endpoints may form."""
     if not _endpoints(config, "connect") and not _endpoints(config, "listen"):
-        return "no endpoint is set, so Zenoh looks for others by itself"
+        return "no endpoint is set, so Zenoh discovers other hosts"
     if _value(config, "scouting/multicast/enabled") is not False:
         return "scouting.multicast.enabled is not false"
     if _value(config, "adminspace/permissions/write") is True:
@@ -60,7 +60,7 @@ def _other_links(config: Any) -> str:
     protocols = _value(config, "transport/link/protocols") or ["tcp"]
     gossips = _value(config, "scouting/gossip/enabled") is not False
     if _value(config, "mode") != "client" and gossips and not set(protocols) <= set(_TLS_LINKS):
-        return 'a peer links with whom its router names, over any link; set mode: "client"'
+        return 'a peer connects over any link to hosts that its router reports; set mode: "client"'
     return ""
 
 

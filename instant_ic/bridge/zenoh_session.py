@@ -162,7 +162,7 @@ def open_zenoh(config: Any) -> Any:
     except queue.Empty:
         given_up.set()
         raise ZenohError(
-            f"Zenoh session: not open after {_OPEN_S:g} s; as a client it waits for its router: is it running?"
+            f"Zenoh session: not open after {_OPEN_S:g} s; a client waits for its router: is it running?"
         ) from None
     if isinstance(session, package.ZError):
         raise ZenohError(f"Zenoh session: {_words(session)}")
@@ -380,7 +380,7 @@ class RosSubscription:
         except FormatError as error:
             self.malformed += 1
             if self.malformed == 1:
-                log.error("%s: a message that rmw_zenoh did not make is refused: %s", self.topic, error)
+                log.error("%s: refused a message not made by rmw_zenoh: %s", self.topic, error)
             return
         last = self._sequences.pop(attachment.gid, None)
         if last is not None:

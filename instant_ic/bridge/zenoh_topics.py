@@ -86,7 +86,7 @@ def parse_publish(entries: Sequence[str]) -> dict[str, int]:
         except ValueError:
             rate_hz = 0.0
         if not pattern.startswith("/") or (option and key != "rate_hz") or not rate_hz > 0:
-            raise ValueError(f"publish: {entry!r} must be /TOPIC, a pattern, or one of them with rate_hz=N behind it")
+            raise ValueError(f"publish: {entry!r} must be /TOPIC or a pattern, optionally followed by rate_hz=N")
         periods[pattern] = int(1e9 / rate_hz)
     return periods
 

@@ -122,7 +122,7 @@ def test_convert_recover_reindex(capsys: pytest.CaptureFixture[str], tmp_path: P
     file = tmp_path / "new" / "new_2.mcap"
     file.write_bytes(file.read_bytes()[:-100])
     status, _, error = ic(capsys, "bag", "reindex", tmp_path / "new")
-    assert status == 1 and "new_2.mcap is not whole" in error
+    assert status == 1 and "new_2.mcap is incomplete" in error
     status, out, _ = ic(capsys, "bag", "recover", tmp_path / "new", "-o", tmp_path / "saved")
     assert status == 0 and "5 messages" in out and "new_2.mcap" in out
     with BagReader(tmp_path / "saved") as reader:

@@ -137,8 +137,8 @@ def test_big_messages_over_many_chunks_keep_their_order(tmp_path: Path) -> None:
     [
         (lambda p: BagReader(p / "nothing"), "does not exist"),
         (lambda p: BagReader(p), "no metadata.yaml"),
-        (lambda p: BagWriter(p), "exists already"),
-        (lambda p: recover(p, p / "new"), "there is no .mcap file"),
+        (lambda p: BagWriter(p), "already exists"),
+        (lambda p: recover(p, p / "new"), "no .mcap file found"),
     ],
 )
 def test_what_cannot_be_done_is_told(tmp_path: Path, action: object, message: str) -> None:

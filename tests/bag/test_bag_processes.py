@@ -255,7 +255,7 @@ def test_folder_that_cannot_be_written_is_told(talker: Talker, tmp_path: Path) -
     (tmp_path / "file").write_text("")
     process = talker.start("bag", "record", "-o", tmp_path / "file" / "bag")
     text = process.communicate(timeout=60)[0]
-    assert process.returncode == 1 and "cannot be made: Not a directory" in text and "Traceback" not in text
+    assert process.returncode == 1 and "cannot be created: Not a directory" in text and "Traceback" not in text
 
 
 def test_keys_in_a_terminal(talker: Talker, tmp_path: Path) -> None:

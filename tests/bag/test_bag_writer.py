@@ -126,7 +126,7 @@ def test_metadata_tells_complete_files_while_the_last_is_written(tmp_path: Path)
     with BagReader(tmp_path / "bag") as reader:
         assert [m.payload[0] for m in reader.messages()] == [0, 1, 2, 3]
         assert [file.name for file in reader.unlisted] == ["bag_2.mcap"]
-    with pytest.raises(BagError, match=r"bag_2.mcap is not whole.*ic bag recover"):
+    with pytest.raises(BagError, match=r"bag_2.mcap is incomplete.*ic bag recover"):
         reindex(tmp_path / "bag")
     result = recover(tmp_path / "bag", tmp_path / "saved")
     assert (result.count, "bag_2.mcap" in result.stopped_by) == (5, True)
@@ -176,7 +176,7 @@ def test_recover_leaves_out_a_damaged_chunk_and_goes_on(tmp_path: Path) -> None:
     file.write_bytes(data)
     result = recover(tmp_path / "bag", tmp_path / "saved")
     assert [m[2][0] for m in read(tmp_path / "saved")] == [0, 1, 2, 6, 7, 8]
-    assert len(result.damaged) == 1 and "check sum" in result.damaged[0] and result.stopped_by == ""
+    assert len(result.damaged) == 1 and "checksum" in result.damaged[0] and result.stopped_by == ""
 
 
 def test_unknown_type_is_kept_as_bytes_without_definition(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_unknown_type_is_kept_as_bytes_without_definition(tmp_path: Path) -> Non
         assert [(m.type_name, m.payload) for m in reader.messages()] == [
             ("their_msgs/msg/Odd", b"\x00\x01\x00\x00bytes")
         ]
-        with pytest.raises(BagError, match=r"/odd: its type their_msgs/msg/Odd is not known"):
+        with pytest.raises(BagError, match=r"/odd: type their_msgs/msg/Odd is unknown"):
             reader.decoder(reader.topics[0])
 
 
@@ -202,7 +202,7 @@ def test_same_topic_of_two_types(tmp_path: Path) -> None:
 
 def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(BagError, match=r"cannot be made: Not a directory"):
+    with pytest.raises(BagError, match=r"cannot be created: Not a directory"):
         BagWriter(tmp_path / "file" / "bag")
     with BagWriter(tmp_path / "bag") as writer:
         pass

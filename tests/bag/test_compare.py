@@ -77,7 +77,7 @@ def test_paired_by_stamp_a_missing_message_shifts_nothing(tmp_path: Path) -> Non
     b = bag(tmp_path / "b", [[0], [2], [3], [4]], [0.01, 2.02, 2.99, 4.0])
     found = scan_difference(a, b, Tolerance(ignore=("header",), stamp_s=0.05))
     assert (found.count_a, found.count_b, found.only_a, found.only_b, found.differing) == (4, 4, 1, 1, 0)
-    assert found.first == "the message of 11.000000 s is only in the first"
+    assert found.first == "the message at 11.000000 s is only in the first bag"
     # By their order everything after the missing one differs, and the stamps do at once.
     assert scan_difference(a, b).first == "message 1: stamps differ by +0.010000000 s"
     assert scan_difference(a, b).differing == 4

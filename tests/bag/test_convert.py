@@ -155,7 +155,7 @@ def test_topics_are_chosen_and_renamed(tmp_path: Path) -> None:
     bag = ours(tmp_path / "bag")
     options = ConvertOptions(choice=TopicChoice(("/s*",)), remap={"/scan": "/front/scan"})
     assert convert([bag], tmp_path / "new", options).counts == {"/front/scan": 10}
-    with pytest.raises(BagError, match="none of the topics"):
+    with pytest.raises(BagError, match="none of the selected topics"):
         convert([bag], tmp_path / "none", ConvertOptions(choice=TopicChoice(("/nothing",))))
     assert not (tmp_path / "none").exists()
 
@@ -198,7 +198,7 @@ def test_type_of_another_definition_keeps_its_own(tmp_path: Path) -> None:
 
 def test_nothing_to_convert(tmp_path: Path) -> None:
     BagWriter(tmp_path / "empty").close()
-    with pytest.raises(BagError, match="no message in it"):
+    with pytest.raises(BagError, match="no messages to convert"):
         convert([tmp_path / "empty"], tmp_path / "new")
     with pytest.raises(BagError, match="does not exist"):
         convert([tmp_path / "nowhere"], tmp_path / "new")

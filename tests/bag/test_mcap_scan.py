@@ -69,7 +69,7 @@ def test_flipped_bytes_never_give_a_message_that_was_not_written(
     try:
         scan(bytes(garbled[:cut]))
     except BagError as error:
-        assert "no MCAP file" in str(error)
+        assert "not an MCAP file" in str(error)
 
 
 @settings(max_examples=100, deadline=None)
@@ -92,7 +92,7 @@ def test_reader_of_a_garbled_file_says_that_it_is_damaged(compressed: bool, flip
 @given(st.binary(max_size=400))
 def test_any_bytes_after_the_magic(data: bytes) -> None:
     scan(good(False)[:8] + data)
-    with pytest.raises(BagError, match="no MCAP file"):
+    with pytest.raises(BagError, match="not an MCAP file"):
         scan(b"x" + data)
 
 

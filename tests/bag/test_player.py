@@ -101,7 +101,7 @@ def test_stop_interrupts_waiting(bag: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (PlayOptions(choice=TopicChoice(("/nothing",))), "none of the topics"),
+        (PlayOptions(choice=TopicChoice(("/nothing",))), "none of the selected topics"),
         (PlayOptions(start_offset_s=60.0), "ends before start_offset_s = 60"),
     ],
 )
@@ -225,7 +225,7 @@ def test_of_a_topic_with_two_types_one_is_played(tmp_path: Path) -> None:
             writer.write("/a", BOOL, b"b", stamp_ns, SENSOR)
     player = BagPlayer(tmp_path / "bag", PlayOptions())
     assert [(t.topic, t.type_name) for t in player.topics] == [("/a", BOOL)]
-    assert player.left_out == {f"/a ({TF}, 1 messages)": "it has another type too"}
+    assert player.left_out == {f"/a ({TF}, 1 messages)": "the topic also has another type"}
     sent: list[bytes] = []
     player.play(lambda message: sent.append(message.payload), threading.Event())
     player.close()
@@ -255,14 +255,14 @@ def test_types_that_cannot_be_sent_are_named(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag") as writer:
         writer.write("/unknown", "their_msgs/msg/Odd", b"u", 1, SENSOR)
         writer.write("/other", BOOL, b"o", 1, SENSOR, theirs)
-    with pytest.raises(BagError, match=r"/unknown \(their_msgs/msg/Odd, 1 messages\): its type is not known"):
+    with pytest.raises(BagError, match=r"/unknown \(their_msgs/msg/Odd, 1 messages\): its type is unknown"):
         BagPlayer(tmp_path / "bag", PlayOptions())
     with BagWriter(tmp_path / "more") as writer:
         writer.write("/cells", new.name, b"c", 1, SENSOR, new)
         writer.write("/other", BOOL, b"o", 1, SENSOR, theirs)
     player = BagPlayer(tmp_path / "more", PlayOptions())
     assert [t.topic for t in player.topics] == ["/cells"]  # its definition is in the bag
-    assert player.left_out == {f"/other ({BOOL}, 1 messages)": "its type has another definition in the bag than here"}
+    assert player.left_out == {f"/other ({BOOL}, 1 messages)": "the bag defines its type differently"}
     player.close()
 
 

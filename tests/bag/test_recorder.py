@@ -198,8 +198,8 @@ def test_folder_taken_away_is_told(tmp_path: Path) -> None:
     recorder.take("/scan", BOOL, b"1", 1 * S)
     shutil.rmtree(tmp_path / "bag")
     wait_for(lambda: recorder.state == FAILED, "the failure")
-    assert "its folder was taken away" in recorder.error
-    with pytest.raises(BagError, match="taken away"):
+    assert "its folder was removed" in recorder.error
+    with pytest.raises(BagError, match="was removed"):
         recorder.close()
 
 
@@ -299,7 +299,7 @@ def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path:
     recorder = make(tmp_path / "snaps", snapshot_s=60.0)
     empty = recorder.snapshot("early")
     wait_for(lambda: empty.state == "failed", "the failure")
-    assert "no message has come yet" in empty.words
+    assert "no message has been received yet" in empty.words
     recorder.take("/scan", BOOL, b"1", 2 * S)
     good = recorder.snapshot("late")
     wait_for(lambda: good.state == "done", "the snapshot")
@@ -325,5 +325,5 @@ def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
 
 def test_bag_that_exists_is_not_overwritten(tmp_path: Path) -> None:
     BagWriter(tmp_path / "bag").close()
-    with pytest.raises(BagError, match="exists already"):
+    with pytest.raises(BagError, match="already exists"):
         make(tmp_path / "bag")

@@ -326,7 +326,7 @@ def test_other_topics_and_types_are_not_taken(driving):
         client.texts.clear()
         client.advertise(topic, name, number=number)
         status = client.until(lambda: client.text("status"), "the refusal")
-        assert f"{topic} {name} json is not taken; only /operator/cmd_vel" in status["message"]
+        assert f"{topic} {name} json is not accepted; only /operator/cmd_vel" in status["message"]
         client.publish(b'{"linear": {"x": 0.1}, "angular": {"z": 0}}', number)
     listener.spin(0.2)
     assert drives == []
@@ -382,7 +382,7 @@ def test_parameters_are_read_only_by_default(world, talker):
     wait_for(lambda: "talker" in bridge.server.parameters.nodes, "the node")
     client.texts.clear()
     client.send(op="setParameters", parameters=[{"name": "/talker.rate_hz", "value": 5.0}], id="s")
-    assert "only be read" in client.until(lambda: client.text("status"), "the refusal")["message"]
+    assert "read-only" in client.until(lambda: client.text("status"), "the refusal")["message"]
     answer = client.until(lambda: client.text("parameterValues"), "the present value")
     assert [p["value"] for p in answer["parameters"]] == [2.0] and talker.config.rate_hz == 2.0
 

@@ -235,7 +235,7 @@ def test_other_type_on_a_topic_is_refused_and_told(hosts, monkeypatch):
     near, far = hosts.neighbour("robot", "talker"), hosts.neighbour("station", "listener")
     got = far.listen("/state")
     near.publisher("/state", Bool, LATCHED).publish(Bool(data=True))
-    wait_for(lambda: "other fields" in a.told("topic /state") and "other fields" in b.told("topic /state"), "words")
+    wait_for(lambda: all("different fields" in side.told("topic /state") for side in (a, b)), "words")
     assert a.node.diagnoses()["topic /state"][0] == ERROR
     far.spin(0.2)
     assert got == []
@@ -326,7 +326,7 @@ def test_latched_values_that_a_peer_makes_are_limited_with_a_clear_error():
         collector.incoming.take(Arrived(announce, bytes(serialize(Bool(data=True))), number, 0, number))
     last = collector.incoming._topics["/state"].last
     assert list(last) == [f"node{number}" for number in range(36, 100)]  # the newest 64
-    assert collector.troubles[0] == ("/state", "more than 64 nodes publish it: the value of node0 is forgotten")
+    assert collector.troubles[0] == ("/state", "more than 64 nodes publish it: the value of node0 was dropped")
 
 
 def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
@@ -334,8 +334,8 @@ def test_topics_of_no_list_that_a_peer_names_share_one_diagnosis(hosts):
     robot = hosts.bridge("robot").node
     before = set(robot.diagnoses())
     for number in range(100):
-        robot.trouble(f"/x{number}", "refused here: it is not on the list of robot")
-    robot.trouble("/operator/cmd_vel", "refused here: other fields")
+        robot.trouble(f"/x{number}", "refused here: it is not on the topic list of robot")
+    robot.trouble("/operator/cmd_vel", "refused here: different fields")
     assert set(robot.diagnoses()) - before == {"topic of no list", "topic /operator/cmd_vel"}
     assert robot.diagnoses()["topic of no list"][1].startswith("/x99: refused")
 

@@ -50,7 +50,7 @@ def test_new_key_is_kept_secret(store):
     assert store.identity() == made and len(made.secret_key) == 32 and made.public_key != made.secret_key
     assert stat.S_IMODE(store.identity_path.stat().st_mode) == 0o600
     assert stat.S_IMODE(store.folder.stat().st_mode) == 0o700
-    with pytest.raises(KeyFileError, match="is there already"):
+    with pytest.raises(KeyFileError, match="already exists"):
         store.create("robot")
     assert store.create("robot", force=True) != made
 
@@ -106,7 +106,7 @@ def test_allow_list_by_command(store):
     assert store.allow(viewer) == "added"
     assert store.peers() == [driver, viewer] and store.peer("tablet") == viewer
     assert store.allow(Peer("station", "driver", bytes(32))) == "replaced"
-    with pytest.raises(KeyFileError, match="allowed already, as tablet"):
+    with pytest.raises(KeyFileError, match="already allowed as tablet"):
         store.allow(Peer("other", "driver", KEY[::-1]))
     with pytest.raises(KeyFileError, match=r"several hosts are allowed \(tablet, station\)"):
         store.peer()
@@ -122,10 +122,10 @@ def test_allow_list_by_command(store):
     [
         ("station driver", r"allowed:3: expected NAME, driver or viewer, KEY"),
         (f"station boss {key_text(KEY)}", r"allowed:3: expected NAME"),
-        ("station driver ick_xyz", r"allowed:3: 'ick_xyz' is no key"),
+        ("station driver ick_xyz", r"allowed:3: 'ick_xyz' is not a key"),
         (f"2station driver {key_text(KEY)}", r"allowed:3: name '2station'"),
-        (f"a driver {key_text(KEY)}", r"allowed:3: a stands twice"),
-        (f"b driver {key_text(bytes(32))}", r"allowed:3: b stands twice.*as a"),
+        (f"a driver {key_text(KEY)}", r"allowed:3: a is listed twice"),
+        (f"b driver {key_text(bytes(32))}", r"allowed:3: b is listed twice.*as a"),
     ],
 )
 def test_mistakes_in_the_list_name_their_line(store, line, words):

@@ -213,7 +213,7 @@ def test_another_robot_at_the_address_is_not_believed(ends, keys):
     a = robot(ends, keys)
     wrong = Peer("robot", "driver", keys["tablet"].identity().public_key)
     b = station(ends, keys, a.link.port, peer=wrong)
-    wait_for(lambda: b.said("before it has proved the key of robot"), "words")
+    wait_for(lambda: b.said("before it proves the key of robot"), "words")
     assert b.of(Up) == [] and a.of(Up) == []
 
 
@@ -222,7 +222,7 @@ def test_server_without_a_key_is_not_believed(ends, keys):
         impostor.linger = 0
         port = impostor.bind_to_random_port("tcp://127.0.0.1")
         b = station(ends, keys, port)
-        wait_for(lambda: b.said("before it has proved the key of robot"), "words")
+        wait_for(lambda: b.said("before it proves the key of robot"), "words")
         b.link.stop()
 
 

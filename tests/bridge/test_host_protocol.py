@@ -101,7 +101,7 @@ def test_bytes_of_a_data_message_by_hand():
         (b'\x03{"code": "x", "reason": 5}', "reason must be str"),
         (b'\x05{"channel": true, "reason": ""}', "channel must be int"),
         (b"\x10short", "bytes, 21 expected"),
-        (b"\x13" + bytes(60), "cannot be"),
+        (b"\x13" + bytes(60), "impossible"),
         (b"\x01" + b"[" * 5000, "not JSON"),
     ],
 )
@@ -121,7 +121,7 @@ def test_rules_by_line():
     ("line", "words"),
     [
         ("", "empty line"),
-        ("scan", "no topic"),
+        ("scan", "not a topic"),
         ("/scan rate", "'rate' is not one of rate_hz=, lane=, max_age_s=, shared="),
         ("/scan rate=5", "'rate=5' is not one of"),
         ("/scan rate_hz=fast", "rate_hz must be float"),
@@ -138,7 +138,7 @@ def test_wrong_lines_say_what_is_wrong(line, words):
 
 
 def test_topic_twice_is_an_error():
-    with pytest.raises(ValueError, match="/scan stands twice"):
+    with pytest.raises(ValueError, match="/scan is listed twice"):
         parse_rules(("/scan", "/scan rate_hz=2"))
 
 

@@ -392,7 +392,7 @@ def test_other_fields_of_a_type_are_refused_and_told_on_both_sides():
     world.run(0.1)
     for who, here in (("station", True), ("robot", False)):
         (refused,) = [e for _, e in world.events[who] if isinstance(e, Refused)]
-        assert refused.here is here and refused.topic == STATE.topic and "other fields" in refused.reason
+        assert refused.here is here and refused.topic == STATE.topic and "different fields" in refused.reason
     assert world.arrived("station") == []
     assert DIGEST != "f" * 16
 
@@ -420,7 +420,7 @@ def test_topic_that_is_not_on_the_list_is_refused_even_from_a_driver():
     world.run(0.1)
     session = world.sessions["robot"]
     events = session.receive(Announce(9, "/cmd_vel", "evil", "std_msgs/msg/String", DIGEST, "sensor").encode())
-    assert [e.here for e in events] == [True] and "not on the list" in events[0].reason
+    assert [e.here for e in events] == [True] and "not on the topic list" in events[0].reason
     assert session.receive(Data(9, 1, 0, 0, 0, 1, 0, b"x").encode()) == []
     assert session.up
 

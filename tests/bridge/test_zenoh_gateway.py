@@ -347,7 +347,7 @@ def test_fresh_commands_come_in_and_old_or_mad_ones_do_not(operator):
         assert driven == []
     listener.wait(lambda: command(0.25) and driven, "a fresh command")
     assert twist_values(deserialize(driven[-1].payload, TWIST)) == (0.25, 0.0)
-    wait_for(lambda: gateway.told("in /operator/cmd_vel") == "commands come in", "all clear")
+    wait_for(lambda: gateway.told("in /operator/cmd_vel") == "commands are accepted", "all clear")
     refused = dict(gateway.node.gate.refused)
     refused.pop("no sender", None)  # what the fixture sent before the graph knew it
     assert refused == {"old": 1, "future": 1, "not finite": 1, "too fast": 1}

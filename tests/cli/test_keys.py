@@ -56,7 +56,7 @@ def test_mistakes_are_told_in_a_line(hosts, capsys):
     assert hosts("robot", "revoke", "nobody") == 1
     assert "has no host 'nobody' (allowed: none)" in capsys.readouterr().err
     assert hosts("robot", "allow", "station", "ick_short") == 1
-    assert "is no key" in capsys.readouterr().err
+    assert "is not a key" in capsys.readouterr().err
     hosts("robot", "new", "robot")
     out = capsys.readouterr().out
     assert hosts("robot", "new", "robot") == 1
@@ -64,7 +64,7 @@ def test_mistakes_are_told_in_a_line(hosts, capsys):
     assert hosts("robot", *printed_command(out)) == 1
     assert "own key" in capsys.readouterr().err
     assert hosts("robot", "allow", "2 words", printed_command(out)[2]) == 1
-    assert "not legal" in capsys.readouterr().err
+    assert "not valid" in capsys.readouterr().err
 
 
 def test_revoke_and_other_folder(hosts, capsys, tmp_path):
