@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
-# Installs the pinned torch as a CPU build, never the CUDA build of several gigabytes. What torch itself needs stands in
+# Installs the CPU build of the pinned torch, never the CUDA build of several gigabytes. The dependencies of torch are in
 # requirements.lock, which is installed first.
 #   install_torch.sh PYTHON
-# TORCH_SPEC=torch==2.13.0+cu130 (say) chooses another build, for a machine with a GPU.
+# On a machine with a GPU, TORCH_SPEC selects another build, for example torch==2.13.0+cu130.
 set -euo pipefail
 python=$1
 pin=$(grep -E '^torch==' "$(dirname "$0")/../constraints.txt")
@@ -19,7 +19,7 @@ PY
 then exit 0; fi
 pip=("$python" -m pip install -q --disable-pip-version-check --progress-bar off)
 if [ -n "${TORCH_SPEC:-}" ]; then exec "${pip[@]}" "$spec"; fi
-# A dry run tells which build the index would give; only a CPU build is taken from it.
+# A dry run shows which build the index offers; only a CPU build is installed from it.
 report=$("$python" -m pip install -q --disable-pip-version-check --dry-run --no-deps --report - "$spec" 2>/dev/null || true)
 if printf '%s' "$report" | grep -q '%2Bcpu\|+cpu'; then exec "${pip[@]}" --no-deps "$spec"; fi
 exec "${pip[@]}" --no-deps --index-url https://download.pytorch.org/whl/cpu "$spec"

@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Writes requirements.lock: every package of the versions in constraints.txt, with the hashes of all its files.
-# torch is left out: scripts/install_torch.sh installs its CPU build. Needs network; `make lock` runs it.
+# Writes requirements.lock: every package in its version from constraints.txt, with the hashes of all its files.
+# torch is excluded: scripts/install_torch.sh installs its CPU build. Needs network access; `make lock` runs this script.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
 "$folder/venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt uv
-# The mirror's or the user's own settings must not reach the lock: uv reads no pip configuration, and names no index.
-# pip itself is locked too: it installs all the others.
+# Settings of a mirror or of the user must not reach the lock file: uv reads no pip configuration and records no index.
+# pip is locked too, because it installs the other packages.
 echo pip | "$folder/venv/bin/uv" pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-annotate \
   --custom-compile-command 'make lock' --extra dev --extra train --constraint constraints.txt --no-emit-package torch \
   --output-file "$folder/requirements.lock" pyproject.toml -

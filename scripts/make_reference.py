@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Writes docs/reference.md: every node with its topics and parameters, read from the code and config/*.yaml.
+"""Write docs/reference.md: topics and parameters of every node, read from the code and config/*.yaml.
 
 Usage: python scripts/make_reference.py [--check]
 """
@@ -25,7 +25,11 @@ CALLS = {
 
 
 def topics(source: str) -> dict[str, dict[str, str]]:
-    """Topics of the literal publisher, subscribe and latest calls in a node's source: direction → topic → type."""
+    """Topics of the publisher, subscribe and latest calls with literal names in a node's source.
+
+    Returns:
+        Direction → topic → type.
+    """
     found: dict[str, dict[str, str]] = {"takes": {}, "gives": {}}
     for call in ast.walk(ast.parse(source)):
         if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute):
@@ -35,7 +39,7 @@ def topics(source: str) -> dict[str, dict[str, str]]:
             topic = arguments[0].value
             if isinstance(topic, str) and topic.startswith("/"):
                 kind = arguments[1]
-                if name in ("subscribe_raw", "subscribe_received"):  # its bytes are handed on, or read by the callback
+                if name in ("subscribe_raw", "subscribe_received"):  # raw bytes, passed on or decoded by the callback
                     kind = next((k.value for k in call.keywords if k.arg == "message_class"), ast.Name("bytes"))
                 found[CALLS[name]][topic] = ast.unparse(kind)
         elif name == "tf_broadcast":
@@ -49,12 +53,12 @@ def topics(source: str) -> dict[str, dict[str, str]]:
 
 
 def cell(text: str) -> str:
-    """Text that a Markdown table can hold."""
+    """Escape text for a Markdown table cell."""
     return text.replace("|", "\\|")
 
 
 def render() -> str:
-    """The page."""
+    """Return the page as Markdown."""
     from instant_ic.bus.node_files import node_class
     from instant_ic.config.parameter_info import parameter_infos
 
@@ -93,7 +97,7 @@ def render() -> str:
 
 
 def main() -> int:
-    """Writes or checks the page."""
+    """Write the page, or check that it is up to date."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true", help="only tell whether the page is current")
     args = parser.parse_args()

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
-"""Makes the small bag that the tests replay: a slow drive in the simulated corridor, as its devices would tell it.
+"""Make the small bag that the tests replay: a slow drive through the simulated corridor, with device-level messages.
 
-In one process and in simulated time: the simulator's world and sensors, the real base driver on the emulated motor
-controller, packets and pictures as the devices send them. The same call gives the same bag on the same machine.
+Everything runs in one process and in simulated time: the simulator's world and sensors, the real base driver on the
+emulated motor controller, packets and images as the devices send them. Calls on the same machine give the same bag.
 
 Usage: python scripts/make_test_bag.py tests/data/corridor_drive
 """
@@ -43,16 +43,16 @@ from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 START_NS = 1_760_000_000_000_000_000
 STEP_S = 0.002
 FIRST_SCAN_S = 0.2
-"""The base has connected and tells odometry by then."""
+"""By this time the base has connected and publishes odometry."""
 CAMERA_PERIOD_S = 0.5
 CAMERA_LATENCY_S = 0.2
 TRUTH_PERIOD_S = 1.0 / 30.0
 STANDING_S = 0.6
-"""At first the robot stands: the map begins at a known pose."""
+"""The robot stands still at first, so that the map starts at a known pose."""
 
 
 class SimulatedPort:
-    """The motor controller's serial line, without a line."""
+    """Stands in for the serial port: passes bytes straight to the emulated motor controller."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._controller = simulation.controller
@@ -70,18 +70,18 @@ class SimulatedPort:
         self._replies = b""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no port is open."""
 
 
 def twist(time_s: float, seconds: float) -> tuple[float, float]:
-    """The drive: ahead in a gentle S, and to a stop."""
+    """Commanded twist: drive ahead in a gentle S curve, then stop."""
     if time_s < STANDING_S or time_s > seconds - 0.6:
         return 0.0, 0.0
     return 0.3, 0.25 * math.sin(2 * math.pi * (time_s - STANDING_S) / (seconds - STANDING_S))
 
 
 def make(path: Path, seconds: float, quality: int) -> None:
-    """Drives and writes the bag."""
+    """Simulate the drive and write the bag."""
     simulation = Simulation(SimulationConfig(), start_ns=START_NS)
     with BagWriter(path, compressed=True) as writer:
 
@@ -129,7 +129,7 @@ def make(path: Path, seconds: float, quality: int) -> None:
 
 
 def mounts(simulation: Simulation) -> TFMessage:
-    """The sensors' places, as their drivers tell them."""
+    """Sensor mounts as the drivers publish them."""
     camera, lidar = simulation.config.camera, simulation.config.lidar
     places = (("camera", camera.mount_xyz, camera.mount_yaw_deg), ("velodyne", lidar.mount_xyz, lidar.mount_yaw_deg))
     return TFMessage(
@@ -141,7 +141,7 @@ def mounts(simulation: Simulation) -> TFMessage:
 
 
 class _Lidar:
-    """Packets, gathered by revolutions as the driver publishes them."""
+    """Collects LiDAR packets into one message per revolution, as the driver does."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
@@ -150,7 +150,7 @@ class _Lidar:
         self._first_ns = 0
 
     def due(self, time_s: float) -> list[tuple[VelodyneScan, int]]:
-        """Messages whose last packet is complete by now, each with that packet's stamp."""
+        """Messages whose last packet is complete, each with the stamp of that packet."""
         done = []
         simulation = self._simulation
         while simulation.scanner.due(time_s) > 0:

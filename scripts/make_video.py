@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Films the operator's page while somebody drives through an obstacle: docs/images/console.webp of the README.
+"""Record the operator's page during a drive through an obstacle: docs/images/console.webp of the README.
 
     python scripts/make_video.py docs/images/console.webp
 
-The page is the real one in Chromium, driven by its W key. What it shows comes from the real nodes (SLAM, depth, virtual
-space, arbiter, virtual robot, navigator, console) and a simulated robot, in one process and in simulated time as for
-`ic evaluate teleop`; the page's clock is the simulation's, so the film has the right pace however slow the machine is.
+The real page runs in Chromium and is driven by its W key. Its content comes from the real nodes (SLAM, depth, virtual
+space, arbiter, virtual robot, navigator, console) and a simulated robot, in one process and in simulated time as in
+`ic evaluate teleop`. The page uses the simulation's clock, so the video plays at the right speed on a slow machine too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LONGEST_S = 120.0
 
 
 class Page(_Page):
-    """Gives what the console tells on to a real page as well, in the simulation's time."""
+    """Also forwards the console's messages to a real page, in simulated time."""
 
     def __init__(self, stack: SimulatedStack, server: ConsoleServer) -> None:
         super().__init__(stack)
@@ -68,7 +68,7 @@ class Page(_Page):
         self.server.show(*kinds)
 
     def photo(self) -> bytes:
-        """The camera's picture that has just come, which the simulated stack leaves empty."""
+        """Render the camera image, which the simulated stack leaves empty."""
         import cv2
 
         x, y, yaw = self.stack._newest[False].pose
@@ -77,7 +77,7 @@ class Page(_Page):
 
 
 class Operator:
-    """What the page sends; the newest command counts."""
+    """Receives the page's input; keeps the newest drive command."""
 
     def __init__(self, stack: SimulatedStack) -> None:
         self.stack = stack
@@ -87,7 +87,7 @@ class Operator:
         self.command = (linear, angular)
 
     def on_operator(self, there: bool) -> None:
-        """The page is there all the time: its beats are not in the film's time."""
+        """Ignore the page's heartbeats: they are not in simulated time, and the page is always connected."""
 
     def on_look(self, look: Look) -> None:
         self.stack.nodes["console"].on_look(look)
@@ -109,7 +109,7 @@ class Operator:
 
 
 def film(args: argparse.Namespace) -> list[bytes]:
-    """PNG pictures of the page, ``args.fps`` a second of simulated time."""
+    """PNG screenshots of the page, ``args.fps`` per second of simulated time."""
     from playwright.sync_api import sync_playwright
 
     course = make_course(args.world, args.seed, 0)
@@ -138,7 +138,7 @@ def film(args: argparse.Namespace) -> list[bytes]:
 
 
 def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args: argparse.Namespace) -> list[bytes]:
-    """Waits until the virtual space is ready, then holds W through the obstacle, and lets go behind it."""
+    """Wait until the virtual space is ready, hold W through the obstacle, release it behind the obstacle."""
     frames: list[bytes] = []
     steps = round(1.0 / args.fps / STEP_S)
     ready_s = pressed_s = back_s = None
@@ -146,7 +146,7 @@ def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args
     while True:
         for _ in range(steps):
             stack.step(lambda: operator.command)
-        page.wait_for_timeout(args.settle_ms)  # pictures come over a real socket and are decoded
+        page.wait_for_timeout(args.settle_ms)  # images arrive over a real socket and are decoded
         for part in (0.5, 1.0):
             page.evaluate("(ms) => film(ms)", 1e3 * (stack.time_s - (1 - part) / args.fps))
         now, state = stack.time_s, stack.state
@@ -178,7 +178,7 @@ def vspace_ready(stack: SimulatedStack) -> bool:
 
 
 def write(frames: list[bytes], args: argparse.Namespace) -> None:
-    """An animated WebP, which GitHub shows in a README."""
+    """Write an animated WebP, which GitHub shows in a README."""
     from PIL import Image
 
     kept = frames[round(args.skip_s * args.fps) :: args.every]

@@ -1,4 +1,4 @@
-"""Kinds of numbers on the command line."""
+"""Argument types: numbers and durations on the command line."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def not_negative(text: str) -> int:
 
 
 def seconds(text: str) -> float:
-    """A time: ``90``, ``90s``, ``10m``, ``2h``, ``1d``."""
+    """A duration in seconds: ``90``, ``90s``, ``10m``, ``2h``, ``1d``."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd]?)", text)
     if not match:
         raise argparse.ArgumentTypeError(f"must look like 90, 30s, 10m, 2h or 1d (got {text})")

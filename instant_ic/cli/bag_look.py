@@ -1,4 +1,4 @@
-"""``ic bag info``, ``diff``, ``convert``, ``recover`` and ``reindex``: what needs only files."""
+"""``ic bag info``, ``diff``, ``convert``, ``recover`` and ``reindex``: the commands that work on files alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _LEFT_OUT = {
 
 
 def info(args: argparse.Namespace) -> int:
-    """Prints what a bag holds."""
+    """Print the contents of a bag: size, times, topics, losses, bookmarks."""
     with BagReader(Path(args.bag)) as reader:
         told = _info(reader)
     if args.json:
@@ -72,7 +72,7 @@ def info(args: argparse.Namespace) -> int:
 
 
 def _bookmarks(reader: BagReader) -> list[dict[str, Any]]:
-    """The moments that the operator has named, with their distance from the beginning."""
+    """Bookmarks set by the operator, with their offset from the start of the bag."""
     if not any(topic.topic == BOOKMARKS and topic.type_name == _STRING for topic in reader.topics):
         return []
     try:
@@ -80,7 +80,7 @@ def _bookmarks(reader: BagReader) -> list[dict[str, Any]]:
         return [
             {"at_s": (m.stamp_ns - reader.start_ns) / 1e9, "name": deserialize(m.payload, _STRING).data} for m in found
         ]
-    except BagError as error:  # all else can still be told
+    except BagError as error:  # the rest of the bag can still be described
         print(f"bookmarks cannot be read: {error}", file=sys.stderr)
         return []
 
@@ -130,7 +130,7 @@ def _info(reader: BagReader) -> dict[str, Any]:
 
 
 def diff(args: argparse.Namespace) -> int:
-    """Compares topic by topic."""
+    """Compare two bags topic by topic."""
     found = compare(Path(args.a), Path(args.b), tuple(topic_names(args.ignore)), args.common, tolerance_of(args))
     if not found:
         raise UserError("there is no topic to compare")
@@ -141,10 +141,10 @@ def diff(args: argparse.Namespace) -> int:
 
 
 def tolerance_of(args: argparse.Namespace) -> Tolerance:
-    """What the command line forgives.
+    """Tolerances given on the command line.
 
     Raises:
-        UserError: a tolerance that is no number.
+        UserError: a tolerance is not a number.
     """
     fields = {}
     for name, text in pairs(args.tolerance, "=", "--tolerance").items():
@@ -159,7 +159,7 @@ def tolerance_of(args: argparse.Namespace) -> Tolerance:
 
 
 def print_differences(found: list[TopicDifference]) -> int:
-    """A line a topic, and one for each field that differs; returns the exit status."""
+    """Print a line per topic and per differing field; return the exit status."""
     width = max([len(topic.topic) for topic in found], default=0)
     for topic in found:
         print(f"{topic.topic:<{width}}  {topic.count_a:>6} {topic.count_b:>6}  {topic.first or 'same'}")
@@ -176,12 +176,12 @@ def print_differences(found: list[TopicDifference]) -> int:
 def _plain(topic: TopicDifference) -> dict[str, Any]:
     plain = {**asdict(topic), "same": topic.same}
     for entry in plain["fields"].values():
-        entry["largest"] = entry["largest"] if math.isfinite(entry["largest"]) else None  # JSON knows no nan
+        entry["largest"] = entry["largest"] if math.isfinite(entry["largest"]) else None  # JSON has no NaN
     return plain
 
 
 def convert(args: argparse.Namespace) -> int:
-    """Writes a new bag."""
+    """Write a new bag from one or several others."""
     options = ConvertOptions(
         choice=TopicChoice(tuple(topic_names(args.topics)), tuple(topic_names(args.exclude))),
         start_s=args.start,
@@ -202,7 +202,7 @@ def convert(args: argparse.Namespace) -> int:
 
 
 def recover(args: argparse.Namespace) -> int:
-    """Copies what can be read."""
+    """Copy every readable message into a new bag."""
     source = Path(args.bag)
     target = Path(args.output) if args.output else source.with_name(f"{source.stem}_recovered")
     result = recover_bag(source, target)
@@ -217,7 +217,7 @@ def recover(args: argparse.Namespace) -> int:
 
 
 def reindex(args: argparse.Namespace) -> int:
-    """Writes metadata.yaml."""
+    """Rewrite metadata.yaml."""
     files, messages = reindex_bag(Path(args.bag))
     print(f"{args.bag}/metadata.yaml: {messages} messages in {files} files")
     return 0

@@ -1,4 +1,4 @@
-"""``ic bag record``, ``play``, ``snapshot`` and ``control``: what needs the bus."""
+"""``ic bag record``, ``play``, ``snapshot`` and ``control``: the commands that use the bus."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from instant_ic.cli.errors import UserError
 from instant_ic.cli.terminal import Terminal
 from instant_ic.paths import run_dir
 
-_STARTING_S = 10.0  # a node that is just starting gets so much time
+_STARTING_S = 10.0  # grace period for a node that is just starting
 _STEERED = ("bag_recorder", "bag_player")
 
 
 def _attended(name: str, attend: Callable[[Node[Any]], Terminal]) -> type[Node[Any]]:
-    """A node's class with keys and a status line."""
+    """Return a node class extended with keys and a status line."""
     base = node_class(name)
 
     def setup(self: Any) -> None:
@@ -52,7 +52,7 @@ def _recorder_terminal(node: Node[Any]) -> Terminal:
         left_out = sum(told["overflow"].values())
         return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if told["lost"] else "")
 
-    # On the node's thread, which the recorder is used from.
+    # The recorder may only be used from the node's thread.
     keys = {" ": lambda: node.call_soon(node.commands["toggle"])}
     if getattr(node.config, "snapshot", False):
         keys["s"] = lambda: node.call_soon(node.commands["snapshot"], "key")
@@ -83,7 +83,7 @@ def _player_terminal(node: Node[Any]) -> Terminal:
 
 
 def record(args: argparse.Namespace) -> int:
-    """Runs the recorder node in this process."""
+    """Run the recorder node in this process."""
     if args.output and Path(args.output).exists() and not args.snapshot:
         raise UserError(f"{args.output} exists already, not overwriting")
     words = ["--name", f"bag_recorder_{os.getpid()}"]
@@ -108,7 +108,7 @@ def record(args: argparse.Namespace) -> int:
 
 
 def play(args: argparse.Namespace) -> int:
-    """Runs the player node in this process."""
+    """Run the player node in this process."""
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")
     words = ["--name", f"bag_player_{os.getpid()}"]
@@ -133,7 +133,7 @@ def play(args: argparse.Namespace) -> int:
 
 
 def snapshot(args: argparse.Namespace) -> int:
-    """Has a recorder write the last seconds; waits until they are on the disk."""
+    """Make a recorder write the last seconds; wait until they are on disk."""
     node = _node(("bag_recorder",), args.node, keeps_snapshots=True)
     recorder = NodeControl(run_dir(), node.name)
     path = _call(recorder, "snapshot", reason=args.reason)["path"]
@@ -150,7 +150,7 @@ def snapshot(args: argparse.Namespace) -> int:
 
 
 def control(args: argparse.Namespace) -> int:
-    """Steers a running recorder or player."""
+    """Send a command to a running recorder or player."""
     arguments = argument_of(args.command, args.value)
     on_request = args.command in ("record", "stop")
     kinds = ("bag_player",) if arguments else ("bag_recorder",) if on_request or args.command == "split" else _STEERED
@@ -177,7 +177,7 @@ def _call(node: NodeControl, command: str, **arguments: Any) -> Any:
 
 
 def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -> NodeInfo:
-    """The node that is meant; of several recorders the one that can do it."""
+    """Node that a command is for; of several recorders, the one that supports the command."""
     running = [node for node in list_nodes(run_dir()) if node.executable in kinds]
     chosen = [node for node in running if not name or node.name == name]
     if len(chosen) > 1:
@@ -197,5 +197,5 @@ def _megabytes(size: int) -> int:
 
 
 def _parameters(**values: Any) -> list[str]:
-    """Command-line words of a node (JSON is YAML)."""
+    """Parameter arguments for a node's command line (JSON is valid YAML)."""
     return [word for key, value in values.items() for word in ("-p", f"{key}:={json.dumps(value)}")]

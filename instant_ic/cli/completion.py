@@ -1,6 +1,6 @@
-"""What the shell completes: topics, nodes, parameters, types, launch files, bags.
+"""Completers for the shell: topics, nodes, parameters, types, launch files, bags.
 
-Called by argcomplete at each press of TAB: nothing heavy may be imported here, and no error may come out.
+argcomplete calls them at each press of TAB, so they import nothing heavy and raise no errors.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ def _quiet(function: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
     def complete(prefix: str = "", parsed_args: Any = None, **_: Any) -> list[str]:
         try:
             return [word for word in function(parsed_args) if word.startswith(prefix)]
-        except Exception:  # noqa: BLE001 - a trace in the middle of the user's command line helps nobody
+        except Exception:  # noqa: BLE001 - a traceback in the middle of the user's command line helps nobody
             return []
 
     return complete
 
 
 def offer(argument: Any, words: Callable[..., list[str]]) -> None:
-    """Has the shell complete an argument of a parser by one of the functions below."""
+    """Attach one of the completers below to an argument of a parser."""
     argument.completer = words
 
 
@@ -35,7 +35,7 @@ def topics(args: Any) -> Iterable[str]:
 
 @_quiet
 def nodes(args: Any) -> Iterable[str]:
-    """Nodes that run."""
+    """Running nodes."""
     from instant_ic import paths
     from instant_ic.bus import registry
 
@@ -44,7 +44,7 @@ def nodes(args: Any) -> Iterable[str]:
 
 @_quiet
 def parameters(args: Any) -> Iterable[str]:
-    """Parameters of the node that stands before on the command line."""
+    """Parameters of the node named earlier on the command line."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.config import params
@@ -57,7 +57,7 @@ def parameters(args: Any) -> Iterable[str]:
 
 @_quiet
 def types(args: Any) -> Iterable[str]:
-    """Message types on the bus now, the others of ROS 2 after them by their files."""
+    """Message types: those in use on the bus first, then the other ROS 2 types."""
     from instant_ic.cli.names import topic_types
 
     found = set(topic_types().values()) - {"any"}
@@ -84,7 +84,7 @@ def launch_files(args: Any) -> Iterable[str]:
 
 @_quiet
 def launch_arguments(args: Any) -> Iterable[str]:
-    """``key:=`` of the launch file that stands before on the command line."""
+    """``key:=`` arguments of the launch file named earlier on the command line."""
     from instant_ic.launch.description import find_launch_file, read_arguments
 
     return [f"{argument.name}:=" for argument in read_arguments(find_launch_file(args.file))]
@@ -92,6 +92,6 @@ def launch_arguments(args: Any) -> Iterable[str]:
 
 @_quiet
 def bags(args: Any) -> Iterable[str]:
-    """Bags in the working directory and one folder down."""
+    """Bags in the working directory and its direct subfolders."""
     found = [path.parent for pattern in ("*/metadata.yaml", "*/*/metadata.yaml") for path in Path().glob(pattern)]
     return sorted(str(path) for path in [*found, *Path().glob("*.mcap"), *Path().glob("*.bag")])

@@ -1,4 +1,4 @@
-"""``ic depth train``."""
+"""``ic depth train``: train a depth model."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _EPILOG = """examples:
 
 
 def add_parser(commands: Any) -> None:
-    """Adds ``train`` to the subcommands of ``ic depth``."""
+    """Add ``train`` to the subcommands of ``ic depth``."""
     parser = commands.add_parser(
         "train",
         help="train SliceNet on generated worlds and on folders of panoramas",
@@ -122,7 +122,7 @@ def train(args: argparse.Namespace) -> int:
                 trainer.bar = stack.enter_context(progress("training"))
             metrics = trainer.run()
     except ValueError as error:
-        if type(error) is not ValueError:  # those of our own modules say all
+        if type(error) is not ValueError:  # errors of our own modules explain themselves
             raise
         raise UserError(f"ic depth train: {error}", 2) from error
     finally:
@@ -174,7 +174,7 @@ def _trainer(args: argparse.Namespace, network: SliceNetConfig, team: Team, repo
 
 
 def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report: Any) -> tuple[Feed, Samples]:
-    """Training batches and panoramas for evaluation, as the command line asks for."""
+    """Training batches and evaluation panoramas selected on the command line."""
     from instant_ic.training.dataset import Subset
     from instant_ic.training.feeds import FileFeed, MixedFeed, RenderedFeed
     from instant_ic.training.rooms import FIRST_HELD_OUT, RoomsConfig
@@ -232,10 +232,10 @@ def _rendered(recipe: RoomsConfig, workers: int) -> list[Any]:
 
 
 def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, report: Any) -> PanoramaDataset:
-    """The data folder, rendered first (by process 0) where it is absent or not complete.
+    """Open the data folder; process 0 renders it first where it is missing or incomplete.
 
     Raises:
-        UserError: it was rendered by another recipe.
+        UserError: it was rendered with other settings.
     """
     from instant_ic.training.dataset import PanoramaDataset, write_dataset
     from instant_ic.training.feeds import WORLD_TIMEOUT_S, Renderers
@@ -266,7 +266,7 @@ def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, repo
 
 @contextlib.contextmanager
 def _ends_early(trainer: Trainer) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the training as its schedule would; a second one ends it at once."""
+    """End the training cleanly on Ctrl-C or SIGTERM, as at the end of its schedule; a second signal aborts it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,4 +1,4 @@
-"""The checks of ``ic doctor``: each looks at one thing and says what to do when it is wrong."""
+"""The checks of ``ic doctor``: each examines one thing and says what to do when it is wrong."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found.
+    """Result of a check.
 
     Attributes:
-        level: OK, WARN (something will be missing or slow) or FAIL (it will not work).
-        subject: what was looked at.
-        words: what is so.
-        advice: what to do; empty where all is well.
+        level: OK, WARN (a function will be missing or slow) or FAIL (the stack will not work).
+        subject: what was checked.
+        words: what was found.
+        advice: what to do about it; empty where all is well.
     """
 
     level: str
@@ -45,14 +45,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What this machine is to do, by the parameters of the nodes that would run on it.
+    """Devices and ports that the nodes of this machine would use.
 
     Attributes:
         real_devices: missing devices are failures, not warnings.
-        serial_port: of the RoboClaw.
-        camera_url: of the Theta.
+        serial_port: port of the RoboClaw.
+        camera_url: URL of the Theta.
         lidar_port: UDP port of the VLP-16's data.
-        listen_seconds: how long to wait for its packets.
+        listen_seconds: how long to wait for LiDAR packets.
         tcp_ports: port → what needs it.
         udp_ports: port → what needs it.
     """
@@ -67,7 +67,7 @@ class Expectation:
 
 
 def run_checks(expectation: Expectation, run_dir: Path) -> Iterator[Finding]:
-    """Every check, one after another; the slow ones last."""
+    """Run every check, the slow ones last."""
     yield from check_machine(run_dir)
     yield from check_packages()
     yield from check_configuration()
@@ -85,7 +85,7 @@ def run_checks(expectation: Expectation, run_dir: Path) -> Iterator[Finding]:
 
 
 def check_machine(run_dir: Path) -> Iterator[Finding]:
-    """Python, cores, memory, disk, shared memory, run directory."""
+    """Check Python, cores, memory, disk, shared memory and run directory."""
     import psutil
 
     version = ".".join(map(str, sys.version_info[:3]))
@@ -129,7 +129,7 @@ def _check_run_dir(run_dir: Path) -> Finding:
 
 
 def check_packages() -> Iterator[Finding]:
-    """Every package that the installed distribution asks for."""
+    """Check that every package required by the installed distribution is present."""
     from packaging.requirements import Requirement
 
     try:
@@ -152,7 +152,7 @@ def check_packages() -> Iterator[Finding]:
 
 
 def check_configuration() -> Iterator[Finding]:
-    """Every shipped launch file with the parameters of its nodes."""
+    """Check every shipped launch file and the parameters of its nodes."""
     from instant_ic import paths
     from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
     from instant_ic.launch.parameters import check_parameters
@@ -177,7 +177,7 @@ def check_configuration() -> Iterator[Finding]:
 
 
 def check_models() -> Iterator[Finding]:
-    """Every model file loads."""
+    """Check that every model file loads."""
     from instant_ic import paths
 
     try:
@@ -201,7 +201,7 @@ def check_models() -> Iterator[Finding]:
 
 
 def check_ports(expectation: Expectation) -> Iterator[Finding]:
-    """Ports that the stack listens on are free."""
+    """Check that the ports of the stack are free."""
     kinds = ((socket.SOCK_STREAM, "tcp", expectation.tcp_ports), (socket.SOCK_DGRAM, "udp", expectation.udp_ports))
     for kind, word, ports in kinds:
         for port, need in ports:
@@ -222,7 +222,7 @@ def check_ports(expectation: Expectation) -> Iterator[Finding]:
 
 
 def check_gpu() -> Iterator[Finding]:
-    """A CUDA device that torch can use."""
+    """Look for a CUDA device that torch can use."""
     if importlib.util.find_spec("torch") is None:
         yield Finding(FAIL, "gpu", "torch is not installed", "pip install torch")
         return
@@ -237,7 +237,7 @@ def check_gpu() -> Iterator[Finding]:
 
 
 def check_browser() -> Iterator[Finding]:
-    """A browser for the operator's page."""
+    """Look for a browser for the operator's page."""
     found = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if found:
         yield Finding(OK, "browser", found)
@@ -248,7 +248,7 @@ def check_browser() -> Iterator[Finding]:
 
 
 def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterator[Finding]:
-    """Reverse-path filtering: strict, it drops a sensor's packets from a foreign subnet without a word."""
+    """Check reverse-path filtering: strict filtering silently drops packets of a sensor in another subnet."""
     strict = []
     for file in sorted(root.glob("*/rp_filter")):
         try:
@@ -268,7 +268,7 @@ def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterat
 
 
 def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | None = None) -> Iterator[Finding]:
-    """The RoboClaw's serial port is there and may be opened."""
+    """Check that the RoboClaw's serial port exists and may be opened."""
     if devices is None:
         from serial.tools.list_ports import comports as devices
     assert devices is not None
@@ -293,14 +293,14 @@ def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | No
 
 
 def check_camera(expectation: Expectation) -> Iterator[Finding]:
-    """The Theta answers on its Web API."""
+    """Check that the Theta answers on its Web API."""
     import requests
 
     url = expectation.camera_url.rstrip("/")
     missing = FAIL if expectation.real_devices else WARN
     try:
         with requests.Session() as session:
-            session.trust_env = False  # a proxy has no way to a camera in the local network
+            session.trust_env = False  # a proxy cannot reach a camera in the local network
             reply = session.get(f"{url}/osc/info", timeout=2.0)
         info = reply.json() if reply.status_code == 200 else {}
     except (requests.RequestException, ValueError) as error:
@@ -316,7 +316,7 @@ def check_camera(expectation: Expectation) -> Iterator[Finding]:
 
 
 def check_lidar(expectation: Expectation) -> Iterator[Finding]:
-    """Packets of a VLP-16 arrive."""
+    """Check that packets of a VLP-16 arrive."""
     subject = f"lidar udp {expectation.lidar_port}"
     missing = FAIL if expectation.real_devices else WARN
     try:

@@ -1,4 +1,4 @@
-"""What ``ic doctor`` says of a stack that runs: the faults that its nodes tell, and what to do about them."""
+"""The part of ``ic doctor`` for a running stack: faults reported by its nodes, and what to do about them."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ ADVICE: tuple[tuple[str, str], ...] = (
     ("path follower", "look at navigator (ic log navigator)"),
     ("v-bot", "look at virtual_robot (ic log virtual_robot)"),
 )
-"""Words of a fault, and what to do; the first that fits."""
+"""Pattern in a fault's text → advice; the first match counts."""
 
 
 def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
-    """The faults that the nodes of a running stack tell within some seconds of its time; nothing where none runs."""
+    """Faults that running nodes report within some seconds of the stack's time; nothing where no node runs."""
     from instant_ic.cli.observer import Observer
 
     nodes = registry.list_nodes(run_dir)

@@ -1,8 +1,8 @@
-"""What a command raises when the user can do something about it."""
+"""The error a command raises for a problem that the user can solve."""
 
 
 class UserError(Exception):
-    """Told in one line, without a trace; the process ends with ``status``."""
+    """Printed as one line without a traceback; the process exits with ``status``."""
 
     def __init__(self, message: str, status: int = 1) -> None:
         super().__init__(message)

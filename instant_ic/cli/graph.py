@@ -1,4 +1,4 @@
-"""Nodes and topics as a picture (SVG, PNG), as text for graphviz and mermaid, and as a tree for the terminal."""
+"""The graph of nodes and topics: as an image (SVG, PNG), graphviz or mermaid text, or a tree for the terminal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events", "/clock")
-"""Topics of every node, which say nothing of how the stack hangs together."""
+"""Topics that every node has; they do not show how the stack is connected."""
 TRANSFORMS = ("/tf", "/tf_static")
 
 _FORMATS = ("svg", "png", "pdf", "dot", "mmd")
@@ -16,13 +16,13 @@ _FORMATS = ("svg", "png", "pdf", "dot", "mmd")
 
 @dataclass
 class StackGraph:
-    """Who publishes and who reads what.
+    """Which node publishes and which node subscribes to each topic.
 
     Attributes:
-        nodes: name → state (``running``, ...; empty where nothing is known).
+        nodes: name → state (``running``, ...; empty where unknown).
         topics: topic → type.
-        publishes: (node, topic) → rate, or None where it is not known.
-        subscribes: (topic, node) → messages lost on the way.
+        publishes: (node, topic) → rate in Hz, or None where unknown.
+        subscribes: (topic, node) → messages lost.
         hidden: topics that were left out.
     """
 
@@ -33,7 +33,7 @@ class StackGraph:
     hidden: list[str] = field(default_factory=list)
 
     def readers(self, topic: str) -> list[str]:
-        """Nodes that read a topic."""
+        """Nodes that subscribe to a topic."""
         return [node for name, node in self.subscribes if name == topic]
 
 
@@ -47,11 +47,11 @@ def make_graph(
     """Graph of the running nodes.
 
     Args:
-        infos: nodes as the registry has them.
+        infos: nodes listed in the registry.
         beats: node → its newest heartbeat, where there is one.
-        only: nodes to show with what they share with others; empty shows all.
-        show_all: also what every node has, and topics without a publisher or a reader.
-        transforms: also /tf and /tf_static.
+        only: nodes to show, with their topics and the nodes they exchange messages with; empty shows all.
+        show_all: also show topics that every node has, and topics without a publisher or a subscriber.
+        transforms: also show /tf and /tf_static.
     """
     graph = StackGraph()
     published: dict[str, list[str]] = {}
@@ -89,10 +89,10 @@ def make_graph(
 
 
 def write(graph: StackGraph, path: Path) -> None:
-    """Writes a picture or a text, by the ending of the file's name.
+    """Write the graph as an image or text; the file suffix selects the format.
 
     Raises:
-        ValueError: of another ending.
+        ValueError: the suffix is not supported.
         OSError: the file cannot be written.
     """
     kind = path.suffix.lstrip(".").lower()
@@ -109,14 +109,14 @@ def write(graph: StackGraph, path: Path) -> None:
 
 
 def rate_words(rate_hz: float | None) -> str:
-    """``10 Hz``, ``0.5 Hz``; empty where nothing flows, or nothing is known of it."""
+    """``10 Hz``, ``0.5 Hz``; empty where the rate is zero or unknown."""
     if not rate_hz:
         return ""
     return f"{rate_hz:.0f} Hz" if rate_hz >= 9.5 else f"{rate_hz:.1f} Hz"
 
 
 def tree(graph: StackGraph) -> str:
-    """Each node with what it publishes, and to whom."""
+    """Tree of the nodes, the topics each one publishes and their subscribers."""
     lines: list[str] = []
     for node, state in graph.nodes.items():
         lines.append(node + (f"  ({state})" if state not in ("", "running") else ""))
@@ -138,7 +138,7 @@ def tree(graph: StackGraph) -> str:
 
 
 def dot(graph: StackGraph) -> str:
-    """Text for graphviz."""
+    """The graph in graphviz's DOT language."""
     lines = [
         "digraph stack {",
         "  rankdir=LR; node [fontname=Helvetica, fontsize=10]; edge [fontname=Helvetica, fontsize=8];",
@@ -156,7 +156,7 @@ def dot(graph: StackGraph) -> str:
 
 
 def mermaid(graph: StackGraph) -> str:
-    """Text for mermaid, as Markdown pages show it."""
+    """The graph as a mermaid flowchart, which Markdown pages can show."""
     keys = {name: f"v{number}" for number, name in enumerate([*graph.nodes, *graph.topics])}
     lines = ["flowchart LR"]
     lines += [f'  {keys[node]}["{node}"]' for node in graph.nodes]

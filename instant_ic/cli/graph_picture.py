@@ -1,4 +1,4 @@
-"""The graph of nodes and topics as a picture: a box for each node, its topics as rows, wires between the rows."""
+"""The graph of nodes and topics as an image: a box per node, its topics as rows, wires between the rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _STATE_COLOURS = {
 _TEXT, _DIM, _RATE, _LOST, _BOX = "#1d2733", "#7a8694", "#2e7d4f", "#c62828", "#f7f9fb"
 _WIRES = ("#4c78a8", "#b07a2a", "#3f8f6b", "#8a5fa8", "#a8554c", "#4f8fa0", "#7a7f35", "#95577f", "#5b6b8c", "#9a6a4f")
 _FONT = "DejaVu Sans Mono"
-_CHARACTER = 0.602  # width of one of its characters, in font sizes
+_CHARACTER = 0.602  # width of a character of the font, in units of the font size
 _NAME, _ROW, _SMALL = 11.0, 8.0, 6.8  # points
 _HEAD, _LINE, _PAD = 21.0, 13.0, 6.0
 _LAYER_GAP, _BOX_GAP = 64.0, 22.0
@@ -31,19 +31,19 @@ _LAYER_GAP, _BOX_GAP = 64.0, 22.0
 
 @dataclass
 class _Box:
-    """A node: its size, and its rows from top to bottom as (topic, whether it goes out)."""
+    """A node: its size, and its rows from top to bottom as (topic, is_output)."""
 
     width: float
     height: float
     rows: list[tuple[str, bool]] = field(default_factory=list)
 
     def row_y(self, topic: str, out: bool) -> float:
-        """Middle of a row, below the middle of the box."""
+        """Vertical offset of a row's centre from the centre of the box, downwards."""
         return -self.height / 2 + _HEAD + _PAD / 2 + (self.rows.index((topic, out)) + 0.5) * _LINE
 
 
 def draw(graph: StackGraph, path: Path) -> None:
-    """Draws the graph with matplotlib, layers left to right."""
+    """Draw the graph with matplotlib, layers from left to right."""
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -58,7 +58,7 @@ def draw(graph: StackGraph, path: Path) -> None:
     linked = {end for wire in wires for end in wire[:2]}
     heights = {node: box.height for node, box in boxes.items() if node in linked}
     layout = lay_out(wires, heights, _BOX_GAP)
-    for _ in range(2):  # rows by where their wires lead, then the boxes by where their rows are
+    for _ in range(2):  # sort the rows by where their wires lead, then place the boxes by their rows
         _sort_rows(layout, boxes)
         settle(layout, heights, _BOX_GAP, _ports(layout, boxes))
     x, columns, total = _columns(layout, boxes)
@@ -97,7 +97,7 @@ def _box(graph: StackGraph, node: str) -> _Box:
 
 
 def _beside(graph: StackGraph, node: str, topic: str, out: bool) -> str:
-    """What stands beside a topic: the rate at which it goes out, the losses with which it comes in."""
+    """Label beside a topic: its rate for an output, its losses for an input."""
     if out:
         return rate_words(graph.publishes[node, topic])
     lost = graph.subscribes[topic, node]
@@ -105,7 +105,7 @@ def _beside(graph: StackGraph, node: str, topic: str, out: bool) -> str:
 
 
 def _sort_rows(layout: Layout, boxes: dict[str, _Box]) -> None:
-    """Inputs first, then outputs, each by the height to which its wires lead."""
+    """Sort the rows: inputs first, then outputs, each by the height of its wires' other ends."""
     leads: dict[tuple[str, str, bool], list[float]] = defaultdict(list)
     for (source, target, topic), course in layout.course.items():
         leads[source, topic, True].append(layout.y[course[1]])
@@ -129,7 +129,7 @@ def _ports(layout: Layout, boxes: dict[str, _Box]) -> dict[tuple[Wire, bool], fl
 
 
 def _columns(layout: Layout, boxes: dict[str, _Box]) -> tuple[dict[str, float], dict[int, float], float]:
-    """Middle of each box and bend, width of each layer, and of all together."""
+    """Horizontal centre of each box and bend, width of each layer, and total width."""
     x: dict[str, float] = {}
     widths: dict[int, float] = {}
     left = 0.0
@@ -141,7 +141,7 @@ def _columns(layout: Layout, boxes: dict[str, _Box]) -> tuple[dict[str, float], 
 
 
 def _place_alone(boxes: dict[str, _Box], linked: set[str], layout: Layout, x: dict[str, float]) -> None:
-    """Boxes without a wire stand in a line under the others."""
+    """Place boxes without wires in lines below the others."""
     heights = [y + (boxes[name].height / 2 if name in boxes else 0.0) for name, y in layout.y.items()]
     bottom = max(heights, default=-_BOX_GAP) + _BOX_GAP
     left = 0.0
@@ -178,7 +178,7 @@ def _draw_wires(
     columns: dict[int, float],
     colours: dict[str, str],
 ) -> None:
-    """Each piece once, though several wires of a topic run through it; level within layers, an S between them."""
+    """Draw each segment once, even where several wires of a topic share it: level in a layer, an S between layers."""
     drawn: set[tuple[Any, ...]] = set()
     for (source, target, topic), course in layout.course.items():
         lost = graph.subscribes.get((topic, target), 0)

@@ -1,4 +1,4 @@
-"""The newest heartbeat of each node, for the verbs that show what the nodes tell of themselves."""
+"""The newest heartbeat of each node, for the commands that show the state of nodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from instant_ic.msg import deserialize
 TYPE = "instant_ic_msgs/msg/NodeStatus"
 STATES = ("starting", "running", "degraded", "failed", "stopping")
 SILENT_AFTER_S = 3.0
-"""A node without a heartbeat for longer than this is called silent."""
+"""A node without a heartbeat for longer than this is stale (state ``silent``)."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Flow:
     """One topic in or out of a node.
 
     Attributes:
-        rate_hz: messages a second.
-        age_s: since the newest message; inf before the first.
+        rate_hz: messages per second.
+        age_s: time since the newest message; inf before the first.
     """
 
     rate_hz: float
@@ -34,19 +34,19 @@ class Flow:
 
 @dataclass
 class Heartbeat:
-    """What a node last told of itself.
+    """Newest status of a node.
 
     Attributes:
         node: its name.
-        pid: of its process.
-        state: a word of ``STATES``.
-        message: its worst diagnosis in words; empty when all is well.
+        pid: process id.
+        state: one of ``STATES``.
+        message: text of its worst diagnosis; empty when all is well.
         cpu_percent: of one core.
         rss_mb: resident memory.
-        inputs: topic → what comes in.
-        outputs: topic → what goes out.
-        lost: (topic, publisher) → messages lost on the way in.
-        seen_s: monotonic time when the heartbeat came.
+        inputs: topic → flow of a subscription.
+        outputs: topic → flow of a publisher.
+        lost: (topic, publisher) → messages that this node has lost.
+        seen_s: monotonic time at which the heartbeat arrived.
     """
 
     node: str
@@ -67,7 +67,7 @@ class Heartbeat:
 
 
 def from_message(message: Any) -> Heartbeat:
-    """A NodeStatus message."""
+    """Heartbeat from a NodeStatus message."""
     flows = zip(message.inputs, message.input_rates_hz, message.input_ages_s, strict=True)
     sent = zip(message.outputs, message.output_rates_hz, message.output_ages_s, strict=True)
     lost = zip(message.lost_topics, message.lost_publishers, message.lost_counts, strict=True)
@@ -86,7 +86,7 @@ def from_message(message: Any) -> Heartbeat:
 
 
 class Heartbeats:
-    """Listens to the heartbeats of every node in a run directory, whatever its namespace; a context manager."""
+    """Context manager that listens to the heartbeats of every node in a run directory, in every namespace."""
 
     def __init__(self, run_dir: Path) -> None:
         self.run_dir = run_dir
@@ -94,18 +94,18 @@ class Heartbeats:
         self._observer: Observer | None = None
 
     def __enter__(self) -> Heartbeats:
-        """Starts to listen."""
+        """Start listening."""
         topics = {info.topic for info in registry.list_topics(self.run_dir) if info.type_name == TYPE}
         self._observer = Observer(sorted(topics | {"/heartbeat"}), run_dir=self.run_dir)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Lets go of the bus."""
+        """Disconnect from the bus."""
         if self._observer is not None:
             self._observer.__exit__(None, None, None)
 
     def listen(self, seconds: float, until: Collection[str] = ()) -> dict[str, Heartbeat]:
-        """Takes in what comes for some time, or until every node named has been heard; the newest of each node."""
+        """Listen for some time, or until all the named nodes were heard; return the newest heartbeat of each node."""
         assert self._observer is not None
         for batch in self._observer.batches(seconds, 0.1):
             for received in batch:
@@ -118,7 +118,7 @@ class Heartbeats:
 
 
 def hear(run_dir: Path, nodes: Collection[str], seconds: float = 1.5) -> dict[str, Heartbeat]:
-    """The heartbeats of some nodes; those that stay silent for ``seconds`` are missing."""
+    """Heartbeats of the given nodes, without those that send none within ``seconds``."""
     if not nodes:
         return {}
     with Heartbeats(run_dir) as heartbeats:

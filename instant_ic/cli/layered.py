@@ -1,8 +1,8 @@
 """Layered drawing of a directed graph (Sugiyama's method): layers left to right, few crossings, short edges.
 
-Cycles are opened by turning a few edges round, layers follow from the longest path, edges over several layers get a
-bend in each, the order within the layers is improved by medians, and the heights are those nearest to the neighbours'
-that keep the distances.
+Steps: break cycles by reversing a few edges; assign layers by the longest path; give an edge over several layers a bend
+in each; improve the order within the layers by medians; set the heights as close to the neighbours' as the minimum
+distances allow.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from itertools import pairwise
 
 Edge = tuple[str, str]
 Wire = tuple[str, str, str]
-"""Source, target, and what runs there: wires of one source and one kind share their bends."""
+"""Source, target and kind. Wires with the same source and kind share their bends."""
 
 
 @dataclass
 class Layout:
-    """Places of the vertices and courses of the wires.
+    """Positions of the vertices and routes of the wires.
 
     Attributes:
-        layer: vertex → number of its layer, from the left.
-        order: layer → its vertices from top to bottom, bends of long wires among them (:func:`is_bend`).
-        y: vertex → height, in the unit of the sizes given; grows downwards.
-        course: wire → the vertices it runs through, from its source to its target.
+        layer: vertex → index of its layer, from the left.
+        order: layer → its vertices from top to bottom, including the bends of long wires (:func:`is_bend`).
+        y: vertex → vertical position, downwards, in the unit of the given sizes.
+        course: wire → the vertices on its route, from source to target.
     """
 
     layer: dict[str, int] = field(default_factory=dict)
@@ -35,13 +35,13 @@ class Layout:
 
 
 def lay_out(wires: Sequence[Wire], height: Mapping[str, float], gap: float, sweeps: int = 24) -> Layout:
-    """Places the vertices of a graph.
+    """Compute the layout of a graph.
 
     Args:
-        wires: each once; source and target are vertices.
-        height: vertex → its height; vertices without wires are placed, too.
-        gap: between two vertices of a layer.
-        sweeps: rounds of improving the order.
+        wires: without duplicates; source and target are vertices.
+        height: vertex → its height; vertices without wires are placed too.
+        gap: distance between two vertices of a layer.
+        sweeps: number of sweeps that improve the order.
     """
     edges = list(dict.fromkeys((source, target) for source, target, _ in wires if source != target))
     layout = Layout(_layers(list(height), _open_cycles(list(height), edges)))
@@ -50,7 +50,7 @@ def lay_out(wires: Sequence[Wire], height: Mapping[str, float], gap: float, swee
         source, target, kind = wire
         first, last = layout.layer[source], layout.layer[target]
         step = 1 if last > first else -1
-        # The side is part of the name: one kind may run both ways from its source.
+        # The direction is part of the name: wires of one kind may leave their source to both sides.
         bends = [f"\0{source} {kind} {step} {layer}" for layer in range(first + step, last, step)]
         for layer, bend in zip(range(first + step, last, step), bends, strict=True):
             layout.layer.setdefault(bend, layer)
@@ -64,13 +64,13 @@ def lay_out(wires: Sequence[Wire], height: Mapping[str, float], gap: float, swee
 
 
 def settle(layout: Layout, height: Mapping[str, float], gap: float, ports: Mapping[tuple[Wire, bool], float]) -> None:
-    """Sets the heights for wires that begin and end beside the middles of their vertices.
+    """Set the vertical positions for wires that join their vertices above or below the centre.
 
     Args:
-        layout: whose order stays.
+        layout: its order is kept, its ``y`` is replaced.
         height: vertex → its height.
-        gap: between two vertices of a layer.
-        ports: (wire, True at its target) → how far below the middle of the vertex it joins; 0 where not given.
+        gap: distance between two vertices of a layer.
+        ports: (wire, True at its target) → offset of the joint below the centre of the vertex; default 0.
     """
     pulls: dict[Edge, tuple[float, float]] = {}
     for wire, course in layout.course.items():
@@ -83,12 +83,12 @@ def settle(layout: Layout, height: Mapping[str, float], gap: float, ports: Mappi
 
 
 def is_bend(vertex: str) -> bool:
-    """Whether a vertex of a layout is only a bend of an edge."""
+    """Whether a vertex of a layout is a bend of an edge."""
     return vertex.startswith("\0")
 
 
 def _open_cycles(vertices: Sequence[str], edges: Sequence[Edge]) -> list[Edge]:
-    """The edges, some turned round so that no cycle is left (greedy heuristic of Eades, Lin and Smyth, 1993)."""
+    """Edges, some reversed so that no cycle remains (greedy heuristic of Eades, Lin and Smyth, 1993)."""
     after: dict[str, set[str]] = {vertex: set() for vertex in vertices}
     before: dict[str, set[str]] = {vertex: set() for vertex in vertices}
     for source, target in edges:
@@ -117,7 +117,7 @@ def _open_cycles(vertices: Sequence[str], edges: Sequence[Edge]) -> list[Edge]:
 
 
 def _layers(vertices: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
-    """Longest path from the left; what has only successors then moves up to the nearest of them."""
+    """Assign layers by the longest path; then move a vertex with no more inputs than outputs next to a successor."""
     after: dict[str, list[str]] = defaultdict(list)
     before: dict[str, list[str]] = defaultdict(list)
     for source, target in edges:
@@ -139,7 +139,7 @@ def _layers(vertices: Sequence[str], edges: Sequence[Edge]) -> dict[str, int]:
 
 
 def _order(layer: Mapping[str, int], links: Sequence[Edge], sweeps: int) -> list[list[str]]:
-    """Orders within the layers with few crossings: medians of the neighbours, to and fro, the best one kept."""
+    """Order the layers for few crossings: sweep both ways by the neighbours' medians and keep the best order."""
     neighbours: dict[str, dict[int, list[str]]] = defaultdict(lambda: {-1: [], 1: []})
     for source, target in links:
         neighbours[source][1].append(target)
@@ -174,11 +174,11 @@ def _swap(
     layer: Mapping[str, int],
     neighbours: Mapping[str, dict[int, list[str]]],
 ) -> list[list[str]]:
-    """Exchanges of two neighbours within a layer, for as long as one takes crossings away."""
+    """Swap neighbours within a layer as long as a swap removes crossings."""
     place = {v: i for row in order for i, v in enumerate(row)}
 
     def crossed(upper: str, lower: str) -> int:
-        """Crossings between the edges of two neighbours, less those with the two exchanged."""
+        """Number of crossings that swapping two neighbours would remove."""
         count = 0
         for side in (-1, 1):
             for a in neighbours[upper][side]:
@@ -218,10 +218,10 @@ def _heights(
     gap: float,
     rounds: int = 40,
 ) -> dict[str, float]:
-    """Heights as near as can be to where the neighbours pull, with the distances kept."""
+    """Vertical positions as close to the neighbours' as the minimum distances allow."""
     neighbours: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for (source, target), (below, end) in pulls.items():
-        # Two bends in a row are a wire's straight middle: they hold each other more than they hold a vertex.
+        # Two consecutive bends are the straight middle of a wire: they attract each other more than a vertex.
         times = 4 if is_bend(source) and is_bend(target) else 1
         neighbours[source] += [(target, end - below)] * times
         neighbours[target] += [(source, below - end)] * times
@@ -247,19 +247,19 @@ def _heights(
 
 
 def nearest(wanted: Sequence[float], apart: Sequence[float]) -> list[float]:
-    """Numbers in order, at least ``apart`` from each other, with the least sum of squared distances to those wanted.
+    """Ascending numbers, at least ``apart`` from each other, with the least squared distance to those wanted.
 
-    Without the distances this is isotonic regression, which pooling adjacent violators solves; the distances are taken
-    off first and put back at the end.
+    Without the minimum distances this is isotonic regression, solved by pooling adjacent violators. The distances are
+    subtracted first and added back at the end.
 
     Args:
-        wanted: (n,) where each would be on its own.
-        apart: (n - 1,) least distance between each and the next.
+        wanted: (n,) preferred values.
+        apart: (n - 1,) minimum distance between each value and the next.
     """
     shift = [0.0] if wanted else []
     for distance in apart:
         shift.append(shift[-1] + distance)
-    pools: list[tuple[float, int]] = []  # mean and number of what hangs together
+    pools: list[tuple[float, int]] = []  # mean and size of each pool
     for value, moved in zip(wanted, shift, strict=True):
         mean, count = value - moved, 1
         while pools and pools[-1][0] > mean:

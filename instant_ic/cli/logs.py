@@ -1,4 +1,4 @@
-"""Log lines of the nodes: out of the launcher's files, and live from ``/rosout`` where there is no file."""
+"""Log lines of the nodes: from the launcher's files, and live from ``/rosout`` where there is no file."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _COLOURS = {"DEBUG": "2", "WARNING": "33", "ERROR": "31", "CRITICAL": "1;31"}
 
 @dataclass
 class LogLine:
-    """One entry of a log; a trace belongs to the line before it.
+    """One log entry; a traceback belongs to the entry before it.
 
     Attributes:
         stamp_s: seconds since the epoch.
-        level: a word of ``LEVELS``.
-        node: who said it.
-        text: what was said; several lines for a trace.
+        level: one of ``LEVELS``.
+        node: the node that logged it.
+        text: the message; several lines for a traceback.
     """
 
     stamp_s: float
@@ -34,7 +34,7 @@ class LogLine:
 
 
 def level_number(word: str) -> int:
-    """Place of a level in ``LEVELS``.
+    """Index of a level in ``LEVELS``.
 
     Raises:
         ValueError: there is no such level.
@@ -48,12 +48,12 @@ def level_number(word: str) -> int:
 def parse(text: str, node: str, end_s: float) -> list[LogLine]:
     """Lines of a node's log file.
 
-    The lines carry the time of day alone. The last one was written just before ``end_s``; where the time of day of a
-    line is later than that of the next, midnight lies between them.
+    The lines carry the time of day without a date. The last one was written just before ``end_s``. Where a line has a
+    later time of day than the next one, midnight lies between them.
 
     Args:
-        text: of the file.
-        node: whose it is: what does not look like a log line (a library's own output) is taken for this node's.
+        text: content of the file.
+        node: owner of the file; a line in another format (output of a library) is attributed to it.
         end_s: when the file was last written, seconds since the epoch.
     """
     lines: list[LogLine] = []
@@ -83,7 +83,7 @@ def parse(text: str, node: str, end_s: float) -> list[LogLine]:
 
 
 def show(line: LogLine, colour: bool) -> str:
-    """A line for the terminal."""
+    """Format a line for the terminal."""
     stamp = datetime.fromtimestamp(line.stamp_s).strftime("%H:%M:%S.%f")[:-3]
     if not colour:
         return f"{stamp} {line.level:<7} {line.node}: {line.text}"
@@ -93,7 +93,7 @@ def show(line: LogLine, colour: bool) -> str:
 
 
 class LogFile:
-    """A log file that grows, and that a new start of its node replaces."""
+    """A growing log file, which is replaced when its node restarts."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -103,7 +103,7 @@ class LogFile:
         self._partial = b""
 
     def new_lines(self) -> list[LogLine]:
-        """What has been written since the last call; at first all of it."""
+        """Lines written since the last call; the first call returns all of them."""
         try:
             with self.path.open("rb") as file:
                 status = os.fstat(file.fileno())
@@ -114,7 +114,7 @@ class LogFile:
         except FileNotFoundError:
             return []
         self._offset += len(data)
-        # A line that is not complete yet is shown with its rest.
+        # An incomplete line waits for its rest.
         whole, separator, rest = (self._partial + data).rpartition(b"\n")
         self._partial = rest
         return parse((whole + separator).decode(errors="replace"), self.node, status.st_mtime)
@@ -125,7 +125,7 @@ class LogFolder:
 
     Args:
         folder: ``RUN_DIR/log``.
-        nodes: only these; empty takes all.
+        nodes: read only the files of these; empty reads all.
     """
 
     def __init__(self, folder: Path, nodes: Collection[str] = ()) -> None:
@@ -134,7 +134,7 @@ class LogFolder:
         self._files: dict[Path, LogFile] = {}
 
     def new_lines(self) -> list[LogLine]:
-        """What has been written since the last call, in the order of time."""
+        """Lines of all files written since the last call, sorted by time."""
         for path in sorted(self._folder.glob("*.log")):
             if not self._nodes or path.stem in self._nodes:
                 self._files.setdefault(path, LogFile(path))
@@ -142,7 +142,7 @@ class LogFolder:
         return sorted(lines, key=lambda line: line.stamp_s)
 
     def has(self, node: str, since_s: float) -> bool:
-        """Whether a node that was started at ``since_s`` writes into a file here."""
+        """Whether a node that was started at ``since_s`` has a log file here."""
         try:
             return (self._folder / f"{node}.log").stat().st_mtime >= since_s
         except FileNotFoundError:
@@ -150,12 +150,12 @@ class LogFolder:
 
 
 def chosen(lines: Iterable[LogLine], level: int, since_s: float = 0.0) -> Iterator[LogLine]:
-    """Lines of at least a level and an age."""
+    """Lines of at least a level, not older than ``since_s``."""
     return (line for line in lines if LEVELS.index(line.level) >= level and line.stamp_s >= since_s)
 
 
 def from_rosout(message: object, now_s: float | None = None) -> LogLine:
-    """A line of ``/rosout`` (rcl_interfaces/Log)."""
+    """Log line from a ``/rosout`` message (rcl_interfaces/Log)."""
     from instant_ic.msg import stamp_ns
 
     level = min(max(int(message.level) // 10 - 1, 0), len(LEVELS) - 1)  # type: ignore[attr-defined]

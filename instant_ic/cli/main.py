@@ -1,6 +1,6 @@
-"""The ``ic`` command: one module a verb in ``instant_ic.cli.commands``, each with ``add_parser(subparsers)``.
+"""The ``ic`` command. Each module of ``instant_ic.cli.commands`` is a verb, with ``add_parser(subparsers)``.
 
-A verb's module imports what it needs inside its functions, so that ``ic --help`` stays quick. Exit status: 0 done,
+These modules import their dependencies inside their functions, which keeps ``ic --help`` fast. Exit status: 0 done,
 1 failed, 2 wrong usage.
 """
 
@@ -35,7 +35,7 @@ _EPILOG = """examples:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The command line with every verb."""
+    """Build the parser with every verb."""
     parser = argparse.ArgumentParser(
         prog="ic", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -51,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit status."""
+    """Run one command; return the exit status."""
     words = sys.argv[1:] if argv is None else argv
     with _quiet_end() if words[:1] == ["launch"] else nullcontext():
         return _main(argv)
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextmanager
 def _quiet_end() -> Iterator[None]:
-    """A signal before the stack is up ends ``ic launch`` as one after it does: cleanly, with status 0."""
+    """End ``ic launch`` cleanly, with status 0, on a signal that arrives before the stack is up."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -77,7 +77,7 @@ def _quiet_end() -> Iterator[None]:
 
 def _main(argv: Sequence[str] | None) -> int:
     parser = build_parser()
-    if "_ARGCOMPLETE" in os.environ:  # the shell asks what may come next
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks for completions
         import argcomplete
 
         argcomplete.autocomplete(parser)
@@ -104,7 +104,7 @@ def _call(args: argparse.Namespace) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        # Our own error classes carry words for the user; anything else is a bug and keeps its trace.
+        # Our own error classes carry a message for the user; anything else is a bug and keeps its traceback.
         if not type(error).__module__.startswith("instant_ic."):
             raise
         print(f"ic: {error}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""A message out of YAML as the user types it; every mistake is told with the path of its field."""
+"""Messages built from YAML that the user types; an error names the path of the field."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _BASE, _NAME, _ARRAY, _SEQUENCE = 1, 2, 3, 4
 
 TIME = "builtin_interfaces/msg/Time"
 HEADER = "std_msgs/msg/Header"
-QUATERNION = "geometry_msgs/msg/Quaternion"  # its w is 1 where nothing is given, as its definition says
+QUATERNION = "geometry_msgs/msg/Quaternion"  # its w defaults to 1, as its definition says
 
 
 def parse(text: str, name: str) -> Any:
-    """YAML text as the values of a message.
+    """Parse YAML text into the values of a message.
 
     Raises:
         UserError: it is not YAML, or not a mapping.
@@ -43,7 +43,7 @@ def parse(text: str, name: str) -> Any:
 
 
 def fields(name: str) -> list[tuple[str, Any]]:
-    """Fields of a message type, with rosbags' descriptions of their types.
+    """Fields of a message type, with their types as rosbags describes them.
 
     Raises:
         UserError: there is no such type.
@@ -59,18 +59,18 @@ def fields(name: str) -> list[tuple[str, Any]]:
 
 
 def build(name: str, values: Any, now_ns: int, path: str = "") -> Any:
-    """A message with the given values; fields that are not given are zero or empty.
+    """Build a message from the given values; other fields are zero or empty.
 
-    ``header: auto`` and ``stamp: now`` take the present time.
+    ``header: auto`` and ``stamp: now`` take the current time.
 
     Args:
-        name: type of the message, full or short.
+        name: message type, full or short.
         values: mapping of field → value.
-        now_ns: for ``auto`` and ``now``.
-        path: of this message within the whole, for errors.
+        now_ns: current time for ``auto`` and ``now``.
+        path: path of this message in the outermost one, for errors.
 
     Raises:
-        UserError: a field is unknown, or its value does not fit; the words name its path.
+        UserError: a field is unknown, or its value does not fit; the message names the path of the field.
     """
     known = dict(fields(name))
     full = type_name(message_type(name))
@@ -147,7 +147,7 @@ def _scalar(base: str, most: int, value: Any, path: str) -> Any:
                 raise UserError(f"{path} must have at most {most} characters (got {len(value)})", 2)
             return value
     elif base in _FLOATS:
-        if isinstance(value, (int, float, str)) and not isinstance(value, bool):  # YAML 1.1 takes 1e-3 for a word
+        if isinstance(value, (int, float, str)) and not isinstance(value, bool):  # YAML 1.1 reads 1e-3 as a string
             try:
                 return float(value)
             except (ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""Messages as text: YAML-like for people, long arrays shortened; a line of CSV or JSON for programs."""
+"""Messages as text: YAML-like with long arrays shortened for people, a line of CSV or JSON for programs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class Style:
     """How much of a message is shown.
 
     Attributes:
-        full: long arrays and strings in full.
-        length: values of an array, or tens of characters of a string, from which on it is shortened.
-        arrays: whether the values of arrays are shown.
-        strings: whether strings are shown.
+        full: show long arrays and strings in full.
+        length: shorten arrays above this many values, and strings above ten times as many characters.
+        arrays: show the values of arrays.
+        strings: show strings.
     """
 
     full: bool = False
@@ -29,10 +29,10 @@ class Style:
 
 
 def field(message: Any, path: str) -> Any:
-    """A field by dotted path; an index picks from a list or array (``transforms.0.transform``).
+    """Field by dotted path; an index selects an entry of a list or array (``transforms.0.transform``).
 
     Raises:
-        AttributeError: no such field; the message names those that there are.
+        AttributeError: there is no such field; the message lists the existing ones.
     """
     value = message
     for part in path.split(".") if path else []:
@@ -54,7 +54,7 @@ def _fields(message: Any) -> list[tuple[str, Any]]:
 
 
 def describe(value: Any, style: Style | None = None, indent: str = "") -> str:
-    """A message, or a field of one, as indented lines."""
+    """Format a message, or a field of one, as indented lines."""
     style = style or Style()
     if dataclasses.is_dataclass(value):
         lines = []

@@ -1,4 +1,4 @@
-"""Names of topics and nodes that the user types: found in the registry, or told what is near."""
+"""Look up topic and node names that the user types; an unknown name gets a suggestion."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def absolute(topic: str) -> str:
 
 
 def near(name: str, known: Iterable[str], otherwise: str) -> str:
-    """``did you mean 'x'?`` where a known name is near, else ``otherwise``."""
+    """``did you mean 'x'?`` where a known name is similar, else ``otherwise``."""
     close = difflib.get_close_matches(name, list(known), n=1)
     return f"did you mean {close[0]!r}?" if close else otherwise
 
 
 def topic_types() -> dict[str, str]:
-    """Every topic that is published or subscribed → its type (``any`` where only readers of any type know it)."""
+    """Every published or subscribed topic → its type (``any`` where all its subscribers accept any type)."""
     run_dir = paths.run_dir()
     types = {info.topic: info.type_name for info in registry.list_topics(run_dir)}
     for node in registry.list_nodes(run_dir):
@@ -33,12 +33,12 @@ def topic_types() -> dict[str, str]:
 
 
 def unknown_topic(topic: str, known: Iterable[str]) -> str:
-    """What is told of a topic that nobody publishes."""
+    """Message for a topic that no node publishes."""
     return f"nobody publishes {topic} ({near(topic, known, 'ic topic list shows what there is')})"
 
 
 def nobody_runs() -> str:
-    """What is told where no node runs; stacks in folders of the run directory (a fleet's robots) are named."""
+    """Message for a run directory without running nodes; it names stacks in its subfolders (robots of a fleet)."""
     run_dir = paths.run_dir()
     inside = [folder.parent for folder in sorted(run_dir.glob("*/nodes")) if registry.list_nodes(folder.parent)]
     hint = f"; nodes run in {', '.join(map(str, inside))}: ic --run-dir {inside[0]} ..." if inside else ""
@@ -49,7 +49,7 @@ def find_node(name: str) -> registry.NodeInfo:
     """A running node.
 
     Raises:
-        UserError: there is none of that name.
+        UserError: no running node has that name.
     """
     nodes = {node.name: node for node in registry.list_nodes(paths.run_dir())}
     if name.strip("/") not in nodes:

@@ -1,4 +1,4 @@
-"""Eyes on the bus for commands: raw subscriptions without being a node."""
+"""Raw subscriptions for commands, which are not nodes."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _CLOCK = "/clock"
 
 
 class Observer:
-    """Listens to topics; a context manager.
+    """Context manager that subscribes to topics.
 
     Args:
-        topics: one name or several, with or without the leading slash.
-        use_sim_time: arrival times and :meth:`now_ns` are those of ``/clock``.
+        topics: one or several names, with or without the leading slash.
+        use_sim_time: take arrival times and :attr:`clock` from ``/clock``.
         run_dir: run directory of the stack.
 
     Raises:
-        RegistryError: the run directory cannot be used, or a name is not legal.
+        RegistryError: the run directory cannot be used, or a name is invalid.
     """
 
     def __init__(self, topics: str | Sequence[str], use_sim_time: bool = False, run_dir: Path | None = None) -> None:
@@ -39,7 +39,7 @@ class Observer:
         self.topics = list(dict.fromkeys(absolute(name) for name in names))
         self.clock: Clock = ManualClock() if use_sim_time else SystemClock()
         self._run_dir = run_dir or paths.run_dir()
-        registry.prepare(self._run_dir)  # before anything in it is believed
+        registry.prepare(self._run_dir)  # checks its owner before any content is used
         try:
             pace.use(pace.read(self._run_dir))
         except pace.PaceError as error:
@@ -57,21 +57,21 @@ class Observer:
         return self.transport.subscribe(topic, None, RELIABLE, self._ready.set)
 
     def __enter__(self) -> Observer:
-        """The observer itself."""
+        """Return the observer itself."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Lets go of the bus."""
+        """Disconnect from the bus."""
         self.transport.close()
 
     def lost_by(self, topic: str) -> dict[str, int]:
-        """Publisher → messages of a topic that were lost on the way here."""
+        """Publisher → messages of a topic that were lost before they arrived here."""
         return self.subscriptions[topic].stats.lost_by
 
     def batches(self, duration_s: float, period_s: float) -> Iterator[list[Received]]:
-        """What came, at least every ``period_s`` (then maybe empty), for ``duration_s`` in all."""
+        """Yield arrived messages for ``duration_s``, at least every ``period_s`` (the list may then be empty)."""
         end_s = time.monotonic() + duration_s
         while (left_s := end_s - time.monotonic()) > 0:
             self._ready.wait(min(period_s, left_s))
@@ -80,20 +80,20 @@ class Observer:
             yield [received for topic in self.topics for received in self.subscriptions[topic].take()]
 
     def follow_clock(self) -> None:
-        """Sets the clock to the newest ``/clock``, where simulated time is used."""
+        """Set the clock to the newest ``/clock`` message where simulated time is used."""
         for received in self._sim_clock.take() if self._sim_clock is not None else ():
             assert isinstance(self.clock, ManualClock)
             self.clock.set(stamp_ns(deserialize(received.payload, received.type_name).clock))
 
     def hint(self) -> None:
-        """Says on the error output which of the topics nobody publishes yet."""
+        """Print to standard error which of the topics have no publisher yet."""
         known = {info.topic for info in registry.list_topics(self._run_dir)}
         for topic in self.topics:
             if topic not in known:
                 print(f"ic: {unknown_topic(topic, known)}; waiting for it", file=sys.stderr)
 
     def nothing_heard(self, seconds: float) -> UserError:
-        """The error of a command that heard nothing, with what is likely the reason."""
+        """Error for a command that received nothing, with the likely reason."""
         known = {info.topic for info in registry.list_topics(self._run_dir)}
         missing = [topic for topic in self.topics if topic not in known]
         silent = [topic for topic in self.topics if topic in known]

@@ -1,4 +1,4 @@
-"""How far a long command is: a bar in a terminal, a line each tenth elsewhere."""
+"""Progress of a long command: a bar in a terminal, a line per 10 % elsewhere."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-_QUIET_S = 5.0  # a command that is done so soon needs no lines
+_QUIET_S = 5.0  # a command that ends within this time prints no lines
 
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """Gives a function to call with the share that is done, 0 to 1; shown on the error output."""
+    """Yield a function that takes the completed share, 0 to 1, and shows it on standard error."""
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import Progress

@@ -1,4 +1,4 @@
-"""Keys and a status line for a command that runs until Ctrl-C; does nothing where there is no terminal."""
+"""Keys and a status line for a command that runs until Ctrl-C. Without a terminal it does nothing."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _CLEAR_LINE = "\r\x1b[K"
 
 
 class Terminal:
-    """Reads keys and keeps one line up to date, from a thread of its own.
+    """Reads keys and updates a status line, in its own thread.
 
     Args:
-        keys: key (a character, or ``up``, ``down``, ``left``, ``right``) → what it does.
-        line: text of the status line.
-        period_s: how often it is drawn anew.
+        keys: key (a character, or ``up``, ``down``, ``left``, ``right``) → its action.
+        line: returns the text of the status line.
+        period_s: update period of the status line.
     """
 
     def __init__(self, keys: Mapping[str, Callable[[], Any]], line: Callable[[], str], period_s: float = 0.2) -> None:
@@ -38,11 +38,11 @@ class Terminal:
         self._lock = threading.Lock()
 
     def start(self) -> None:
-        """Takes the terminal, if standard input and error output are one and this process stands in front."""
+        """Take over the terminal if stdin and stderr are terminals and this process is in the foreground."""
         if not (sys.stdin.isatty() and sys.stderr.isatty()) or not self._in_front():
             return
         self._before = termios.tcgetattr(sys.stdin)
-        tty.setcbreak(sys.stdin)  # keys come at once; Ctrl-C stays a signal
+        tty.setcbreak(sys.stdin)  # keys arrive without Enter; Ctrl-C remains a signal
         for handler in logging.getLogger().handlers:
             if isinstance(handler, logging.StreamHandler) and handler.stream is sys.stderr:
                 self._streams.append((handler, handler.stream))
@@ -51,7 +51,7 @@ class Terminal:
         self._thread.start()
 
     def close(self) -> None:
-        """Gives the terminal back."""
+        """Restore the terminal."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join(2.0)
@@ -74,7 +74,7 @@ class Terminal:
                 width = os.get_terminal_size(sys.stderr.fileno()).columns or 80
                 sys.stderr.write(_CLEAR_LINE + self._line()[: max(1, width - 1)])
                 sys.stderr.flush()
-            # A process sent to the background would be stopped by reading.
+            # Reading would stop a process in the background.
             if not self._in_front():
                 self._stop.wait(self._period_s)
                 continue
@@ -83,7 +83,7 @@ class Terminal:
                 self._on_keys(os.read(sys.stdin.fileno(), 64).decode(errors="replace"))
 
     def _on_keys(self, text: str) -> None:
-        for key in _KEY.findall(text):  # several, when they were pressed quickly
+        for key in _KEY.findall(text):  # one read can return several keys
             try:
                 self._keys.get(ARROWS.get(key, key), lambda: None)()
             except ValueError as error:
@@ -91,7 +91,7 @@ class Terminal:
 
 
 class _AboveTheLine:
-    """A stream whose lines take the place of the status line, which comes again below them."""
+    """Stream whose lines replace the status line; the status line is then written again below them."""
 
     def __init__(self, stream: TextIO, lock: threading.Lock) -> None:
         self._stream = stream

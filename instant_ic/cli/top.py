@@ -1,4 +1,4 @@
-"""What ``ic top`` shows: a row for each node, from its heartbeat, its process and the table of nominal rates."""
+"""Rows of ``ic top``: one per node, from its heartbeat, its process and the table of nominal rates."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ if TYPE_CHECKING:
     from instant_ic.launch.topics import TopicRate
 
 EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events")
-"""Topics that every node has: left out of the rates."""
+"""Topics that every node has; excluded from the rates."""
 
 
 @dataclass(frozen=True)
 class TopicRow:
-    """A topic in or out of a node.
+    """An input or output topic of a node.
 
     Attributes:
         topic: its name.
-        rate_hz: messages a second.
-        age_s: since the newest message; inf before the first.
-        nominal_hz: expected rate; None where nothing is known.
-        fault: what is wrong in words; empty when nothing is.
+        rate_hz: messages per second.
+        age_s: time since the newest message; inf before the first.
+        nominal_hz: expected rate; None where unknown.
+        fault: text of the fault; empty where there is none.
     """
 
     topic: str
@@ -42,16 +42,16 @@ class NodeRow:
 
     Attributes:
         node: its name.
-        pid: of its process.
-        state: as in its heartbeat; ``silent`` or ``busy`` where there is none.
-        message: its worst diagnosis, or what is wrong with its rates.
-        cpu_percent: of one core, over the time since the last look.
+        pid: process id.
+        state: from its heartbeat; ``silent`` or ``busy`` where there is none.
+        message: its worst diagnosis, else the faults of its rates.
+        cpu_percent: percent of one core since the last measurement.
         rss_mb: resident memory.
-        threads: how many there are.
-        outputs: what it sends.
-        inputs: what it gets.
-        lost: messages lost on the way in.
-        up_s: since its start.
+        threads: number of threads.
+        outputs: published topics.
+        inputs: subscribed topics.
+        lost: messages that the node has lost.
+        up_s: time since its start.
     """
 
     node: str
@@ -76,20 +76,20 @@ SORT_KEYS: dict[str, Callable[[NodeRow], Any]] = {
 
 
 class Processes:
-    """CPU, memory and threads of processes, asked of the system: also of a node that hangs."""
+    """CPU, memory and threads of processes, read from the operating system: also available for a hanging node."""
 
     def __init__(self) -> None:
         self._known: dict[int, Any] = {}
 
     def begin(self, pid: int) -> None:
-        """Counts the CPU of a process that is new from now on."""
+        """Start measuring the CPU of a process that is not known yet."""
         if pid not in self._known:
             self.look(pid)
 
     def look(self, pid: int) -> tuple[float, float, int]:
-        """CPU in percent of one core since the last look, memory in MB, number of threads.
+        """CPU in percent of one core since the last call, memory in MB, number of threads.
 
-        The CPU is nan at the first look; (nan, nan, 0) when there is no such process.
+        The CPU is nan at the first call; the result is (nan, nan, 0) when there is no such process.
         """
         import psutil
 
@@ -113,14 +113,14 @@ def make_rows(
     nominal: Callable[[str], TopicRate | None],
     now_ns: int,
 ) -> list[NodeRow]:
-    """Rows of the nodes that run.
+    """Rows of the running nodes.
 
     Args:
-        infos: nodes as the registry has them.
+        infos: nodes listed in the registry.
         beats: node → its newest heartbeat.
-        look: CPU, memory and threads of a process.
-        nominal: expected rate of a topic.
-        now_ns: the machine's time.
+        look: returns CPU, memory and threads of a process.
+        nominal: returns the expected rate of a topic.
+        now_ns: system time.
     """
     rows = []
     for info in infos:
@@ -158,7 +158,7 @@ def _topics(flows: Mapping[str, Flow], nominal: Callable[[str], TopicRate | None
 
 
 def rate_words(row: TopicRow) -> str:
-    """``9.8/10`` (measured and nominal), ``9.8``, or ``-`` where nothing flows."""
+    """``9.8/10`` (measured and nominal), ``9.8``, or ``-`` where the rate is zero."""
     if row.rate_hz <= 0:
         return "-" if row.nominal_hz is None else f"-/{row.nominal_hz:g}"
     measured = f"{row.rate_hz:.0f}" if row.rate_hz >= 19.5 else f"{row.rate_hz:.1f}"
@@ -166,7 +166,7 @@ def rate_words(row: TopicRow) -> str:
 
 
 def expected_rate(topic: str) -> TopicRate | None:
-    """Nominal rate of a topic, also of one in a namespace; None where nothing is known."""
+    """Nominal rate of a topic, with or without a namespace; None where unknown."""
     from instant_ic.launch.topics import nominal_rate
 
     return nominal_rate(topic) or nominal_rate(topic, topic.split("/")[1])
@@ -200,7 +200,7 @@ def cells(row: NodeRow, topics: bool = True) -> list[str]:
 
 
 def plain_table(rows: Sequence[NodeRow]) -> str:
-    """The rows for a pipe or a log: columns of spaces, the rates after them."""
+    """Table for a pipe or a log: columns aligned with spaces, rates in lines below each node."""
     table = [[*HEADINGS[:7], "MESSAGE"], *([*cells(row)[:7], row.message] for row in rows)]
     widths = [max(len(line[column]) for line in table) for column in range(7)]
     lines = []
@@ -220,7 +220,7 @@ def plain_table(rows: Sequence[NodeRow]) -> str:
 
 
 def as_json(rows: Sequence[NodeRow]) -> list[dict[str, Any]]:
-    """The rows as plain values; what is not known is null."""
+    """Rows as plain values; unknown values are null."""
     from dataclasses import asdict
 
     def clean(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""The live table of ``ic top``: drawn by rich, steered by single keys."""
+"""The live table of ``ic top``: rendered by rich, controlled by single keys."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _KEYS = {"c": "cpu", "m": "memory", "n": "name", "l": "lost"}
 
 
 def table(rows: Sequence[NodeRow], sort: str, inputs: bool = False) -> Group:
-    """The nodes as a table, and a line over it.
+    """Table of the nodes, with a summary above and the keys below.
 
     Args:
-        rows: one a node.
+        rows: one per node.
         sort: a key of ``SORT_KEYS``.
-        inputs: whether to show what comes in as well as what goes out.
+        inputs: show the rates of inputs as well as outputs.
     """
     shown = Table(box=None, pad_edge=False, header_style="bold reverse", expand=True)
     for heading in HEADINGS:
@@ -61,14 +61,14 @@ def _flows(rows: Sequence[TopicRow]) -> Text:
     text = Text()
     for row in rows:
         if row.rate_hz > 0 or row.fault:
-            rate = f"\u00a0{rate_words(row)}"  # a space that does not part the rate from its topic
+            rate = f"\u00a0{rate_words(row)}"  # a no-break space keeps the rate beside its topic
             text.append(row.topic, style="dim").append(rate, style="red" if row.fault else "").append("  ")
     return text
 
 
 @contextmanager
 def _single_keys() -> Iterator[None]:
-    """Keys come at once and are not shown, for as long as the block runs."""
+    """Read keys without Enter and without echo inside the block."""
     descriptor = sys.stdin.fileno()
     before = termios.tcgetattr(descriptor)
     tty.setcbreak(descriptor)
@@ -79,11 +79,11 @@ def _single_keys() -> Iterator[None]:
 
 
 def run(rows: Callable[[float], list[NodeRow]], period_s: float, sort: str) -> int:
-    """Shows the table until ``q`` or Ctrl-C.
+    """Show the table until ``q`` or Ctrl-C.
 
     Args:
-        rows: called with the seconds it may take to listen; gives the newest rows.
-        period_s: between two pictures.
+        rows: returns the newest rows; its argument is the listening time in seconds.
+        period_s: update period.
         sort: a key of ``SORT_KEYS``.
     """
     inputs = False

@@ -1,4 +1,4 @@
-"""``ic topic info``: who publishes and reads a topic, how fast, and what is lost between them."""
+"""``ic topic info``: publishers and subscribers of a topic, rates, and losses between them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from instant_ic.cli.names import absolute, near, topic_types
 
 
 def show(name: str, verbose: bool) -> int:
-    """Prints one topic.
+    """Print one topic.
 
     Raises:
-        UserError: nobody publishes or subscribes it.
+        UserError: the topic has neither publisher nor subscriber.
     """
     run_dir = paths.run_dir()
     topic = absolute(name)
@@ -48,7 +48,7 @@ def _show_verbose(
 
     run_dir = paths.run_dir()
     nodes = {node.name: node for node in registry.list_nodes(run_dir)}
-    # Commands such as ic topic pub publish, too, but have no heartbeat.
+    # Commands such as ic topic pub publish too, but have no heartbeat.
     beats = hear(run_dir, {p.node for p in publishers if p.node in nodes} | {node.name for node in readers})
     nominal = expected_rate(topic)
     expected = f" (nominal {nominal.rate_hz:g} Hz{f', {nominal.when}' if nominal.when else ''})" if nominal else ""

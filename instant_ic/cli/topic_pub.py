@@ -1,4 +1,4 @@
-"""``ic topic pub``: messages from the command line, checked before the first is sent."""
+"""``ic topic pub``: publish messages from the command line. All values are checked before the first is sent."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from instant_ic.cli.observer import Observer
 from instant_ic.msg import message_type, type_name
 
 _QOS = {"sensor": SENSOR, "reliable": RELIABLE, "latched": LATCHED}
-_KEEP_S = 0.2  # the last message is still on its way when the last one is published
+_KEEP_S = 0.2  # time for the last message to arrive before the publisher closes
 
 
 def publish(args: argparse.Namespace) -> int:
-    """Publishes messages until Ctrl-C, or as many as were asked for.
+    """Publish messages until Ctrl-C, or the given number of them.
 
     Raises:
-        UserError: the type, a value or the topic does not fit; a node commands the robot there; nobody listens.
+        UserError: the type, a value or the topic does not fit; a node already commands the robot on this topic; no
+            subscriber appeared.
     """
     topic = registry.check_topic(absolute(args.topic))
-    fields(args.type)  # tells of an unknown type
+    fields(args.type)  # raises for an unknown type
     full = type_name(message_type(args.type))
     values = parse(args.values, full)
-    build(full, values, time.time_ns())  # tells of values that do not fit
+    build(full, values, time.time_ns())  # raises for values that do not fit
     _check_topic(topic, full, args.force)
     if topic.endswith("/estop") and not values.get("data") and not args.force:
         raise UserError(

@@ -1,4 +1,4 @@
-"""``ic topic echo``, ``hz``, ``bw``, ``delay``: messages as they come, and figures of them once a second."""
+"""``ic topic echo``, ``hz``, ``bw``, ``delay``: print messages as they arrive, or statistics once a second."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from instant_ic.msg import MessageError, deserialize, stamp_ns
 
 
 def echo(args: argparse.Namespace) -> int:
-    """Prints messages.
+    """Print messages.
 
     Raises:
-        UserError: the field does not exist, or fewer messages than asked for came in time.
+        UserError: the field does not exist, or fewer messages than requested arrived in time.
     """
     wanted = 1 if args.once else args.n
     style = Style(args.full_length, args.truncate_length, not args.no_arr, not args.no_str)
@@ -48,7 +48,7 @@ def echo(args: argparse.Namespace) -> int:
 
 
 def rate(args: argparse.Namespace) -> int:
-    """Prints the rate of each topic, once a second."""
+    """Print the rate of each topic once a second."""
     with Observer(args.topic, args.use_sim_time) as observer:
         rates = {topic: Rate(args.window) for topic in observer.topics}
         _watch(
@@ -76,7 +76,7 @@ class _Bandwidth:
         sizes, stamps = self.sizes.values, self.stamps.values
         if not sizes:
             return "no message yet"
-        # From the first message to now, so that silence counts too.
+        # From the first message to now, so that a pause lowers the result.
         per_s = sum(sizes) / max(time.monotonic() - stamps[0], 1e-3)
         return (
             f"{size_words(per_s)}/s from {len(sizes)} messages  size mean: {size_words(fmean(sizes))} "
@@ -85,7 +85,7 @@ class _Bandwidth:
 
 
 def bandwidth(args: argparse.Namespace) -> int:
-    """Prints bytes a second of each topic, once a second."""
+    """Print the bandwidth of each topic once a second."""
     with Observer(args.topic) as observer:
         flows = {topic: _Bandwidth(args.window) for topic in observer.topics}
         _watch(
@@ -100,7 +100,7 @@ def bandwidth(args: argparse.Namespace) -> int:
 
 
 def delay(args: argparse.Namespace) -> int:
-    """Prints how old messages are by their stamp when they come, once a second.
+    """Print the age of messages on arrival, by their stamp, once a second.
 
     Raises:
         UserError: a message has no header with a stamp.
@@ -118,7 +118,7 @@ def delay(args: argparse.Namespace) -> int:
                 stamp = stamp_ns(message)
             except MessageError:
                 raise UserError(f"{received.topic}: a {received.type_name} has no stamp, so it has no age", 2) from None
-            if received.received_ns:  # simulated time has begun
+            if received.received_ns:  # simulated time has started
                 delays[received.topic].add((received.received_ns - stamp) / 1e9)
 
         def line(topic: str) -> str:
@@ -132,7 +132,7 @@ def delay(args: argparse.Namespace) -> int:
 
 
 def _watch(observer: Observer, duration_s: float, take: Callable[[Received], None], line: Callable[[str], str]) -> None:
-    """Prints a line a topic each second, and at the end."""
+    """Print a line per topic each second and at the end."""
     observer.hint()
     width = max(len(topic) for topic in observer.topics) if len(observer.topics) > 1 else 0
 

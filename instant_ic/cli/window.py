@@ -1,4 +1,4 @@
-"""Figures over the newest values: what ``ic topic hz``, ``bw`` and ``delay`` print."""
+"""Statistics over the newest values, for ``ic topic hz``, ``bw`` and ``delay``."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from statistics import fmean, pstdev
 
 
 class Window:
-    """The newest values.
+    """Sliding window over the newest values.
 
     Args:
-        size: how many.
+        size: maximum number of values.
     """
 
     def __init__(self, size: int) -> None:
@@ -19,12 +19,12 @@ class Window:
         self.count = 0
 
     def add(self, value: float) -> None:
-        """Takes a value; the oldest goes when the window is full."""
+        """Add a value; drop the oldest when the window is full."""
         self.values.append(value)
         self.count += 1
 
     def spread(self) -> str:
-        """Minimum, maximum, standard deviation of values in seconds, and how many there are."""
+        """Text with minimum, maximum and standard deviation of values in seconds, and their number."""
         values = self.values
         return f"min: {min(values):.4f}s max: {max(values):.4f}s std dev: {pstdev(values):.5f}s window: {len(values)}"
 
@@ -33,7 +33,7 @@ class Rate:
     """Rate of a topic from the arrival times of its messages.
 
     Args:
-        size: messages that count.
+        size: number of messages in the window.
     """
 
     def __init__(self, size: int) -> None:
@@ -42,7 +42,7 @@ class Rate:
         self._last_ns: int | None = None
 
     def add(self, received_ns: int) -> None:
-        """Takes the arrival of one message; time that goes back (a bag that starts anew) begins a new count."""
+        """Add the arrival of one message; restart the count when time jumps back (a bag that loops)."""
         self.count += 1
         if self._last_ns is not None and received_ns < self._last_ns:
             self.gaps.values.clear()
@@ -62,13 +62,13 @@ class Rate:
 
 
 def losses(lost_by: Mapping[str, int]) -> str:
-    """Messages lost, and whose they were: ``3 (vlp16_driver 3)``."""
+    """Number of lost messages, by publisher: ``3 (vlp16_driver 3)``."""
     by = ", ".join(f"{publisher} {count}" for publisher, count in sorted(lost_by.items()))
     return f"{sum(lost_by.values())} ({by})" if by else "0"
 
 
 def size_words(size: float) -> str:
-    """Bytes as people read them: ``1.25 MB``."""
+    """Number of bytes with a unit: ``1.25 MB``."""
     for factor, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
         if size >= factor:
             return f"{size / factor:.2f} {unit}"

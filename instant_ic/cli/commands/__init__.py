@@ -1,1 +1,1 @@
-"""One module a verb of `ic`, each with ``add_parser(subparsers)``."""
+"""One module per verb of `ic`, each with ``add_parser(subparsers)``."""

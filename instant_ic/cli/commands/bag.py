@@ -1,4 +1,4 @@
-"""``ic bag``: record, play, look at, compare, convert and rescue bags."""
+"""``ic bag``: record, play, inspect, compare, convert and recover bags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _VALUES = {"step": "count", "rate": "rate", "seek": "offset_s"}
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "bag",
         help="record, play, inspect, compare, convert and recover bags",
@@ -185,7 +185,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def tolerances(parser: argparse.ArgumentParser) -> None:
-    """What a comparison forgives."""
+    """Add the tolerance options of a comparison."""
     parser.add_argument("--ignore", action="append", default=[], metavar="TOPIC", help="leave out; name or pattern")
     parser.add_argument("--atol", type=_seconds, default=0.0, metavar="X", help="numbers may differ by this")
     parser.add_argument("--rtol", type=_seconds, default=0.0, metavar="X", help="and by this share")
@@ -218,7 +218,7 @@ def _files(parser: argparse.ArgumentParser) -> None:
 
 
 def size(text: str) -> int:
-    """Bytes of ``1000000``, ``500MB``, ``2GB``, ``1.5GiB``."""
+    """Parse a size into bytes: ``1000000``, ``500MB``, ``2GB``, ``1.5GiB``."""
     units = {"": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
     number = text.strip().upper()
     unit = number.lstrip("0123456789.").strip()
@@ -240,15 +240,15 @@ def _seconds(text: str) -> float:
 
 
 def topic_names(names: list[str]) -> list[str]:
-    """Names as they stand in a bag: a slash may be left out on the command line."""
+    """Topic names with their leading slash, which is optional on the command line."""
     return [name if name.startswith(("/", "*")) else f"/{name}" for name in names]
 
 
 def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
-    """``a:=b`` words.
+    """Arguments of the form ``a:=b`` as a dictionary.
 
     Raises:
-        UserError: a word of another form.
+        UserError: an argument has another form.
     """
     found = {}
     for word in words:
@@ -260,10 +260,10 @@ def pairs(words: list[str], separator: str, option: str) -> dict[str, str]:
 
 
 def argument_of(command: str, value: float | None) -> dict[str, Any]:
-    """Arguments of a command to a node.
+    """Arguments of a control command for a node.
 
     Raises:
-        UserError: a value is missing, or there is none to give.
+        UserError: a value is missing, or the command takes none.
     """
     if command in _VALUES:
         if value is None and command != "step":

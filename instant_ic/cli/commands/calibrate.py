@@ -1,4 +1,4 @@
-"""``ic calibrate``: where the sensors are on the robot, from a recording."""
+"""``ic calibrate``: sensor mounts from a recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds ``calibrate`` to the ``ic`` command."""
+    """Add ``calibrate`` to the ``ic`` command."""
     parser = subparsers.add_parser(
         "calibrate",
         help="mounts of the sensors from a recording",
@@ -51,7 +51,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def camera_lidar(args: argparse.Namespace) -> int:
-    """Runs ``ic calibrate camera-lidar``; returns the exit status."""
+    """Run ``ic calibrate camera-lidar``; return the exit status."""
     from instant_ic.calibration.bag import Selection, read_recording
     from instant_ic.calibration.mount import CalibrationConfig, calibrate
 
@@ -92,7 +92,7 @@ def camera_lidar(args: argparse.Namespace) -> int:
 
 
 def _guess(text: str) -> Matrix:
-    """``camera_from_lidar`` of the camera's pose on the LiDAR."""
+    """``camera_from_lidar`` from the camera's pose in the LiDAR frame."""
     import numpy as np
 
     from instant_ic.geometry.poses import inverse, pose_matrix
@@ -121,7 +121,7 @@ def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: 
     from instant_ic.calibration.mount import AXES
     from instant_ic.geometry.poses import inverse, pose_matrix
 
-    # Without a mount of the LiDAR in the bag: the one of config/lidar.yaml.
+    # Where the bag has no LiDAR mount, use the one of config/lidar.yaml.
     base_from_lidar = recording.base_from_lidar if recording.base_from_lidar is not None else pose_matrix(z=0.6)
     xyz, rpy = _xyz_rpy(base_from_lidar @ inverse(result.camera_from_lidar))
     xyz_before, rpy_before = _xyz_rpy(base_from_lidar @ inverse(given))

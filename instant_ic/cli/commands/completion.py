@@ -1,4 +1,4 @@
-"""``ic completion``: what the shell needs to complete verbs, topics, nodes, parameters, launch files and bags."""
+"""``ic completion``: shell completion of verbs, topics, nodes, parameters, launch files and bags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _HINTS = {
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "completion",
         help="completion for the shell",
@@ -26,7 +26,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Prints the shell's code."""
+    """Print the shell code."""
     import argcomplete
 
     print(argcomplete.shellcode(["ic"], shell=args.shell))

@@ -1,4 +1,4 @@
-"""``ic depth``: train, convert, check and try depth models."""
+"""``ic depth``: train, convert, check and run depth models."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PROVIDERS = ("auto", "tensorrt", "cuda", "cpu")
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds ``depth`` with its own subcommands."""
+    """Add ``depth`` with its own subcommands."""
     parser = subparsers.add_parser(
         "depth",
         help="train, convert, check and try 360° depth models",
@@ -151,7 +151,7 @@ def check(args: argparse.Namespace) -> int:
     model = _load(args)
     took = [time.perf_counter() - begin]
     manifest = model.manifest
-    # Smooth random colours: a picture of one colour would not show an output that is always the same.
+    # Random colour blocks: an image of one colour would not reveal a constant output.
     coarse = np.random.default_rng(0).integers(0, 256, (8, 16, 3), np.uint8)
     picture = coarse.repeat(max(1, manifest.input_height // 8), 0).repeat(max(1, manifest.input_width // 16), 1)
     try:
@@ -201,10 +201,10 @@ def estimate(args: argparse.Namespace) -> int:
     model = _load(args)
     rgb = np.ascontiguousarray(picture[..., ::-1])
     try:
-        model.estimate(rgb)  # the first run allocates; time the second
+        model.estimate(rgb)  # the first run allocates memory; time the second
         begin = time.perf_counter()
         depth = model.estimate(rgb)
-    except ValueError as error:  # ManifestError is one
+    except ValueError as error:  # includes ManifestError
         raise UserError(f"{args.image}: {error}") from error
     except InferenceError as error:
         raise UserError(str(error)) from error

@@ -1,4 +1,4 @@
-"""``ic doctor``: what this machine lacks."""
+"""``ic doctor``: check machine, devices and configuration."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "doctor",
         help="check machine, devices, ports, models and configuration",
@@ -25,7 +25,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs the checks and prints a line each."""
+    """Run the checks and print a line for each."""
     from instant_ic import paths
     from instant_ic.cli.doctor import FAIL, OK, WARN, run_checks
 
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _expectation(args: argparse.Namespace) -> Any:
-    """Addresses from the command line, else as the shipped configuration has them."""
+    """Addresses from the command line, else from the shipped configuration."""
     from instant_ic import paths
     from instant_ic.cli.doctor import Expectation
     from instant_ic.config.params import ParameterError, load_file
@@ -53,7 +53,7 @@ def _expectation(args: argparse.Namespace) -> Any:
         try:
             found = load_file(paths.share_dir("config") / file, node).get(key)
         except (ParameterError, FileNotFoundError):
-            return default  # check_configuration tells what is wrong with the file
+            return default  # check_configuration reports the fault in the file
         return default if found is None else found.value
 
     plain = Expectation()

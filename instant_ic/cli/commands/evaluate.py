@@ -1,6 +1,6 @@
-"""``ic evaluate``: runs the stack or a part of it on recordings and measures what comes out.
+"""``ic evaluate``: run the stack or a part of it on recordings and measure the results.
 
-Each module ``evaluate_*`` beside this one adds a kind by its ``add_kind(kinds)``.
+Each ``evaluate_*`` module of this package adds a kind through its ``add_kind(kinds)``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from instant_ic.cli import commands
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds ``evaluate`` to the ``ic`` command."""
+    """Add ``evaluate`` to the ``ic`` command."""
     parser = subparsers.add_parser(
         "evaluate",
         help="measure the stack on recordings",
@@ -48,7 +48,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def evaluate_recordings(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate recordings``; returns the exit status."""
+    """Run ``ic evaluate recordings``; return the exit status."""
     from rich.console import Console
 
     from instant_ic.experiments.recordings import evaluate_recordings as run

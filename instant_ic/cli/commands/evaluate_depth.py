@@ -1,4 +1,4 @@
-"""``ic evaluate depth``: panoramas with true depth through each source of depth; see ``evaluate``."""
+"""``ic evaluate depth``: estimated depth of panoramas against the true depth, for each depth source."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_kind(kinds: Any) -> None:
-    """Adds ``depth`` to ``ic evaluate``."""
+    """Add ``depth`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "depth",
         help="depth of panoramas against the truth",
@@ -60,7 +60,7 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_depth(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate depth``; returns the exit status."""
+    """Run ``ic evaluate depth``; return the exit status."""
     from instant_ic.cli.progress import progress
     from instant_ic.depth.files import DepthFileError, load_picture
     from instant_ic.depth.manifest import ManifestError

@@ -11,7 +11,7 @@ from typing import Any
 
 
 def add_kind(kinds: Any) -> None:
-    """Adds ``follow`` to ``ic evaluate``."""
+    """Add ``follow`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "follow",
         help="the r-bot behind a v-bot through random rooms, in simulation",
@@ -36,7 +36,7 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate follow``; returns the exit status."""
+    """Run ``ic evaluate follow``; return the exit status."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

@@ -1,4 +1,4 @@
-"""``ic evaluate slam``: a laser log through SLAM; see `instant_ic.cli.commands.evaluate`."""
+"""``ic evaluate slam``: SLAM on a laser log."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def add_kind(kinds: Any) -> None:
-    """Adds ``slam`` to ``ic evaluate``."""
+    """Add ``slam`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "slam",
         help="a 2D laser log through the grid SLAM",
@@ -50,7 +50,7 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate slam``; returns the exit status."""
+    """Run ``ic evaluate slam``; return the exit status."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

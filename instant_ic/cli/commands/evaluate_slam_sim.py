@@ -1,4 +1,4 @@
-"""``ic evaluate slam-sim``: SLAM on the simulated crawler; see `instant_ic.cli.commands.evaluate`."""
+"""``ic evaluate slam-sim``: SLAM on the simulated crawler."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_kind(kinds: Any) -> None:
-    """Adds ``slam-sim`` to ``ic evaluate``."""
+    """Add ``slam-sim`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "slam-sim",
         help="a round trip of the simulated crawler on slipping tracks",
@@ -34,7 +34,7 @@ def add_kind(kinds: Any) -> None:
 
 
 def evaluate_slam_sim(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate slam-sim``; returns the exit status."""
+    """Run ``ic evaluate slam-sim``; return the exit status."""
     from rich.console import Console
     from rich.progress import Progress
 

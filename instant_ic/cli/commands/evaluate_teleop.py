@@ -1,4 +1,4 @@
-"""``ic evaluate teleop``: an operator who looks at goals only, through corridors with obstacles."""
+"""``ic evaluate teleop``: a simulated operator, who only sees goals, drives corridors with obstacles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 
 
 def add_kind(kinds: Any) -> None:
-    """Adds ``teleop`` to ``ic evaluate``."""
+    """Add ``teleop`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "teleop",
         help="an operator drives through corridors with hidden obstacles: illusory control, stopping, shared control",
@@ -80,8 +80,8 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate teleop``; returns the exit status."""
-    # Small matrices: threads of the linear algebra would only fight for the cores. Read when numpy is loaded.
+    """Run ``ic evaluate teleop``; return the exit status."""
+    # The matrices are small: threads of the linear algebra would only compete for cores. Read when numpy loads.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(name, "1")
     from rich.console import Console
@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _wrong_usage(args: argparse.Namespace) -> str:
-    """What is wrong with the words given; "" where nothing is."""
+    """Text of the error in the arguments; empty where there is none."""
     for path in (args.json, args.plot, args.video):
         if path is not None and not path.parent.is_dir():
             return f"{path.parent} is no folder"
@@ -151,7 +151,7 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
 
 
 def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: list[Any]) -> int:
-    """Adds the drives that are missing; what was driven is kept whatever ends it. Returns the exit status."""
+    """Run the missing drives; return the exit status. Finished drives are kept however the run ends."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -166,7 +166,7 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
     planned, known = settings.episodes * len(settings.methods), len(drives)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     status, words = 0, ""
-    # A drive takes minutes on a slow core: the time that remains is told from all of them, not from the last 30 s.
+    # A drive takes minutes on a slow core: estimate the remaining time from all drives, not from the last 30 s.
     day_s = 86400.0
     with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=day_s) as progress:
         task = progress.add_task("driving", total=planned - known)
@@ -199,7 +199,7 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
 
 @contextlib.contextmanager
 def _stopped_by_sigterm() -> Iterator[None]:
-    """SIGTERM ends what is driven as Ctrl-C does."""
+    """Make SIGTERM end the drives as Ctrl-C does."""
 
     def stop(number: int, frame: Any) -> None:
         raise KeyboardInterrupt

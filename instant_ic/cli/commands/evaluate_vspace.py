@@ -1,4 +1,4 @@
-"""``ic evaluate vspace``: how good the virtual space looks away from the panorama, against simpler ways."""
+"""``ic evaluate vspace``: image quality of the virtual space away from the panorama, against simpler methods."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_kind(kinds: Any) -> None:
-    """Adds ``vspace`` to ``ic evaluate``."""
+    """Add ``vspace`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "vspace",
         help="pictures of the virtual space against the truth, by distance and training time",
@@ -54,7 +54,7 @@ def add_kind(kinds: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs ``ic evaluate vspace``; returns the exit status."""
+    """Run ``ic evaluate vspace``; return the exit status."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table

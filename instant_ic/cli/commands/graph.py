@@ -1,4 +1,4 @@
-"""``ic graph``: nodes and topics of the running stack as a picture."""
+"""``ic graph``: nodes and topics of the running stack as a tree or an image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "graph",
         help="picture of nodes and topics",
@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Prints the tree, or writes the picture."""
+    """Print the tree, or write the image."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.graph import make_graph, tree, write

@@ -1,4 +1,4 @@
-"""``ic keys``: keys of this host, and of the hosts that it is linked with."""
+"""``ic keys``: keys of this host and of the hosts it is linked with."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "keys",
         help="keys of the link between robot and station",
@@ -65,7 +65,7 @@ def _store(args: argparse.Namespace) -> KeyStore:
 
 
 def host_name() -> str:
-    """This machine's name as a name of a host here."""
+    """Host name of this machine in the form that the link accepts."""
     import re
     import socket
 
@@ -74,7 +74,7 @@ def host_name() -> str:
 
 
 def make(args: argparse.Namespace) -> int:
-    """Makes the key."""
+    """Create this host's key."""
     from instant_ic.bridge.host_keys import key_text
 
     store = _store(args)
@@ -85,7 +85,7 @@ def make(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Prints this host's key and a line for each allowed host."""
+    """Print this host's key and a line for each allowed host."""
     from instant_ic.bridge.host_keys import key_text
 
     store = _store(args)
@@ -104,7 +104,7 @@ def show(args: argparse.Namespace) -> int:
 
 
 def let_in(args: argparse.Namespace) -> int:
-    """Allows a host; makes this host's own key where there is none, for it is needed next."""
+    """Allow a host; also create this host's own key where it has none, since the link needs it."""
     from instant_ic.bridge.host_keys import Peer, check_name, key_text, parse_key
 
     store = _store(args)
@@ -123,7 +123,7 @@ def let_in(args: argparse.Namespace) -> int:
 
 
 def shut_out(args: argparse.Namespace) -> int:
-    """Takes a host off the list."""
+    """Remove a host from the list."""
     peer = _store(args).revoke(args.name)
     print(f"{peer.name} (fingerprint {peer.fingerprint}) is no longer allowed")
     return 0

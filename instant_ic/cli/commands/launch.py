@@ -1,4 +1,4 @@
-"""``ic launch``: a whole stack from a launch file."""
+"""``ic launch``: start a stack from a launch file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "launch",
         help="start a stack from a launch file",
@@ -53,7 +53,7 @@ def add_parser(subparsers: Any) -> None:
     parse = parser.parse_known_args
 
     def pairs_beside_the_file(words: Any = None, namespace: Any = None) -> Any:
-        """``sim --check a:=b`` too: argparse takes positional words only where they stand together."""
+        """Allow ``sim --check a:=b``: argparse accepts positional arguments only next to each other."""
         first, rest = list(words or [])[:1], list(words or [])[1:]
         if first and not first[0].startswith("-"):
             pairs = [word for word in rest if ":=" in word and not word.startswith("-")]
@@ -64,7 +64,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Reads, checks and runs the file."""
+    """Read, check and run the launch file."""
     from instant_ic import paths
     from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
     from instant_ic.pace import Pace, PaceError

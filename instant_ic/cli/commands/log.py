@@ -1,4 +1,4 @@
-"""``ic log``: what the nodes say, and how much of it."""
+"""``ic log``: log lines and log levels of the nodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _POLL_S = 0.2
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "log",
         help="log lines of the nodes; their log level",
@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Prints lines, or a node's log level."""
+    """Print log lines, or print or set a node's log level."""
     import sys
     import time
 

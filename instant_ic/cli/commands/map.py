@@ -1,4 +1,4 @@
-"""``ic map``: the map of the running stack as a file."""
+"""``ic map``: save the map of the running stack."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SAVE, SAVED = "/slam/save", "/slam/saved"
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds ``map`` to the ``ic`` command."""
+    """Add ``map`` to the ``ic`` command."""
     parser = subparsers.add_parser("map", help="save the map", description="Saves the map of the running stack.")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     save = verbs.add_parser(
@@ -31,7 +31,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def save_map(args: argparse.Namespace) -> int:
-    """Runs ``ic map save``; returns the exit status."""
+    """Run ``ic map save``; return the exit status."""
     from instant_ic.bus import RELIABLE
     from instant_ic.bus.node import Publisher
     from instant_ic.cli.observer import Observer
@@ -55,7 +55,7 @@ def save_map(args: argparse.Namespace) -> int:
             for received in batch:
                 answer = str(deserialize(received.payload, received.type_name).data)
                 if str(name) not in answer and answer.startswith("saved"):
-                    continue  # to somebody else's request
+                    continue  # answers another client's request
                 if not answer.startswith("saved"):
                     raise UserError(answer.removeprefix("error: "))
                 print(answer)

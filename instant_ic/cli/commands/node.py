@@ -1,4 +1,4 @@
-"""``ic node``: which nodes run."""
+"""``ic node``: list and describe running nodes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from instant_ic.cli import completion
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "node", help="list running nodes", description="Tells which nodes run.", epilog="example: ic node list"
     )
@@ -36,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_nodes(args: argparse.Namespace) -> int:
-    """Prints a line a node."""
+    """Print a line per node."""
     import sys
     import time
 
@@ -62,7 +62,7 @@ def list_nodes(args: argparse.Namespace) -> int:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Prints one node."""
+    """Print one node."""
     import math
 
     from instant_ic import paths

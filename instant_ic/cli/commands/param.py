@@ -1,4 +1,4 @@
-"""``ic param``: parameters of running nodes, read and changed."""
+"""``ic param``: read and change parameters of running nodes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "param",
         help="read and change parameters of running nodes",
@@ -68,7 +68,7 @@ def _control(node: str) -> NodeControl:
 
 
 def list_parameters(args: argparse.Namespace) -> int:
-    """Prints names (and values) by node, out of the registry: also where a node hangs."""
+    """Print names (and values) by node, from the registry: this also works for a hanging node."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import find_node, nobody_runs
@@ -85,7 +85,7 @@ def list_parameters(args: argparse.Namespace) -> int:
 
 
 def get_parameter(args: argparse.Namespace) -> int:
-    """Prints one value, or those of a group."""
+    """Print one value, or the values of a group."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 
@@ -107,7 +107,7 @@ def _no_parameter(node: str, key: str, known: Any) -> UserError:
 
 
 def set_parameters(args: argparse.Namespace) -> int:
-    """Changes parameters together."""
+    """Change several parameters in one step."""
     from instant_ic.config import params
 
     words = args.pairs
@@ -127,7 +127,7 @@ def _change(node: str, values: dict[str, Any]) -> int:
 
 
 def describe(args: argparse.Namespace) -> int:
-    """Prints what is known of parameters."""
+    """Print type, range, value, default and meaning of parameters."""
     infos = {info.name: info for info in _control(args.node).describe()}
     chosen: list[ParameterInfo] = []
     for key in args.keys or infos:
@@ -148,7 +148,7 @@ def describe(args: argparse.Namespace) -> int:
 
 
 def dump(args: argparse.Namespace) -> int:
-    """Writes a ROS 2 parameter file."""
+    """Write a ROS 2 parameter file."""
     import yaml
 
     from instant_ic.cli.names import find_node
@@ -174,7 +174,7 @@ def dump(args: argparse.Namespace) -> int:
 
 
 def load(args: argparse.Namespace) -> int:
-    """Changes parameters to those of a file; those that are as in the file need not be live."""
+    """Set the parameters of a file. Parameters that already have the file's value need not be live."""
     from instant_ic.cli.names import find_node
     from instant_ic.config import params
 

@@ -1,4 +1,4 @@
-"""``ic replay``: a bag through nodes in lockstep."""
+"""``ic replay``: replay a bag through nodes in lockstep."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "replay",
         help="feed a bag to nodes in lockstep and record what they make",
@@ -54,7 +54,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replays."""
+    """Run ``ic replay``; return the exit status."""
     from instant_ic.paths import node_names
 
     names = [name for name in args.nodes.split(",") if name]

@@ -1,4 +1,4 @@
-"""``ic run``: one node in the foreground."""
+"""``ic run``: run one node in the foreground."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "run",
         help="run one node in the foreground",
@@ -30,7 +30,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Runs the node in this process."""
+    """Run the node in this process."""
     import sys
 
     from instant_ic.bus.node_files import NodeFileError, load, node_class

@@ -15,7 +15,7 @@ _SORT = ("cpu", "memory", "name", "lost")
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "top",
         help="CPU, memory, rates and losses of every node, live",
@@ -32,7 +32,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _ask(row: NodeRow, run_dir: Path) -> None:
-    """What a node without a heartbeat is doing, by its control channel."""
+    """Ask a node without a heartbeat, through its control channel, what it is doing."""
     from instant_ic.bus.control import ControlError, NodeControl
 
     try:
@@ -45,7 +45,7 @@ def _ask(row: NodeRow, run_dir: Path) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Prints the table, or shows it until it is left."""
+    """Print the table once, or show it until the user quits."""
     import json
     import sys
     import time

@@ -1,4 +1,4 @@
-"""``ic topic``: what goes over the bus."""
+"""``ic topic``: inspect and publish topics."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from instant_ic.cli.errors import UserError
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds the verb."""
+    """Add the verb."""
     parser = subparsers.add_parser(
         "topic",
         help="list, watch, measure and publish topics",
@@ -107,7 +107,7 @@ def add_parser(subparsers: Any) -> None:
 
 
 def list_topics(args: argparse.Namespace) -> int:
-    """Prints a line a topic."""
+    """Print a line per topic."""
     from instant_ic import paths
     from instant_ic.bus import registry
     from instant_ic.cli.names import topic_types
@@ -133,7 +133,7 @@ def list_topics(args: argparse.Namespace) -> int:
 
 
 def show_type(args: argparse.Namespace) -> int:
-    """Prints a type."""
+    """Print the type of a topic."""
     from instant_ic.cli.names import absolute, near, topic_types
 
     types = topic_types()
@@ -144,7 +144,7 @@ def show_type(args: argparse.Namespace) -> int:
 
 
 def find(args: argparse.Namespace) -> int:
-    """Prints the topics of one type."""
+    """Print the topics of one type."""
     from instant_ic.cli.names import topic_types
 
     package, _, short = args.type.rpartition("/")
@@ -156,42 +156,42 @@ def find(args: argparse.Namespace) -> int:
 
 
 def info(args: argparse.Namespace) -> int:
-    """Prints one topic."""
+    """Print one topic."""
     from instant_ic.cli.topic_info import show
 
     return show(args.topic, args.verbose)
 
 
 def echo(args: argparse.Namespace) -> int:
-    """Prints messages."""
+    """Print messages."""
     from instant_ic.cli.topic_watch import echo
 
     return echo(args)
 
 
 def rate(args: argparse.Namespace) -> int:
-    """Prints rates."""
+    """Print rates."""
     from instant_ic.cli.topic_watch import rate
 
     return rate(args)
 
 
 def bandwidth(args: argparse.Namespace) -> int:
-    """Prints bytes a second."""
+    """Print bandwidths."""
     from instant_ic.cli.topic_watch import bandwidth
 
     return bandwidth(args)
 
 
 def delay(args: argparse.Namespace) -> int:
-    """Prints ages."""
+    """Print the age of messages on arrival."""
     from instant_ic.cli.topic_watch import delay
 
     return delay(args)
 
 
 def publish(args: argparse.Namespace) -> int:
-    """Publishes messages."""
+    """Publish messages."""
     from instant_ic.cli.topic_pub import publish
 
     return publish(args)

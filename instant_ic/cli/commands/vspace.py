@@ -1,4 +1,4 @@
-"""``ic vspace``: a virtual space from one panorama: trained, drawn, exported, flown through."""
+"""``ic vspace``: train a virtual space from one panorama; render, export or film it."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from instant_ic.vspace import View, VirtualSpace, VirtualSpaceConfig
 
 DEVICES = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
-"""As in ``VirtualSpaceConfig``, whose module is not loaded for this."""
+"""Same values as in ``VirtualSpaceConfig``; its module is too heavy to import here."""
 PREVIEW = "preview.png"
 PREVIEW_S = 1.0
 _SIZES = {"perspective": (640, 360), "equirect": (1024, 512), "cube": (512, 512)}
 _TRUE_SIGMA, _MODEL_SIGMA = 0.02, 0.1
 _LITTLE = 0.1
-"""Under this share of known pixels a picture is hardly more than a guess."""
+"""Below this share of known pixels an image is little more than a guess."""
 
 
 def numbers(text: str) -> list[float]:
@@ -58,7 +58,7 @@ def degrees(text: str) -> float:
 
 
 def add_parser(subparsers: Any) -> None:
-    """Adds ``vspace`` to the ``ic`` command."""
+    """Add ``vspace`` to the ``ic`` command."""
     parser = subparsers.add_parser(
         "vspace",
         help="a virtual space from one panorama",
@@ -76,7 +76,7 @@ def add_parser(subparsers: Any) -> None:
     _folder(info)
     info.set_defaults(func=info_)
     for verb in verbs.choices.values():
-        # "--pose -1,0,0,90" is no option: argparse itself knows only single negative numbers.
+        # Makes "--pose -1,0,0,90" a value: argparse on its own only recognises single negative numbers.
         verb._negative_number_matcher = re.compile(r"-[\d.]")
 
 
@@ -218,7 +218,7 @@ def train(args: argparse.Namespace) -> int:
 
 
 def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Depth of a panorama in the model's own metres; says so."""
+    """Estimate the depth of a panorama in the model's own metres; print a note about that."""
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
     from instant_ic.paths import shipped_file
 
@@ -231,7 +231,7 @@ def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.fl
 
 
 def _tidied(depth: NDArray[np.float32], camera_height_m: float | None, panorama: Path) -> NDArray[np.float32]:
-    """Estimated depth with level floor and ceiling and upright walls; says where they lie."""
+    """Straighten floor, ceiling and walls of estimated depth; print where floor and ceiling are."""
     from instant_ic.depth.tidy import tidy
 
     try:
@@ -248,7 +248,7 @@ def _tidied(depth: NDArray[np.float32], camera_height_m: float | None, panorama:
 
 
 def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args: argparse.Namespace) -> VirtualSpace:
-    """A space with the panorama as its keyframe, and a schedule as long as asked for."""
+    """Virtual space with the panorama as its keyframe and a schedule of the requested length."""
     import numpy as np
 
     from instant_ic.vspace import VirtualSpace
@@ -265,7 +265,7 @@ def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args:
 
 
 def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
-    """Trains to the end, telling how far it is; whether it was ended early by the user."""
+    """Train to the end and report the progress; return whether the user ended it early."""
     from instant_ic.geometry.poses import pose_matrix
 
     preview = args.out / PREVIEW
@@ -279,21 +279,21 @@ def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
             if begin >= next_preview or space.status.converged:
                 write_picture(preview, space.render(pose_matrix(x=0.5), *_SIZES["perspective"], math.pi / 2).rgb)
                 took = time.monotonic() - begin
-                next_preview = begin + max(PREVIEW_S, 4 * took)  # on a slow machine training comes first
+                next_preview = begin + max(PREVIEW_S, 4 * took)  # on a slow machine, training has priority
     except KeyboardInterrupt:
         return True
     return False
 
 
 def open_space(args: argparse.Namespace) -> VirtualSpace:
-    """The saved space that a command is about."""
+    """Load the saved space given on the command line."""
     from instant_ic.vspace import VirtualSpace
 
     return VirtualSpace.load(args.space, args.device)
 
 
 def placed(space: VirtualSpace, pose: list[float]) -> NDArray[np.float64]:
-    """The pose in the space's map of a pose relative to the panorama's camera, yaw in degrees."""
+    """Transform a pose relative to the panorama's camera (yaw in degrees) into the map of the space."""
     from instant_ic.geometry.poses import pose_matrix
 
     assert space.keyframe is not None
@@ -332,7 +332,7 @@ def render(args: argparse.Namespace) -> int:
 
 
 def _row(faces: NDArray) -> NDArray:
-    """A cube map's faces beside each other; any other picture as it is."""
+    """Faces of a cube map side by side; any other image unchanged."""
     import numpy as np
 
     return np.concatenate(list(faces), axis=1) if len(faces) == 6 else faces
@@ -425,7 +425,7 @@ def info_(args: argparse.Namespace) -> int:
 
 
 def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Writes RGB or grey by the file's suffix, whole or not at all."""
+    """Write an RGB or grey image in the format of the file suffix; never leave a partial file."""
     import cv2
 
     try:
@@ -439,7 +439,7 @@ def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -
 
 
 def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
-    """Writes depth as PNG of 16 bits in millimetres or as ``.npy`` in metres."""
+    """Write depth as a 16-bit PNG in millimetres or as ``.npy`` in metres."""
     import numpy as np
 
     if path.suffix == ".npy":
