@@ -167,9 +167,9 @@ class _Lidar:
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("bag", type=Path, help="folder to make")
+    parser.add_argument("bag", type=Path, help="output folder")
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--quality", type=int, default=80, help="of the pictures' JPEG (default: %(default)s)")
+    parser.add_argument("--quality", type=int, default=80, help="JPEG quality (default: %(default)s)")
     args = parser.parse_args()
     make(args.bag, args.seconds, args.quality)
     with BagReader(args.bag) as reader:

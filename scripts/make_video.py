@@ -30,7 +30,7 @@ CHROMIUM_FLAGS = [
     "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
 CLOCK = """
-// The page lives in the film's time: what is drawn is drawn when the film says so.
+// The page uses the video's time and renders only when the video steps.
 window.filmMs = 1;
 const waiting = [];
 performance.now = () => window.filmMs;
@@ -93,16 +93,16 @@ class Operator:
         self.stack.nodes["console"].on_look(look)
 
     def on_estop(self, stop: bool) -> None:
-        raise RuntimeError("nobody presses the emergency stop in this film")
+        raise RuntimeError("the emergency stop is not used in this video")
 
     def on_record(self, on: bool) -> None:
-        raise RuntimeError("nobody records in this film")
+        raise RuntimeError("recording is not used in this video")
 
     def on_snapshot(self) -> None:
-        raise RuntimeError("nobody takes a snapshot in this film")
+        raise RuntimeError("snapshots are not used in this video")
 
     def on_bookmark(self, name: str) -> None:
-        raise RuntimeError("nobody sets a bookmark in this film")
+        raise RuntimeError("bookmarks are not used in this video")
 
     def export_map(self) -> dict[str, bytes]:
         return {}
@@ -151,14 +151,14 @@ def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args
             page.evaluate("(ms) => film(ms)", 1e3 * (stack.time_s - (1 - part) / args.fps))
         now, state = stack.time_s, stack.state
         if now > LONGEST_S:
-            raise RuntimeError(f"the drive is not over after {LONGEST_S:g} s: {state and state.reason}")
+            raise RuntimeError(f"the drive has not finished after {LONGEST_S:g} s: {state and state.reason}")
         if ready_s is None:
             ready = state is not None and int(state.mode) == ControlState.REAL and vspace_ready(stack)
             drives = page.locator('body[data-driver="you"][data-picture="live"]').count() > 0
             ready_s = now if ready and drives else None
             continue
         frames.append(page.screenshot(type="png"))
-        print(f"\r{len(frames)} pictures, {now - ready_s:.1f} s, {told.mode}   ", end="", file=sys.stderr)
+        print(f"\r{len(frames)} frames, {now - ready_s:.1f} s, {told.mode}   ", end="", file=sys.stderr)
         if pressed_s is None and now > ready_s + 0.8:
             pressed_s = now
             page.keyboard.down("w")
@@ -197,21 +197,23 @@ def write(frames: list[bytes], args: argparse.Namespace) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path, help="where the animated WebP goes")
+    parser.add_argument("out", type=Path, help="animated WebP to write")
     parser.add_argument("--world", default="corridor", help="as for `ic evaluate teleop` (default corridor)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--depth", default="fused", choices=("fused", "lidar"))
-    parser.add_argument("--fps", type=int, default=10, help="pictures a second; 60 must be a multiple (default 10)")
+    parser.add_argument("--fps", type=int, default=10, help="frames per second; must divide 60 (default 10)")
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--height", type=int, default=600)
     parser.add_argument("--out-width", type=int, default=704)
     parser.add_argument("--quality", type=int, default=50)
-    parser.add_argument("--every", type=int, default=2, help="of the pictures made, every which is kept (default 2)")
-    parser.add_argument("--skip-s", type=float, default=4.4, help="seconds left out at the beginning (default 4.4)")
-    parser.add_argument("--speed", type=float, default=1.5, help="how much faster it plays (default 1.5)")
-    parser.add_argument("--after-s", type=float, default=1.5, help="seconds driven on after the way back (default 1.5)")
-    parser.add_argument("--settle-ms", type=int, default=120, help="real time for each picture to arrive (default 120)")
-    parser.add_argument("--frames", type=Path, metavar="DIR", help="also keep the single pictures here")
+    parser.add_argument("--every", type=int, default=2, help="keep every Nth frame (default 2)")
+    parser.add_argument("--skip-s", type=float, default=4.4, help="seconds to skip at the start (default 4.4)")
+    parser.add_argument("--speed", type=float, default=1.5, help="playback speed (default 1.5)")
+    parser.add_argument(
+        "--after-s", type=float, default=1.5, help="seconds to keep driving after the switch back (default 1.5)"
+    )
+    parser.add_argument("--settle-ms", type=int, default=120, help="real time to wait for each frame (default 120)")
+    parser.add_argument("--frames", type=Path, metavar="DIR", help="also write all frames to this folder")
     args = parser.parse_args()
     if round(1 / STEP_S) % args.fps:
         parser.error(f"--fps must divide {round(1 / STEP_S)}")

@@ -29,7 +29,7 @@ _LEFT_OUT = {
     "overflow": "left out because the disk was too slow",
     "disk_full": "left out while the disk was full",
     "paused": "left out while paused",
-    "no_type": "left out, their publisher's type was not known",
+    "no_type": "left out because the publisher's type was unknown",
 }
 
 
@@ -67,7 +67,9 @@ def info(args: argparse.Namespace) -> int:
     if told["recovered_from"]:
         print(f"recovered from {told['recovered_from']}")
     for name in told["unlisted"]:
-        print(f"{name} is in the folder but not in the bag: its recording was cut short: ic bag recover {args.bag}")
+        print(
+            f"{name} is in the folder but not in the index: its recording was cut short. Run ic bag recover {args.bag}"
+        )
     return 0
 
 
@@ -133,7 +135,7 @@ def diff(args: argparse.Namespace) -> int:
     """Compare two bags topic by topic."""
     found = compare(Path(args.a), Path(args.b), tuple(topic_names(args.ignore)), args.common, tolerance_of(args))
     if not found:
-        raise UserError("there is no topic to compare")
+        raise UserError("there are no topics to compare")
     if args.json:
         print(json.dumps([_plain(topic) for topic in found], indent=2))
         return 0 if all(topic.same for topic in found) else 1
@@ -151,7 +153,7 @@ def tolerance_of(args: argparse.Namespace) -> Tolerance:
         try:
             fields[name] = float(text)
         except ValueError:
-            raise UserError(f"--tolerance {name}={text}: {text} is no number", 2) from None
+            raise UserError(f"--tolerance {name}={text}: {text} is not a number", 2) from None
     try:
         return Tolerance(args.atol, args.rtol, fields, tuple(args.ignore_field), args.stamp_tolerance)
     except ValueError as error:
@@ -164,7 +166,7 @@ def print_differences(found: list[TopicDifference]) -> int:
     for topic in found:
         print(f"{topic.topic:<{width}}  {topic.count_a:>6} {topic.count_b:>6}  {topic.first or 'same'}")
         if topic.only_a or topic.only_b:
-            print(f"{'':<{width}}  without partner: {topic.only_a} in the first, {topic.only_b} in the second")
+            print(f"{'':<{width}}  unmatched messages: {topic.only_a} in the first, {topic.only_b} in the second")
         for path, entry in topic.fields.items():
             largest = f"largest difference {entry.largest:.6g}, " if math.isfinite(entry.largest) else ""
             print(f"{'':<{width}}  {path}: {largest}in {entry.messages} messages, first in message {entry.first}")
@@ -197,7 +199,7 @@ def convert(args: argparse.Namespace) -> int:
     print(f"{args.output}: {result.counts.total()} messages in {result.files} files")
     _print_counts(result.counts)
     for type_name, topics in sorted(result.skipped.items()):
-        print(f"left out: {type_name} ({', '.join(topics)}) is not known")
+        print(f"left out: unknown type {type_name} ({', '.join(topics)})")
     return 0
 
 
@@ -208,7 +210,7 @@ def recover(args: argparse.Namespace) -> int:
     result = recover_bag(source, target)
     print(f"{target}: {result.count} messages")
     if result.stopped_by:
-        print(f"reading stopped at the cut: {result.stopped_by}")
+        print(f"the bag ends early: {result.stopped_by}")
     for words in result.damaged:
         print(f"left out, damaged: {words}")
     for topic, why in sorted(result.skipped.items()):

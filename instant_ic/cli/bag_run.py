@@ -48,7 +48,7 @@ def _recorder_terminal(node: Node[Any]) -> Terminal:
         if "bytes" in told:
             words += f"  {told['bytes'] / 1e6:.1f} MB  {told['files']} files   [space] pause"
         else:
-            words += f"  last {told['cached_s']:g} s at hand   [s] snapshot [space] pause"
+            words += f"  last {told['cached_s']:g} s in memory   [s] snapshot [space] pause"
         left_out = sum(told["overflow"].values())
         return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if told["lost"] else "")
 
@@ -68,7 +68,7 @@ def _player_terminal(node: Node[Any]) -> Terminal:
         bar = "█" * round(20 * done) + "·" * (20 - round(20 * done))
         return (
             f"{told['state']:<7} {bar} {told['position_s']:.1f} / {told['length_s']:.1f} s  x{told['rate']:.2g}"
-            "   [space] pause [→] step [↑↓] rate [←] back 5 s [q] end"
+            "   [space] pause [→] step [↑↓] rate [←] back 5 s [q] quit"
         )
 
     keys = {
@@ -85,7 +85,7 @@ def _player_terminal(node: Node[Any]) -> Terminal:
 def record(args: argparse.Namespace) -> int:
     """Run the recorder node in this process."""
     if args.output and Path(args.output).exists() and not args.snapshot:
-        raise UserError(f"{args.output} exists already, not overwriting")
+        raise UserError(f"{args.output} exists already: choose another name with -o")
     words = ["--name", f"bag_recorder_{os.getpid()}"]
     words += _parameters(
         path=args.output,
@@ -187,9 +187,9 @@ def _node(kinds: tuple[str, ...], name: str, *, keeps_snapshots: bool = False) -
         return chosen[0]
     what = " or ".join(kinds)
     if not chosen:
-        others = f" (there are {', '.join(node.name for node in running)})" if running else ""
+        others = f" (running: {', '.join(node.name for node in running)})" if running else ""
         raise UserError(f"no {what}{f' named {name}' if name else ''} runs in {run_dir()}{others}")
-    raise UserError(f"several run, say which with --node: {', '.join(node.name for node in chosen)}", 2)
+    raise UserError(f"several are running, choose one with --node: {', '.join(node.name for node in chosen)}", 2)
 
 
 def _megabytes(size: int) -> int:

@@ -96,9 +96,11 @@ def check_machine(run_dir: Path) -> Iterator[Finding]:
     cores = len(os.sched_getaffinity(0))
     yield _at_least("cores", cores, MIN_CORES, "", "the stack will run at lower rates")
     memory_gb = psutil.virtual_memory().total / 1e9
-    yield _at_least("memory", memory_gb, MIN_MEMORY_GB, " GB", "close other programs, or run station.yaml elsewhere")
+    yield _at_least(
+        "memory", memory_gb, MIN_MEMORY_GB, " GB", "close other programs, or run station.yaml on another machine"
+    )
     disk_gb = shutil.disk_usage(Path.cwd()).free / 1e9
-    yield _at_least("disk", disk_gb, MIN_DISK_GB, " GB free here", "make room before recording bags")
+    yield _at_least("disk", disk_gb, MIN_DISK_GB, " GB free here", "free disk space before recording bags")
     if Path("/dev/shm").is_dir():
         shm_mb = shutil.disk_usage("/dev/shm").free / 1e6
         yield _at_least("/dev/shm", shm_mb, MIN_SHM_MB, " MB free", "in a container: --shm-size=256m")
@@ -111,7 +113,7 @@ def _at_least(subject: str, value: float, least: float, unit: str, advice: str) 
     words = f"{value:.0f}{unit}" if value >= 10 or float(value).is_integer() else f"{value:.1f}{unit}"
     if value >= least:
         return Finding(OK, subject, words)
-    return Finding(WARN, subject, f"{words}, at least {least:g} wanted", advice)
+    return Finding(WARN, subject, f"{words}, at least {least:g} recommended", advice)
 
 
 def _check_run_dir(run_dir: Path) -> Finding:
@@ -121,9 +123,13 @@ def _check_run_dir(run_dir: Path) -> Finding:
         registry.prepare(run_dir)
         longest = registry.topic_dir(run_dir, "/camera/image/compressed") / "depth_estimator.sock"
     except RegistryError as error:
-        return Finding(FAIL, "run directory", str(error), "set INSTANT_IC_RUN_DIR to a folder of your own")
+        return Finding(
+            FAIL, "run directory", str(error), "set INSTANT_IC_RUN_DIR to a folder that only you can write to"
+        )
     if len(os.fsencode(longest)) > 107:
-        return Finding(FAIL, "run directory", f"{run_dir} is too long for sockets", "set INSTANT_IC_RUN_DIR shorter")
+        return Finding(
+            FAIL, "run directory", f"{run_dir} is too long for sockets", "set INSTANT_IC_RUN_DIR to a shorter path"
+        )
     nodes = registry.list_nodes(run_dir)
     return Finding(OK, "run directory", f"{run_dir}, {len(nodes)} nodes running")
 
@@ -148,7 +154,9 @@ def check_packages() -> Iterator[Finding]:
     if missing:
         yield Finding(FAIL, "packages", f"missing: {', '.join(missing)}", f"pip install {' '.join(missing)}")
     else:
-        yield Finding(OK, "packages", f"instant-ic {importlib.metadata.version('instant-ic')} with all that it needs")
+        yield Finding(
+            OK, "packages", f"instant-ic {importlib.metadata.version('instant-ic')} with all its dependencies"
+        )
 
 
 def check_configuration() -> Iterator[Finding]:
@@ -173,7 +181,7 @@ def check_configuration() -> Iterator[Finding]:
             more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
             yield Finding(FAIL, f"launch/{file.name}", problems[0] + more, f"ic launch {file.stem} --check")
         else:
-            yield Finding(OK, f"launch/{file.name}", f"{len(description.nodes)} nodes, parameters are good")
+            yield Finding(OK, f"launch/{file.name}", f"{len(description.nodes)} nodes, parameters are valid")
 
 
 def check_models() -> Iterator[Finding]:
@@ -185,7 +193,9 @@ def check_models() -> Iterator[Finding]:
     except FileNotFoundError:
         models = []
     if not models:
-        yield Finding(FAIL, "models", "there is no model file", "install the package again, or ic depth train")
+        yield Finding(
+            FAIL, "models", "no model file found", "install the package again, or train one with ic depth train"
+        )
         return
     import onnxruntime
 
@@ -215,7 +225,7 @@ def check_ports(expectation: Expectation) -> Iterator[Finding]:
                     WARN,
                     f"{word} port {port}",
                     f"{need}: {error.strerror}",
-                    "a stack already runs, or give another port: ic launch sim --show-args",
+                    "a stack is already running; stop it, or set another port (ic launch sim --show-args)",
                 )
             else:
                 yield Finding(OK, f"{word} port {port}", f"free for the {need}")
@@ -231,7 +241,7 @@ def check_gpu() -> Iterator[Finding]:
     if torch.cuda.is_available():
         yield Finding(OK, "gpu", torch.cuda.get_device_name(0))
     elif Path("/proc/driver/nvidia/version").exists():
-        yield Finding(WARN, "gpu", f"torch {torch.__version__} sees none", "install a CUDA build of torch")
+        yield Finding(WARN, "gpu", f"torch {torch.__version__} cannot use the GPU", "install a CUDA build of torch")
     else:
         yield Finding(OK, "gpu", "none: the virtual space is trained on the CPU")
 
@@ -242,9 +252,7 @@ def check_browser() -> Iterator[Finding]:
     if found:
         yield Finding(OK, "browser", found)
     else:
-        yield Finding(
-            WARN, "browser", "none found here", "open the operator's page from another machine (docs/console.md)"
-        )
+        yield Finding(WARN, "browser", "none found", "open the operator's page from another machine (docs/console.md)")
 
 
 def check_network_filter(root: Path = Path("/proc/sys/net/ipv4/conf")) -> Iterator[Finding]:
@@ -276,11 +284,11 @@ def check_serial(expectation: Expectation, devices: Callable[[], list[Any]] | No
     missing = FAIL if expectation.real_devices else WARN
     if not port.exists():
         others = ", ".join(device.device for device in devices()) or "none"
-        advice = "plug in the RoboClaw, or give serial_port:=... (not needed for sim.yaml)"
-        yield Finding(missing, f"serial {port}", f"does not exist (there are: {others})", advice)
+        advice = "connect the RoboClaw, or set serial_port:=... (not needed for sim.yaml)"
+        yield Finding(missing, f"serial {port}", f"does not exist (available: {others})", advice)
         return
     if os.access(port, os.R_OK | os.W_OK):
-        yield Finding(OK, f"serial {port}", "may be opened")
+        yield Finding(OK, f"serial {port}", "can be opened")
         return
     info = port.stat()
     try:
@@ -304,12 +312,12 @@ def check_camera(expectation: Expectation) -> Iterator[Finding]:
             reply = session.get(f"{url}/osc/info", timeout=2.0)
         info = reply.json() if reply.status_code == 200 else {}
     except (requests.RequestException, ValueError) as error:
-        advice = "join the camera's wireless network, or give camera_url:=... (not needed for sim.yaml)"
+        advice = "join the camera's wireless network, or set camera_url:=... (not needed for sim.yaml)"
         yield Finding(missing, f"camera {url}", _short(error), advice)
         return
     if reply.status_code != 200:
-        advice = "in client mode the camera wants its user and password: docs/devices.md"
-        yield Finding(missing, f"camera {url}", f"answers {reply.status_code}", advice)
+        advice = "in client mode the camera needs user and password (docs/devices.md)"
+        yield Finding(missing, f"camera {url}", f"HTTP status {reply.status_code}", advice)
         return
     model, firmware = info.get("model", "unknown model"), info.get("firmwareVersion", "?")
     yield Finding(OK, f"camera {url}", f"{model}, firmware {firmware}")
@@ -325,16 +333,18 @@ def check_lidar(expectation: Expectation) -> Iterator[Finding]:
             receiver.settimeout(expectation.listen_seconds)
             packet, sender = receiver.recvfrom(2048)
     except TimeoutError:
-        advice = "check cable and address of the sensor (default 192.168.1.201; not needed for sim.yaml)"
+        advice = "check the sensor's cable and address (default 192.168.1.201; not needed for sim.yaml)"
         yield Finding(missing, subject, f"no packet in {expectation.listen_seconds:g} s", advice)
     except OSError as error:
-        yield Finding(missing, subject, f"cannot listen: {error.strerror}", "a driver already has the port")
+        yield Finding(
+            missing, subject, f"cannot listen: {error.strerror}", "another driver already uses the port; stop it"
+        )
     else:
         if len(packet) == 1206:
             yield Finding(OK, subject, f"packets from {sender[0]}")
         else:
-            advice = "something else sends to this port"
-            yield Finding(missing, subject, f"{len(packet)} bytes from {sender[0]} are no VLP-16 packet", advice)
+            advice = "another device sends to this port; stop it, or set another port"
+            yield Finding(missing, subject, f"{len(packet)} bytes from {sender[0]} are not a VLP-16 packet", advice)
 
 
 def _short(error: Exception) -> str:
@@ -344,5 +354,5 @@ def _short(error: Exception) -> str:
     if isinstance(error, Timeout):
         return "no answer in 2 s"
     if isinstance(error, RequestsConnectionError):
-        return "cannot be reached"
-    return f"no Web API there ({type(error).__name__})"
+        return "is unreachable"
+    return f"no Web API at this address ({type(error).__name__})"

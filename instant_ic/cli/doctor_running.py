@@ -15,23 +15,23 @@ from instant_ic.msg import DiagnosticArray, deserialize
 _LONGEST_S = 20.0
 
 ADVICE: tuple[tuple[str, str], ...] = (
-    ("emergency stop button", "let the button on the robot out, then release the stop on the page"),
+    ("emergency stop button", "release the button on the robot, then release the stop on the operator's page"),
     ("emergency stop", "release it on the operator's page"),
-    ("let go of the controls", "let go of keys, stick and pad once"),
-    ("operator's link", "open the operator's page, or look at its network (ic topic info /operator/cmd_vel)"),
-    ("LiDAR scan", "look at the VLP-16's cable and network (ic topic info /scan)"),
-    ("3D points", "look at the VLP-16's driver (ic topic info /lidar/points)"),
-    ("wheel odometry", "look at crawler_base and its serial port (ic topic info /wheel/odom)"),
-    ("SLAM pose", "look at grid_slam and the machine's load (ic top)"),
-    ("camera image", "look at the camera and the link to the page (ic topic info /camera/image/compressed)"),
-    ("view of the virtual space", "look at nerf, the console and the machine's load (ic top)"),
-    ("virtual space", "look at depth and keyframes; without a virtual space the robot stops before obstacles"),
+    ("let go of the controls", "release all keys, the joystick and the pad once"),
+    ("operator's link", "open the operator's page, or check its network (ic topic info /operator/cmd_vel)"),
+    ("LiDAR scan", "check the VLP-16's cable and network (ic topic info /scan)"),
+    ("3D points", "check the VLP-16's driver (ic topic info /lidar/points)"),
+    ("wheel odometry", "check crawler_base and its serial port (ic topic info /wheel/odom)"),
+    ("SLAM pose", "check grid_slam and the CPU load (ic top)"),
+    ("camera image", "check the camera and the link to the page (ic topic info /camera/image/compressed)"),
+    ("view of the virtual space", "check nerf, the console and the CPU load (ic top)"),
+    ("virtual space", "check depth and keyframes; without a virtual space the robot stops at obstacles"),
     (
         "no way round",
-        "drive round by hand; what the map holds and no scan sees is forgotten in seconds (docs/control.md)",
+        "drive around by hand; obstacles that no scan sees are cleared within seconds (docs/control.md)",
     ),
-    ("path follower", "look at navigator (ic log navigator)"),
-    ("v-bot", "look at virtual_robot (ic log virtual_robot)"),
+    ("path follower", "check navigator (ic log navigator)"),
+    ("v-bot", "check virtual_robot (ic log virtual_robot)"),
 )
 """Pattern in a fault's text → advice; the first match counts."""
 
@@ -52,11 +52,13 @@ def check_running(run_dir: Path, seconds: float = 2.5) -> Iterator[Finding]:
                     message: DiagnosticArray = deserialize(received.payload, received.type_name)
                     told |= {status.name: (int(status.level), status.message) for status in message.status}
     except (registry.RegistryError, pace.PaceError) as error:
-        yield Finding(FAIL, "running stack", str(error), "ic log shows what its nodes say")
+        yield Finding(FAIL, "running stack", str(error), "see ic log")
         return
     faults = {name: words for name, words in told.items() if words[0] > OK}
     if not told:
-        yield Finding(DOUBTFUL, "running stack", f"its {len(nodes)} nodes say nothing", "ic log; ic top")
+        yield Finding(
+            DOUBTFUL, "running stack", f"none of its {len(nodes)} nodes publishes diagnostics", "see ic log and ic top"
+        )
     elif not faults:
         yield Finding(FINE, "running stack", f"{len(nodes)} nodes, no faults")
     for name, (level, words) in sorted(faults.items()):

@@ -129,7 +129,9 @@ def tree(graph: StackGraph) -> str:
                 for reader in graph.readers(topic)
             ]
             branch = "└─" if topic == topics[-1] else "├─"
-            lines.append(f"  {branch} {topic} [{kind}]{' ' + flow if flow else ''} → {', '.join(readers) or 'nobody'}")
+            lines.append(
+                f"  {branch} {topic} [{kind}]{' ' + flow if flow else ''} → {', '.join(readers) or 'no subscriber'}"
+            )
     unfed = [topic for topic in graph.topics if not any(name == topic for _, name in graph.publishes)]
     lines += [
         f"{topic} [{graph.topics[topic]}] has no publisher → {', '.join(graph.readers(topic))}" for topic in unfed

@@ -20,15 +20,15 @@ from types import FrameType
 from instant_ic.cli import commands
 from instant_ic.cli.errors import UserError
 
-_DESCRIPTION = "Instant IC: teleoperation that passes between a real robot and an instantly built virtual one."
+_DESCRIPTION = "Instant IC: teleoperation that switches between a real robot and an instantly built virtual one."
 _EPILOG = """examples:
-  ic launch sim                         everything against simulated devices
-  ic launch robot --show-args           what can be set
+  ic launch sim                         the whole stack with simulated devices
+  ic launch robot --show-args           list the launch arguments
   ic topic hz /scan                     rate of a topic
   ic param set depth_estimator max_rate_hz 1
-  ic top                                what every node does, live
-  ic graph -o stack.svg                 a picture of nodes and topics
-  ic bag record -o drive                record everything into the folder drive
+  ic top                                state and load of every node, live
+  ic graph -o stack.svg                 nodes and topics as an image
+  ic bag record -o drive                record all topics into the folder drive
   ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again
   ic doctor                             check this machine
 """

@@ -85,7 +85,7 @@ def build(name: str, values: Any, now_ns: int, path: str = "") -> Any:
     for key in values:
         if key not in known:
             close = difflib.get_close_matches(str(key), known, n=1)
-            hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(known)}"
+            hint = f"did you mean {close[0]!r}?" if close else f"fields: {', '.join(known)}"
             raise UserError(f"{full} has no field {_join(path, key)!r} ({hint})", 2)
     arguments = {
         key: _value(kind, values[key], now_ns, _join(path, key)) if key in values else _empty(kind, now_ns)

@@ -40,11 +40,11 @@ def field(message: Any, path: str) -> Any:
             try:
                 value = value[int(part)]
             except IndexError:
-                raise AttributeError(f"{path}: there are {len(value)} entries, no index {part}") from None
+                raise AttributeError(f"{path}: index {part} is out of range (entries: {len(value)})") from None
             continue
         names = [name for name, _ in _fields(value)] if dataclasses.is_dataclass(value) else []
         if part not in names:
-            raise AttributeError(f"no field {part!r} in {path!r} (there are: {', '.join(names) or 'none'})")
+            raise AttributeError(f"no field {part!r} in {path!r} (fields: {', '.join(names) or 'none'})")
         value = getattr(value, part)
     return value
 

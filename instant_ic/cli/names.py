@@ -34,15 +34,15 @@ def topic_types() -> dict[str, str]:
 
 def unknown_topic(topic: str, known: Iterable[str]) -> str:
     """Message for a topic that no node publishes."""
-    return f"nobody publishes {topic} ({near(topic, known, 'ic topic list shows what there is')})"
+    return f"nobody publishes {topic} ({near(topic, known, 'see ic topic list')})"
 
 
 def nobody_runs() -> str:
     """Message for a run directory without running nodes; it names stacks in its subfolders (robots of a fleet)."""
     run_dir = paths.run_dir()
     inside = [folder.parent for folder in sorted(run_dir.glob("*/nodes")) if registry.list_nodes(folder.parent)]
-    hint = f"; nodes run in {', '.join(map(str, inside))}: ic --run-dir {inside[0]} ..." if inside else ""
-    return f"no node runs in {run_dir}{hint}"
+    hint = f"; nodes are running in {', '.join(map(str, inside))}: ic --run-dir {inside[0]} ..." if inside else ""
+    return f"no node is running in {run_dir}{hint}"
 
 
 def find_node(name: str) -> registry.NodeInfo:
@@ -56,5 +56,5 @@ def find_node(name: str) -> registry.NodeInfo:
         if not nodes:
             raise UserError(nobody_runs())
         hint = near(name.strip("/"), nodes, f"running: {', '.join(nodes)}")
-        raise UserError(f"node {name!r} does not run in {paths.run_dir()} ({hint})")
+        raise UserError(f"node {name!r} is not running in {paths.run_dir()} ({hint})")
     return nodes[name.strip("/")]

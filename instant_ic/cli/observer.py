@@ -99,5 +99,5 @@ class Observer:
         silent = [topic for topic in self.topics if topic in known]
         why = [unknown_topic(topic, known) for topic in missing]
         if silent:
-            why.append(f"{', '.join(silent)} has a publisher, but it is silent (ic topic info -v {silent[0]})")
-        return UserError(f"nothing came in {seconds:.0f} s: {'; '.join(why)}")
+            why.append(f"{', '.join(silent)} has a publisher that sends nothing (ic topic info -v {silent[0]})")
+        return UserError(f"nothing received in {seconds:.0f} s: {'; '.join(why)}")

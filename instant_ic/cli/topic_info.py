@@ -23,7 +23,7 @@ def show(name: str, verbose: bool) -> int:
     readers = [node for node in registry.list_nodes(run_dir) if topic in node.subscribes]
     if not publishers and not readers:
         raise UserError(
-            f"{topic}: nobody publishes or subscribes it ({near(topic, topic_types(), 'ic topic list shows what is')})"
+            f"{topic}: no node publishes or subscribes to it ({near(topic, topic_types(), 'see ic topic list')})"
         )
     kind = found.type_name if found else readers[0].subscribes[topic]
     print(f"Type: {kind}")
@@ -57,7 +57,7 @@ def _show_verbose(
         beat = beats.get(publisher.node)
         flow = beat.outputs.get(topic) if beat else None
         print(f"\nNode name: {publisher.node}\n  Endpoint type: PUBLISHER\n  PID: {publisher.pid}")
-        print(f"  Type: {publisher.type_name}{'' if publisher.type_name == kind else '  (not that of the others)'}")
+        print(f"  Type: {publisher.type_name}{'' if publisher.type_name == kind else '  (differs from the others)'}")
         print(f"  QoS: {publisher.qos}")
         print(f"  Rate: {_rate(flow.rate_hz, flow.age_s) if flow else _silence(publisher.node in nodes)}")
     print(f"\nSubscription count: {len(readers)}")
@@ -82,4 +82,4 @@ def _rate(rate_hz: float, age_s: float) -> str:
 
 
 def _silence(is_node: bool) -> str:
-    return "not known: no heartbeat within 1.5 s" if is_node else "not known: no node, ic topic hz measures it"
+    return "unknown: no heartbeat within 1.5 s" if is_node else "unknown: not a node; measure it with ic topic hz"

@@ -35,7 +35,7 @@ def publish(args: argparse.Namespace) -> int:
     _check_topic(topic, full, args.force)
     if topic.endswith("/estop") and not values.get("data") and not args.force:
         raise UserError(
-            f"{topic}: whoever set the emergency stop releases it, on the operator's page; --force does it from here", 2
+            f"{topic}: release the emergency stop where it was set, on the operator's page; --force overrides this", 2
         )
     wanted = 1 if args.once else args.times
     readers = args.readers if args.readers is not None else int(wanted > 0)
@@ -70,7 +70,7 @@ def _check_topic(topic: str, full: str, force: bool) -> None:
     types |= {node.name: node.subscribes[topic] for node in nodes if node.subscribes.get(topic, "any") != "any"}
     for node, other in types.items():
         if other != full:
-            raise UserError(f"{topic} is a {other} for {node}: a {full} would be refused there", 2)
+            raise UserError(f"{topic} has type {other} in {node}, which would reject a {full}", 2)
     if not topic.endswith("/cmd_vel"):
         return
     writers = ", ".join(p.node for p in found.publishers) if found else ""
@@ -89,7 +89,7 @@ def _wait_for_clock(observer: Observer, seconds: float) -> None:
     deadline_s = time.monotonic() + seconds
     while observer.clock.now_ns() == 0:
         if time.monotonic() > deadline_s:
-            raise UserError(f"no /clock within {seconds:g} s: leave out --use-sim-time, or start what publishes it")
+            raise UserError(f"no /clock within {seconds:g} s: omit --use-sim-time, or start the node that publishes it")
         time.sleep(0.01)
         observer.follow_clock()
 
@@ -100,8 +100,8 @@ def _wait_for_readers(publisher: Publisher, wanted: int, seconds: float) -> None
     while publisher.subscriber_count < wanted:
         if time.monotonic() > deadline_s:
             raise UserError(
-                f"{publisher.topic}: {publisher.subscriber_count} of {wanted} readers within {seconds:g} s; "
-                "-w 0 publishes without"
+                f"{publisher.topic}: {publisher.subscriber_count} of {wanted} subscribers within {seconds:g} s; "
+                "use -w 0 to publish without them"
             )
         if not told and time.monotonic() > deadline_s - seconds + 0.5:
             told = True

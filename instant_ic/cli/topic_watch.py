@@ -117,7 +117,9 @@ def delay(args: argparse.Namespace) -> int:
             try:
                 stamp = stamp_ns(message)
             except MessageError:
-                raise UserError(f"{received.topic}: a {received.type_name} has no stamp, so it has no age", 2) from None
+                raise UserError(
+                    f"{received.topic}: {received.type_name} has no stamp, so its age is unknown", 2
+                ) from None
             if received.received_ns:  # simulated time has started
                 delays[received.topic].add((received.received_ns - stamp) / 1e9)
 

@@ -56,7 +56,7 @@ class Rate:
 
     def _rate(self) -> str:
         if not self.gaps.values:
-            return "no rate yet: one message" if self.count else "no message yet"
+            return "no rate yet: only one message" if self.count else "no message yet"
         mean = fmean(self.gaps.values)
         return f"average rate: {1 / mean if mean > 0 else float('inf'):.3f}  {self.gaps.spread()}"
 

@@ -73,7 +73,8 @@ def test_info_names_a_file_that_is_not_in_the_bag(capsys: pytest.CaptureFixture[
     status, out, _ = ic(capsys, "bag", "info", bag)
     assert (
         status == 0
-        and f"bag_1.mcap is in the folder but not in the bag: its recording was cut short: ic bag recover {bag}" in out
+        and f"bag_1.mcap is in the folder but not in the index: its recording was cut short. Run ic bag recover {bag}"
+        in out
     )
 
 
@@ -97,7 +98,7 @@ def test_diff_prints_what_differs(capsys: pytest.CaptureFixture[str], tmp_path: 
     ("words", "message"),
     [
         (("--tolerance", "ranges"), "--tolerance ranges: expected FROM=TO"),
-        (("--tolerance", "ranges=much"), "--tolerance ranges=much: much is no number"),
+        (("--tolerance", "ranges=much"), "--tolerance ranges=much: much is not a number"),
         (("--tolerance", "ranges=-1"), "tolerance of ranges must be >= 0"),
     ],
 )
@@ -153,7 +154,7 @@ def test_sizes(text: str, bytes_: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "MB", "5XB", "-5MB", "1e9"])
 def test_what_is_no_size(text: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match="is no size"):
+    with pytest.raises(argparse.ArgumentTypeError, match="is not a size"):
         size(text)
 
 

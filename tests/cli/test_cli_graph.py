@@ -151,9 +151,9 @@ def test_verb(ic, tmp_path_factory, monkeypatch):
     run_dir = tmp_path_factory.mktemp("r")
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(run_dir))
     status, _, error = ic("graph")
-    assert status == 1 and "no node runs in" in error
+    assert status == 1 and "no node is running in" in error
     with talking(run_dir):
-        flow = r"[├└]─ /scan \[LaserScan\] [\d.]+ Hz → nobody\n"
+        flow = r"[├└]─ /scan \[LaserScan\] [\d.]+ Hz → no subscriber\n"
         wait_until(lambda: re.search(flow, ic("graph", "--all")[1]), "the first heartbeat with rates")
         status, out, _ = ic("graph", "--all")
         assert status == 0

@@ -29,7 +29,7 @@ def test_list_and_get(ic):
     status, _, error = ic("param", "get", "talker", "inner.dept")
     assert status == 1 and "did you mean 'inner.depth'?" in error
     status, _, error = ic("param", "get", "talkr", "inner.depth")
-    assert status == 1 and "node 'talkr' does not run" in error and "did you mean 'talker'?" in error
+    assert status == 1 and "node 'talkr' is not running" in error and "did you mean 'talker'?" in error
 
 
 def test_describe(ic):
@@ -107,7 +107,7 @@ def test_node_list_and_info(ic, talker):
     assert re.search(r"  /scan: sensor_msgs/msg/LaserScan, [\d.]+ Hz\n", out)
     assert "Subscribers:\n  /order: geometry_msgs/msg/TwistStamped, no message yet" in out
     status, _, error = ic("node", "info", "nobody")
-    assert status == 1 and "node 'nobody' does not run" in error and "running: talker" in error
+    assert status == 1 and "node 'nobody' is not running" in error and "running: talker" in error
 
 
 def test_nobody_runs_here_but_in_a_folder_of_it(ic, talker, tmp_path, monkeypatch):
@@ -116,9 +116,9 @@ def test_nobody_runs_here_but_in_a_folder_of_it(ic, talker, tmp_path, monkeypatc
     for words in (("node", "list"), ("param", "list"), ("param", "get", "x", "y"), ("graph",), ("top",)):
         status, out, error = ic(*words)
         assert status == (words == ("node", "list")) ^ 1 and out == ""
-        assert f"no node runs in {talker.parent}; nodes run in" in error and f"{talker}" in error, words
+        assert f"no node is running in {talker.parent}; nodes are running in" in error and f"{talker}" in error, words
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
-    assert ic("node", "list") == (0, "", f"ic: no node runs in {tmp_path}\n")
+    assert ic("node", "list") == (0, "", f"ic: no node is running in {tmp_path}\n")
 
 
 def test_busy_node_is_told_and_nothing_is_changed(ic, tmp_path_factory, monkeypatch):
@@ -161,7 +161,7 @@ def test_dora_2152_own_file_leaves_at_once_whatever_threads_are_left(tmp_path_fa
 
 def test_run_mistakes(ic, tmp_path):
     status, _, error = ic("run", "warp_drive")
-    assert status == 2 and "there is no node 'warp_drive'; there are" in error and "bag_player" in error
+    assert status == 2 and "there is no node 'warp_drive'; available:" in error and "bag_player" in error
     status, _, error = ic("run", "grid_slm")
     assert status == 2 and "did you mean 'grid_slam'?" in error
     assert "nowhere.py does not exist" in ic("run", "nowhere.py")[2]

@@ -120,7 +120,7 @@ def test_node_in_a_long_callback_and_one_that_hangs(ic, tmp_path_factory, monkey
 def test_nobody_runs(ic, tmp_path, monkeypatch):
     monkeypatch.setenv("INSTANT_IC_RUN_DIR", str(tmp_path))
     status, _, error = ic("top")
-    assert status == 1 and "no node runs in" in error
+    assert status == 1 and "no node is running in" in error
 
 
 def test_live_table_on_a_terminal(run_dir):

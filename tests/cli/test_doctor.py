@@ -68,9 +68,9 @@ def test_devices_that_are_missing(real: bool, level: str, tmp_path: Path) -> Non
     for check in (doctor.check_camera, doctor.check_lidar):
         found = one(check(expected))
         assert found.level == level and found.advice
-    assert "cannot be reached" in one(doctor.check_camera(expected)).words
+    assert "is unreachable" in one(doctor.check_camera(expected)).words
     serial = one(doctor.check_serial(expected, list))
-    assert serial.level == level and "does not exist (there are: none)" in serial.words
+    assert serial.level == level and "does not exist (available: none)" in serial.words
 
 
 @pytest.mark.parametrize(("size", "level"), [(1206, OK), (100, WARN)])

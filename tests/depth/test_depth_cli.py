@@ -48,7 +48,7 @@ def test_estimate(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert ic("check", str(tiny), "--threads", "1") == 0
     told = capsys.readouterr().out
-    for part in ("licence  MIT", "image: tensor(float) [1, 3, 64, 128]", "cpu, CPU threads: 1", "s a panorama"):
+    for part in ("licence  MIT", "image: tensor(float) [1, 3, 64, 128]", "cpu, CPU threads: 1", "s per panorama"):
         assert part in told
     assert ic("check", str(tiny.with_suffix(".yaml")), "--json", "--runs", "1") == 0
     record = json.loads(capsys.readouterr().out)
@@ -60,7 +60,7 @@ def test_check(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("estimate", "absent.jpg"), "absent.jpg: not a readable picture"),
+        (("estimate", "absent.jpg"), "absent.jpg: not a readable image"),
         (("estimate", "{pano}", "--model", "absent.onnx"), "absent.yaml: no manifest"),
         (("estimate", "{pano}", "--model", "{tiny}", "-o", "/proc/nowhere/x.png"), "cannot write"),
         (("estimate", "{square}", "--model", "{tiny}"), "square.png: a panorama is twice as wide as high"),

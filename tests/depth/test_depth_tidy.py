@@ -147,8 +147,8 @@ def test_a_photo_without_depth_on_the_command_line(words, tmp_path, capsys, monk
     train = ["vspace", "train", str(tmp_path / "p.png"), "--iterations", "1", "--device", "cpu", "-o", out, *words]
     assert main(train) == 0
     said = capsys.readouterr().err
-    assert ("floor 1.20 m under the camera, ceiling 1.5" in said and "times 2.0" in said) == (
+    assert ("floor 1.20 m under the camera, ceiling 1.5" in said and "scaled by 2.0" in said) == (
         words[0] != "--as-estimated"
     )
     assert main([*train, "--camera-height", "1.2", "--as-estimated"]) == 2
-    assert "leave one of them out" in capsys.readouterr().err
+    assert "omit one of them" in capsys.readouterr().err

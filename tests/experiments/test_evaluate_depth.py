@@ -353,7 +353,7 @@ def test_command_goes_on_after_a_bad_file_and_ends_with_an_error(folder, capsys)
     assert [row["name"] for row in figures["images"]] == ["a.jpg", "b.jpg"]
     assert [row["name"] for row in figures["errors"]] == ["c.jpg", "d.jpg"]
     assert "c.jpg: not a readable picture" in printed.err
-    assert "d.jpg: no depth file of this stem" in printed.err
+    assert "d.jpg: no depth file has this stem" in printed.err
     assert "b.npz: median" in printed.err
 
 
@@ -370,11 +370,11 @@ def test_command_without_truth_draws_only(folder):
     [
         (("--source", "fused"), "--lidar too"),
         (("--lidar",), "give --depth"),
-        (("--json", "none/o.json"), "no folder none"),
+        (("--json", "none/o.json"), "the folder none does not exist"),
         (("--model", "none.onnx"), "none"),
         (("--camera-height", "-1"), "above 0"),
-        (("--png-unit", "0"), "above 0"),
-        (("--plot", "o.gif"), "written as .png"),
+        (("--png-unit", "0"), "must be > 0"),
+        (("--plot", "o.gif"), "must end in .png"),
         (("--json", "."), ". cannot be written"),
         (("--depth", "{}/a.png", "--lidar", "--outliers", "2"), "outliers must lie"),
         (("--depth", "{}/a.png", "--lidar", "--lidar-height", "-1"), "height must be above 0"),

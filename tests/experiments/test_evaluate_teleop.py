@@ -430,13 +430,13 @@ class TestRecordedInABag:
         (["--world", "nowhere"], "neither corridor"),
         (["--jobs", "0"], "jobs must be at least 1"),
         (["--operator", "recorded"], "needs --log"),
-        (["--log", "x.csv"], "is for --operator recorded"),
+        (["--log", "x.csv"], "needs --operator recorded"),
         (["--operator", "recorded", "--log", "/no/such.csv"], "there is no such bag or CSV file"),
-        (["--video", "film.avi"], "is an .mp4"),
+        (["--video", "film.avi"], "must end in .mp4"),
         (["--resume"], "--resume needs --json"),
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),
         (["-p", "arbiter.no_key:=1"], "unknown parameter 'no_key'"),
-        (["--json", "/no/such/folder/out.json"], "is no folder"),
+        (["--json", "/no/such/folder/out.json"], "does not exist"),
     ],
 )
 def test_wrong_words_are_told(words: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:

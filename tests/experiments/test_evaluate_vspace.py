@@ -210,7 +210,7 @@ def test_plot_and_strip_are_written(report, tmp_path):
         (["--world", "corridor", "--size", "big"], "WIDTHxHEIGHT"),
         (["--world", "corridor", "--start", "1,2"], "x,y,yaw"),
         (["--world", "corridor", "--times", "1,x"], "--times"),
-        (["--world", "corridor", "--json", "/nowhere/at/all.json"], "no folder"),
+        (["--world", "corridor", "--json", "/nowhere/at/all.json"], "does not exist"),
     ],
 )
 def test_mistakes_are_told_in_a_line(arguments, words, capsys):

@@ -494,5 +494,5 @@ def test_show_args_tells_types_choices_and_what_included_files_keep(
         "  port: int (default: '80')",
         "      of the page",
         "  mode: fast | slow (must be given)",
-        "part.yaml, which it includes, keeps its own defaults of: speed '3'",
+        "the included part.yaml keeps its own defaults of: speed '3'",
     ]

@@ -108,4 +108,4 @@ def test_options_and_arguments_stand_in_any_order(
         "launch:\n- arg: {name: n, default: two}\n- executable: {cmd: echo, unless: $(equals $(var n) one)}\n"
     )
     assert main(["launch", *(str(file) if word == "F" else word for word in words)]) == 0
-    assert f"{0 if 'n:=one' in words else 1} nodes, no mistake found" in capsys.readouterr().out
+    assert f"{0 if 'n:=one' in words else 1} nodes, no errors" in capsys.readouterr().out

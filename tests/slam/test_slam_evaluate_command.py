@@ -124,7 +124,7 @@ def test_what_is_missing_is_told(log: Path, tmp_path: Path, capsys: pytest.Captu
     assert main(["evaluate", "slam", str(log), "--stamps", "x"]) == 2
     assert "--relations" in capsys.readouterr().err
     assert main(["evaluate", "slam", str(log), "--plot", str(tmp_path / "no" / "x.png")]) == 2
-    assert "there is no folder" in capsys.readouterr().err
+    assert "does not exist" in capsys.readouterr().err
     (tmp_path / "r").write_text("5 6 0 0 0 0 0 0\n")
     assert (
         main(["evaluate", "slam", str(log), "--relations", str(tmp_path / "r"), "--trajectory", str(tmp_path / "t")])

@@ -65,6 +65,6 @@ def test_what_goes_wrong_is_told(run_dir: Path, tmp_path: Path, capsys: pytest.C
         assert main(["map", "save", str(tmp_path / "m")]) == 1
     assert "the map is empty" in capsys.readouterr().err
     assert main(["map", "save", str(tmp_path / "m.yaml")]) == 2
-    assert "without ending" in capsys.readouterr().err
+    assert "must have no suffix" in capsys.readouterr().err
     assert main(["map", "save", "m", "--timeout", "0.3"]) == 1
     assert "grid_slam is not running" in capsys.readouterr().err

@@ -61,7 +61,7 @@ def test_a_pose_is_relative_to_the_camera_with_yaw_in_degrees(folder, tmp_path, 
     assert seen.mean() > 0.9
     depth = np.load(tmp_path / "a.npy")
     assert np.median(np.abs(depth / truth.depth_m - 1)[seen]) < 0.03
-    assert "of the picture is known" in capsys.readouterr().out
+    assert "of the image is known" in capsys.readouterr().out
 
 
 def test_panorama_and_cube(folder, tmp_path):
@@ -197,9 +197,9 @@ def test_a_patch_without_depth_is_filled_and_said(tmp_path, capsys):
         ("render", ["--size", "100x40", "--projection", "equirect", "-o", "a.png"], 2, "twice as wide"),
         ("render", ["--size", "100x40", "--projection", "cube", "-o", "a.png"], 2, "square"),
         ("render", ["--fov", "180", "-o", "a.png"], 2, "1..170"),
-        ("render", ["--size", "32x32", "-o", "a.bin"], 2, "as .png"),
+        ("render", ["--size", "32x32", "-o", "a.bin"], 2, "must end in .png"),
         ("render", ["--size", "32x32", "-o", "none/a.png"], 1, "No such file"),
-        ("render", ["--size", "32x32", "-o", "a.png", "--depth", "d.exr"], 2, "depth is written as"),
+        ("render", ["--size", "32x32", "-o", "a.png", "--depth", "d.exr"], 2, "depth file must end in"),
         ("export", ["--mesh", "none/a.ply", "--width", "64"], 1, "No such file"),
         ("export", ["--mesh", "a.ply", "--width", "7"], 2, "16 to 4096"),
         ("video", ["-o", "a.avi"], 2, ".mp4"),
@@ -220,8 +220,8 @@ def test_what_cannot_be_done_is_said(folder, verb, words, status, said, capsys, 
 def test_a_view_from_far_off_is_drawn_with_a_warning(folder, tmp_path, capsys):
     assert run(folder, "render", "--pose", "90,0,0,180", "--size", "64x32", "-o", tmp_path / "a.png") == 0
     said = capsys.readouterr()
-    assert "hardly anything" in said.err
-    assert "0% of the picture is known" in said.out
+    assert "has seen little" in said.err
+    assert "0% of the image is known" in said.out
 
 
 def test_a_folder_without_a_space(tmp_path, capsys):

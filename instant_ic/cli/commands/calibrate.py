@@ -20,16 +20,16 @@ def add_parser(subparsers: Any) -> None:
     """Add ``calibrate`` to the ``ic`` command."""
     parser = subparsers.add_parser(
         "calibrate",
-        help="mounts of the sensors from a recording",
-        description="Mounts of the sensors (docs/calibration.md).",
+        help="calibrate sensor mounts from a recording",
+        description="Calibrate sensor mounts from a recording (docs/calibration.md).",
     )
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     camera = verbs.add_parser(
         "camera-lidar",
-        help="where the camera is, seen from the LiDAR",
+        help="calibrate the camera's pose relative to the LiDAR",
         description=(
-            "Estimates the pose of the camera against the LiDAR from a recording, by the edges that both see, and says "
-            "which degrees of freedom the recording constrains. Writes the camera's mount as a parameter file. "
+            "Estimate the camera's pose relative to the LiDAR from the edges that both see in a recording, report "
+            "which degrees of freedom the recording constrains, and write the camera's mount as a parameter file. "
             "Record a minute of slow driving in a furnished room (docs/calibration.md)."
         ),
         epilog="example: ic calibrate camera-lidar drive -o config/mount.yaml --plot overlay.png; "
@@ -38,15 +38,17 @@ def add_parser(subparsers: Any) -> None:
     completion.offer(camera.add_argument("bag", type=Path, metavar="BAG"), completion.bags)
     camera.add_argument("-o", "--out", type=Path, default=Path("camera_mount.yaml"), metavar="FILE",
                         help="parameter file to write (%(default)s)")  # fmt: skip
-    camera.add_argument("--plot", type=Path, metavar="PNG", help="points over the pictures, before and after")
-    camera.add_argument("--json", type=Path, metavar="FILE", help="the result in numbers")
-    camera.add_argument("--images", default="", metavar="TOPIC", help="pictures (default: /camera/image/compressed)")
+    camera.add_argument("--plot", type=Path, metavar="PNG", help="LiDAR points over the images, before and after")
+    camera.add_argument("--json", type=Path, metavar="FILE", help="write the figures here")
+    camera.add_argument("--images", default="", metavar="TOPIC", help="images (default: /camera/image/compressed)")
     camera.add_argument("--points", default="", metavar="TOPIC",
-                        help="revolutions (default: /lidar/points, else /lidar/packets)")  # fmt: skip
-    camera.add_argument("--frames", type=int, default=24, metavar="N", help="most pictures (%(default)s)")
+                        help="LiDAR points (default: /lidar/points, else /lidar/packets)")  # fmt: skip
+    camera.add_argument("--frames", type=int, default=24, metavar="N", help="maximum number of images (%(default)s)")
     camera.add_argument("--guess", metavar="X,Y,Z,ROLL,PITCH,YAW",
-                        help="camera on the LiDAR (m, degrees), where /tf_static does not tell it")  # fmt: skip
-    camera.add_argument("--near", action="store_true", help="the yaw is right within a few degrees: no full circle")
+                        help="initial camera pose in the LiDAR frame (m, degrees) if /tf_static lacks it")  # fmt: skip
+    camera.add_argument(
+        "--near", action="store_true", help="the initial yaw is right within a few degrees: skip the full-circle search"
+    )
     camera.set_defaults(func=camera_lidar)
 
 
@@ -66,11 +68,12 @@ def camera_lidar(args: argparse.Namespace) -> int:
     given = guess if guess is not None else recording.camera_from_lidar
     if given is None:
         raise UserError(
-            f"{args.bag}: /tf_static does not tell the camera and the LiDAR against each other: record it too, or give "
+            f"{args.bag}: /tf_static has no transform between camera and LiDAR: record it too, or give "
             "--guess X,Y,Z,ROLL,PITCH,YAW"
         )
-    print(f"{recording.pictures} pictures, {len(recording.frames)} taken, from {recording.places} places"
-          + ("" if recording.moves else "; no odometry on /tf: the robot is taken to stand"), flush=True)  # fmt: skip
+    print(f"{recording.pictures} images, {len(recording.frames)} used, from {recording.places} places"
+          + ("" if recording.moves else "; no odometry on /tf: the robot is assumed to stand still"),
+          flush=True)  # fmt: skip
     result = calibrate(
         recording.frames, given, CalibrationConfig(full_circle=not args.near), lambda line: print(line, flush=True)
     )
@@ -83,8 +86,8 @@ def camera_lidar(args: argparse.Namespace) -> int:
         _plot(args.plot, recording, given, result)
     if not any(summary["constrained"].values()):
         raise UserError(
-            f"{args.bag}: nothing is constrained, so no mount is written: record slow driving from several places of a "
-            "furnished room (docs/calibration.md)"
+            f"{args.bag}: the recording constrains no axis, so no mount was written: record slow driving through "
+            "several places of a furnished room (docs/calibration.md)"
         )
     args.out.write_text(_yaml(summary))
     print(f"wrote {args.out}; use it with: ic launch robot params:={args.out}")
@@ -152,10 +155,10 @@ def _tell(summary: dict[str, Any]) -> None:
         unit = "m" if number < 3 else "deg"
         note = "" if summary["constrained"][axis] else "   not constrained by this recording"
         print(f"  {axis:5} {unit:12} {before[number]:9.3f} {after[number]:9.3f} {sigma:8.3f}{note}")
-    print(f"edges of the LiDAR on edges of the pictures: {summary['score_before']:.2f} times chance before, "
+    print(f"overlap of LiDAR edges with image edges: {summary['score_before']:.2f} times chance before, "
           f"{summary['score_after']:.2f} after")  # fmt: skip
     if summary["yaw_rival"] > 0.8:
-        print("another yaw fits nearly as well: the place looks alike in two directions; check the overlay (--plot)")
+        print("another yaw fits nearly as well: the place looks similar in two directions; check the overlay (--plot)")
 
 
 def _yaml(summary: dict[str, Any]) -> str:
@@ -177,5 +180,5 @@ def _plot(path: Path, recording: CalibrationRecording, given: Matrix, result: Ca
 
     sheet = before_and_after(recording.frames, given, result.camera_from_lidar)
     if not cv2.imwrite(str(path), sheet[..., ::-1]):
-        raise UserError(f"{path} cannot be written: give a name that ends in .png or .jpg")
+        raise UserError(f"{path} cannot be written: use a name that ends in .png or .jpg")
     print(f"wrote {path}")

@@ -16,8 +16,9 @@ def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
         "completion",
-        help="completion for the shell",
-        description="Prints what makes the shell complete ic's words with TAB:\n\n  " + "\n  ".join(_HINTS.values()),
+        help="set up shell completion",
+        description="Print the code that enables completion of ic commands with TAB. Add one of these lines:\n\n  "
+        + "\n  ".join(_HINTS.values()),
         epilog="example: ic completion bash",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -23,8 +23,8 @@ def add_parser(subparsers: Any) -> None:
     """Add ``depth`` with its own subcommands."""
     parser = subparsers.add_parser(
         "depth",
-        help="train, convert, check and try 360° depth models",
-        description="Train, convert, check and try 360° depth models (docs/depth.md).",
+        help="train, convert, check and run 360° depth models",
+        description="Train, convert, check and run 360° depth models (docs/depth.md).",
         epilog="example: ic depth estimate panorama.jpg --output depth.png",
     )
     commands = parser.add_subparsers(dest="depth_command", required=True)
@@ -37,54 +37,56 @@ def add_parser(subparsers: Any) -> None:
 def _add_convert(commands: Any) -> None:
     parser = commands.add_parser(
         "convert",
-        help="turn SliceNet weights into ONNX with its manifest",
-        description="Turns a checkpoint (published SliceNet weights, or ours) into ONNX with its manifest beside it, "
-        "and holds what ONNX computes against torch. Nothing is written when they differ.",
+        help="convert SliceNet weights to ONNX with a manifest",
+        description="Convert a checkpoint (published SliceNet weights, or ours) to ONNX with its manifest, and compare "
+        "the output of ONNX with that of torch. Nothing is written if they differ.",
         epilog="example: ic depth convert resnet50_m3d.pth -o slicenet_m3d.onnx",
     )
     parser.add_argument("weights", type=Path, help="checkpoint file")
     parser.add_argument("-o", "--output", type=Path, help="ONNX file to write (default: WEIGHTS.onnx)")
-    parser.add_argument("--half", action="store_true", help="store the weights as float16: half the size")
+    parser.add_argument("--half", action="store_true", help="store the weights as float16, half the size")
     parser.add_argument("--brightness", type=float, default=0.0, metavar="BYTE",
-                        help="mean byte of the training pictures, 0 for any (%(default)s)")  # fmt: skip
-    parser.add_argument("--max-range", type=positive, default=16.0, metavar="M", help="metres (%(default)s)")
-    parser.add_argument("--name", help="for the manifest (default: the file's)")
-    parser.add_argument("--licence", help="of the weights, for the manifest (default: unknown; Apache-2.0 for ours)")
+                        help="mean byte value of the training images, 0 for any (%(default)s)")  # fmt: skip
+    parser.add_argument(
+        "--max-range", type=positive, default=16.0, metavar="M", help="longest range in metres (%(default)s)"
+    )
+    parser.add_argument("--name", help="name in the manifest (default: the file's name)")
+    parser.add_argument("--licence", help="licence in the manifest (default: unknown; Apache-2.0 for our own)")
     parser.set_defaults(func=convert)
 
 
 def _add_model(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--provider", choices=PROVIDERS, default="auto", help="what runs it (%(default)s)")
+    parser.add_argument("--provider", choices=PROVIDERS, default="auto", help="execution provider (%(default)s)")
     parser.add_argument("--threads", type=positive_int, default=2, help="CPU threads (%(default)s)")
 
 
 def _add_check(commands: Any) -> None:
     parser = commands.add_parser(
         "check",
-        help="look at a model file and its manifest, and run it once",
-        description="Loads a model as the node does and tells what it is, what it takes and gives, what runs it, and "
-        "how long a panorama takes.",
+        help="check a model file and its manifest, and time it",
+        description="Load a model as the node does and print its manifest, inputs, outputs, execution provider and "
+        "the time per panorama.",
         epilog="example: ic depth check models/da2.onnx --provider cuda",
     )
     parser.add_argument("model", type=Path, nargs="?", help="ONNX file or its manifest (default: the shipped one)")
     _add_model(parser)
     parser.add_argument("--runs", type=positive_int, default=3, metavar="N", help="timed runs (%(default)s)")
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(func=check)
 
 
 def _add_estimate(commands: Any) -> None:
     parser = commands.add_parser(
         "estimate",
-        help="depth of one panorama as a coloured picture",
-        description="Estimates the depth of one equirect picture; writes a coloured PNG and, if wanted, the numbers.",
+        help="estimate the depth of one panorama as a coloured image",
+        description="Estimate the depth of one equirectangular image; write a coloured PNG and optionally the values.",
         epilog="example: ic depth estimate panorama.jpg --output depth.png --npy depth.npy",
     )
-    parser.add_argument("image", type=Path, help="equirect picture")
+    parser.add_argument("image", type=Path, help="equirectangular image")
     parser.add_argument("--model", type=Path, help="ONNX file with a manifest beside it (default: the shipped one)")
     _add_model(parser)
     parser.add_argument("-o", "--output", type=Path, default=Path("depth.png"), help="coloured depth (%(default)s)")
-    parser.add_argument("--npy", type=Path, help="depth as float32 array")
+    parser.add_argument("--npy", type=Path, help="also write the depth as a float32 array")
     parser.set_defaults(func=estimate)
 
 
@@ -180,9 +182,9 @@ def check(args: argparse.Namespace) -> int:
     print(f"{'runs on':>14}  {model.provider}, CPU threads: {args.threads}")
     for note in model.notes:
         print(f"{'not on':>14}  {note}")
-    print(f"{'gives':>14}  {depth.shape[1]} x {depth.shape[0]}, {low:.3g} to {high:.3g}, "
-          f"{known.size / depth.size:.0%} known (of a meaningless picture)")  # fmt: skip
-    print(f"{'takes':>14}  {seconds:.3f} s a panorama (the first {first_s:.3f} s, to load {load_s:.2f} s)")
+    print(f"{'output depth':>14}  {depth.shape[1]} x {depth.shape[0]}, {low:.3g} to {high:.3g}, "
+          f"{known.size / depth.size:.0%} known (on a random test image)")  # fmt: skip
+    print(f"{'time':>14}  {seconds:.3f} s per panorama (first run {first_s:.3f} s, loading {load_s:.2f} s)")
     return 0
 
 
@@ -197,7 +199,7 @@ def estimate(args: argparse.Namespace) -> int:
 
     picture = load_image(args.image, cv2.IMREAD_COLOR)
     if picture is None:
-        raise UserError(f"{args.image}: not a readable picture")
+        raise UserError(f"{args.image}: not a readable image")
     model = _load(args)
     rgb = np.ascontiguousarray(picture[..., ::-1])
     try:

@@ -12,15 +12,17 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "doctor",
         help="check machine, devices, ports, models and configuration",
-        description="Checks this machine, the devices, ports, models and configuration, and says what to do. "
-        "Exit status 1 when something would not work.",
+        description="Check this machine, its devices, ports, models and configuration, and advise what to do. "
+        "The exit status is 1 if a check fails.",
         epilog="example: ic doctor --robot --serial-port /dev/ttyACM0",
     )
-    parser.add_argument("--robot", action="store_true", help="the real devices must be there")
-    parser.add_argument("--serial-port", metavar="PORT", help="of the RoboClaw (default: as in config/base.yaml)")
-    parser.add_argument("--camera-url", metavar="URL", help="of the Theta (default: as in config/camera.yaml)")
+    parser.add_argument("--robot", action="store_true", help="missing devices are failures, not warnings")
+    parser.add_argument("--serial-port", metavar="PORT", help="port of the RoboClaw (default: from config/base.yaml)")
+    parser.add_argument("--camera-url", metavar="URL", help="URL of the Theta (default: from config/camera.yaml)")
     parser.add_argument("--lidar-port", type=int, metavar="PORT", help="UDP port of the VLP-16's data")
-    parser.add_argument("--listen", type=float, default=1.0, metavar="S", help="wait so long for LiDAR packets")
+    parser.add_argument(
+        "--listen", type=float, default=1.0, metavar="S", help="time to wait for LiDAR packets (default: %(default)g s)"
+    )
     parser.set_defaults(func=run)
 
 

@@ -21,25 +21,31 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "evaluate",
         help="measure the stack on recordings",
-        description="Runs the stack or a part of it on recordings and measures what comes out.",
+        description="Run the stack or a part of it on recordings or in simulation, and measure the results.",
     )
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
     recordings = kinds.add_parser(
         "recordings",
-        help="a LiDAR capture and a panorama photo through every node",
+        help="run a LiDAR capture and a panorama photo through every node",
         description=(
-            "Sends a VLP-16 capture as UDP packets and a 360° photo by the Theta's web API through the whole stack. "
-            "Writes a bag, the trained view beside the photo's own crop, the depth and the map as PNG, "
-            "and summary.json into the output folder. Photo and capture are taken to be from different places: "
-            "the depth is then in the model's own metres. With --same-place the LiDAR scales it, as on the robot."
+            "Send a VLP-16 capture as UDP packets and a 360° photo through the Theta's Web API to the whole stack. "
+            "Write a bag, the trained view beside the same crop of the photo, the depth and the map as PNG, "
+            "and summary.json to the output folder. Photo and capture may be from different places: the depth "
+            "is then in the model's own metres. With --same-place the LiDAR scales it, as on the robot."
         ),
         epilog="example: ic evaluate recordings --pcap drive.pcap --panorama room.jpg -o runs/recordings",
     )
     recordings.add_argument("--pcap", type=Path, required=True, help="capture of VLP-16 data packets")
-    recordings.add_argument("--panorama", type=Path, required=True, help="equirect photo (JPEG, 2:1)")
-    recordings.add_argument("-o", "--out", type=Path, required=True, help="folder for what is written")
-    recordings.add_argument("--same-place", action="store_true", help="scale the photo's depth by the capture")
-    recordings.add_argument("--timeout", type=float, default=240.0, metavar="S", help="in all (default: %(default)g s)")
+    recordings.add_argument("--panorama", type=Path, required=True, help="equirectangular photo (JPEG, 2:1)")
+    recordings.add_argument("-o", "--out", type=Path, required=True, help="output folder")
+    recordings.add_argument(
+        "--same-place",
+        action="store_true",
+        help="photo and capture are from the same place: scale the depth by the LiDAR",
+    )
+    recordings.add_argument(
+        "--timeout", type=float, default=240.0, metavar="S", help="time limit (default: %(default)g s)"
+    )
     recordings.add_argument("--json", type=Path, metavar="OUT", help="also write the summary here")
     recordings.set_defaults(func=evaluate_recordings)
     for info in sorted(pkgutil.iter_modules(commands.__path__), key=lambda info: info.name):
@@ -71,5 +77,5 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
     if args.json:
         args.json.write_text(text + "\n")
     sys.stdout.write(text + "\n")
-    console.print(f"pictures and bag in {args.out}/: view.png, depth.png, map.png, bag/")
+    console.print(f"images and bag in {args.out}/: view.png, depth.png, map.png, bag/")
     return 0

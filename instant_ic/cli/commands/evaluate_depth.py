@@ -17,44 +17,47 @@ def add_kind(kinds: Any) -> None:
     """Add ``depth`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "depth",
-        help="depth of panoramas against the truth",
+        help="compare estimated depth of panoramas with the true depth",
         description=(
-            "Estimates the depth of level 360° panoramas as the robot does and compares it with the truth: MRE, MAE, "
-            "RMSE, δ1 to δ3, error of the scale, time; for each image and in the mean, before and after scaling. "
-            "Prints JSON. Without --depth nothing is compared: --plot and --side show what the depth looks like."
+            "Estimate the depth of level 360° panoramas as the robot does and compare it with the true depth: MRE, "
+            "MAE, RMSE, δ1 to δ3, scale error and time, for each image and on average, before and after scaling. "
+            "Prints JSON. Without --depth there is no comparison: use --plot and --side to see the estimate."
         ),
         epilog="example: ic evaluate depth rgb/ --depth depth/ --lidar --outliers 0.05 --json out.json --plot out.png",
     )
     parser.add_argument("images", type=Path, nargs="+", metavar="IMAGES", help="panoramas (2:1): files or folders")
     parser.add_argument("--depth", type=Path, nargs="+", default=[], metavar="GT",
-                        help="true radial depth: files or a folder, same stems as the images; PNG of 16 bits in "
+                        help="true radial depth: files or a folder, same stems as the images; 16-bit PNG in "
                         "millimetres, .npy, .npz (key depth) or .exr in metres; 0 = unknown")  # fmt: skip
     parser.add_argument(
         "--model", type=Path, metavar="M", help="ONNX file with its manifest (default: the shipped one)"
     )
     parser.add_argument("--source", choices=("network", "lidar", "fused"),
-                        help="where depth comes from (default: fused with --lidar, else network)")  # fmt: skip
+                        help="depth source (default: fused with --lidar, else network)")  # fmt: skip
     parser.add_argument(
-        "--lidar", action="store_true", help="a simulated VLP-16 measures the truth and scales the depth"
+        "--lidar", action="store_true", help="scale the depth by a simulated VLP-16 that measures the true depth"
     )
     parser.add_argument("--lidar-height", type=float, default=0.6, metavar="M",
-                        help="above the floor (default: %(default)g m)")  # fmt: skip
+                        help="height of the LiDAR above the floor (default: %(default)g m)")  # fmt: skip
     parser.add_argument("--camera-height", type=float, default=1.2, metavar="M",
-                        help="above the floor (default: %(default)g m)")  # fmt: skip
-    parser.add_argument("--noise", type=float, default=0.02, metavar="M", help="of a range (default: %(default)g m)")
+                        help="height of the camera above the floor (default: %(default)g m)")  # fmt: skip
+    parser.add_argument("--noise", type=float, default=0.02, metavar="M",
+                        help="noise of a LiDAR range (default: %(default)g m)")  # fmt: skip
     parser.add_argument("--outliers", type=float, default=0.0, metavar="SHARE",
-                        help="of the LiDAR's points, 0 to 1 (default: %(default)g)")  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of noise and outliers (default: %(default)s)")
+                        help="share of LiDAR outliers, 0 to 1 (default: %(default)g)")  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, help="seed of noise and outliers (default: %(default)s)")
     parser.add_argument("--method", default="", metavar="RULE",
-                        help="of scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)")  # fmt: skip
+                        help="scaling: median_ratio, max_ratio, ransac, sector (default: the scaler's)")  # fmt: skip
     parser.add_argument("--png-unit", type=float, default=1e-3, metavar="M",
-                        help="metres of one step of a depth PNG (default: %(default)g)")  # fmt: skip
-    parser.add_argument("--max-depth", type=float, metavar="M", help="leave out truth farther than this")
+                        help="metres per unit of a depth PNG (default: %(default)g)")  # fmt: skip
+    parser.add_argument("--max-depth", type=float, metavar="M", help="ignore true depth beyond this")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads of the model (default: %(default)s)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="sheet of image, prediction, truth and error")
     parser.add_argument(
-        "--side", type=Path, metavar="OUT.png", help="sheet of the point clouds, from the side and above"
+        "--plot", type=Path, metavar="OUT.png", help="write images, estimates, true depth and errors here"
+    )
+    parser.add_argument(
+        "--side", type=Path, metavar="OUT.png", help="write the point clouds here, from the side and from above"
     )
     parser.set_defaults(func=evaluate_depth)
 
@@ -72,14 +75,14 @@ def evaluate_depth(args: argparse.Namespace) -> int:
 
     for file in (args.json, args.plot, args.side):
         if file is not None and not file.parent.is_dir():
-            raise UserError(f"{file}: there is no folder {file.parent}", 2)
+            raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
     for file in (args.plot, args.side):
         if file is not None and file.suffix.lower() != ".png":
-            raise UserError(f"{file}: sheets are written as .png", 2)
+            raise UserError(f"{file}: the name must end in .png", 2)
     if not args.png_unit > 0:
-        raise UserError(f"--png-unit must be above 0 (got {args.png_unit:g})", 2)
+        raise UserError(f"--png-unit must be > 0 (got {args.png_unit:g})", 2)
     if args.lidar and not args.depth:
-        raise UserError("--lidar measures the true depth: give --depth too", 2)
+        raise UserError("--lidar needs the true depth: give --depth too", 2)
     if args.source not in (None, "network") and not args.lidar:
         raise UserError(f"--source {args.source} needs LiDAR points: give --depth and --lidar too", 2)
     try:
@@ -104,7 +107,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
             tell(done / len(pairs))
             try:
                 if args.depth and truth is None:
-                    raise PairError(f"{image}: no depth file of this stem")
+                    raise PairError(f"{image}: no depth file has this stem")
                 truth_m = load_truth(truth, args.png_unit) if truth is not None else None
                 warning = unit_warning(truth_m) if truth_m is not None else ""
                 if warning:
@@ -124,7 +127,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     figures = report(rows, settings, evaluator.model)
     if unfit := [row["name"] for row in rows if row["fit"] and not row["fit"]["ok"]]:
         warnings.append(
-            f"{len(unfit)} of {len(rows)} fits are not ok, their depth is not to be trusted: {unfit[0]} ..."
+            f"{len(unfit)} of {len(rows)} scale fits are not reliable, and neither is their depth: {unfit[0]} ..."
         )
     figures |= {"errors": errors, "warnings": warnings, "pictures": [str(p) for sheet in sheets for p in sheet.written]}
     text = json.dumps(figures, indent=2)

@@ -14,24 +14,25 @@ def add_kind(kinds: Any) -> None:
     """Add ``follow`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "follow",
-        help="the r-bot behind a v-bot through random rooms, in simulation",
+        help="simulate the r-bot following a v-bot through random rooms",
         description=(
-            "Random rooms with walls, boxes, low and hanging things, people in a fifth of them. A v-bot is driven "
-            "through them to a goal, the r-bot follows: costmap, planner, follower and collision monitor as on the "
-            "robot, with slip, late commands, sensor noise and a pose that wanders. Tells contacts, goals reached, the "
-            "length of the way against the shortest one, and what each part takes of the processor. The same seed "
-            "gives the same drives."
+            "Drive a v-bot to a goal through random rooms with walls, boxes, low and hanging obstacles, and people in "
+            "a fifth of them. The r-bot follows with the robot's own costmap, planner, follower and collision monitor, "
+            "under slip, command delay, sensor noise and pose drift. Reports contacts, goals reached, path length "
+            "relative to the shortest path, and CPU time of each part. The same seed gives the same drives."
         ),
         epilog="example: ic evaluate follow --episodes 50 --seed 0 --json follow.json --plot follow.png",
     )
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="drives (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the rooms and all noise (default: %(default)s)")
+    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="number of drives (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the rooms and all noise (default: %(default)s)")
     parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives at a time (default: all cores)"
+        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives in parallel (default: all cores)"
     )
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write a sheet of drives here, the worst first")
-    parser.add_argument("--timeout", type=float, default=3600.0, metavar="S", help="in all (default: %(default)g s)")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="plot the drives here, the worst first")
+    parser.add_argument(
+        "--timeout", type=float, default=3600.0, metavar="S", help="time limit (default: %(default)g s)"
+    )
     parser.set_defaults(func=run)
 
 
@@ -52,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     console = Console(stderr=True)
     for path in (args.json, args.plot):
         if path is not None and not path.parent.is_dir():
-            console.print(f"ic evaluate follow: {path.parent} is no folder", style="red", markup=False)
+            console.print(f"ic evaluate follow: the folder {path.parent} does not exist", style="red", markup=False)
             return 1
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     try:

@@ -19,33 +19,35 @@ def add_kind(kinds: Any) -> None:
     """Add ``slam`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "slam",
-        help="a 2D laser log through the grid SLAM",
+        help="run SLAM on a 2D laser log",
         description=(
-            "Runs a log through the grid SLAM as fast as it goes. LOG is a CARMEN log (FLASER or ROBOTLASER1 lines, "
-            "gzip or not), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes the final trajectory, 't x y yaw' "
-            "a line for every scan, and prints the figures as JSON; with relations also the error against them."
+            "Run the grid SLAM on a log as fast as possible. LOG is a CARMEN log (FLASER or ROBOTLASER1 lines, gzip or "
+            "plain), a BreezySLAM exp*.dat, or a bag with LaserScan. Writes the final trajectory, one line "
+            "'t x y yaw' per scan, and prints the figures as JSON; with relations also the error against them."
         ),
         epilog="example: ic evaluate slam intel.log.gz --relations intel.relations --stamps intel.exact_stamps",
     )
     parser.add_argument("log", type=Path, metavar="LOG")
-    parser.add_argument("--relations", type=Path, metavar="REL", help="checked relations: t1 t2 x y z roll pitch yaw")
-    parser.add_argument("--stamps", type=Path, metavar="FILE", help="only relations whose ends lie on these times")
+    parser.add_argument("--relations", type=Path, metavar="REL", help="reference relations: t1 t2 x y z roll pitch yaw")
+    parser.add_argument("--stamps", type=Path, metavar="FILE", help="use only relations whose ends match these times")
     parser.add_argument(
-        "--tolerance", type=float, default=0.006, metavar="S", help="... within so much (default: %(default)g s)"
+        "--tolerance", type=float, default=0.006, metavar="S", help="tolerance of that match (default: %(default)g s)"
     )
     parser.add_argument("--backend", choices=("graph", "rbpf"), help="SLAM method (default: slam.backend, graph)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="picture of map and trajectory")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write an image of map and trajectory here")
     parser.add_argument(
         "--trajectory", type=Path, metavar="FILE", help="trajectory file (default: LOG's name + .trajectory.txt, here)"
     )
-    parser.add_argument("--scan-topic", metavar="TOPIC", help="of a bag with several LaserScan topics")
+    parser.add_argument("--scan-topic", metavar="TOPIC", help="scan topic, for a bag with several")
     parser.add_argument("--params-file", type=Path, action="append", metavar="F", help="parameters of grid_slam")
     parser.add_argument(
         "-p", "--param", action="append", default=[], metavar="KEY:=VALUE", help="one parameter of grid_slam"
     )
-    parser.add_argument("--no-odometry", action="store_true", help="leave the log's odometry out")
-    parser.add_argument("--perturb-odometry", type=int, metavar="SEED", help="worsen it: 5 %% noise, 2 %% scale")
+    parser.add_argument("--no-odometry", action="store_true", help="ignore the log's odometry")
+    parser.add_argument(
+        "--perturb-odometry", type=int, metavar="SEED", help="degrade the odometry: 5 %% noise, 2 %% scale"
+    )
     parser.set_defaults(func=evaluate_slam)
 
 
@@ -66,7 +68,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     from instant_ic.slam.logs import LogError, read_log
 
     if args.stamps and not args.relations:
-        raise UserError("--stamps chooses among relations: give --relations too", 2)
+        raise UserError("--stamps selects relations: give --relations too", 2)
     if not args.tolerance > 0:
         raise UserError(f"--tolerance must be > 0 (got {args.tolerance:g})", 2)
     words = [f"grid_slam.{word}" for word in args.param]
@@ -76,14 +78,14 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     trajectory_file = args.trajectory or Path(_stem(args.log) + ".trajectory.txt")
     for file in (args.json, args.plot, trajectory_file):
         if file is not None and not file.parent.is_dir():
-            raise UserError(f"{file}: there is no folder {file.parent}", 2)
+            raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
     console = Console(stderr=True)
     try:
         relations = read_relations(args.relations) if args.relations else None
         if relations is not None and args.stamps:
             relations = relations.at_stamps(read_stamps(args.stamps), args.tolerance)
             if len(relations) == 0:
-                raise LogError(f"no relation of {args.relations} has both ends on a time of {args.stamps}")
+                raise LogError(f"no relation in {args.relations} has both ends at a time in {args.stamps}")
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),

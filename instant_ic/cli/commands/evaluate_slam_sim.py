@@ -15,21 +15,27 @@ def add_kind(kinds: Any) -> None:
     """Add ``slam-sim`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "slam-sim",
-        help="a round trip of the simulated crawler on slipping tracks",
+        help="run SLAM on round trips of the simulated crawler with slipping tracks",
         description=(
-            "Drives the simulated crawler up a corridor and back on tracks that lose a random share of their way, runs "
-            "SLAM on its scans and encoders, and compares with the true poses. Prints the figures of each seed as JSON."
+            "Drive the simulated crawler along a corridor and back, on tracks with random slip; run SLAM on its scans "
+            "and encoders, and compare with the true poses. Prints the figures of each seed as JSON."
         ),
         epilog="example: ic evaluate slam-sim --slip 0.2 --seeds 5",
     )
-    parser.add_argument("--world", default="corridor", help="of the simulator (default: %(default)s)")
-    parser.add_argument("--slip", type=float, default=0.2, help="share of the way, one σ (default: %(default)g)")
-    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="drives (default: %(default)d)")
-    parser.add_argument("--rounds", type=int, default=2, help="of about 39 m each (default: %(default)d)")
+    parser.add_argument("--world", default="corridor", help="world of the simulator (default: %(default)s)")
+    parser.add_argument(
+        "--slip", type=float, default=0.2, help="slip as a share of the distance, 1 σ (default: %(default)g)"
+    )
+    parser.add_argument("--seeds", type=int, default=5, metavar="N", help="number of drives (default: %(default)d)")
+    parser.add_argument(
+        "--rounds", type=int, default=2, help="round trips per drive, about 39 m each (default: %(default)d)"
+    )
     parser.add_argument("--backend", choices=("graph", "rbpf"), default="graph", help="SLAM method")
-    parser.add_argument("--no-odometry", action="store_true", help="leave the encoders out")
+    parser.add_argument("--no-odometry", action="store_true", help="ignore the encoders")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="picture of the last drive's map and paths")
+    parser.add_argument(
+        "--plot", type=Path, metavar="OUT.png", help="write an image of the last drive's map and paths here"
+    )
     parser.set_defaults(func=evaluate_slam_sim)
 
 

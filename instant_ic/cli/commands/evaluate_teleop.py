@@ -18,25 +18,27 @@ def add_kind(kinds: Any) -> None:
     """Add ``teleop`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "teleop",
-        help="an operator drives through corridors with hidden obstacles: illusory control, stopping, shared control",
+        help="simulate an operator in corridors with hidden obstacles: illusory control, stopping, shared control",
         description=(
-            "A scripted operator who looks at goals only drives a simulated robot through random corridors with boxes, "
-            "posts and low things in the way. The whole stack runs in one process in simulated time: the nodes, their "
-            "parameters and messages. Each course is driven by illusory control (ic), by a robot that stops at "
-            "obstacles until the operator looks and steers round (stop), and by shared control that goes round by "
-            "itself (shared). Tells contacts, obedience, switches and how far the picture jumps at them, time lost. "
+            "A scripted operator who only sees goals drives a simulated robot through random corridors with boxes, "
+            "posts and low obstacles. All nodes run in one process in simulated time, with their parameters and "
+            "messages. Each course is driven with illusory control (ic), with a robot that stops at obstacles until "
+            "the operator looks and steers around them (stop), and with shared control that avoids them by itself "
+            "(shared). Reports contacts, obedience, switches, image jumps at switches, and lost time. "
             "The same seed gives the same drives."
         ),
         epilog="example: ic evaluate teleop --episodes 50 --seed 0 --json teleop.json --plot teleop.png",
     )
-    parser.add_argument("--episodes", type=int, default=50, metavar="N", help="courses (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the courses and all noise (default: %(default)s)")
+    parser.add_argument(
+        "--episodes", type=int, default=50, metavar="N", help="number of courses (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the courses and all noise (default: %(default)s)")
     parser.add_argument(
         "--world",
         default="corridors",
         metavar="W",
-        help="corridors (random ones); or one of the simulator's: corridor, where the operator drives straight on, "
-        "random:SEED or a mesh file, where he drives at random places that he can see (default: %(default)s)",
+        help="corridors (random), or a world of the simulator: corridor, where the operator drives straight on, "
+        "random:SEED or a mesh file, where the operator drives to random visible places (default: %(default)s)",
     )
     parser.add_argument(
         "--methods", default="ic,stop,shared", metavar="M,M", help="ic, stop, shared (default: %(default)s)"
@@ -45,7 +47,7 @@ def add_kind(kinds: Any) -> None:
         "--operator",
         choices=("scripted", "recorded"),
         default="scripted",
-        help="recorded repeats the commands of --log, whatever they lead to (default: %(default)s)",
+        help="recorded replays the commands of --log regardless of their effect (default: %(default)s)",
     )
     parser.add_argument(
         "--log", type=Path, metavar="FILE", help="bag with /operator/cmd_vel, or CSV: time_s,linear_m_s,angular_rad_s"
@@ -54,7 +56,7 @@ def add_kind(kinds: Any) -> None:
         "--depth",
         choices=("fused", "lidar"),
         default="fused",
-        help="what the virtual space's depth is made of: network and LiDAR, or the LiDAR alone (default: %(default)s)",
+        help="depth source of the virtual space: network and LiDAR, or LiDAR only (default: %(default)s)",
     )
     parser.add_argument(
         "-p",
@@ -62,20 +64,20 @@ def add_kind(kinds: Any) -> None:
         action="append",
         default=[],
         metavar="NODE.KEY:=VALUE",
-        help="another parameter than the shipped one, as virtual_robot.vbot.ease_m_s:=0.05; may be repeated",
+        help="override a parameter, for example virtual_robot.vbot.ease_m_s:=0.05; repeatable",
     )
     parser.add_argument(
-        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives at a time (default: all cores)"
+        "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="drives in parallel (default: all cores)"
     )
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here, anew after each drive")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here, updated after each drive")
+    parser.add_argument("--resume", action="store_true", help="keep the drives in --json and run only the missing ones")
+    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="plot paths, and bars by method, here")
     parser.add_argument(
-        "--resume", action="store_true", help="go on with what --json has: only drives that it lacks are driven"
+        "--video", type=Path, metavar="OUT.mp4", help="write a split-view video of the first course and method here"
     )
-    parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write paths and bars by method here")
     parser.add_argument(
-        "--video", type=Path, metavar="OUT.mp4", help="write the first course by the first method here, as a split view"
+        "--timeout", type=float, default=7200.0, metavar="S", help="time limit (default: %(default)g s)"
     )
-    parser.add_argument("--timeout", type=float, default=7200.0, metavar="S", help="in all (default: %(default)g s)")
     parser.set_defaults(func=run)
 
 
@@ -102,15 +104,15 @@ def _wrong_usage(args: argparse.Namespace) -> str:
     """Text of the error in the arguments; empty where there is none."""
     for path in (args.json, args.plot, args.video):
         if path is not None and not path.parent.is_dir():
-            return f"{path.parent} is no folder"
+            return f"the folder {path.parent} does not exist"
     if args.video is not None and args.video.suffix.lower() != ".mp4":
-        return f"{args.video}: the video is an .mp4"
+        return f"{args.video}: the name must end in .mp4"
     if args.operator == "recorded" and args.log is None:
-        return "--operator recorded needs --log: a bag, or a CSV file"
+        return "--operator recorded needs --log: a bag or a CSV file"
     if args.operator == "scripted" and args.log is not None:
-        return "--log is for --operator recorded"
+        return "--log needs --operator recorded"
     if args.resume and args.json is None:
-        return "--resume needs --json: the file that the earlier run has written"
+        return "--resume needs --json: the file written by the earlier run"
     return ""
 
 
@@ -136,7 +138,7 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     if args.video and not status:
         from instant_ic.experiments.teleop_plot import Video
 
-        with Video(args.video) as video, console.status("drawing the video"):
+        with Video(args.video) as video, console.status("rendering the video"):
             teleop.run_episode(settings, 0, video.on_step, methods[:1])
     each = figures.pop("each")
     sys.stdout.write(json.dumps(figures, indent=2) + "\n")
@@ -191,7 +193,7 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
         except KeyboardInterrupt:
             status, words = 130, "interrupted"
     if status:
-        kept = f"; {args.json} has them, --resume drives the others" if args.json and drives else ""
+        kept = f"; they are saved in {args.json}, continue with --resume" if args.json and drives else ""
         words = f"ic evaluate teleop: {words}; {len(drives)} of {planned} drives are done{kept}"
         console.print(words, style="red", markup=False)
     return status

@@ -15,14 +15,14 @@ def add_kind(kinds: Any) -> None:
     """Add ``vspace`` to ``ic evaluate``."""
     parser = kinds.add_parser(
         "vspace",
-        help="pictures of the virtual space against the truth, by distance and training time",
+        help="image quality of the virtual space by distance and training time",
         description=(
-            "Takes a panorama in a simulated world, makes each source ready, and compares its pictures with the "
-            "world's own at distances from the panorama: PSNR and SSIM. Sources: ours (the shipped depth model, scaled "
-            "by a simulated LiDAR, and the virtual space), field (its field alone, never the warp), true-depth (ours "
-            "with the world's depth: the ceiling), no-depth (colours alone), no-scale (the model's depth as it comes), "
-            "panorama (turned, no depth), depth-warp, point-warp and true-warp (the panorama warped by depth), mesh "
-            "(the world scanned at another time)."
+            "Take a panorama in a simulated world, prepare each source, and compare its views with the world's own at "
+            "several distances from the panorama: PSNR and SSIM. Sources: ours (the shipped depth model, scaled by a "
+            "simulated LiDAR, and the virtual space), field (its field only, without the warp), true-depth (ours with "
+            "the true depth: the upper bound), no-depth (colours only), no-scale (the model's unscaled depth), "
+            "panorama (rotated only, no depth), depth-warp, point-warp and true-warp (the panorama warped by depth), "
+            "mesh (the world scanned at another time)."
         ),
         epilog=(
             "example: ic evaluate vspace --world corridor --path straight --sources ours,panorama,depth-warp "
@@ -34,14 +34,18 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument(
         "--sources", default="ours,no-depth,no-scale,panorama,depth-warp,mesh", help="default: %(default)s"
     )
-    parser.add_argument("--start", metavar="X,Y,YAW", help="place of the last panorama, metres and degrees")
-    parser.add_argument("--seconds", type=float, default=8.0, metavar="S", help="CPU s of training (default: 8)")
+    parser.add_argument("--start", metavar="X,Y,YAW", help="position of the last panorama, metres and degrees")
+    parser.add_argument(
+        "--seconds", type=float, default=8.0, metavar="S", help="training time, CPU seconds (default: 8)"
+    )
     parser.add_argument("--times", metavar="S,S,...", help="training times at which ours and field are measured")
-    parser.add_argument("--size", default="640x360", metavar="WxH", help="of the pictures (default: %(default)s)")
-    parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="horizontal (default: 90)")
+    parser.add_argument("--size", default="640x360", metavar="WxH", help="size of the images (default: %(default)s)")
+    parser.add_argument("--fov", type=float, default=90.0, metavar="DEG", help="horizontal field of view (default: 90)")
     parser.add_argument("--panorama-width", type=int, default=2048, metavar="PX", help="default: %(default)s")
-    parser.add_argument("--keyframes", type=int, default=1, metavar="K", help="each 1 m behind the next (default: 1)")
-    parser.add_argument("--step", type=float, default=0.25, metavar="M", help="between distances (default: 0.25)")
+    parser.add_argument(
+        "--keyframes", type=int, default=1, metavar="K", help="number of panoramas, 1 m apart (default: 1)"
+    )
+    parser.add_argument("--step", type=float, default=0.25, metavar="M", help="step between distances (default: 0.25)")
     parser.add_argument("--reach", type=float, default=4.0, metavar="M", help="longest distance (default: 4)")
     parser.add_argument(
         "--depth-source", choices=("network", "lidar", "fused"), default="fused", help="of ours (default: %(default)s)"
@@ -49,7 +53,7 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, metavar="OUT", help="write all figures here")
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write the curves here")
-    parser.add_argument("--strip", type=Path, metavar="OUT.png", help="write pictures at 0.5, 1, 2 and 3 m here")
+    parser.add_argument("--strip", type=Path, metavar="OUT.png", help="write images at 0.5, 1, 2 and 3 m here")
     parser.set_defaults(func=run)
 
 
@@ -63,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
     for file in (args.json, args.plot, args.strip):
         if file is not None and not file.parent.is_dir():
-            raise UserError(f"{file}: there is no folder {file.parent}", 2)
+            raise UserError(f"{file}: the folder {file.parent} does not exist", 2)
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     try:
@@ -123,7 +127,7 @@ def _numbers(text: str, option: str) -> list[float]:
     try:
         return [float(word) for word in text.split(",")]
     except ValueError as error:
-        raise ValueError(f"{option} must be numbers with commas between (got {text!r})") from error
+        raise ValueError(f"{option} must be numbers separated by commas (got {text!r})") from error
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -14,12 +14,12 @@ def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
         "graph",
-        help="picture of nodes and topics",
-        description="Shows who publishes what to whom, as a tree, or as a picture with -o.",
+        help="nodes and topics as a tree or an image",
+        description="Show publishers and subscribers as a tree, or as an image with -o.",
         epilog="example: ic graph -o stack.svg",
     )
     completion.offer(
-        parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these and their partners (default: all)"),
+        parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these and their neighbours (default: all)"),
         completion.nodes,
     )
     parser.add_argument(
@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
         "-a",
         "--all",
         action="store_true",
-        help="also topics that all nodes have, and those without a reader or publisher",
+        help="also topics that every node has, and topics without a subscriber or publisher",
     )
     parser.add_argument("--tf", action="store_true", help="also /tf and /tf_static")
     parser.set_defaults(func=show)

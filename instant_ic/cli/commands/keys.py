@@ -14,39 +14,41 @@ def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
         "keys",
-        help="keys of the link between robot and station",
-        description="Makes this host's key, and says which other hosts may be linked with it (docs/bridge.md).",
+        help="manage keys of the link between robot and station",
+        description="Create this host's key, and set which other hosts may connect to it (docs/bridge.md).",
         epilog="example: ic keys new",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     new = _verb(
-        verbs, "new", make, "make this host's key",
-        "Makes this host's key and prints the line by which the other host allows it.",
+        verbs, "new", make, "create this host's key",
+        "Create this host's key and print the command that allows it on the other host.",
         "example: ic keys new robot",
     )  # fmt: skip
-    new.add_argument("name", metavar="NAME", nargs="?", help="what this host is called (default: its host name)")
-    new.add_argument("--force", action="store_true", help="replace a key; every other host must then allow the new one")
+    new.add_argument("name", metavar="NAME", nargs="?", help="name of this host (default: its host name)")
+    new.add_argument(
+        "--force", action="store_true", help="replace an existing key; every other host must then allow the new one"
+    )
     _verb(
-        verbs, "list", show, "this host's key and the allowed hosts",
-        "Shows this host's public key and the hosts that are allowed.",
+        verbs, "list", show, "list this host's key and the allowed hosts",
+        "List this host's public key and the allowed hosts.",
         "example: ic keys list",
     )  # fmt: skip
     allow = _verb(
         verbs, "allow", let_in, "allow another host",
-        "Allows another host. A running bridge takes it up at once; the same name again replaces the key or the role.",
+        "Allow another host. A running bridge applies this at once. An existing name gets the new key or role.",
         "example: ic keys allow station ick_...",
     )  # fmt: skip
-    allow.add_argument("name", metavar="NAME", help="what the other host is called here")
-    allow.add_argument("key", metavar="KEY", help="its public key, as `ic keys list` shows it there")
+    allow.add_argument("name", metavar="NAME", help="name for the other host")
+    allow.add_argument("key", metavar="KEY", help="its public key, from `ic keys list` on that host")
     allow.add_argument(
-        "--role", choices=("driver", "viewer"), default="driver", help="viewer: sees, sends nothing (default: driver)"
+        "--role", choices=("driver", "viewer"), default="driver", help="viewer receives only (default: driver)"
     )
     revoke = _verb(
         verbs, "revoke", shut_out, "no longer allow another host",
-        "Takes a host off the list. A running bridge cuts it off at once.",
+        "Remove a host from the list. A running bridge disconnects it at once.",
         "example: ic keys revoke station",
     )  # fmt: skip
-    revoke.add_argument("name", metavar="NAME", help="as it was allowed")
+    revoke.add_argument("name", metavar="NAME", help="name given to ic keys allow")
 
 
 def _verb(verbs: Any, name: str, function: Any, help_: str, description: str, epilog: str) -> argparse.ArgumentParser:
@@ -79,7 +81,7 @@ def make(args: argparse.Namespace) -> int:
 
     store = _store(args)
     identity = store.create(args.name or host_name(), args.force)
-    print(f"key of {identity.name} made in {store.folder} (fingerprint {identity.fingerprint})")
+    print(f"created the key of {identity.name} in {store.folder} (fingerprint {identity.fingerprint})")
     print(f"on the other host run:\n\n  ic keys allow {identity.name} {key_text(identity.public_key)}\n")
     return 0
 
@@ -99,7 +101,7 @@ def show(args: argparse.Namespace) -> int:
     for peer in peers:
         print(f"allowed:   {peer.name:<{width}}  {peer.role}  {peer.fingerprint}  {key_text(peer.public_key)}")
     if not peers:
-        print("allowed:   nobody yet (ic keys allow NAME KEY)")
+        print("allowed:   none yet (ic keys allow NAME KEY)")
     return 0
 
 
@@ -112,12 +114,12 @@ def let_in(args: argparse.Namespace) -> int:
     if store.identity_path.exists() and store.identity().public_key == peer.public_key:
         from instant_ic.cli.errors import UserError
 
-        raise UserError("this is this host's own key: allow it on the other host, and the other's here")
+        raise UserError("this is this host's own key: allow it on the other host, and the other host's key here")
     done = store.allow(peer)
     print(f"{peer.name} ({peer.role}, fingerprint {peer.fingerprint}): {done}")
     if not store.identity_path.exists():
         identity = store.create(host_name())
-        print(f"this host had no key: key of {identity.name} made; on the other host run:\n")
+        print(f"this host had no key: created the key of {identity.name}; on the other host run:\n")
         print(f"  ic keys allow {identity.name} {key_text(identity.public_key)}\n")
     return 0
 

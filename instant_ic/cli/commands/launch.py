@@ -17,13 +17,13 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "launch",
         help="start a stack from a launch file",
-        description="Starts the nodes of a launch file, shows how they are, and ends them all on Ctrl-C.",
+        description="Start the nodes of a launch file, show their state, and stop them all on Ctrl-C.",
         epilog="example: ic launch sim console_port:=9000 record:=drive",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     completion.offer(
         parser.add_argument(
-            "file", metavar="FILE", help="path, or a shipped one: sim, robot, station, full, fleet, replay"
+            "file", metavar="FILE", help="path, or a shipped file: sim, robot, station, full, fleet, replay"
         ),
         completion.launch_files,
     )
@@ -32,21 +32,23 @@ def add_parser(subparsers: Any) -> None:
         completion.launch_arguments,
     )
     parser.add_argument(
-        "-s", "--show-args", "--show-arguments", action="store_true", help="list the file's arguments and end"
+        "-s", "--show-args", "--show-arguments", action="store_true", help="list the file's arguments and exit"
     )
     parser.add_argument(
-        "--check", action="store_true", help="check file, arguments and every node's parameters, start nothing"
+        "--check", action="store_true", help="check file, arguments and every node's parameters without starting"
     )
     parser.add_argument(
-        "--no-check", action="store_true", help="start without checking the nodes' parameters first; they do it too"
+        "--no-check",
+        action="store_true",
+        help="skip the check of node parameters before the start (each node checks its own)",
     )
-    parser.add_argument("--plain", action="store_true", help="plain lines also in a terminal")
+    parser.add_argument("--plain", action="store_true", help="plain log lines even in a terminal")
     parser.add_argument(
         "--pace",
         type=float,
         default=1.0,
         metavar="X",
-        help="let a simulated stack's time go at X of the machine's: 0.5 is half as fast, for a slow machine",
+        help="speed of simulated time relative to real time: 0.5 is half as fast, for a slow machine",
     )
     parser.add_argument("--run-dir", type=Path, default=None, metavar="DIR", help="default: $INSTANT_IC_RUN_DIR")
     parser.set_defaults(func=run)
@@ -97,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
         if problems:
             return 2
     if args.check:
-        print(f"{description.file.name}: {len(description.nodes)} nodes, no mistake found")
+        print(f"{description.file.name}: {len(description.nodes)} nodes, no errors")
         return 0
     from instant_ic.launch.app import run_stack
 
@@ -110,11 +112,11 @@ def _show(name: str, arguments: Sequence[Any], included: Sequence[Any]) -> None:
         print("  none")
     for argument in arguments:
         kind = " | ".join(argument.choices) if argument.choices else argument.type
-        default = "must be given" if argument.default is None else f"default: {argument.default!r}"
+        default = "required" if argument.default is None else f"default: {argument.default!r}"
         print(f"  {argument.name}: {kind} ({default})")
         if argument.description:
             print(f"      {argument.description}")
     for file in dict.fromkeys(argument.file for argument in included):
         left = ", ".join(f"{a.name} {a.default!r}" for a in included if a.file == file and a.default is not None)
         if left:
-            print(f"{file.name}, which it includes, keeps its own defaults of: {left}")
+            print(f"the included {file.name} keeps its own defaults of: {left}")

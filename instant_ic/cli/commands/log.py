@@ -16,21 +16,21 @@ def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
         "log",
-        help="log lines of the nodes; their log level",
-        description="Shows log lines of the nodes, in the order of time.\n"
-        "ic log level NODE [LEVEL] tells or sets how much a running node says: debug, info, warning, error.",
+        help="show log lines of the nodes, or set a log level",
+        description="Show log lines of the nodes, sorted by time.\n"
+        "ic log level NODE [LEVEL] prints or sets the log level of a running node: debug, info, warning, error.",
         epilog="example: ic log arbiter navigator --level warning -f",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     completion.offer(parser.add_argument("nodes", metavar="NODE", nargs="*", help="default: all"), completion.nodes)
     parser.add_argument(
-        "-l", "--level", default="debug", metavar="LEVEL", help="this and worse: debug, info, warn, error"
+        "-l", "--level", default="debug", metavar="LEVEL", help="lowest level to show: debug, info, warn, error"
     )
-    parser.add_argument("-f", "--follow", action="store_true", help="go on with what comes")
+    parser.add_argument("-f", "--follow", action="store_true", help="follow: print new lines as they arrive")
     parser.add_argument(
         "-n", "--lines", type=not_negative, metavar="N", help="the last N (default: 30, or all since --since)"
     )
-    parser.add_argument("--since", type=seconds, metavar="TIME", help="of the last 30s, 10m, 2h, 1d")
+    parser.add_argument("--since", type=seconds, metavar="TIME", help="lines of the last 30s, 10m, 2h, 1d")
     parser.add_argument("--color", choices=("auto", "always", "never"), default="auto", help="default: auto")
     parser.set_defaults(func=show)
 
@@ -65,7 +65,7 @@ def show(args: argparse.Namespace) -> int:
     if not args.follow:
         if silent:
             print(
-                f"ic: {', '.join(silent)}: no log file, as ic launch did not start it; -f shows what it says now",
+                f"ic: {', '.join(silent)}: no log file because ic launch did not start it; -f shows new lines",
                 file=sys.stderr,
             )
         return 0
@@ -79,7 +79,7 @@ def _check_names(names: list[str], run_dir: Any, running: dict[str, float]) -> N
     known = {*running, *(path.stem for path in (run_dir / "log").glob("*.log"))}
     for name in names:
         if name not in known:
-            raise UserError(f"{name}: no such node, nor a log of it in {run_dir} ({near(name, known, 'ic node list')})")
+            raise UserError(f"{name}: no such node and no log of it in {run_dir} ({near(name, known, 'ic node list')})")
 
 
 def _follow(folder: Any, nodes: set[str], level: int, colour: bool) -> int:

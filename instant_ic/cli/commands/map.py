@@ -14,19 +14,21 @@ SAVE, SAVED = "/slam/save", "/slam/saved"
 
 def add_parser(subparsers: Any) -> None:
     """Add ``map`` to the ``ic`` command."""
-    parser = subparsers.add_parser("map", help="save the map", description="Saves the map of the running stack.")
+    parser = subparsers.add_parser("map", help="save the map", description="Save the map of the running stack.")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
     save = verbs.add_parser(
         "save",
-        help="write the map as ROS has it",
+        help="save the map in ROS format",
         description=(
-            "Has grid_slam write NAME.yaml and NAME.pgm, as ROS's map_server reads them, and NAME.graph.npz, with "
-            "which the map can be continued (grid_slam's map_file)."
+            "Make grid_slam write NAME.yaml and NAME.pgm for ROS's map_server, and NAME.graph.npz, from which "
+            "mapping can continue (grid_slam's map_file)."
         ),
         epilog="example: ic map save ~/maps/floor3",
     )
-    save.add_argument("name", type=Path, metavar="NAME", help="path without ending; folders are made")
-    save.add_argument("--timeout", type=float, default=20.0, metavar="S", help="(default: %(default)g s)")
+    save.add_argument("name", type=Path, metavar="NAME", help="path without suffix; missing folders are created")
+    save.add_argument(
+        "--timeout", type=float, default=20.0, metavar="S", help="wait at most this long (default: %(default)g s)"
+    )
     save.set_defaults(func=save_map)
 
 
@@ -41,14 +43,14 @@ def save_map(args: argparse.Namespace) -> int:
         raise UserError(f"--timeout must be > 0 (got {args.timeout:g})", 2)
     name = args.name.expanduser().absolute()
     if name.suffix in (".yaml", ".pgm"):
-        raise UserError(f"NAME goes without ending: {name.with_suffix('')}", 2)
+        raise UserError(f"NAME must have no suffix: {name.with_suffix('')}", 2)
     string = message_type("String")
     deadline = time.monotonic() + args.timeout
     with Observer([SAVED]) as observer:
         request = Publisher(observer.transport.advertise(SAVE, type_name(string), RELIABLE))
         while request.subscriber_count == 0:
             if time.monotonic() > deadline:
-                raise UserError("nobody saves maps here: grid_slam is not running (ic node list)")
+                raise UserError("cannot save the map: grid_slam is not running (ic node list)")
             time.sleep(0.05)
         request.publish(string(data=str(name)))
         for batch in observer.batches(max(deadline - time.monotonic(), 0.1), 0.1):

@@ -11,24 +11,25 @@ from instant_ic.cli import completion
 def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
-        "node", help="list running nodes", description="Tells which nodes run.", epilog="example: ic node list"
+        "node",
+        help="list running nodes",
+        description="List and describe running nodes.",
+        epilog="example: ic node list",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
     listing = verbs.add_parser(
         "list",
         help="names of the running nodes",
-        description="Lists the running nodes.",
+        description="List the running nodes.",
         epilog="example: ic node list -v",
     )
-    listing.add_argument("-c", "--count-nodes", action="store_true", help="only how many there are")
-    listing.add_argument(
-        "-v", "--verbose", action="store_true", help="with process id, time since the start, executable"
-    )
+    listing.add_argument("-c", "--count-nodes", action="store_true", help="print only their number")
+    listing.add_argument("-v", "--verbose", action="store_true", help="also process id, uptime, executable")
     listing.set_defaults(func=list_nodes)
     info = verbs.add_parser(
         "info",
         help="state, process and topics of a node",
-        description="Tells what a node does: state, process, what it publishes and subscribes, at which rates.",
+        description="Show a node's state and process, its publishers and subscriptions, and their rates.",
         epilog="example: ic node info grid_slam",
     )
     completion.offer(info.add_argument("node", metavar="NODE"), completion.nodes)

@@ -19,7 +19,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "param",
         help="read and change parameters of running nodes",
-        description="Reads and changes parameters of running nodes.",
+        description="Read and change parameters of running nodes.",
         epilog="example: ic param set arbiter switch.yaw_deg 12",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
@@ -38,25 +38,25 @@ def add_parser(subparsers: Any) -> None:
 
     added = verb("list", "names of the parameters of one node, or of all", list_parameters, "list grid_slam")
     argument(added, "node", nargs="?", metavar="NODE", help="default: every node", completer=completion.nodes)
-    added.add_argument("-v", "--values", action="store_true", help="with their values")
+    added.add_argument("-v", "--values", action="store_true", help="also print their values")
     added = verb("get", "value of one parameter", get_parameter, "get grid_slam field.resolution_m")
     argument(added, "node", metavar="NODE", completer=completion.nodes)
-    argument(added, "key", metavar="KEY", help="nested keys with dots", completer=completion.parameters)
-    added = verb("set", "changes parameters while the node runs", set_parameters, "set depth_estimator max_rate_hz 1")
+    argument(added, "key", metavar="KEY", help="a nested key is separated by dots", completer=completion.parameters)
+    added = verb("set", "change parameters while the node runs", set_parameters, "set depth_estimator max_rate_hz 1")
     argument(added, "node", metavar="NODE", completer=completion.nodes)
     argument(
         added, "pairs", metavar="KEY VALUE", nargs="+", completer=completion.parameters,
-        help="several are changed together, or none; values are YAML",
+        help="several pairs are changed together, or none; values are YAML",
     )  # fmt: skip
     added = verb("describe", "type, range, default and meaning", describe, "describe arbiter switch.yaw_deg")
     argument(added, "node", metavar="NODE", completer=completion.nodes)
     argument(added, "keys", metavar="KEY", nargs="*", help="default: all", completer=completion.parameters)
     added = verb("dump", "all parameters of a node as a parameter file", dump, "dump arbiter > arbiter.yaml")
     argument(added, "node", metavar="NODE", completer=completion.nodes)
-    added.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: the standard output")
-    added = verb("load", "changes parameters to those of a file", load, "load arbiter arbiter.yaml")
+    added.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: standard output")
+    added = verb("load", "set parameters from a file", load, "load arbiter arbiter.yaml")
     argument(added, "node", metavar="NODE", completer=completion.nodes)
-    added.add_argument("file", metavar="FILE", type=Path, help="as ic param dump writes it")
+    added.add_argument("file", metavar="FILE", type=Path, help="file in the format of ic param dump")
 
 
 def _control(node: str) -> NodeControl:
@@ -103,7 +103,7 @@ def get_parameter(args: argparse.Namespace) -> int:
 def _no_parameter(node: str, key: str, known: Any) -> UserError:
     from instant_ic.cli.names import near
 
-    return UserError(f"node {node} has no parameter {key!r} ({near(key, known, f'ic param list {node} shows them')})")
+    return UserError(f"node {node} has no parameter {key!r} ({near(key, known, f'see ic param list {node}')})")
 
 
 def set_parameters(args: argparse.Namespace) -> int:
@@ -122,7 +122,7 @@ def _change(node: str, values: dict[str, Any]) -> int:
     for key, value in changed.items():
         print(f"{key}: {_show(value)}")
     if not changed:
-        print("nothing to change: these values hold already")
+        print("nothing to change: the parameters already have these values")
     return 0
 
 

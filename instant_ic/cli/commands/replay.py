@@ -16,16 +16,16 @@ def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
         "replay",
-        help="feed a bag to nodes in lockstep and record what they make",
+        help="replay a bag through nodes in lockstep and record their output",
         description=(
-            "Runs nodes in one process on the clock of a bag, message by message, and records what they publish. "
-            "The result does not depend on how fast the machine is: twice the same command gives twice the same bytes."
+            "Run nodes in one process on the clock of a bag, message by message, and record what they publish. "
+            "The result does not depend on the speed of the machine: repeating a command gives the same bytes."
         ),
         epilog="example: ic replay drive --nodes grid_slam,depth_estimator,depth_scaler -o again "
         "-p grid_slam.field.resolution_m:=0.1",
     )
     completion.offer(parser.add_argument("bag", metavar="BAG"), completion.bags)
-    parser.add_argument("--nodes", required=True, metavar="A,B,...", help="nodes, in the order of their turns")
+    parser.add_argument("--nodes", required=True, metavar="A,B,...", help="nodes, in the order in which they run")
     parser.add_argument("-o", "--output", required=True, metavar="DIR", help="new bag")
     parser.add_argument(
         "--params-file",
@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
         type=Path,
         default=None,
         metavar="FILE",
-        help="repeatable; default: what config/ has for the nodes",
+        help="parameter file; repeatable; default: the nodes' files in config/",
     )
     parser.add_argument(
         "-p", "--param", action="append", default=[], metavar="NODE.KEY:=VALUE", help="one parameter; repeatable"
@@ -43,11 +43,14 @@ def add_parser(subparsers: Any) -> None:
         action="append",
         default=[],
         metavar="FRAME",
-        help="leave out transforms with this child",
+        help="leave out transforms with this child frame; repeatable",
     )
     parser.add_argument("--compression", action="store_true", help="compress the new bag with zstd")
     parser.add_argument(
-        "--compare", default="", metavar="BAG", help="then compare with this bag; exit status 1 when a topic differs"
+        "--compare",
+        default="",
+        metavar="BAG",
+        help="compare the result with this bag; exit status 1 if a topic differs",
     )
     tolerances(parser)
     parser.set_defaults(func=run)
@@ -60,13 +63,13 @@ def run(args: argparse.Namespace) -> int:
     names = [name for name in args.nodes.split(",") if name]
     for name in names:
         if name not in node_names():
-            raise UserError(f"there is no node {name!r}; there are {', '.join(node_names())}", 2)
+            raise UserError(f"there is no node {name!r}; available: {', '.join(node_names())}", 2)
     for word in args.param:
         node, dot, rest = word.partition(".")
         if not dot or ":=" not in rest or node not in names:
-            raise UserError(f"-p {word}: expected NODE.KEY:=VALUE with a NODE of {', '.join(names)}", 2)
+            raise UserError(f"-p {word}: expected NODE.KEY:=VALUE, NODE being one of {', '.join(names)}", 2)
     if Path(args.output).exists():
-        raise UserError(f"{args.output} exists already, not overwriting")
+        raise UserError(f"{args.output} exists already: choose another name with -o")
     if not Path(args.bag).exists():
         raise UserError(f"bag {args.bag} does not exist")
 

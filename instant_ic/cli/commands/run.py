@@ -15,17 +15,17 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "run",
         help="run one node in the foreground",
-        description="Runs one node until Ctrl-C. What follows its name goes to the node; ic run NODE --help lists it.",
+        description="Run one node until Ctrl-C. Arguments after its name go to the node: ic run NODE --help",
         epilog="example: ic run grid_slam --params-file config/slam.yaml -p use_sim_time:=true -r /scan:=/front/scan",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     completion.offer(
         parser.add_argument(
-            "node", metavar="NODE", help="name of a node (a wrong one lists them all), or a Python file with a node"
+            "node", metavar="NODE", help="name of a node (an unknown name lists all), or a Python file with a node"
         ),
         completion.programs,
     )
-    parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGUMENTS", help="for the node")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, metavar="ARGUMENTS", help="arguments for the node")
     parser.set_defaults(func=run, leaves=True)
 
 

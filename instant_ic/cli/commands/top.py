@@ -19,15 +19,13 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "top",
         help="CPU, memory, rates and losses of every node, live",
-        description="Shows CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
+        description="Show CPU, memory, threads, rates (measured/nominal) and losses of every node, once a second.",
         epilog="example: ic top --once",
     )
-    parser.add_argument("--once", action="store_true", help="print one table and end (as where there is no terminal)")
-    parser.add_argument("--json", action="store_true", help="print one table as JSON and end")
+    parser.add_argument("--once", action="store_true", help="print one table and exit (default without a terminal)")
+    parser.add_argument("--json", action="store_true", help="print one table as JSON and exit")
     parser.add_argument("--sort", choices=_SORT, default="cpu", help="default: %(default)s")
-    parser.add_argument(
-        "-d", "--delay", type=positive, default=1.0, metavar="S", help="between two tables (default: 1)"
-    )
+    parser.add_argument("-d", "--delay", type=positive, default=1.0, metavar="S", help="update period (default: 1)")
     parser.set_defaults(func=show)
 
 

@@ -15,7 +15,7 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "topic",
         help="list, watch, measure and publish topics",
-        description="Looks at topics, and publishes to them.",
+        description="Inspect topics and publish to them.",
         epilog="example: ic topic hz /scan",
     )
     verbs = parser.add_subparsers(metavar="VERB", required=True)
@@ -31,10 +31,10 @@ def add_parser(subparsers: Any) -> None:
         argument = added.add_argument("topic", metavar="TOPIC", nargs=nargs)
         completion.offer(argument, completion.topics)
 
-    added = verb("list", "names of the topics that are published or subscribed", list_topics, "ic topic list -t")
-    added.add_argument("-t", "--show-types", action="store_true", help="with the type of each")
-    added.add_argument("-c", "--count-topics", action="store_true", help="only how many there are")
-    added.add_argument("-v", "--verbose", action="store_true", help="with type, QoS, publishers and readers")
+    added = verb("list", "list published and subscribed topics", list_topics, "ic topic list -t")
+    added.add_argument("-t", "--show-types", action="store_true", help="also print the type of each")
+    added.add_argument("-c", "--count-topics", action="store_true", help="print only their number")
+    added.add_argument("-v", "--verbose", action="store_true", help="also print type, QoS, publishers and subscribers")
 
     added = verb("type", "type of a topic", show_type, "ic topic type /scan")
     topic(added)
@@ -46,64 +46,77 @@ def add_parser(subparsers: Any) -> None:
     added = verb("info", "type, publishers and subscribers of a topic", info, "ic topic info -v /scan")
     topic(added)
     added.add_argument(
-        "-v", "--verbose", action="store_true", help="with QoS, rates, and losses from each publisher to each reader"
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="also print QoS, rates, and losses from each publisher to each subscriber",
     )
 
-    added = verb("echo", "prints messages as they come", echo, "ic topic echo /pose --once --field pose.pose")
+    added = verb("echo", "print messages as they arrive", echo, "ic topic echo /pose --once --field pose.pose")
     topic(added)
-    added.add_argument("--once", action="store_true", help="end after the first message")
-    added.add_argument("-n", type=positive_int, default=0, metavar="COUNT", help="end after so many messages")
+    added.add_argument("--once", action="store_true", help="stop after the first message")
+    added.add_argument("-n", type=positive_int, default=0, metavar="COUNT", help="stop after this many messages")
     added.add_argument("--field", default="", metavar="PATH", help="only this field, for example pose.pose")
-    added.add_argument("-f", "--full-length", "--full", action="store_true", help="long arrays and strings in full")
+    added.add_argument(
+        "-f", "--full-length", "--full", action="store_true", help="print long arrays and strings in full"
+    )
     added.add_argument(
         "-l", "--truncate-length", type=positive_int, default=12, metavar="N",
-        help="values of an array, or tens of characters, from which on the rest is left out (default: %(default)s)",
+        help="shorten arrays above N values and strings above 10 N characters (default: %(default)s)",
     )  # fmt: skip
     added.add_argument("--no-arr", action="store_true", help="leave out the values of arrays")
     added.add_argument("--no-str", action="store_true", help="leave out strings")
     added.add_argument("--csv", action="store_true", help="one line of comma-separated values for each message")
-    added.add_argument("--json", action="store_true", help="one line of JSON for each message, nothing left out")
+    added.add_argument("--json", action="store_true", help="one line of JSON for each message, in full")
     added.add_argument(
-        "--timeout", type=positive, default=float("inf"), metavar="S", help="end after this time without COUNT"
+        "--timeout", type=positive, default=float("inf"), metavar="S", help="fail if fewer messages arrive in this time"
     )
 
     for name, words, function in (
-        ("hz", "rate, jitter and losses of topics, once a second", rate),
-        ("bw", "bytes a second of topics, once a second", bandwidth),
-        ("delay", "age of messages by their stamp when they come, once a second", delay),
+        ("hz", "print rate, jitter and losses of topics once a second", rate),
+        ("bw", "print the bandwidth of topics once a second", bandwidth),
+        ("delay", "print the age of messages on arrival, by their stamp, once a second", delay),
     ):
         added = verb(name, words, function, f"ic topic {name} /scan")
         topic(added, "+")
         added.add_argument(
             "-w", "--window", type=positive_int, default=10_000 if name == "hz" else 100, metavar="N",
-            help="messages that count (default: %(default)s)",
+            help="number of messages in the window (default: %(default)s)",
         )  # fmt: skip
-        added.add_argument("--duration", type=positive, default=float("inf"), metavar="S", help="default: no end")
+        added.add_argument(
+            "--duration", type=positive, default=float("inf"), metavar="S", help="stop after this time (default: never)"
+        )
         if name != "bw":
-            added.add_argument("--use-sim-time", action="store_true", help="by the time of /clock")
+            added.add_argument("--use-sim-time", action="store_true", help="measure in the time of /clock")
 
-    added = verb("pub", "publishes messages", publish, "ic topic pub --once /flag std_msgs/msg/Bool '{data: true}'")
+    added = verb("pub", "publish messages", publish, "ic topic pub --once /flag std_msgs/msg/Bool '{data: true}'")
     topic(added)
     argument = added.add_argument("type", metavar="TYPE", help="full or short name, for example TwistStamped")
     completion.offer(argument, completion.types)
     added.add_argument(
         "values", metavar="YAML", nargs="?", default="{}",
-        help="values of its fields; the others are zero; 'header: auto' and 'stamp: now' take the time",
+        help="values of its fields; others are zero; 'header: auto' and 'stamp: now' take the current time",
     )  # fmt: skip
-    added.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="default: %(default)s")
+    added.add_argument("-r", "--rate", type=positive, default=1.0, metavar="HZ", help="rate (default: %(default)s)")
     added.add_argument("-1", "--once", action="store_true", help="publish one message")
-    added.add_argument("-n", "--times", type=positive_int, default=0, metavar="N", help="publish so many messages")
+    added.add_argument("-n", "--times", type=positive_int, default=0, metavar="N", help="publish this many messages")
     added.add_argument(
         "-w", "--wait-matching-subscriptions", type=not_negative, metavar="N", dest="readers",
-        help="wait for so many readers first (default: 1 with --once or -n, else 0)",
+        help="wait for this many subscribers first (default: 1 with --once or -n, else 0)",
     )  # fmt: skip
     added.add_argument(
-        "--max-wait-time-secs", type=positive, default=10.0, metavar="S", help="for readers (default: %(default)s)"
+        "--max-wait-time-secs",
+        type=positive,
+        default=10.0,
+        metavar="S",
+        help="longest wait for subscribers (default: %(default)s)",
     )
     added.add_argument("--qos", choices=("sensor", "reliable", "latched"), default="reliable", help="default: reliable")
-    added.add_argument("--use-sim-time", action="store_true", help="stamps by the time of /clock")
+    added.add_argument("--use-sim-time", action="store_true", help="stamp messages with the time of /clock")
     added.add_argument("-p", "--print", type=positive_int, default=1, metavar="N", help="print every Nth message")
-    added.add_argument("--force", action="store_true", help="also where a node commands the robot on this topic")
+    added.add_argument(
+        "--force", action="store_true", help="publish even where a node commands the robot on this topic"
+    )
 
 
 def list_topics(args: argparse.Namespace) -> int:
@@ -138,7 +151,7 @@ def show_type(args: argparse.Namespace) -> int:
 
     types = topic_types()
     if absolute(args.topic) not in types:
-        raise UserError(f"nobody publishes or subscribes {args.topic} ({near(args.topic, types, 'ic topic list')})")
+        raise UserError(f"no node publishes or subscribes to {args.topic} ({near(args.topic, types, 'ic topic list')})")
     print(types[absolute(args.topic)])
     return 0
 

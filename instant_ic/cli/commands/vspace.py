@@ -61,9 +61,9 @@ def add_parser(subparsers: Any) -> None:
     """Add ``vspace`` to the ``ic`` command."""
     parser = subparsers.add_parser(
         "vspace",
-        help="a virtual space from one panorama",
-        description="Trains a virtual space from one panorama and looks at it (docs/nerf.md). Poses are relative to "
-        "the panorama's camera: x forward, where its centre column looks, y left, z up, metres; yaw in degrees, "
+        help="train and render a virtual space from one panorama",
+        description="Train a virtual space from one panorama and render it (docs/nerf.md). Poses are relative to the "
+        "panorama's camera, in metres: x forward (the centre column of the panorama), y left, z up; yaw in degrees, "
         "counter-clockwise.",
         epilog="example: ic vspace train room.jpg -o room && ic vspace render room --pose 0.5,0,0,30 -o view.png",
     )
@@ -72,7 +72,9 @@ def add_parser(subparsers: Any) -> None:
     _add_render(verbs)
     _add_export(verbs)
     _add_video(verbs)
-    info = verbs.add_parser("info", help="what is in a saved space", description="Tells what is in a saved space.")
+    info = verbs.add_parser(
+        "info", help="print the content of a saved space", description="Print the content of a saved space."
+    )
     _folder(info)
     info.set_defaults(func=info_)
     for verb in verbs.choices.values():
@@ -81,40 +83,46 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _folder(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("space", type=Path, metavar="DIR", help="folder that ic vspace train has made")
-    parser.add_argument("--device", choices=DEVICES, help="(default: as it was trained)")
+    parser.add_argument("space", type=Path, metavar="DIR", help="folder written by ic vspace train")
+    parser.add_argument("--device", choices=DEVICES, help="(default: as in training)")
 
 
 def _add_train(verbs: Any) -> None:
     parser = verbs.add_parser(
         "train",
-        help="learn a panorama",
-        description="Learns one panorama and saves the space in a folder. A picture from 0.5 m ahead lies in it "
-        f"({PREVIEW}) and is renewed each second meanwhile. Ctrl-C ends early: what is learnt is saved.",
+        help="train on a panorama",
+        description="Train on one panorama and save the space in a folder. A preview from 0.5 m ahead in that folder "
+        f"({PREVIEW}) is updated every second. Ctrl-C ends the training early and saves the result.",
         epilog="example: ic vspace train room.jpg --depth room_depth.png --seconds 10 -o room",
     )
-    parser.add_argument("panorama", type=Path, help="equirect picture, twice as wide as high")
+    parser.add_argument("panorama", type=Path, help="equirectangular image, twice as wide as high")
     depth = parser.add_mutually_exclusive_group()
-    depth.add_argument("--depth", type=Path, metavar="D", help="its radial depth: PNG of 16 bits in mm; .npy, .npz "
-                       "(key depth) or .exr in m; 0 or not finite: unknown")  # fmt: skip
+    depth.add_argument("--depth", type=Path, metavar="D", help="its radial depth: 16-bit PNG in mm; .npy, .npz "
+                       "(key depth) or .exr in m; 0 or non-finite is unknown")  # fmt: skip
     depth.add_argument("--model", type=Path, metavar="M", help="depth model, ONNX or manifest (default: the shipped "
-                       "one, whose metres are an estimate: no LiDAR scales them here)")  # fmt: skip
-    parser.add_argument("--depth-sigma", type=positive, metavar="SHARE", help="standard deviation of the depth against "
-                        f"it (default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)")  # fmt: skip
-    parser.add_argument("--camera-height", type=positive, metavar="M", help="of the camera above the floor: what is "
-                        "estimated is scaled so that the floor lies there (default: the model's metres)")  # fmt: skip
-    parser.add_argument("--as-estimated", action="store_true", help="take the model's depth as it comes; otherwise "
-                        "floor and ceiling are made level and walls upright where they nearly are")  # fmt: skip
+                       "one; its metres are an estimate, not scaled by a LiDAR)")  # fmt: skip
+    parser.add_argument("--depth-sigma", type=positive, metavar="SHARE", help="relative standard deviation of depth "
+                        f"(default: {_TRUE_SIGMA:g} with --depth, {_MODEL_SIGMA:g} without)")  # fmt: skip
+    parser.add_argument("--camera-height", type=positive, metavar="M", help="height of the camera above the floor; the "
+                        "estimate is scaled to it (default: the model's metres)")  # fmt: skip
+    parser.add_argument("--as-estimated", action="store_true", help="use the model's depth unchanged; otherwise "
+                        "nearly level floors and ceilings and nearly upright walls are straightened")  # fmt: skip
     length = parser.add_mutually_exclusive_group()
-    length.add_argument("--seconds", type=positive, metavar="S", help="train for about so long")
-    length.add_argument("--iterations", type=positive_int, metavar="N", help="train so many iterations (default: 600)")
+    length.add_argument("--seconds", type=positive, metavar="S", help="train for about this time")
+    length.add_argument(
+        "--iterations", type=positive_int, metavar="N", help="train this many iterations (default: 600)"
+    )
     parser.add_argument("--device", default="auto", choices=DEVICES, help="(%(default)s)")
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="folder, made when absent")
+    parser.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="DIR", help="output folder, created if missing"
+    )
     parser.set_defaults(func=train)
 
 
 def _add_picture(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--fov", type=degrees, default=90.0, metavar="DEG", help="horizontal (%(default)g degrees)")
+    parser.add_argument(
+        "--fov", type=degrees, default=90.0, metavar="DEG", help="horizontal field of view (%(default)g degrees)"
+    )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: " +
                         ", ".join(f"{name} {w}x{h}" for name, (w, h) in _SIZES.items()) + ")")  # fmt: skip
 
@@ -122,8 +130,8 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
 def _add_render(verbs: Any) -> None:
     parser = verbs.add_parser(
         "render",
-        help="draw a picture of a space",
-        description="Draws a picture of a saved space. A cube map is one row of faces: front, left, back, right, up, "
+        help="render an image of a space",
+        description="Render an image of a saved space. A cube map is one row of faces: front, left, back, right, up, "
         "down.",
         epilog="example: ic vspace render room --pose 0.5,-0.2,0,30 --fov 90 --size 640x360 -o view.png",
     )
@@ -131,12 +139,12 @@ def _add_render(verbs: Any) -> None:
     parser.add_argument("--pose", type=numbers, default=[0.0, 0.0, 0.0, 0.0], metavar="x,y,z,yaw", help="(0,0,0,0)")
     parser.add_argument("--projection", choices=tuple(_SIZES), default="perspective", help="(%(default)s)")
     _add_picture(parser)
-    parser.add_argument("-o", "--out", type=Path, required=True, metavar="PNG", help="picture to write")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="PNG", help="image to write")
     parser.add_argument(
-        "--depth", type=Path, metavar="FILE", help="also write the depth: .png (16 bits, mm) or .npy (m)"
+        "--depth", type=Path, metavar="FILE", help="also write the depth: .png (16-bit, mm) or .npy (m)"
     )
     parser.add_argument(
-        "--confidence", type=Path, metavar="PNG", help="also write what is known: white seen, black not"
+        "--confidence", type=Path, metavar="PNG", help="also write the confidence: white is seen, black is not"
     )
     parser.set_defaults(func=render)
 
@@ -144,30 +152,30 @@ def _add_render(verbs: Any) -> None:
 def _add_export(verbs: Any) -> None:
     parser = verbs.add_parser(
         "export",
-        help="write the surfaces as PLY",
-        description="Writes the surfaces that the panorama has seen as binary PLY, in the frame of the space.",
+        help="export the surfaces as PLY",
+        description="Export the surfaces that the panorama has seen as binary PLY, in the frame of the space.",
         epilog="example: ic vspace export room --mesh room.ply",
     )
     _folder(parser)
     kind = parser.add_mutually_exclusive_group(required=True)
     kind.add_argument("--points", type=Path, metavar="OUT.ply", help="coloured points")
-    kind.add_argument("--mesh", type=Path, metavar="OUT.ply", help="coloured triangles, torn at depth edges")
-    parser.add_argument("--width", type=positive_int, default=1024, help="points round the horizon (%(default)s)")
+    kind.add_argument("--mesh", type=Path, metavar="OUT.ply", help="coloured triangles, split at depth edges")
+    parser.add_argument("--width", type=positive_int, default=1024, help="points around the horizon (%(default)s)")
     parser.set_defaults(func=export)
 
 
 def _add_video(verbs: Any) -> None:
     parser = verbs.add_parser(
         "video",
-        help="fly through a space",
-        description="Writes a flight through a saved space as MP4, a smooth curve through the waypoints.",
+        help="record a flight through a space",
+        description="Write a flight through a saved space as MP4, along a smooth curve through the waypoints.",
         epilog="example: ic vspace video room --path 0,0,0,0 1,0,0,0 1,0.3,0,90 -o flight.mp4",
     )
     _folder(parser)
     parser.add_argument("--path", type=numbers, nargs="+", metavar="x,y,z,yaw", help="two waypoints or more; the "
-                        "heading turns by the yaws' difference (default: ahead, back and once round)")  # fmt: skip
+                        "heading turns by the difference of the yaws (default: ahead, back, and one turn)")  # fmt: skip
     parser.add_argument("--seconds", type=positive, default=8.0, metavar="S", help="(%(default)g)")
-    parser.add_argument("--fps", type=positive, default=25.0, help="pictures a second (%(default)g)")
+    parser.add_argument("--fps", type=positive, default=25.0, help="frames per second (%(default)g)")
     _add_picture(parser)
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="OUT.mp4", help="video to write")
     parser.set_defaults(func=video)
@@ -185,7 +193,9 @@ def train(args: argparse.Namespace) -> int:
 
     if args.camera_height and (args.depth or args.as_estimated):
         other = "--depth" if args.depth else "--as-estimated"
-        raise UserError(f"--camera-height scales an estimate, and {other} is taken as it is: leave one of them out", 2)
+        raise UserError(
+            f"--camera-height scales an estimate, but {other} uses the depth unchanged: omit one of them", 2
+        )
     rgb = load_picture(args.panorama)
     if args.depth:
         depth, sigma = load_depth(args.depth), args.depth_sigma or _TRUE_SIGMA
@@ -201,7 +211,7 @@ def train(args: argparse.Namespace) -> int:
     began = time.monotonic()
     warm_up(config)
     if time.monotonic() - began > 5:
-        print("the kernels were compiled; that is done once", file=sys.stderr)
+        print("compiled the kernels (first run only)", file=sys.stderr)
     try:
         space = _space(config, rgb, depth, sigma, args)
     except KeyframeError as error:
@@ -213,7 +223,7 @@ def train(args: argparse.Namespace) -> int:
         print(f"warning: {status.warning}", file=sys.stderr)
     print(f"{'ended early: ' if ended else ''}{status.iterations} iterations in {status.train_seconds:.1f} s on "
           f"{status.device}, {status.psnr_db:.1f} dB on the panorama's own rays; depth known in "
-          f"{(depth > 0).mean():.0%}, fit to show up to {status.ready_radius_m:.1f} m; wrote {file}")  # fmt: skip
+          f"{(depth > 0).mean():.0%}, usable up to {status.ready_radius_m:.1f} m; wrote {file}")  # fmt: skip
     return 0
 
 
@@ -225,8 +235,10 @@ def estimated_depth(model: Path | None, rgb: NDArray[np.uint8]) -> NDArray[np.fl
     loaded = DepthModel.load(model or shipped_file("models", DEFAULT_MODEL))
     kind = loaded.manifest.output_kind
     if kind not in ("metric", "scale_invariant"):
-        raise UserError(f"{model}: its {kind} depth has no metres without a LiDAR; give --depth, or a metric model")
-    print(f"no --depth: the metres are {loaded.manifest.name}'s estimate, not measured", file=sys.stderr)
+        raise UserError(
+            f"{model}: its {kind} depth has no metric scale without a LiDAR; give --depth or a metric model"
+        )
+    print(f"no --depth: the scale is an estimate of {loaded.manifest.name}, not measured", file=sys.stderr)
     return loaded.estimate(rgb)
 
 
@@ -242,7 +254,7 @@ def _tidied(depth: NDArray[np.float32], camera_height_m: float | None, panorama:
         f"{name} {'not found' if away is None else f'{away:.2f} m {where} the camera'}"
         for name, away, where in (("floor", room.floor_m, "under"), ("ceiling", room.ceiling_m, "over"))
     ]
-    scaled = f"; estimated metres times {room.scale:.2f}" if camera_height_m else ""
+    scaled = f"; estimate scaled by {room.scale:.2f}" if camera_height_m else ""
     print(", ".join(found) + scaled, file=sys.stderr)
     return room.depth_m
 
@@ -313,11 +325,11 @@ def render(args: argparse.Namespace) -> int:
             view = space.render(pose, width, height, math.radians(args.fov))
         elif args.projection == "equirect":
             if width != 2 * height:
-                raise UserError(f"--size of a panorama is twice as wide as high (got {width}x{height})", 2)
+                raise UserError(f"--size of a panorama must be twice as wide as high (got {width}x{height})", 2)
             view = space.render_equirect(pose, width)
         else:
             if width != height:
-                raise UserError(f"--size of a cube map is that of one square face (got {width}x{height})", 2)
+                raise UserError(f"--size of a cube map must be that of one square face (got {width}x{height})", 2)
             view = space.render_cube(pose, width)
     except ValueError as error:
         raise UserError(f"--size: {error}", 2) from error
@@ -327,7 +339,7 @@ def render(args: argparse.Namespace) -> int:
     if args.confidence:
         write_picture(args.confidence, (255 * _row(view.confidence)).astype(np.uint8))
     _warn_of_the_unknown(view, space, args.pose)
-    print(f"{view.mean_confidence:.0%} of the picture is known; wrote {args.out}")
+    print(f"{view.mean_confidence:.0%} of the image is known; wrote {args.out}")
     return 0
 
 
@@ -341,10 +353,10 @@ def _row(faces: NDArray) -> NDArray:
 def _warn_of_the_unknown(view: View, space: VirtualSpace, pose: list[float]) -> None:
     radius, away = space.status.ready_radius_m, math.dist(pose[:3], (0, 0, 0))
     if view.mean_confidence < _LITTLE:
-        print(f"warning: the panorama has seen hardly anything of this view ({view.mean_confidence:.0%}): "
-              "it is continued from around, or black", file=sys.stderr)  # fmt: skip
+        print(f"warning: the panorama has seen little of this view ({view.mean_confidence:.0%}): "
+              "the rest is extrapolated or black", file=sys.stderr)  # fmt: skip
     elif away > radius > 0:
-        print(f"warning: {away:.1f} m from the panorama's place; the space is fit to show up to {radius:.1f} m",
+        print(f"warning: {away:.1f} m from the panorama; the space is usable up to {radius:.1f} m",
               file=sys.stderr)  # fmt: skip
 
 
@@ -371,7 +383,7 @@ def video(args: argparse.Namespace) -> int:
     from instant_ic.vspace.export import default_flight, flight
 
     if args.out.suffix.lower() != ".mp4":
-        raise UserError(f"{args.out}: the video is an .mp4", 2)
+        raise UserError(f"{args.out}: the name must end in .mp4", 2)
     space = open_space(args)
     waypoints = [(x, y, z, math.radians(yaw)) for x, y, z, yaw in args.path or []]
     try:
@@ -380,10 +392,10 @@ def video(args: argparse.Namespace) -> int:
         raise UserError(f"--path: {error}", 2) from error
     width, height = args.size or _SIZES["perspective"]
     if width % 2 or height % 2:
-        raise UserError(f"--size of a video is even (got {width}x{height})", 2)
+        raise UserError(f"--size of a video must be even (got {width}x{height})", 2)
     assert space.keyframe is not None
     writer, known = None, 0.0
-    with progress("drawing") as tell:
+    with progress("rendering") as tell:
         for number, pose in enumerate(poses):
             try:
                 view = space.render(space.keyframe.map_from_camera @ pose, width, height, math.radians(args.fov))
@@ -398,7 +410,7 @@ def video(args: argparse.Namespace) -> int:
             tell((number + 1) / len(poses))
     assert writer is not None
     writer.release()
-    print(f"wrote {args.out}: {len(poses)} pictures, {known:.0%} known")
+    print(f"wrote {args.out}: {len(poses)} frames, {known:.0%} known")
     return 0
 
 
@@ -408,7 +420,7 @@ def info_(args: argparse.Namespace) -> int:
 
     saved = read(args.space)
     field, progress = saved.config.field, saved.progress
-    fit = "fit to show" if progress.ready else "not fit to show yet"
+    fit = "usable" if progress.ready else "not usable yet"
     print(f"{space_file(args.space)}: {progress.iteration} iterations in {progress.train_seconds:.1f} s, "
           f"{progress.psnr_db:.1f} dB; {fit}")  # fmt: skip
     print(f"field: {field.levels} levels x {field.features} features, 2^{field.log2_table} entries, "
@@ -433,7 +445,7 @@ def write_picture(path: Path, picture: NDArray[np.uint8] | NDArray[np.uint16]) -
     except cv2.error:
         done = False
     if not done:
-        raise UserError(f"{path}: pictures are written as .png or .jpg", 2)
+        raise UserError(f"{path}: the name of an image must end in .png or .jpg", 2)
     part = path.with_name(f".{path.name}.part")
     _write(path, lambda: (part.write_bytes(content.tobytes()), part.replace(path)))
 
@@ -447,7 +459,7 @@ def write_depth(path: Path, depth_m: NDArray[np.float32]) -> None:
     elif path.suffix == ".png":
         write_picture(path, np.rint(np.clip(1000 * depth_m, 0, 65535)).astype(np.uint16))
     else:
-        raise UserError(f"{path}: depth is written as .png (16 bits, mm) or .npy (m)", 2)
+        raise UserError(f"{path}: the name of a depth file must end in .png (16-bit, mm) or .npy (m)", 2)
 
 
 def _write(path: Path, write: Any) -> None:
