@@ -40,9 +40,10 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "train",
         help="train SliceNet on generated worlds and on folders of panoramas",
-        description="Train SliceNet on worlds rendered during the training, on folders of panoramas with depth, or on "
-        "both, and export it. Ctrl-C ends the training early: the last weights are evaluated, saved and exported. A "
-        "CSV of the progress and, where the package is installed, a TensorBoard folder are written beside the checkpoint.",
+        description="Train SliceNet on worlds rendered during the training, on folders of panoramas with depth,\n"
+        "or on both, and export it. Ctrl-C ends the training early: the last weights are evaluated, saved\n"
+        "and exported. A CSV of the progress and, where the package is installed, a TensorBoard folder are\n"
+        "written beside the checkpoint.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
