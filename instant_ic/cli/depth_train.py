@@ -49,49 +49,55 @@ def add_parser(commands: Any) -> None:
     )
     data = parser.add_argument_group("data")
     data.add_argument("--data", action="append", default=[], metavar="LAYOUT:FOLDER",
-                      help="panoramas with depth: m3d, s2d3d, s3d or plain (docs/depth.md); may be given several times"
+                      help="panoramas with depth: m3d, s2d3d, s3d or plain (docs/depth.md); repeatable"
                       )  # fmt: skip
-    data.add_argument("--generated", choices=("wide", "random", "none"), help="generated interiors: of all kinds, only "
-                      "plain random rooms, or none (wide, and none with --data)")  # fmt: skip
+    data.add_argument("--generated", choices=("wide", "random", "none"), help="generated interiors: all kinds, only "
+                      "plain random rooms, or none (default: wide; none with --data)")  # fmt: skip
     data.add_argument("--generated-share", type=float, default=0.5, metavar="SHARE",
-                      help="of a batch, beside --data (%(default)s)")  # fmt: skip
-    data.add_argument("--worlds", type=positive_int, default=None, help="generated worlds (100000; "
-                      "400 with --cache)")  # fmt: skip
-    data.add_argument("--poses", type=positive_int, default=6, help="panoramas in each (%(default)s)")
+                      help="share of generated panoramas in a batch, with --data (%(default)s)")  # fmt: skip
+    data.add_argument("--worlds", type=positive_int, default=None, help="number of generated worlds "
+                      "(default: 100000; 400 with --cache)")  # fmt: skip
+    data.add_argument("--poses", type=positive_int, default=6, help="panoramas per world (%(default)s)")
     data.add_argument("--first-world", type=not_negative, default=100_000, metavar="SEED",
-                      help="seed of the first (%(default)s)")  # fmt: skip
+                      help="seed of the first world (%(default)s)")  # fmt: skip
     data.add_argument("--workers", type=not_negative, default=max(1, (os.cpu_count() or 2) - 1), metavar="N",
-                      help="processes that render in the background (%(default)s)")  # fmt: skip
+                      help="background processes for rendering (%(default)s)")  # fmt: skip
     data.add_argument("--pool", type=positive_int, default=192, metavar="N",
-                      help="generated panoramas to draw from at a time (%(default)s)")  # fmt: skip
+                      help="size of the pool of generated panoramas (%(default)s)")  # fmt: skip
     data.add_argument("--reuse", type=positive, default=3.0, metavar="N",
-                      help="how often each is used, on average (%(default)s)")  # fmt: skip
-    data.add_argument("--cache", type=Path, metavar="FOLDER", help="render all worlds into this folder first (once) "
-                      "and train on it, instead of rendering on the way")  # fmt: skip
+                      help="average number of uses of each generated panorama (%(default)s)")  # fmt: skip
+    data.add_argument("--cache", type=Path, metavar="FOLDER", help="render all worlds into this folder once, before "
+                      "the training, instead of rendering during it")  # fmt: skip
     training = parser.add_argument_group("training")
     training.add_argument("--network", default="small", metavar="NAME",
                           help="small, or BACKBONE:HEIGHT such as resnet50:512 (%(default)s)")  # fmt: skip
-    training.add_argument("--init", type=Path, metavar="FILE", help="begin with the weights of this checkpoint or ONNX")
-    training.add_argument("--mix", type=positive, default=1.0, metavar="SHARE", help="of the trained weights in the "
-                          "result, the rest are --init's: a short training forgets less (%(default)s)")  # fmt: skip
-    training.add_argument("--minutes", type=positive, default=60.0, help="wall time (%(default)s)")
-    training.add_argument("--epochs", type=positive_int, default=1000, help="most passes over the data (%(default)s)")
-    training.add_argument("--batch-size", type=positive_int, default=8, help="panoramas a step and GPU (%(default)s)")
-    training.add_argument("--learning-rate", type=positive, default=2e-3, metavar="RATE", help="highest (%(default)s)")
+    training.add_argument("--init", type=Path, metavar="FILE", help="start from the weights of this checkpoint or ONNX")
+    training.add_argument("--mix", type=positive, default=1.0, metavar="SHARE", help="share of the trained weights in "
+                          "the result, the rest is --init's; limits forgetting (%(default)s)")  # fmt: skip
+    training.add_argument("--minutes", type=positive, default=60.0, help="wall-clock time (%(default)s)")
+    training.add_argument(
+        "--epochs", type=positive_int, default=1000, help="maximum passes over the data (%(default)s)"
+    )
+    training.add_argument("--batch-size", type=positive_int, default=8, help="panoramas per step and GPU (%(default)s)")
+    training.add_argument(
+        "--learning-rate", type=positive, default=2e-3, metavar="RATE", help="peak rate (%(default)s)"
+    )
     training.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1 (%(default)s)")
     training.add_argument("--threads", type=positive_int, default=1, help="CPU threads; more only on idle cores "
                           "(%(default)s)")  # fmt: skip
-    training.add_argument("--seed", type=not_negative, default=0, help="weights, order, augmentation (%(default)s)")
+    training.add_argument(
+        "--seed", type=not_negative, default=0, help="seed of weights, order and augmentation (%(default)s)"
+    )
     training.add_argument("--held-out", type=positive_int, default=48, metavar="N",
-                          help="generated panoramas for evaluation, of worlds of their own (%(default)s)")  # fmt: skip
+                          help="generated panoramas for evaluation, from separate worlds (%(default)s)")  # fmt: skip
     training.add_argument("--checkpoint-s", type=positive, default=300.0, metavar="S",
-                          help="seconds between checkpoints with evaluation (%(default)s)")  # fmt: skip
+                          help="seconds between checkpoints, each with an evaluation (%(default)s)")  # fmt: skip
     output = parser.add_argument_group("output")
     output.add_argument("--checkpoint", type=Path, default=Path("runs/depth/slicenet_small.pt"),
-                        help="file of the weights (%(default)s)")  # fmt: skip
-    output.add_argument("--resume", action="store_true", help="go on from the checkpoint")
+                        help="checkpoint file (%(default)s)")  # fmt: skip
+    output.add_argument("--resume", action="store_true", help="continue from the checkpoint")
     output.add_argument(
-        "--export", type=Path, metavar="ONNX", help="file to write at the end, with manifest and record"
+        "--export", type=Path, metavar="ONNX", help="model to write at the end, with manifest and record"
     )
     parser.set_defaults(func=train)
 
@@ -103,7 +109,7 @@ def train(args: argparse.Namespace) -> int:
 
     for path in (args.checkpoint, args.export):
         if path is not None and path.is_dir():
-            raise UserError(f"{path} is a folder; name a file in it", 2)
+            raise UserError(f"{path} is a folder: give a file", 2)
     try:
         network = _network(args.network)
         team = Team.join(args.device)
@@ -150,7 +156,7 @@ def _network(name: str) -> SliceNetConfig:
         return SMALL
     backbone, _, height = name.partition(":")
     if not height.isdigit():
-        raise ValueError(f"--network is small or BACKBONE:HEIGHT, such as resnet50:512 (got {name!r})")
+        raise ValueError(f"--network must be small or BACKBONE:HEIGHT, such as resnet50:512 (got {name!r})")
     return SliceNetConfig(backbone=backbone, height=int(height))
 
 
@@ -163,7 +169,7 @@ def _trainer(args: argparse.Namespace, network: SliceNetConfig, team: Team, repo
         threads=args.threads, seed=args.seed, checkpoint_s=args.checkpoint_s, mix=args.mix,
     )  # fmt: skip
     start = load_start(args.init, network) if args.init else None
-    report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas a step")
+    report(f"training on {team.name}, {config.batch_size * team.ranks} panoramas per step")
     feed, held_out = _data(args, network, team, report)
     command = (
         shlex.join(["ic", *sys.argv[1:]]) if team.ranks == 1 else f"torchrun ({team.ranks}): {shlex.join(sys.argv)}"
@@ -191,14 +197,14 @@ def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report:
         0 if generated == "none" else size if not folders else min(size - 1, max(1, round(size * args.generated_share)))
     )
     if folders and size - own < len(folders):
-        raise ValueError(f"a batch of {size} leaves no place for each of {len(folders)} folders; raise --batch-size")
+        raise ValueError(f"a batch of {size} is too small for {len(folders)} folders: increase --batch-size")
     worlds = args.worlds or (400 if args.cache else 100_000)
     feeds: list[Feed] = []
     held_out: list[Subset] = []
     for number, folder in enumerate(folders):
         part = (size - own + number) // len(folders)
         training, kept = folder.split()
-        report(f"{folder.folder}: {len(training)} panoramas to train on, {len(kept)} for evaluation")
+        report(f"{folder.folder}: {len(training)} panoramas for training, {len(kept)} for evaluation")
         feeds.append(FileFeed(folder, training, part, args.seed, team.rank, team.ranks, folder.info, args.workers or 1))
         held_out.append(Subset(folder, kept))
     if own:
@@ -215,7 +221,7 @@ def _data(args: argparse.Namespace, network: SliceNetConfig, team: Team, report:
             held = RoomsConfig(worlds=kept_worlds, poses=2, first_world=first, height=network.height,
                                interiors=generated)  # fmt: skip
             if args.first_world + worlds > held.first_world:
-                raise ValueError(f"worlds from seed {held.first_world} on are for evaluation; lower --worlds")
+                raise ValueError(f"worlds from seed {held.first_world} are reserved for evaluation: reduce --worlds")
             feeds.append(RenderedFeed(recipe, own, args.seed, args.workers, max(args.pool, own), args.reuse,
                                       team.rank, team.ranks))  # fmt: skip
             if team.rank == 0:
@@ -250,18 +256,20 @@ def open_cache(folder: Path, recipe: RoomsConfig, workers: int, team: Team, repo
             for count in write_dataset(folder, samples, recipe.count, size, recipe.as_dict()):
                 if count % 100 == 0 or count == recipe.count:
                     rate = count / (time.monotonic() - begin)
-                    report(f"rendered {count} of {recipe.count} panoramas, {rate:.1f} a second")
+                    report(f"rendered {count} of {recipe.count} panoramas, {rate:.1f} per second")
         done.touch()
     end = time.monotonic() + WORLD_TIMEOUT_S + recipe.count
     while not done.exists():
         if time.monotonic() > end:
-            raise UserError(f"{folder}: process 0 did not finish rendering")
+            raise UserError(f"{folder}: timed out while process 0 was rendering")
         time.sleep(1.0)
     data = PanoramaDataset(folder)
     wanted = json.loads(json.dumps(recipe.as_dict()))
     differs = [key for key, value in wanted.items() if data.info.get(key) != value]
     if differs:
-        raise UserError(f"{folder} was rendered with another {', '.join(differs)}; name another folder or delete it")
+        raise UserError(
+            f"{folder} was rendered with another {', '.join(differs)}: give another folder, or delete this one"
+        )
     return data
 
 

@@ -161,7 +161,7 @@ def test_dora_2152_own_file_leaves_at_once_whatever_threads_are_left(tmp_path_fa
 
 def test_run_mistakes(ic, tmp_path):
     status, _, error = ic("run", "warp_drive")
-    assert status == 2 and "there is no node 'warp_drive'; available:" in error and "bag_player" in error
+    assert status == 2 and "there is no node 'warp_drive'; the nodes are" in error and "bag_player" in error
     status, _, error = ic("run", "grid_slm")
     assert status == 2 and "did you mean 'grid_slam'?" in error
     assert "nowhere.py does not exist" in ic("run", "nowhere.py")[2]

@@ -294,7 +294,7 @@ def test_launch_mistakes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> 
     status, _, error = ic(capsys, "launch", "player.yaml", "--check")
     assert status == 2 and "player.yaml:2: unknown parameter 'rat'; did you mean 'rate'?" in error
     status, out, _ = ic(capsys, "launch", "replay", "--show-args")
-    assert status == 0 and "bag: path (must be given)" in out
+    assert status == 0 and "bag: path (required)" in out
 
 
 def test_run_tells_what_a_node_refuses() -> None:

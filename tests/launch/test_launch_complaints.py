@@ -493,6 +493,6 @@ def test_show_args_tells_types_choices_and_what_included_files_keep(
         "arguments of stack.yaml:",
         "  port: int (default: '80')",
         "      of the page",
-        "  mode: fast | slow (must be given)",
+        "  mode: fast | slow (required)",
         "the included part.yaml keeps its own defaults of: speed '3'",
     ]

@@ -20,7 +20,7 @@ def add_parser(subparsers: Any) -> None:
     """Add ``evaluate`` to the ``ic`` command."""
     parser = subparsers.add_parser(
         "evaluate",
-        help="measure the stack on recordings",
+        help="measure parts of the stack on recordings or in simulation",
         description="Run the stack or a part of it on recordings or in simulation, and measure the results.",
     )
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="KIND")
@@ -30,7 +30,7 @@ def add_parser(subparsers: Any) -> None:
         description=(
             "Send a VLP-16 capture as UDP packets and a 360° photo through the Theta's Web API to the whole stack. "
             "Write a bag, the trained view beside the same crop of the photo, the depth and the map as PNG, "
-            "and summary.json to the output folder. Photo and capture may be from different places: the depth "
+            "and summary.json to the output folder. Photo and capture count as from different places: the depth "
             "is then in the model's own metres. With --same-place the LiDAR scales it, as on the robot."
         ),
         epilog="example: ic evaluate recordings --pcap drive.pcap --panorama room.jpg -o runs/recordings",

@@ -69,7 +69,11 @@ def add_parser(subparsers: Any) -> None:
     added.add_argument("--csv", action="store_true", help="one line of comma-separated values for each message")
     added.add_argument("--json", action="store_true", help="one line of JSON for each message, in full")
     added.add_argument(
-        "--timeout", type=positive, default=float("inf"), metavar="S", help="fail if fewer messages arrive in this time"
+        "--timeout",
+        type=positive,
+        default=float("inf"),
+        metavar="S",
+        help="stop after this time; fail if messages are missing",
     )
 
     for name, words, function in (
