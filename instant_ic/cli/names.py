@@ -34,7 +34,7 @@ def topic_types() -> dict[str, str]:
 
 def unknown_topic(topic: str, known: Iterable[str]) -> str:
     """Message for a topic that no node publishes."""
-    return f"nobody publishes {topic} ({near(topic, known, 'see ic topic list')})"
+    return f"{topic} has no publisher ({near(topic, known, 'see ic topic list')})"
 
 
 def nobody_runs() -> str:

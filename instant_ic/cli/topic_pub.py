@@ -74,15 +74,15 @@ def _check_topic(topic: str, full: str, force: bool) -> None:
     if not topic.endswith("/cmd_vel"):
         return
     writers = ", ".join(p.node for p in found.publishers) if found else ""
-    readers = ", ".join(node.name for node in nodes if topic in node.subscribes) or "whoever reads it"
+    readers = ", ".join(node.name for node in nodes if topic in node.subscribes) or "any subscriber"
     if writers and not force:
         raise UserError(
-            f"{topic} is written by {writers}, which keeps the robot safe: a second writer would drive it past that. "
-            "Stop that node first, or add --force where nothing can be hit",
+            f"{topic} is published by {writers}, which keeps the robot safe; a second publisher would bypass that. "
+            "Stop that node first, or add --force if the robot cannot hit anything",
             2,
         )
     beside = f" beside {writers}" if writers else ""
-    print(f"ic: {topic} drives the robot ({readers}){beside}: keep the emergency stop at hand", file=sys.stderr)
+    print(f"ic: {topic} moves the robot ({readers}){beside}: keep the emergency stop within reach", file=sys.stderr)
 
 
 def _wait_for_clock(observer: Observer, seconds: float) -> None:

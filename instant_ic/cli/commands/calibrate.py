@@ -166,7 +166,7 @@ def _yaml(summary: dict[str, Any]) -> str:
     sigma = ", ".join(f"{axis} {value:g}" for axis, value in summary["sigma_m_deg"].items())
     kept = f"# Not constrained by the recording, kept as given: {', '.join(loose)}.\n" if loose else ""
     return (
-        f"# Camera's mount by ic calibrate camera-lidar {summary['bag']}, {summary['frames']} pictures.\n"
+        f"# Camera's mount by ic calibrate camera-lidar {summary['bag']}, {summary['frames']} images.\n"
         f"# Standard deviations (m, degrees): {sigma}.\n{kept}"
         "theta_camera:\n  ros__parameters:\n"
         f"    mount_xyz: {summary['mount_xyz']}\n    mount_rpy_deg: {summary['mount_rpy_deg']}\n"
