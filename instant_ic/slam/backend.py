@@ -1,4 +1,4 @@
-"""The SLAM methods behind one interface, chosen by ``SlamConfig.backend``."""
+"""Common interface of the SLAM methods; ``SlamConfig.backend`` selects one."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from instant_ic.slam.scan import FloatArray, Scan
 
 
 class Slam(Protocol):
-    """What the node and the evaluation need of a SLAM method.
+    """Interface of a SLAM method, as the node and the evaluation use it.
 
     Attributes:
         map_from_odom: (3,), takes up all corrections.
         odom_from_base: (3,), at the last scan.
-        motion: compares wheels and scans.
+        motion: compares wheel odometry with scan matching.
     """
 
     map_from_odom: FloatArray
@@ -33,12 +33,12 @@ class Slam(Protocol):
 
     @property
     def map_version(self) -> int:
-        """Grows when the map changes; 0 before there is one."""
+        """Counter that grows when the map changes; 0 before there is a map."""
         ...
 
     @property
     def map_clipped(self) -> int:
-        """Points that fell outside the largest map."""
+        """Number of points outside the largest allowed map."""
         ...
 
     def process(
@@ -48,45 +48,45 @@ class Slam(Protocol):
         ...
 
     def background_job(self) -> Callable[[], Any] | None:
-        """Work that is due and may run on another thread; None: there is none. Its result goes to `take_over`."""
+        """Return pending work that may run on another thread, or None. Pass its result to `take_over`."""
         ...
 
     def take_over(self, outcome: Any) -> None:
-        """Take over what a background job found, on the thread of `process`."""
+        """Apply the result of a background job, on the thread of `process`."""
         ...
 
     def finish(self) -> None:
-        """After the last scan: do all that is still due."""
+        """Complete all pending work after the last scan."""
         ...
 
     def grid(self) -> OccupancyGrid:
-        """The map."""
+        """Return the map."""
         ...
 
     def save(self, stem: Path) -> list[Path]:
-        """Write the map; returns the files."""
+        """Write the map and return the files."""
         ...
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
-        """Say where in the saved map the robot is; ValueError where that makes no sense."""
+        """Set the robot's pose in the saved map; ValueError if the pose cannot be used."""
         ...
 
     def figures(self) -> dict[str, object]:
-        """What is worth telling of its state, for reports and diagnostics."""
+        """Return state figures for reports and diagnostics."""
         ...
 
 
 def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, localize: bool = False) -> Slam:
-    """The method that the configuration names.
+    """Create the SLAM method that the configuration names.
 
     Args:
         config: defaults when None.
-        map_file: a saved map, ``NAME`` or ``NAME.yaml``; None: begin a new one.
-        localize: the map stays as it is; else it is continued, for which its ``NAME.graph.npz`` must be there.
+        map_file: a saved map, ``NAME`` or ``NAME.yaml``; None starts a new map.
+        localize: True keeps the map unchanged; False extends it, which needs its ``NAME.graph.npz``.
 
     Raises:
         MapError: the map cannot be read.
-        ValueError: the method cannot use a saved map, or localisation has none.
+        ValueError: the method does not support saved maps, or localisation was requested without one.
     """
     config = config or SlamConfig()
     if localize and map_file is None:
@@ -104,7 +104,7 @@ def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, lo
 
 
 def warm_up(config: SlamConfig | None = None) -> None:
-    """Compile the kernels, or load them from their cache, so that the first scan is not held up by it."""
+    """Compile the kernels, or load them from their cache, so that they do not delay the first scan."""
     slam = make_slam(config)
     angles = np.linspace(-math.pi, math.pi, 181)[:-1]
     ranges = np.minimum(2.0 / np.maximum(np.abs(np.cos(angles)), 1e-6), 3.0 / np.maximum(np.abs(np.sin(angles)), 1e-6))

@@ -1,4 +1,4 @@
-"""Parameters of the grid SLAM: one frozen dataclass a concept. `config/slam.yaml` explains each to its user."""
+"""Parameters of the grid SLAM: one frozen dataclass per concept. `config/slam.yaml` describes each parameter."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BACKENDS = ("graph", "rbpf")
 
 @dataclass(frozen=True)
 class OdometryNoise:
-    """One standard deviation of an odometry step of ``d`` metres and ``a`` radians.
+    """Standard deviation (1σ) of an odometry step of ``d`` metres and ``a`` radians.
 
     Translation: ``translation_floor_m + translation_per_m·d``; rotation:
     ``rotation_floor_rad + rotation_per_rad·a + rotation_per_m·d``.
@@ -49,7 +49,7 @@ class OdometryNoise:
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Local map that scans are matched against: a likelihood field drawn from recent keyframes."""
+    """Local map for scan matching: a likelihood field built from recent keyframes."""
 
     resolution_m: float = 0.05
     sigma_m: float = 0.06
@@ -120,7 +120,7 @@ class MatchConfig:
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """A scan becomes a keyframe when the pose has moved this far from the last one."""
+    """Motion since the last keyframe after which a scan becomes a keyframe."""
 
     distance_m: float = 0.25
     rotation_rad: float = 0.2
@@ -131,7 +131,7 @@ class KeyframeConfig:
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Closing of loops, and the pose graph that they bend."""
+    """Loop closure and pose graph."""
 
     enabled: bool = True
     spacing_m: float = 0.5
@@ -174,7 +174,7 @@ class LoopConfig:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """When the wheels and the scans contradict each other."""
+    """Thresholds for detecting disagreement between wheel odometry and scans."""
 
     window_s: float = 2.0
     still_m: float = 0.02
@@ -197,7 +197,7 @@ class MotionConfig:
 
 @dataclass(frozen=True)
 class ParticleConfig:
-    """The particle filter (``backend: rbpf``); names and defaults are GMapping's, for who knows these."""
+    """The particle filter (``backend: rbpf``), with GMapping's parameter names and defaults."""
 
     particles: int = 30
     linearUpdate: float = 1.0
@@ -232,7 +232,7 @@ class ParticleConfig:
 
 @dataclass(frozen=True)
 class MapConfig:
-    """Occupancy grid drawn by ray casting from the keyframes."""
+    """Occupancy grid, built by ray casting from the keyframes."""
 
     resolution_m: float = 0.05
     max_range_m: float = 20.0
@@ -255,7 +255,7 @@ class MapConfig:
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """Everything a SLAM method needs."""
+    """All parameters of a SLAM method."""
 
     backend: str = "graph"
     odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)

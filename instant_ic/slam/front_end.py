@@ -1,4 +1,4 @@
-"""Front end: places each scan in the local map of recent keyframes."""
+"""Front end: matches each scan against the local map of recent keyframes."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from instant_ic.slam.matcher import Match, Matcher, Window
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
 RECOVERY_MARGIN = 0.1
-"""By so much must the score of the wide search exceed that of the first one."""
+"""Minimum score gain of the wide search over the first search."""
 START_KEYFRAMES = 4
-"""So many keyframes a robot may take from where it stands at the start."""
+"""Maximum number of keyframes taken at the start pose before the robot moves."""
 
 
 KNOWN_MAP_STEP_M = 2.0
-"""In a known map the local map is drawn anew each time the robot has moved so far."""
+"""Distance in metres after which the local map is rebuilt when localising in a known map."""
 
 
 class TrackStatus(enum.StrEnum):
-    """How a scan was placed."""
+    """How the pose of a scan was found."""
 
     FIRST = "first"
     TRACKED = "tracked"
@@ -37,12 +37,12 @@ class TrackStatus(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Guess:
-    """Where odometry, or constant velocity, expects the base.
+    """Predicted pose of the base, from odometry or constant velocity.
 
     Attributes:
         pose: (3,).
         sigma: (3,) along, across, rotation.
-        window: how far round it to search.
+        window: search window around the pose.
     """
 
     pose: FloatArray
@@ -52,7 +52,7 @@ class Guess:
 
 @dataclass(frozen=True)
 class Track:
-    """The front end's answer for one scan."""
+    """Result of the front end for one scan."""
 
     pose: FloatArray
     covariance: FloatArray
@@ -62,7 +62,7 @@ class Track:
 
 
 class FrontEnd:
-    """Scan-to-local-map matching with keyframes; ``trajectory`` holds these."""
+    """Scan-to-local-map matching with keyframes, which are stored in ``trajectory``."""
 
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
@@ -82,17 +82,17 @@ class FrontEnd:
 
     @property
     def in_known_map(self) -> bool:
-        """Whether scans are matched against a known map, and nothing is added to it."""
+        """Whether scans are matched against a known map that stays unchanged."""
         return self._known is not None
 
     def use_known_map(self, points: FloatArray, pose: FloatArray) -> None:
-        """From now on match against the surfaces (n, 2) of a known map, beginning at ``pose`` (3,)."""
+        """Switch to matching against the surfaces (n, 2) of a known map, starting at ``pose`` (3,)."""
         self._known = points
         self._lost_scans = 0
         self._draw_known(pose)
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
-        """Guess at ``pose`` after odometry moved by ``step`` (3,) in the base's own frame."""
+        """Guess at ``pose`` after an odometry step (3,) in the base's own frame."""
         noise, match = self.config.odometry, self.config.match
         distance, turn = math.hypot(step[0], step[1]), abs(step[2])
         translation = noise.translation_floor_m + noise.translation_per_m * distance
@@ -104,7 +104,7 @@ class FrontEnd:
         return Guess(pose, np.array([translation, translation, rotation]), self._within_recovery(window))
 
     def guess_from_velocity(self, pose: FloatArray, elapsed_s: float) -> Guess:
-        """Guess at ``pose`` without odometry: anything the robot can do in the time is possible."""
+        """Guess at ``pose`` without odometry: the window covers any motion possible in the elapsed time."""
         match = self.config.match
         translation = 0.5 * match.free_motion_speed_mps * elapsed_s + 0.05
         rotation = 0.5 * match.free_motion_yaw_rate_radps * elapsed_s + 0.05
@@ -120,7 +120,7 @@ class FrontEnd:
         )
 
     def track(self, scan: ScanPoints, guess: Guess, stamp_ns: int) -> Track:
-        """Place a scan that has at least ``match.min_points`` points."""
+        """Match a scan that has at least ``match.min_points`` points."""
         config = self.config.match
         points = self._match_points(scan)
         if len(self.trajectory) == 0:
@@ -131,8 +131,8 @@ class FrontEnd:
         match = self._matcher.match(self._field, points, guess.pose, guess.sigma, guess.window)
         if match.score < config.recovery_score or match.at_border:
             recovered = self._recover(points, guess)
-            # Unless the first window was too small, the wide search must be clearly better: so large a window always
-            # finds something a little better.
+            # Unless the first window was too small, the wide search must be clearly better: a window this large always
+            # contains a slightly better pose.
             margin = 0.0 if match.at_border else RECOVERY_MARGIN
             if recovered.score >= config.min_score and recovered.score > match.score + margin:
                 match, status = recovered, TrackStatus.RECOVERED
@@ -150,7 +150,7 @@ class FrontEnd:
         return Track(match.pose, match.covariance, match.score, status, added)
 
     def dead_reckon(self, guess: Guess) -> Track:
-        """Believe the guess, for a scan that shows nothing."""
+        """Use the guess as the pose of a scan that cannot be matched."""
         return Track(guess.pose, self._grown_covariance(guess), 0.0, TrackStatus.LOST, None)
 
     def _match_points(self, scan: ScanPoints) -> FloatArray:
@@ -165,7 +165,7 @@ class FrontEnd:
         return self._matcher.match(self._field, points, guess.pose, guess.sigma, window)
 
     def _lost(self, scan: ScanPoints, guess: Guess, score: float, stamp_ns: int) -> Track:
-        """Nothing fits: go on by odometry, and start a new local map when that lasts."""
+        """Handle a failed match: continue on odometry, and start a new local map if the failures persist."""
         self._lost_scans += 1
         covariance = self._grown_covariance(guess)
         if self._lost_scans < self.config.match.restart_after_lost_scans:
@@ -182,8 +182,10 @@ class FrontEnd:
         return self._covariance
 
     def _first_was_poor(self, match: Match, status: TrackStatus) -> bool:
-        """Whether a robot that still stands where it began sees more than its map has: half a revolution, no odometry
-        yet. It would search far and wide at each scan until it moves.
+        """Whether a robot that has not moved since the start sees more than its map holds.
+
+        This happens when the first scan covered half a revolution, before odometry arrived. Without a further keyframe,
+        each scan would start a wide search until the robot moves.
         """
         few = len(self.trajectory) < START_KEYFRAMES
         return few and status is TrackStatus.TRACKED and match.score < self.config.match.recovery_score
@@ -212,7 +214,7 @@ class FrontEnd:
         return keyframe
 
     def _step_covariance(self, covariance: FloatArray, yaw: float) -> FloatArray:
-        """The match's covariance in the frame of a pose with ``yaw``, and what scan matching errs beyond that."""
+        """Covariance of the match in the frame of a pose with ``yaw``, plus the additional scan-matching error."""
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
         turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
         loop = self.config.loop
@@ -220,7 +222,7 @@ class FrontEnd:
         return step + np.diag(np.square([loop.step_sigma_m, loop.step_sigma_m, loop.step_sigma_rad]))
 
     def redraw(self) -> None:
-        """Draw the local map anew from the recent keyframes, for instance after their poses were optimised."""
+        """Rebuild the local map from the recent keyframes, for example after their poses were optimised."""
         if self._known is not None:
             self._draw_known(self._drawn_at)
             return
@@ -236,6 +238,6 @@ class FrontEnd:
 
 
 def constant_velocity(pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:
-    """The pose ``elapsed_s`` on, moving as in the last ``step`` (3,), which took ``step_s`` seconds."""
+    """Pose after another ``elapsed_s`` at the velocity of the last ``step`` (3,), which took ``step_s`` seconds."""
     part = elapsed_s / step_s if step_s > 0 else 0.0
     return compose2(pose, np.array([part * step[0], part * step[1], wrap_angle(part * step[2])]))

@@ -1,4 +1,4 @@
-"""Grid SLAM: scans and odometry in, pose, map and map→odom out."""
+"""Grid SLAM: takes scans and odometry, returns pose, map and map→odom."""
 
 from __future__ import annotations
 
@@ -29,50 +29,50 @@ MAX_ODOMETRY_GAP_S = 5.0
 
 
 class SlamStatus(enum.StrEnum):
-    """What became of a scan."""
+    """Outcome of processing a scan."""
 
     FIRST = "first"
     """The first scan: the origin of the map."""
     TRACKED = "tracked"
-    """Matched near the guess."""
+    """Matched near the predicted pose."""
     RECOVERED = "recovered"
-    """Matched by the wide search: odometry was far off."""
+    """Matched by the wide search; the odometry error was large."""
     LOST = "lost"
-    """Nothing matches; the pose is odometry's, and its covariance grows."""
+    """No match; the pose comes from odometry, and its covariance grows."""
     RESTARTED = "restarted"
-    """Lost for long: a new local map begins at odometry's pose."""
+    """Lost for several scans; a new local map starts at the odometry pose."""
     NO_POINTS = "no points"
-    """Empty, all infinite or too few points; the pose is odometry's."""
+    """No points, only infinite ranges, or too few points; the pose comes from odometry."""
     TIME_BACKWARDS = "time backwards"
-    """Not newer than the scan before; left out, the pose is the last one."""
+    """Not newer than the previous scan; the scan is ignored and the last pose returned."""
 
     @property
     def matched(self) -> bool:
-        """Whether the pose comes from the scan."""
+        """Whether the pose comes from scan matching."""
         return self in (SlamStatus.FIRST, SlamStatus.TRACKED, SlamStatus.RECOVERED)
 
 
 class Anchor(Protocol):
-    """A pose of the past that later corrections move."""
+    """A past pose that later corrections move."""
 
     def pose(self) -> FloatArray:
-        """map_from_base (3,) as it is known now."""
+        """Current estimate of map_from_base (3,)."""
         ...
 
 
 @dataclass(frozen=True)
 class SlamResult:
-    """Answer for one scan.
+    """Result of one scan.
 
     Attributes:
         map_from_base: (3,) at the scan's stamp.
-        covariance: (3, 3) x, y, yaw in the map frame: of the match, and the drift since the map was last met again.
+        covariance: (3, 3) x, y, yaw in the map frame: match covariance plus drift since the last loop closure.
         score: 0..1, mean likelihood field value over the points.
-        status: what became of the scan.
+        status: outcome of the scan.
         keyframe_added: whether the map has changed.
-        localized: False while the robot's place in a saved map is still looked for; the pose is then in a frame of
-            its own.
-        anchor: what carries this scan when the map is corrected later; None before the first keyframe.
+        localized: False while the robot is not yet located in a saved map; the pose is then in a separate frame.
+        anchor: moves with the map, so that this scan's pose can be read after later corrections; None before the first
+            keyframe.
     """
 
     map_from_base: FloatArray
@@ -86,12 +86,12 @@ class SlamResult:
 
 @dataclass(frozen=True)
 class _Place:
-    """Outcome of a search in the saved map.
+    """Result of a search in the saved map.
 
     Attributes:
-        keyframe: whose place was looked for.
-        found: its place; None: not found.
-        map: drawn from the saved keyframes, where there are any.
+        keyframe: the keyframe that was searched for.
+        found: its pose; None if not found.
+        map: map built from the saved keyframes, if there are any.
     """
 
     keyframe: Keyframe
@@ -102,18 +102,19 @@ class _Place:
 class GridSlam:
     """Online SLAM with a planar laser.
 
-    The first scan's pose is odometry's, or the origin without odometry. `map_from_odom` takes up all corrections;
-    `odom_from_base` is the odometry as given, or, for scans without one, LiDAR odometry that goes on from it.
+    The first scan's pose is the odometry pose, or the origin without odometry. `map_from_odom` takes up all
+    corrections. `odom_from_base` is the given odometry; for scans without odometry it is LiDAR odometry continued from
+    there.
 
     Args:
         config: defaults when None.
-        known: a saved map to drive in, or to go on with.
-        graph: its keyframes and edges: the map is continued. None: it stays as it is, and the robot only finds its
-            way in it. Until the place is found, the robot maps in a frame of its own.
+        known: a saved map to localise in or to extend.
+        graph: keyframes and edges of the saved map, which is then extended. None: the map stays unchanged, and the
+            robot only localises in it. Until it is located, the robot maps in a separate frame.
 
     Attributes:
-        localized: whether the place in the saved map is known; True without one.
-        motion: compares wheels and scans.
+        localized: whether the robot is located in the saved map; True without one.
+        motion: compares wheel odometry with scan matching.
     """
 
     def __init__(
@@ -144,7 +145,7 @@ class GridSlam:
         self._stamp_ns: int | None = None
         self._step: FloatArray = np.zeros(3)
         self._step_s = 0.0
-        # Where odometry and map stood at the last scan that came with odometry.
+        # Odometry and map pose at the last scan that came with odometry.
         self._odometry_stamp_ns: int | None = None
         self._odometry_pose: FloatArray = np.zeros(3)
         self._pose_at_odometry: FloatArray = np.zeros(3)
@@ -152,12 +153,12 @@ class GridSlam:
     def process(
         self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
     ) -> SlamResult:
-        """Place a scan, and enter it into the map when it is a keyframe.
+        """Estimate the pose of a scan, and add the scan to the map when it is a keyframe.
 
         Args:
-            scan: newer than the one before.
+            scan: newer than the previous one.
             odom_pose: odom_from_base (3,) at the scan's stamp, or None.
-            base_from_laser: where the laser stands on the robot, (3,).
+            base_from_laser: mounting pose of the laser on the robot, (3,).
         """
         if self._stamp_ns is not None and scan.stamp_ns <= self._stamp_ns:
             return SlamResult(self.map_from_base, self._covariance, 0.0, SlamStatus.TIME_BACKWARDS, False)
@@ -169,7 +170,7 @@ class GridSlam:
         guess = self._guess(odometry, scan.stamp_ns)
         if len(points.points) < self.config.match.min_points:
             if self._stamp_ns is None:
-                # Nothing to build on yet: the next scan is the first one.
+                # Nothing to match against yet: the next scan becomes the first one.
                 return SlamResult(self.map_from_base, self._covariance, 0.0, SlamStatus.NO_POINTS, False)
             track, status = self.front_end.dead_reckon(guess), SlamStatus.NO_POINTS
         else:
@@ -193,29 +194,29 @@ class GridSlam:
 
     @property
     def map_version(self) -> int:
-        """Grows when `grid` changes; 0 before there is one."""
+        """Counter that grows when `grid` changes; 0 before there is a map."""
         if self._known is not None and (self._graph is None or not self.localized):
             return 1
         return self.map.version
 
     @property
     def map_clipped(self) -> int:
-        """Points outside ``map.max_size_m``."""
+        """Number of points outside ``map.max_size_m``."""
         return self.map.clipped
 
     def save(self, stem: Path) -> list[Path]:
-        """Write the map as ``stem.yaml``, ``stem.pgm`` and ``stem.graph.npz``; returns the files.
+        """Write the map as ``stem.yaml``, ``stem.pgm`` and ``stem.graph.npz``; return the files.
 
         Raises:
-            MapError: there is nothing to save, or it cannot be written.
+            MapError: there is nothing to save, or the files cannot be written.
         """
         files = save_grid(stem, self.grid())
         if self._known is not None and not (self._graph is not None and self.localized):
-            return files  # driven in, not made here: its graph, if any, is where it came from
+            return files  # localisation only: this map was loaded, and its graph, if any, exists where it came from
         keyframes = self.front_end.trajectory.keyframes
         known = max((edge.b for edge in self._edges), default=0) + 1
         edges = list(self._edges)
-        for k in range(known, len(keyframes)):  # those that the back end has not answered for yet
+        for k in range(known, len(keyframes)):  # keyframes that the loop closure has not processed yet
             edges.append(Edge(k - 1, k, keyframes[k].step, keyframes[k].step_covariance))
         kept = [k for k, keyframe in enumerate(keyframes) if keyframe.merged_into is None]
         row = {k: index for index, k in enumerate(kept)}
@@ -223,7 +224,7 @@ class GridSlam:
         return [*files, save_graph(stem, [keyframes[k] for k in kept], edges)]
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
-        """Say where in the saved map the robot is (3,): within 1 m and 60° suffices, scans do the rest.
+        """Set the robot's pose in the saved map (3,). An error of 1 m and 60° is acceptable; scan matching refines it.
 
         Raises:
             ValueError: no saved map, no scan yet, or a pose that is not finite.
@@ -242,7 +243,10 @@ class GridSlam:
             self.front_end.use_known_map(self._localizer.points, self.map_from_base)
 
     def background_job(self) -> Callable[[], Any] | None:
-        """Loop closing and optimisation over the keyframes since the last job; None: none are new, or one is out."""
+        """Return the loop closure and optimisation job for the keyframes since the last job.
+
+        None if there are no new keyframes, or a job is still running.
+        """
         if not self.localized:
             return self._search_job()
         new = self.front_end.trajectory.keyframes[self._handed_over :]
@@ -253,11 +257,11 @@ class GridSlam:
         return lambda: self.back_end.update(new)
 
     def take_over(self, outcome: Any) -> None:
-        """Take over what a background job found: corrected poses go into map_from_odom, never into odometry.
+        """Apply the result of a background job: corrected poses change map_from_odom, never odometry.
 
         Args:
-            outcome: of the job; None: it failed. Nothing changes then, and loops are closed no more, because what the
-                back end knows of the keyframes is not whole.
+            outcome: result of the job; None if it failed. Then nothing changes, and loop closure is disabled, because
+                its copy of the keyframes is incomplete.
         """
         self._busy = False
         if outcome is None:
@@ -294,13 +298,13 @@ class GridSlam:
         keyframes[-1].drift = drift
 
     def _move(self, moved: FloatArray) -> None:
-        """Move the present pose in the map; odometry stays."""
+        """Move the current pose in the map; odometry stays."""
         self.map_from_base = compose2(moved, self.map_from_base)
         self.map_from_odom = compose2(moved, self.map_from_odom)
         self._pose_at_odometry = compose2(moved, self._pose_at_odometry)
 
     def _search_job(self) -> Callable[[], Any] | None:
-        """Look for the last keyframes in the saved map, once for each new one."""
+        """Return a job that searches the saved map for the last keyframes, once for each new keyframe."""
         keyframes = self.front_end.trajectory.recent(self.config.loop.query_keyframes)
         localizer, graph = self._localizer, self._graph
         if self._busy or localizer is None or not keyframes or keyframes[-1] is self._tried_keyframe:
@@ -321,7 +325,7 @@ class GridSlam:
         return search
 
     def _settle_in(self, moved: FloatArray, covariance: FloatArray, drawn: OccupancyMap | None) -> None:
-        """The place in the saved map is known: ``moved`` brings what was mapped so far to it."""
+        """Join the current map to the saved one: ``moved`` transforms everything mapped so far into the saved map."""
         assert self._localizer is not None
         own = self.front_end.trajectory.keyframes
         for keyframe in own:
@@ -334,7 +338,7 @@ class GridSlam:
             return
         saved, edges = self._graph
         first = own[0]
-        # The way from the last saved keyframe is unknown; what ties the first new one is its place in the map.
+        # The motion from the last saved keyframe is unknown; the first new keyframe is tied by its pose in the map.
         first.step = relative2(saved[-1].map_from_base, first.map_from_base)
         first.step_covariance = np.diag([100.0, 100.0, 10.0])
         self.front_end.trajectory.keyframes = [*saved, *own]
@@ -355,7 +359,7 @@ class GridSlam:
         self.front_end.redraw()
 
     def finish(self) -> None:
-        """After the last scan: optimise with all loops, and draw the map from the outcome."""
+        """After the last scan: optimise with all loops, and rebuild the map from the result."""
         if not self.localized or self._broken or self.front_end.in_known_map:
             return
         new = self.front_end.trajectory.keyframes[self._handed_over :]
@@ -364,7 +368,7 @@ class GridSlam:
             self.take_over(self.back_end.update(new, last=True))
 
     def figures(self) -> dict[str, object]:
-        """Keyframes, loops closed, loops taken back."""
+        """Counts of keyframes, closed loops and rejected loops."""
         return {
             "keyframes": len(self.front_end.trajectory) - self._merged,
             "loops": self.back_end.closed,
@@ -376,7 +380,7 @@ class GridSlam:
             start = np.zeros(3) if odometry is None else odometry
             return self.front_end.guess_from_odometry(start, np.zeros(3))
         elapsed_s = (stamp_ns - self._stamp_ns) * 1e-9
-        # Across a short gap the encoders have gone on counting; after a long one they may have been reset.
+        # The encoders keep counting across a short gap; after a long gap they may have been reset.
         gap_s = math.inf if self._odometry_stamp_ns is None else (stamp_ns - self._odometry_stamp_ns) * 1e-9
         if odometry is not None and gap_s <= max(MAX_ODOMETRY_GAP_S, 2 * elapsed_s):
             step = relative2(self._odometry_pose, odometry)
@@ -385,7 +389,7 @@ class GridSlam:
         return self.front_end.guess_from_velocity(pose, elapsed_s)
 
     def _follow(self, track: Track, odometry: FloatArray | None, stamp_ns: int) -> None:
-        """Take over the pose; corrections into map_from_odom."""
+        """Accept the pose and move its correction into map_from_odom."""
         step = relative2(self.map_from_base, track.pose)
         if self._stamp_ns is not None:
             self._step, self._step_s = step, (stamp_ns - self._stamp_ns) * 1e-9
@@ -393,7 +397,7 @@ class GridSlam:
                 matched = track.status in (TrackStatus.TRACKED, TrackStatus.RECOVERED)
                 self.motion.update(relative2(self._odometry_pose, odometry), step, self._step_s, matched)
             if track.status not in (TrackStatus.TRACKED, TrackStatus.RECOVERED):
-                # A robot that cannot see must not run on in the estimate for ever.
+                # Damp the velocity: without a match, the estimate must not keep moving for ever.
                 self._step = 0.5 * self._step
         if odometry is None:
             self.odom_from_base = compose2(self.odom_from_base, step)

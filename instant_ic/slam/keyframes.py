@@ -1,4 +1,4 @@
-"""Keyframes: the scans that the map is made of, with the poses that a later optimisation may move."""
+"""Keyframes: the scans that make up the map, with poses that optimisation may change."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from instant_ic.geometry.poses import compose2
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 NO_SCAN = ScanPoints(np.zeros((0, 2)), np.zeros(0, dtype=np.bool_), np.zeros(2), np.zeros((0, 2)))
-"""Of a keyframe that was taken out."""
+"""Empty scan of a removed keyframe."""
 
 
 @dataclass
@@ -21,14 +21,14 @@ class Keyframe:
     Attributes:
         stamp_ns: time of the scan.
         map_from_base: (3,), changed by optimisation.
-        covariance: (3, 3) of the match that placed it, relative to the keyframes before.
+        covariance: (3, 3) of the match, relative to the preceding keyframes.
         scan: its points in the base frame.
-        dead_reckoned: whether the scan did not match and the pose is odometry's.
-        step: from the keyframe before to this one, as measured when it was made (3,); of the first, zero.
-        step_covariance: of ``step``, in the frame of the keyframe before (3, 3).
-        drift: covariance of the pose in the map as a whole (3, 3), map frame: grows with the way since the map was
-            last met again.
-        merged_into: the keyframe that stands for this one since it was taken out, and this one's pose there (3,).
+        dead_reckoned: whether the scan did not match and the pose comes from odometry.
+        step: measured pose (3,) relative to the previous keyframe, at creation; zero for the first.
+        step_covariance: of ``step``, in the frame of the previous keyframe (3, 3).
+        drift: covariance of the pose in the whole map (3, 3), map frame; grows with the distance since the last loop
+            closure.
+        merged_into: for a removed keyframe, the keyframe that replaces it and this one's pose there (3,).
     """
 
     stamp_ns: int
@@ -42,7 +42,7 @@ class Keyframe:
     merged_into: tuple[Keyframe, FloatArray] | None = None
 
     def pose(self) -> FloatArray:
-        """map_from_base as it is known now (3,); of a keyframe that was taken out, by the one it was merged into."""
+        """Current map_from_base (3,); for a removed keyframe, computed from the keyframe it was merged into."""
         if self.merged_into is None:
             return self.map_from_base
         other, other_from_this = self.merged_into
@@ -50,7 +50,7 @@ class Keyframe:
 
 
 class Trajectory:
-    """All keyframes in order of time."""
+    """All keyframes in time order."""
 
     def __init__(self) -> None:
         self.keyframes: list[Keyframe] = []
@@ -60,11 +60,10 @@ class Trajectory:
 
     @property
     def last(self) -> Keyframe:
-        """The newest one."""
+        """The newest keyframe."""
         return self.keyframes[-1]
 
     def add(self, keyframe: Keyframe) -> None:
-        """Append a keyframe."""
         self.keyframes.append(keyframe)
 
     def recent(self, count: int) -> list[Keyframe]:
@@ -77,11 +76,11 @@ class Trajectory:
 
 
 def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance: FloatArray) -> FloatArray:
-    """Covariance (3, 3), map frame, of a pose one step on from one with covariance ``drift``.
+    """Covariance (3, 3), map frame, one step after a pose with covariance ``drift``.
 
     Args:
         drift: (3, 3).
-        way: from the first place to the second in the map, (2,).
+        way: translation from the first pose to the second in the map, (2,).
         yaw: of the first pose in the map.
         step_covariance: (3, 3) in the first pose's frame.
     """

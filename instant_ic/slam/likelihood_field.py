@@ -1,8 +1,9 @@
-"""Likelihood field: how well a point lies on the surfaces that recent keyframes saw.
+"""Likelihood field: how well a point fits the surfaces seen in recent keyframes.
 
-The value at a place is ``exp(−d²/2σ²)`` with ``d`` the distance to the nearest seen surface (Thrun, Burgard, Fox,
-Probabilistic Robotics, 6.4), on a square grid round the robot. The surface in a cell is the mean of all hits in it and
-near it: were every hit drawn by itself, range noise would make each wall a flat ridge on which scans drift.
+The value at a point is ``exp(−d²/2σ²)``, with ``d`` the distance to the nearest seen surface (Thrun, Burgard, Fox,
+Probabilistic Robotics, 6.4), on a square grid around the robot. The surface in a cell is the mean of all hits in and
+near the cell. A field built from single hits would turn range noise into a flat ridge along each wall, on which scans
+drift.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.scan import FloatArray
 
 GAP_WEIGHT = 0.1
-"""What a place between two joined hits counts for against a hit."""
+"""Weight of an interpolated point between two joined hits, relative to a hit."""
 
 
 @njit(cache=True)
 def _add(weight, sum_x, sum_y, touched, count, x, y, w, margin):  # type: ignore[no-untyped-def]
-    """Enter a surface point into its cell; returns the number of touched cells."""
+    """Add a surface point to its cell; return the number of touched cells."""
     height, width = weight.shape
     ix, iy = math.floor(x + 0.5), math.floor(y + 0.5)
     if ix < margin or iy < margin or ix >= width - margin or iy >= height - margin:
@@ -45,7 +46,7 @@ def _add(weight, sum_x, sum_y, touched, count, x, y, w, margin):  # type: ignore
 def accumulate(  # type: ignore[no-untyped-def]
     weight, sum_x, sum_y, touched, count, origin, resolution, pose, points, joined, margin
 ):
-    """Enter the hits of one keyframe, and the surface between joined ones, into the cells' sums.
+    """Add the hits of one keyframe, and the surface between joined hits, to the cell sums.
 
     Args:
         weight: float64 (H, W), as sum_x and sum_y, changed in place; coordinates in cells.
@@ -54,11 +55,11 @@ def accumulate(  # type: ignore[no-untyped-def]
         touched: int32 (n, 2), row and column of the cells with weight; the first ``count`` are in use.
         count: see ``touched``.
         origin: (2,) centre of cell (0, 0), metres.
-        resolution: metres a cell.
+        resolution: metres per cell.
         pose: field_from_base (3,).
         points: (n, 2) in the base frame.
         joined: (n,) whether point ``i`` continues point ``i - 1``.
-        margin: cells at the border that take nothing.
+        margin: width of the border, in cells, where no points are added.
 
     Returns:
         The new count.
@@ -70,7 +71,8 @@ def accumulate(  # type: ignore[no-untyped-def]
         x = (pose[0] + cos_yaw * points[i, 0] - sin_yaw * points[i, 1] - origin[0]) / resolution
         y = (pose[1] + sin_yaw * points[i, 0] + cos_yaw * points[i, 1] - origin[1]) / resolution
         if i > 0 and joined[i]:
-            # Beams leave gaps on far walls; a dotted wall would hold the scan at the place it was drawn from.
+            # Beams leave gaps on far walls. A dotted wall would lock the scan to the pose that the field was built
+            # from.
             steps = int(math.hypot(x - last_x, y - last_y))
             for k in range(1, steps + 1):
                 part = k / (steps + 1.0)
@@ -86,15 +88,15 @@ def accumulate(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def draw_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # type: ignore[no-untyped-def]
-    """Draw a Gaussian round the surface in each touched cell.
+    """Fill the field with a Gaussian around the surface in each touched cell.
 
     Args:
         field: float32 (H, W), changed in place.
-        weight: as in `accumulate`, with sum_x, sum_y, touched and count.
-        sum_x: see there.
-        sum_y: see there.
-        touched: see there.
-        count: see there.
+        weight: as in `accumulate`.
+        sum_x: as in `accumulate`.
+        sum_y: as in `accumulate`.
+        touched: as in `accumulate`.
+        count: as in `accumulate`.
         sigma: of the field, in cells.
         pull: σ, in cells, within which the hits of neighbouring cells count as the same surface.
     """
@@ -105,7 +107,7 @@ def draw_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # typ
     for t in range(count):
         iy, ix = touched[t, 0], touched[t, 1]
         cx, cy = sum_x[iy, ix] / weight[iy, ix], sum_y[iy, ix] / weight[iy, ix]
-        # One step of mean shift: a wall along a border of cells has its hits in two rows of them.
+        # One mean-shift step: the hits of a wall along a cell border fall into two rows of cells.
         total = 0.0
         x = 0.0
         y = 0.0
@@ -142,7 +144,7 @@ def _forget(weight, sum_x, sum_y, touched, count):  # type: ignore[no-untyped-de
 
 @dataclass(frozen=True)
 class Surface:
-    """What a keyframe gives to the field: pose (3,), points (n, 2) in its base frame, joined (n,)."""
+    """Contribution of a keyframe to the field: pose (3,), points (n, 2) in its base frame, joined (n,)."""
 
     pose: FloatArray
     points: FloatArray
@@ -150,16 +152,16 @@ class Surface:
 
 
 class LikelihoodField:
-    """A square likelihood field round the robot.
+    """A square likelihood field around the robot.
 
     Attributes:
         values: float32 (n, n).
         origin: (2,) metres, centre of cell (0, 0).
-        resolution: metres a cell.
+        resolution: metres per cell.
 
     Args:
         config: resolution, σ, range.
-        margin_m: how far beyond ``max_range_m`` it reaches to each side.
+        margin_m: extent beyond ``max_range_m`` on each side.
     """
 
     def __init__(self, config: FieldConfig, margin_m: float = 0.0) -> None:
@@ -175,7 +177,7 @@ class LikelihoodField:
         self._touched = np.zeros((200_000, 2), dtype=np.int32)
 
     def draw(self, centre: FloatArray, surfaces: Sequence[Surface]) -> None:
-        """Draw the field anew from ``surfaces``, moved in whole cells so that ``centre`` (2,) is in the middle."""
+        """Rebuild the field from ``surfaces``, shifted by whole cells so that ``centre`` (2,) is in the middle."""
         config = self.config
         half = self.values.shape[0] // 2
         self.origin = (np.round(np.asarray(centre[:2]) / self.resolution) - half) * self.resolution

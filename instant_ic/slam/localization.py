@@ -1,4 +1,4 @@
-"""Where in a known map is the robot? Scans against the whole of it, with no idea of the place."""
+"""Global localisation: finds scans anywhere in a known map, without an initial pose."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ MIN_GAIN = 0.2
 
 @njit(cache=True)
 def score_places(field, origin, resolution, points, places, rotations):  # type: ignore[no-untyped-def]
-    """Best mean field value of the points at each place over all headings.
+    """Best mean field value of the points at each place, over all headings.
 
     Args:
         field: float32 (H, W).
         origin: (2,) centre of cell (0, 0).
-        resolution: metres a cell.
+        resolution: metres per cell.
         points: (n, 2) in the base frame, n > 0.
         places: (k, 2) metres.
-        rotations: headings tried at each, evenly round the circle.
+        rotations: number of headings tried at each place, evenly spaced around the circle.
 
     Returns:
         value (k,) float32 and heading (k,).
@@ -49,7 +49,7 @@ def score_places(field, origin, resolution, points, places, rotations):  # type:
             px, py = places[k, 0] / resolution, places[k, 1] / resolution
             total = np.float32(0.0)
             for i in range(n):
-                # Once what is left cannot reach the best, the rest need not be looked at.
+                # Stop once the remaining points cannot reach the best value.
                 if total + (n - i) <= best[k] * n:
                     break
                 ix, iy = int(px + dx[i]), int(py + dy[i])
@@ -93,7 +93,9 @@ class Localizer:
         self._min_score = config.loop.min_score
 
     def find(self, points: FloatArray) -> Found | None:
-        """The one place where the points (n, 2), in the base frame, fit; None: nowhere, or in more places than one."""
+        """Return the only pose where the points (n, 2), in the base frame, fit; None if there is no such pose or
+        several.
+        """
         if len(points) < 10:
             return None
         few = points[(np.arange(min(len(points), COARSE_POINTS)) * len(points)) // min(len(points), COARSE_POINTS)]

@@ -1,6 +1,6 @@
 """Readers of 2D laser logs: CARMEN (`FLASER`, `ROBOTLASER1`) and the mines recordings of BreezySLAM.
 
-A log is an iterable of `LogEntry`; a fault is a `LogError` that names file and line.
+A log is an iterable of `LogEntry`. Errors are raised as `LogError`, with file and line.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _MOST_LOG = 8 << 30
 
 
 class LogError(ValueError):
-    """A log that cannot be read: ``path:line: what is wrong``."""
+    """A log cannot be read: ``path:line: what is wrong``."""
 
 
 @dataclass(frozen=True)
 class LogEntry:
-    """A scan with the odometry of its moment.
+    """A scan with the odometry at its stamp.
 
     Attributes:
         scan: ranges by REP-117.
-        odom_pose: odom_from_base (3,); None: the log has no odometry.
+        odom_pose: odom_from_base (3,); None if the log has no odometry.
         base_from_laser: (3,).
-        logger_s: the logger's own time of the scan, where the log has a second time column, seconds.
+        logger_s: logger time of the scan in seconds, if the log has a second time column.
     """
 
     scan: Scan
@@ -45,7 +45,7 @@ class LogEntry:
 
 
 class _Lines(io.TextIOWrapper):
-    """Lines of a text file; a few kilobytes of gzip can hold one line of gigabytes."""
+    """Lines of a text file, limited in length: a few kilobytes of gzip can hold one line of gigabytes."""
 
     def __init__(self, raw: Any, path: Path) -> None:
         super().__init__(raw, encoding="ascii", errors="replace")
@@ -62,7 +62,7 @@ class _Lines(io.TextIOWrapper):
 
 
 def open_log(path: str | Path) -> IO[str]:
-    """Open a text log, gzip or not; the first two bytes tell."""
+    """Open a text log; gzip is detected from the first two bytes."""
     path = Path(path)
     with path.open("rb") as raw:
         packed = raw.read(2) == b"\x1f\x8b"
@@ -70,10 +70,10 @@ def open_log(path: str | Path) -> IO[str]:
 
 
 def read_log(path: str | Path) -> Iterator[LogEntry]:
-    """Scans of a log of either kind: a line of 24 or more bare numbers is the mines format.
+    """Scans of a log of either format: a line of 24 or more bare numbers is the mines format.
 
     Raises:
-        LogError: a line that cannot be read, or no scan at all.
+        LogError: a line cannot be read, or the log has no scan.
         OSError: no such file.
     """
     with open_log(path) as lines:
@@ -85,12 +85,12 @@ def read_log(path: str | Path) -> Iterator[LogEntry]:
 
 @dataclass(frozen=True)
 class _Survey:
-    """What only the whole CARMEN log tells about its lines.
+    """Properties of a CARMEN log that can only be determined from the whole file.
 
     Attributes:
-        range_max: FLASER readings at or above it mean that nothing was met, metres.
+        range_max: FLASER readings at or above it mean "no return", metres.
         mount: base_from_laser (3,).
-        odometry: slice of the line's six pose values that holds the odometry; None: there is none.
+        odometry: slice of the line's six pose values that holds the odometry; None if there is none.
     """
 
     range_max: float
@@ -106,18 +106,18 @@ _SURVEYED_SCANS = 400
 def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[LogEntry]:
     """Scans of a CARMEN log.
 
-    ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, the
-    middle beam to the front. ``ROBOTLASER1`` lines carry angles and maximum themselves. Other messages are passed
-    over. The laser's place on the robot follows from the lines' two poses where these always differ by the same;
-    where they do not, the first is somebody's corrected pose, and the laser is taken to stand in the middle.
+    ``FLASER n r0..rn-1 x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp``, right to left, with
+    the middle beam pointing forward. ``ROBOTLASER1`` lines hold their own angles and maximum range. Other messages are
+    skipped. The laser's mounting pose is the difference between the two poses of a line, if it is the same on all
+    lines. Otherwise the first pose is a corrected one, and the laser is assumed to be mounted at the robot's centre.
 
     Args:
         path: the log, gzip or not.
-        range_max: FLASER readings at or above it, in metres, mean that nothing was met. None: the log's own
-            ``PARAM``, or the value that readings pile up at, or 80 m.
+        range_max: FLASER readings at or above it, in metres, mean "no return". None: the log's own ``PARAM``, or the
+            value at which readings pile up, or 80 m.
 
     Raises:
-        LogError: a line that cannot be read, or no scan at all.
+        LogError: a line cannot be read, or the log has no scan.
     """
     survey = _survey(path, range_max)
     scans = 0
@@ -137,7 +137,7 @@ def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[Lo
 
 
 def _survey(path: str | Path, range_max: float | None) -> _Survey:
-    """Reads a CARMEN log through once; lines that cannot be read are left for the reader to name."""
+    """Read a whole CARMEN log once; malformed lines are skipped here and reported by the reader."""
     poses: list[FloatArray] = []
     readings: list[FloatArray] = []
     with open_log(path) as lines:
@@ -178,15 +178,16 @@ _MOUNT_WOBBLE = np.array([0.05, 0.05, 0.05])
 
 
 def _pile(readings: FloatArray) -> float:
-    """The range that stands for "nothing met": where the largest readings pile up, or the SICK's 80 m.
+    """Range that means "no return": the value at which the largest readings pile up, or the SICK's 80 m.
 
-    A laser that writes its maximum for a beam without return (8.183 m, 50 m, ...) would else draw arcs of wall.
+    A laser may write its maximum range for a beam without return (8.183 m, 50 m, ...). Taken as hits, these readings
+    would add arcs of wall to the map.
     """
     readings = readings[readings < _SICK_RANGE_MAX_M]
     if len(readings) == 0:
         return _SICK_RANGE_MAX_M
     top = float(readings.max())
-    at_top = readings >= top - 5e-4  # the very same value; a wall's readings are scattered
+    at_top = readings >= top - 5e-4  # exactly the same value; readings of a wall are scattered
     below = int((~at_top & (readings >= 0.9 * top)).sum())
     piled = int(at_top.sum())
     return top - 5e-4 if piled >= max(50, 0.002 * len(readings)) and piled > below else _SICK_RANGE_MAX_M
@@ -209,7 +210,7 @@ def _count(text: str, what: str) -> int:
 
 
 def _stamp_ns(text: str) -> int:
-    """Seconds in decimal, exactly: a float64 of an epoch time keeps only a tenth of a microsecond."""
+    """Convert decimal seconds exactly: an epoch time in float64 keeps only a tenth of a microsecond."""
     try:
         return int(Decimal(text) * 1_000_000_000)
     except (InvalidOperation, ValueError, OverflowError):
@@ -217,7 +218,7 @@ def _stamp_ns(text: str) -> int:
 
 
 def _second_stamp(fields: list[str]) -> float | None:
-    """The logger's time, where the line has one."""
+    """Return the logger time, if the line has one."""
     try:
         return float(fields[0])
     except (IndexError, ValueError):
@@ -232,7 +233,7 @@ _FLASER_INCREMENT_DEG = {
     90: 2.0, 91: 2.0, 101: 1.0, 180: 1.0, 181: 1.0, 201: 0.5, 360: 0.5, 361: 0.5, 401: 0.25, 540: 0.5, 541: 0.5,
     681: 0.36, 682: 0.36, 720: 0.25, 721: 0.25, 1081: 0.25,
 }  # fmt: skip
-"""Degrees between the beams of the usual planar lasers, by their number; of others, 180° is the field of view."""
+"""Degrees between the beams of common planar lasers, by number of beams; other numbers mean a 180° field of view."""
 
 
 def _flaser(fields: list[str], survey: _Survey) -> LogEntry:
@@ -245,7 +246,7 @@ def _flaser(fields: list[str], survey: _Survey) -> LogEntry:
         raise ValueError(f"two poses and a time must follow the {count} readings, only {len(tail)} fields do")
     poses = _numbers(tail, "pose values", 6)
     increment = math.radians(_FLASER_INCREMENT_DEG.get(count, 180.0 / max(count - 1, 1) if count > 181 else 1.0))
-    # 180 of 181 beams: the last one, at +90°, is missing. So with the other even numbers.
+    # 180 of 181 beams: the last one, at +90°, is missing. The same holds for the other even numbers.
     angle_min = -increment * (count // 2) if count in _FLASER_INCREMENT_DEG else -math.pi / 2
     scan = Scan(_no_return(ranges, survey.range_max), angle_min, increment, 0.02, survey.range_max, _stamp_ns(tail[6]))
     return _entry(scan, poses, survey, tail[8:])
@@ -286,12 +287,12 @@ _MINES_RANGE_MAX_M = 4.0
 def read_mines(path: str | Path) -> Iterator[LogEntry]:
     """Scans of a BreezySLAM `exp*.dat` recording (MinesRover: wheel ticks and a Hokuyo URG-04LX).
 
-    Columns: 0 time in µs, 2 and 3 left and right ticks, from 24 on 682 ranges in mm over 240°, right to left, the
-    outer 70 on each side useless. 0 and the sensor's small error codes are erroneous (NaN). The odometry is the
-    differential drive's, integrated from the ticks; it starts at the origin.
+    Columns: 0 is the time in µs, 2 and 3 the left and right ticks, from 24 on 682 ranges in mm over 240°, right to
+    left. The outer 70 on each side are unusable. 0 and the sensor's small error codes are erroneous (NaN). The odometry
+    is integrated from the ticks with differential drive kinematics and starts at the origin.
 
     Raises:
-        LogError: a line that cannot be read, or no scan at all.
+        LogError: a line cannot be read, or the log has no scan.
     """
     increment = _MINES_FIELD_OF_VIEW / (_MINES_RANGES - 1)
     angle_min = -_MINES_FIELD_OF_VIEW / 2 + _MINES_MARGIN * increment

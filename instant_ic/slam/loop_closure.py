@@ -1,7 +1,7 @@
-"""Back end: closes loops over the keyframes and keeps their poses in accord. Runs beside the scan thread.
+"""Loop closure: finds loops over the keyframes and optimises their poses, in parallel to the scan thread.
 
-It owns its own poses; what goes to and fro are new keyframes in one direction and an `Outcome` in the other. Nothing
-in it depends on time, so that the same keyframes give the same answer.
+It keeps its own copy of the poses. Only new keyframes go in, and only an `Outcome` comes out. The result does not
+depend on timing: the same keyframes give the same result.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from instant_ic.slam.pose_graph import Edge, optimise, residuals
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
 OVERLAP_M = 3.0
-"""An older keyframe this near, beyond the uncertainty of the place, is worth comparing with."""
+"""Distance, beyond the pose uncertainty, within which an older keyframe is compared."""
 SETTLED_M, SETTLED_RAD = 0.02, 0.004
-"""Loops that the graph fits this well already need no optimisation of their own."""
+"""Loops that already fit the graph this closely do not trigger an optimisation ..."""
 SETTLED_EDGES = 20
-"""... until there are so many of them."""
+"""... until this many of them are waiting."""
 MAX_LOOPS_OF_ONE = 4
-"""A keyframe that inherits loops keeps no more than so many."""
+"""Maximum number of loops that a keyframe keeps when it inherits those of a removed one."""
 PENDING_KEYFRAMES = 40
-"""A closed loop that is not confirmed within so many keyframes is forgotten."""
+"""Number of keyframes after which an unconfirmed loop is dropped."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the back end found.
+    """Result of an update.
 
     Attributes:
-        count: keyframes that it knows.
-        poses: of these (count, 3); None: not changed.
-        alive: which of them have not been taken out, positions in growing order.
-        drift: covariance of the last one in the map (3, 3).
-        map: drawn anew from all of them; None: not.
-        merged: keyframes taken out, each with the one that stands for it and its pose there (3,).
-        edges: of the graph now.
+        count: number of keyframes processed.
+        poses: of these keyframes (count, 3); None if unchanged.
+        alive: indices of the keyframes that have not been removed, ascending.
+        drift: covariance of the last keyframe in the map (3, 3).
+        map: rebuilt from all keyframes; None if it was not rebuilt.
+        merged: removed keyframes, each with the one that replaces it and its pose there (3,).
+        edges: current edges of the graph.
     """
 
     count: int
@@ -59,19 +59,19 @@ class Outcome:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A loop that passed all checks of its own, and waits for others that say the same."""
+    """A loop that passed all individual checks and waits for others that agree with it."""
 
     edge: Edge
     travelled_m: float
 
 
 class BackEnd:
-    """Loop closing and pose graph.
+    """Loop closure and pose graph.
 
     Attributes:
         edges: of the graph; node ids are positions in the list of keyframes.
-        closed: accepted loops so far.
-        refused: loops taken back after optimisation, because the rest of the graph contradicted them.
+        closed: number of accepted loops.
+        refused: number of loops rejected after optimisation, because the rest of the graph contradicted them.
     """
 
     def __init__(self, config: SlamConfig) -> None:
@@ -99,15 +99,15 @@ class BackEnd:
 
     @property
     def poses(self) -> FloatArray:
-        """Of every keyframe (n, 3)."""
+        """Poses of all keyframes (n, 3)."""
         return self._poses[: len(self._keyframes)]
 
     def update(self, new: Sequence[Keyframe], last: bool = False) -> Outcome:
-        """Take in new keyframes, look for loops, optimise where there is something to gain.
+        """Add new keyframes, search for loops, and optimise when it improves the graph.
 
         Args:
-            new: those since the last call, in order.
-            last: nothing comes after: settle everything.
+            new: keyframes since the last call, in order.
+            last: no more keyframes will follow: complete all pending work.
         """
         changed = False
         for keyframe in new:
@@ -127,7 +127,7 @@ class BackEnd:
         return Outcome(len(self), poses, alive, drift, redrawn, merged, list(self.edges))
 
     def load(self, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
-        """Begin with a saved graph; its first keyframe stays where it is."""
+        """Start with a saved graph; its first keyframe stays fixed."""
         for keyframe in keyframes:
             self._add(keyframe)
         self.edges = list(edges)
@@ -136,7 +136,7 @@ class BackEnd:
         self._drawn = self.poses.copy()
 
     def tie(self, here: int, pose: FloatArray, covariance: FloatArray) -> None:
-        """Tie keyframe ``here``, added next, to the keyframes already there, at ``pose`` (3,) in their map."""
+        """Tie keyframe ``here``, added next, to the existing keyframes, at ``pose`` (3,) in their map."""
         near = int(np.argmin(((self.poses[:, :2] - pose[:2]) ** 2).sum(axis=1)))
         yaw = float(self._poses[near, 2])
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
@@ -164,7 +164,7 @@ class BackEnd:
             self._drifts.append(
                 grown_drift(self._drifts[-1], pose[:2] - before[:2], float(before[2]), keyframe.step_covariance)
             )
-            # Turning shows new things too: a radian counts as half a metre.
+            # Turning also reveals new surfaces: a radian counts as half a metre.
             way = math.hypot(keyframe.step[0], keyframe.step[1]) + 0.5 * abs(float(keyframe.step[2]))
             self._travelled.append(self._travelled[-1] + way)
             self.edges.append(Edge(here - 1, here, keyframe.step, keyframe.step_covariance))
@@ -173,7 +173,7 @@ class BackEnd:
     # -- loops ------------------------------------------------------------------------------------
 
     def _close(self, here: int) -> bool:
-        """Look for loops that end at keyframe ``here``; True when poses changed."""
+        """Search for loops that end at keyframe ``here``; return True if poses changed."""
         loop = self.config.loop
         first = max(0, here - loop.query_keyframes + 1)
         old = first - self.config.field.keyframes
@@ -220,7 +220,7 @@ class BackEnd:
         return self._optimise(accepted)
 
     def _chains(self, pose: FloatArray, old: int, radius_m: float) -> list[list[int]]:
-        """Runs of keyframes before ``old`` within ``radius_m`` of a pose, those that the map knows best first."""
+        """Runs of keyframes before ``old`` within ``radius_m`` of a pose, those with the lowest drift first."""
         way = self._poses[:old, :2] - pose[:2]
         near = np.flatnonzero(((way**2).sum(axis=1) <= radius_m**2) & self._alive[:old])
         if len(near) == 0:
@@ -236,8 +236,8 @@ class BackEnd:
 
     def _good(self, found: Found) -> bool:
         loop = self.config.loop
-        # Two walls of a corridor are enough for a middling score anywhere along it. What counts is how much of the
-        # rest, which the second best place cannot explain, the best one does.
+        # In a corridor, two walls give a medium score anywhere along it. The criterion is therefore the share of the
+        # remainder, unexplained by the second best pose, that the best pose explains.
         gain = (found.score - found.runner_up) / max(1.0 - found.runner_up, 1e-6)
         return found.score >= loop.min_score and found.shape >= loop.min_shape and gain >= loop.min_gain
 
@@ -250,10 +250,10 @@ class BackEnd:
         return Edge(there, here, relative2(self._poses[there], found.pose), covariance, robust=True)
 
     def _confirm(self, candidate: _Candidate) -> list[Edge]:
-        """The loops that, with this one, say the same often enough; else none, and it waits for others."""
+        """Return the loops that agree with this one, if there are enough; otherwise none, and the candidate waits."""
         loop = self.config.loop
         here = candidate.edge.b
-        # A keyframe that was taken out meanwhile is no longer a node of the graph.
+        # A keyframe removed in the meantime is not a node of the graph.
         self._pending = [
             other
             for other in self._pending
@@ -269,7 +269,7 @@ class BackEnd:
         return [other.edge for other in agreeing] + [candidate.edge]
 
     def _consistent(self, one: Edge, two: Edge) -> bool:
-        """Whether two loops agree: round the cycle of both and the graph between their ends nothing remains."""
+        """Whether two loops agree: the cycle through both loops and the graph closes without error."""
         start = relative2(self._poses[one.a], self._poses[two.a])
         end = relative2(self._poses[one.b], self._poses[two.b])
         rest = relative2(compose2(one.a_from_b, end), compose2(start, two.a_from_b))
@@ -277,7 +277,7 @@ class BackEnd:
         return math.hypot(rest[0], rest[1]) <= 0.15 + 0.03 * way and abs(wrap_angle(float(rest[2]))) <= 0.06
 
     def _anchor(self, edge: Edge) -> None:
-        """The end of a loop is as well known in the map as its start, and the step between."""
+        """Limit the drift at the end of a loop to the drift at its start plus the measured step."""
         pose = self._poses[edge.a]
         way = compose2(pose, edge.a_from_b)[:2] - pose[:2]
         drift = grown_drift(self._drifts[edge.a], way, float(pose[2]), edge.covariance)
@@ -291,7 +291,7 @@ class BackEnd:
     # -- keeping it small -------------------------------------------------------------------------
 
     def _thin_out(self, k: int) -> None:
-        """Take keyframe ``k`` out when enough older ones stand at its place: a known area costs no more and more."""
+        """Remove keyframe ``k`` if enough older ones cover its place, so that a known area has a constant cost."""
         loop = self.config.loop
         if loop.same_place == 0 or k < 1 or not self._alive[k]:
             return
@@ -299,7 +299,8 @@ class BackEnd:
         near = np.hypot(apart[:, 0], apart[:, 1]) <= loop.same_place_m
         near &= np.abs(np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))) <= loop.same_place_rad
         near &= self._alive[:k]
-        near[max(0, k - 2 * self.config.field.keyframes) :] = False  # one's own track is no return to a known place
+        # the robot's own recent track is not a return to a known place
+        near[max(0, k - 2 * self.config.field.keyframes) :] = False
         if int(near.sum()) < loop.same_place:
             return
         own = [edge for edge in self.edges if k in (edge.a, edge.b)]
@@ -330,7 +331,7 @@ class BackEnd:
         return math.hypot(error[0], error[1]) <= within_m and abs(float(error[2])) <= within_rad
 
     def _optimise(self, accepted: Sequence[Edge]) -> bool:
-        """Bring the poses in accord with all edges; loops that the rest contradicts are taken back."""
+        """Optimise the poses over all edges; remove loops that the rest of the graph contradicts."""
         self._unsettled = 0
         alive = np.flatnonzero(self._alive[: len(self)])
         index = {int(k): row for row, k in enumerate(alive)}
@@ -345,7 +346,7 @@ class BackEnd:
         return True
 
     def _redraw(self, last: bool) -> OccupancyMap | None:
-        """The map anew when the keyframes have moved from where they were drawn, and not too often."""
+        """Rebuild the map if the keyframes have moved since it was built, at a limited rate."""
         count, drawn = len(self), len(self._drawn)
         if count == 0:
             return None
@@ -354,7 +355,8 @@ class BackEnd:
         turned = float(np.abs(np.arctan2(np.sin(moved[:, 2]), np.cos(moved[:, 2]))).max()) if drawn else math.inf
         if far < 0.5 * self.config.map.resolution_m and turned < 0.005:
             return None
-        # All keyframes cost time in proportion to their number: at that rate the cost for each new one stays the same.
+        # A rebuild takes time in proportion to the number of keyframes; at this rate the cost per new keyframe is
+        # constant.
         if not last and far < 0.2 and turned < 0.05 and count - drawn < max(20, count // 10):
             return None
         drawing = OccupancyMap(self.config.map)
@@ -365,7 +367,7 @@ class BackEnd:
 
 
 def _turned(covariance: FloatArray, yaw: float) -> FloatArray:
-    """A covariance (3, 3) of a frame, in one that is turned by ``-yaw`` against it."""
+    """Rotate a covariance (3, 3) into a frame turned by ``-yaw``."""
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     turn = np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
     turned: FloatArray = turn @ covariance @ turn.T
@@ -382,7 +384,7 @@ def _reversed(edge: Edge) -> Edge:
 
 
 def _chained(first: Edge, second: Edge) -> Edge:
-    """From the start of one edge over its end, where the second begins, to the second's end."""
+    """Compose two edges: from the start of the first to the end of the second, which starts where the first ends."""
     a_from_c = compose2(first.a_from_b, second.a_from_b)
     way = a_from_c[:2] - first.a_from_b[:2]
     covariance = grown_drift(first.covariance, way, float(first.a_from_b[2]), second.covariance)
@@ -390,7 +392,7 @@ def _chained(first: Edge, second: Edge) -> Edge:
 
 
 def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints], loop: LoopConfig) -> FloatArray:
-    """Points of scans at poses (3,) in the frame of the last pose, spread out evenly, (n, 2)."""
+    """Points of scans at poses (3,), in the frame of the last pose, evenly spread, (n, 2)."""
     parts = []
     for pose, scan in zip(poses, scans, strict=True):
         x, y, yaw = relative2(poses[-1], pose)
@@ -401,5 +403,5 @@ def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints], loop: LoopC
 
 
 def correction(before: FloatArray, after: FloatArray) -> FloatArray:
-    """What moved a pose (3,) from ``before`` to ``after``: ``after ∘ before⁻¹``."""
+    """Transform (3,) that moves ``before`` to ``after``: ``after ∘ before⁻¹``."""
     return compose2(after, inverse2(before))

@@ -1,8 +1,8 @@
-"""Search for the place of recent scans in an older part of the map, which may be metres from where they are believed.
+"""Search for recent scans in an older part of the map, metres away from their estimated pose if need be.
 
-Coarse to fine (Olson, 2015, in idea): every pose of a wide window is scored on a pooled field, whose cells hold the
-best value near them; the best few, apart from each other, are searched on the field itself and refined. The second
-best place tells whether the answer is the only one.
+Coarse to fine, after Olson (2015). Every pose of a wide window is scored on a pooled field, whose cells hold the best
+value nearby. The best poses that are far enough apart are then searched on the full field and refined. The score of the
+second best place shows whether the result is unique.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from instant_ic.slam.matcher import correlate, refine
 from instant_ic.slam.scan import FloatArray
 
 POOL = 4
-"""Cells of the field along a side of a pooled cell."""
+"""Field cells along a side of a pooled cell."""
 
 COARSE_POINTS = 100
-"""Of the query, in the wide search; all of them count in the close one."""
+"""Number of query points in the wide search; the fine search uses all."""
 
 
 @njit(cache=True)
@@ -60,7 +60,7 @@ def score_volume(field, origin, resolution, points, centre, cells, rotations, ro
     Args:
         field: float32 (H, W).
         origin: (2,) centre of cell (0, 0).
-        resolution: metres a cell.
+        resolution: metres per cell.
         points: (n, 2) in the base frame, n > 0.
         centre: field_from_base (3,), middle of the window.
         cells: half width of the window.
@@ -93,7 +93,7 @@ def score_volume(field, origin, resolution, points, centre, cells, rotations, ro
 
 @njit(cache=True)
 def peaks(volume, count, apart, apart_rotations):  # type: ignore[no-untyped-def]
-    """The best poses of a score volume that are not near a better one; rows of rotation, y, x indices."""
+    """Best poses of a score volume, each apart from every better one; rows of rotation, y, x indices."""
     turns, rows, columns = volume.shape
     left = volume.copy()
     found = np.zeros((count, 3), dtype=np.int64)
@@ -119,14 +119,14 @@ def peaks(volume, count, apart, apart_rotations):  # type: ignore[no-untyped-def
 
 @dataclass(frozen=True)
 class Found:
-    """Where the query fits.
+    """Pose at which the query fits.
 
     Attributes:
         pose: field_from_base (3,).
         covariance: (3, 3) in the field's frame, of the scans alone.
         score: 0..1, mean field value over the points.
-        shape: smallest over largest information along a direction, 0..1; near 0 in a bare corridor.
-        runner_up: score of the best place that is another one; 0 where there is none.
+        shape: ratio of smallest to largest information over all directions, 0..1; near 0 in a bare corridor.
+        runner_up: score of the best different place; 0 if there is none.
     """
 
     pose: FloatArray
@@ -143,8 +143,8 @@ class LoopSearch:
     Attributes:
         residual_sigma: as in `Matcher`.
         rotation_step_rad: of the coarse search.
-        candidates: so many coarse peaks are looked at closely.
-        apart_m: places at least so far apart, or turned by ``apart_rad``, are different ones.
+        candidates: number of coarse peaks to refine.
+        apart_m: places this far apart, or turned by ``apart_rad``, count as different.
     """
 
     residual_sigma: float = 0.6
@@ -156,7 +156,7 @@ class LoopSearch:
     def find(
         self, field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
     ) -> Found | None:
-        """Best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,); None: nothing fits."""
+        """Best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,); None if nothing fits."""
         resolution = field.resolution
         coarse = POOL * resolution
         cells = max(1, math.ceil(reach_m / coarse))
@@ -173,7 +173,7 @@ class LoopSearch:
                 [(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * self.rotation_step_rad]
             )
             if close and volume[r, j, i] < close[0][0] - 0.1:
-                break  # a pooled score is about an upper bound: nothing to come can be near the best
+                break  # a pooled score is close to an upper bound: no later candidate can be near the best
             x, y, yaw, _ = correlate(
                 field.values, field.origin, resolution, points, start, POOL, 4, self.rotation_step_rad / 4, start,
                 none, 1.0, 1.0,
@@ -190,7 +190,7 @@ class LoopSearch:
         others = [entry[0] for entry in close[1:] if self.apart(entry[1], pose)]
         try:
             covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
-            # What translation is known of when the heading is not: the Schur complement.
+            # Information on translation with unknown heading: the Schur complement.
             known = hessian[:2, :2] - np.outer(hessian[:2, 2], hessian[2, :2]) / hessian[2, 2]
             low, high = np.linalg.eigvalsh(known)
         except np.linalg.LinAlgError:
@@ -206,11 +206,11 @@ class LoopSearch:
 
 
 def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:
-    """One point a cell of ``cell_m``, at most ``max_points``, evenly chosen, (n, 2)."""
+    """One point per cell of ``cell_m``, at most ``max_points``, evenly chosen, (n, 2)."""
     if len(points) == 0:
         return points
     _, first = np.unique(np.floor(points / cell_m).astype(np.int64), axis=0, return_index=True)
-    kept = points[first]  # in the order of their cells, so that an even choice covers the place
+    kept = points[first]  # in cell order, so that an even choice covers the whole area
     if len(kept) > max_points:
         kept = kept[(np.arange(max_points) * len(kept)) // max_points]
     return np.ascontiguousarray(kept)

@@ -1,6 +1,6 @@
-"""Maps on disk: ``NAME.yaml`` with ``NAME.pgm`` as ROS has them, and ``NAME.graph.npz``, from which a map goes on.
+"""Maps on disk: ``NAME.yaml`` and ``NAME.pgm`` in ROS format, and ``NAME.graph.npz`` for extending the map.
 
-The picture follows map_saver and map_server (nav2): 0 occupied, 254 free, 205 unknown; the top row has the largest y.
+The image follows map_saver and map_server (nav2): 0 occupied, 254 free, 205 unknown; the top row has the largest y.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from instant_ic.slam.scan import FloatArray, ScanPoints
 
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.25
 WRITTEN_FREE_THRESH = 0.196
-"""Grey 205 is 0.1961 occupied: a reader that compares with this keeps it unknown."""
+"""Grey 205 is 0.1961 occupied; a reader with this threshold keeps it unknown."""
 _GRAPH_VERSION = 1
 
 
 class MapError(ValueError):
-    """A map that cannot be written or read; says which file and why."""
+    """A map cannot be written or read; the message names the file and the reason."""
 
 
 def graph_file(stem: Path) -> Path:
-    """The pose graph's file beside ``stem.yaml``."""
+    """Path of the pose graph beside ``stem.yaml``."""
     return stem.with_name(stem.name + ".graph.npz")
 
 
 def ros_map(
     values: NDArray[np.int8], resolution: float, origin: Sequence[float] | NDArray[np.float64], image: str
 ) -> tuple[NDArray[np.uint8], str]:
-    """Picture (H, W), largest y on top, and YAML text of a map, as map_server reads them.
+    """Image (H, W), largest y on top, and YAML text of a map, as map_server reads them.
 
     Args:
         values: cells (H, W), lowest y first; 0..100, -1 unknown.
-        resolution: metres a cell.
+        resolution: metres per cell.
         origin: lower left corner (x, y), m.
-        image: file name of the picture, for the text.
+        image: file name of the image, written to the YAML text.
 
     Raises:
-        MapError: an empty map.
+        MapError: the map is empty.
     """
     if values.size == 0:
         raise MapError("the map is empty: nothing to save")
@@ -61,10 +61,10 @@ def ros_map(
 
 
 def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
-    """Write ``stem.pgm`` and ``stem.yaml``; returns them.
+    """Write ``stem.pgm`` and ``stem.yaml`` and return them.
 
     Raises:
-        MapError: an empty map, or a folder that cannot be written.
+        MapError: the map is empty, or the folder is not writable.
     """
     image, text = stem.with_name(stem.name + ".pgm"), stem.with_name(stem.name + ".yaml")
     picture, words = ros_map(grid.values, grid.resolution, grid.origin, image.name)
@@ -79,12 +79,12 @@ def save_grid(stem: Path, grid: OccupancyGrid) -> list[Path]:
 
 
 def load_grid(path: Path) -> OccupancyGrid:
-    """Read a ROS map: the YAML file, with or without its ending.
+    """Read a ROS map from its YAML file, given with or without extension.
 
-    Modes ``trinary``, ``scale`` and ``raw`` as map_server has them; PGM or any picture that OpenCV reads.
+    Modes ``trinary``, ``scale`` and ``raw`` follow map_server; the image may be PGM or any format that OpenCV reads.
 
     Raises:
-        MapError: a file is missing, or something in it is wrong.
+        MapError: a file is missing or invalid.
     """
     import cv2
     import yaml
@@ -118,7 +118,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     image = path.parent / str(content.get("image", ""))
     try:
         found = image.is_file()
-    except (OSError, ValueError):  # a name that no file can have
+    except (OSError, ValueError):  # not a possible file name
         found = False
     if not found:
         raise MapError(f"{path}: image {image} does not exist")
@@ -132,7 +132,7 @@ def load_grid(path: Path) -> OccupancyGrid:
         values[known] = grey[known].astype(np.int8)
         return OccupancyGrid(values, resolution, np.array(origin[:2], dtype=np.float64))
     share = grey / 255 if content.get("negate") else (255 - grey) / 255
-    # Our own grey of what is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
+    # Grey 205 is unknown, whatever the threshold: nav2 writes 0.25, which would make it free.
     unknown = (grey == 205) & (not content.get("negate"))
     values[(share < free) & ~unknown] = 0
     values[share > occupied] = 100
@@ -143,7 +143,7 @@ def load_grid(path: Path) -> OccupancyGrid:
 
 
 _MOST_NUMBER = 1e9
-"""Above any coordinate in metres; YAML has NaN, infinity, and whole numbers that no float can hold."""
+"""Larger than any coordinate in metres; YAML allows NaN, infinity, and integers too large for a float."""
 
 
 def _number(path: Path, content: dict[str, Any], key: str, default: float | None) -> float:
@@ -161,10 +161,10 @@ def occupied_points(grid: OccupancyGrid, threshold: int = 65) -> FloatArray:
 
 
 def save_graph(stem: Path, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Path:
-    """Write keyframes and edges to ``stem.graph.npz``; returns it.
+    """Write keyframes and edges to ``stem.graph.npz`` and return it.
 
     Raises:
-        MapError: it cannot be written.
+        MapError: the file cannot be written.
     """
     path = graph_file(stem)
     arrays: dict[str, Any] = {
@@ -197,10 +197,10 @@ _MATRICES = ("covariance", "step_covariance", "drift")
 
 
 def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
-    """Read what `save_graph` wrote.
+    """Read a file written by `save_graph`.
 
     Raises:
-        MapError: no such file, or not one of these.
+        MapError: the file is missing or is not a saved graph.
     """
     path = graph_file(stem)
     try:

@@ -1,8 +1,8 @@
 """Scan matching against a likelihood field: correlative search, then Gauss-Newton.
 
 The search scores every pose of a window (Olson, Real-time correlative scan matching, ICRA 2009); the refinement
-minimises ``Σ (1 − M(T·p))²`` (Kohlbrecher et al., Hector SLAM, 2011). Both carry the odometry's guess as a Gaussian
-prior, so that along a featureless corridor, where the field says nothing, the odometry decides.
+minimises ``Σ (1 − M(T·p))²`` (Kohlbrecher et al., Hector SLAM, 2011). Both use the odometry guess as a Gaussian prior.
+Along a featureless corridor, where the field is flat, odometry therefore decides.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from instant_ic.slam.scan import FloatArray
 def correlate(  # type: ignore[no-untyped-def]
     field, origin, resolution, points, centre, cells, rotations, rotation_step, guess, information, cutoff, gain
 ):
-    """Best pose of a window of ``(2·cells + 1)² × (2·rotations + 1)`` poses round ``centre``.
+    """Best pose of a window of ``(2·cells + 1)² × (2·rotations + 1)`` poses around ``centre``.
 
-    The value of a pose is ``gain·mean(field at the points) − ½ c²·ln(1 + e²/c²)`` with ``e²`` its squared distance
-    from ``guess`` in the metric of ``information`` (translation in the guess's own axes: along and across the way)
-    and ``c`` the ``cutoff``: a guess that is far off costs little more than one that is merely off.
+    The value of a pose is ``gain·mean(field at the points) − ½ c²·ln(1 + e²/c²)``. ``e²`` is its squared distance from
+    ``guess`` in the metric of ``information``, with translation in the guess's own axes (along and across the direction
+    of travel). ``c`` is the ``cutoff``: it limits the cost of a guess that is far off.
 
     Args:
         field: float32 (H, W).
         origin: (2,) centre of cell (0, 0).
-        resolution: metres a cell.
+        resolution: metres per cell.
         points: (n, 2) in the base frame, n > 0.
         centre: field_from_base (3,), middle of the window.
         cells: half width of the window.
@@ -40,7 +40,7 @@ def correlate(  # type: ignore[no-untyped-def]
         guess: field_from_base (3,), the prior's mean.
         information: (3,) along, across, rotation; the prior's inverse variances.
         cutoff: in σ.
-        gain: what a mean field value of 1 is worth.
+        gain: weight of the mean field value against the prior.
 
     Returns:
         x, y, yaw, value.
@@ -53,7 +53,7 @@ def correlate(  # type: ignore[no-untyped-def]
     best_value = -1e30
     best_x, best_y, best_yaw = centre[0], centre[1], centre[2]
     cos_guess, sin_guess = math.cos(guess[2]), math.sin(guess[2])
-    # From the middle outwards: of equal poses the one nearest to the centre wins.
+    # From the middle outwards: among equal poses the one nearest to the centre wins.
     for turn in range(2 * rotations + 1):
         r = (turn + 1) // 2 if turn % 2 == 1 else -(turn // 2)
         yaw = centre[2] + r * rotation_step
@@ -132,7 +132,7 @@ def _normal_equations(  # type: ignore[no-untyped-def]
         hessian[2, 2] += jyaw * jyaw
     hessian *= weight
     gradient *= weight
-    # The prior, turned from the guess's axes into the field's.
+    # Rotate the prior from the guess's axes into the field's.
     cos_guess, sin_guess = math.cos(guess[2]), math.sin(guess[2])
     pxx = information[0] * cos_guess * cos_guess + information[1] * sin_guess * sin_guess
     pyy = information[0] * sin_guess * sin_guess + information[1] * cos_guess * cos_guess
@@ -154,7 +154,7 @@ def _normal_equations(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _solve(hessian, gradient, damping):  # type: ignore[no-untyped-def]
-    """Step of the damped system by Cramer's rule; zero where it is singular."""
+    """Solve the damped system by Cramer's rule; zero step if it is singular."""
     a = hessian[0, 0] * (1 + damping)
     b, c = hessian[0, 1], hessian[0, 2]
     d = hessian[1, 1] * (1 + damping)
@@ -175,8 +175,8 @@ def _solve(hessian, gradient, damping):  # type: ignore[no-untyped-def]
 def refine(field, origin, resolution, points, start, guess, information, weight, iterations, reach, turn):  # type: ignore[no-untyped-def]
     """Levenberg-Marquardt from ``start`` (3,) on ``½ weight Σ(1 − M)² + ½ eᵀ·diag(information)·e``.
 
-    Goes no farther from ``start`` than ``reach`` metres along x and y and ``turn`` radians: what lies beyond, the
-    search has seen and found worse.
+    The result stays within ``reach`` metres of ``start`` along x and y and within ``turn`` radians: the search has
+    already rejected everything beyond.
 
     Returns:
         The pose (3,), the Hessian there (3, 3), the mean field value, the sum of squared residuals.
@@ -213,7 +213,7 @@ def refine(field, origin, resolution, points, start, guess, information, weight,
 
 @dataclass(frozen=True)
 class Window:
-    """Half widths of a search: metres and radians."""
+    """Half widths of a search, in metres and radians."""
 
     translation_m: float
     rotation_rad: float
@@ -221,13 +221,13 @@ class Window:
 
 @dataclass(frozen=True)
 class Match:
-    """Where a scan fits.
+    """Pose at which a scan fits.
 
     Attributes:
         pose: field_from_base (3,).
         covariance: (3, 3) in the field's frame.
         score: 0..1, mean field value over the points.
-        at_border: the search ended at the edge of its window, so better may lie outside.
+        at_border: the search ended at the edge of its window, so a better pose may lie outside.
     """
 
     pose: FloatArray
@@ -241,12 +241,12 @@ class Matcher:
     """Finds the pose of a scan in a likelihood field.
 
     Attributes:
-        residual_sigma: one standard deviation of ``1 − M`` for a point on its surface; smaller trusts the
-            scan more and the odometry less.
-        cutoff: so many σ from the guess its pull no longer grows.
-        coarse_rotation_step_rad, fine_rotation_step_rad: steps of the two searches; in translation the steps are
-            the field's cells.
-        refine_iterations: at most so many Gauss-Newton steps.
+        residual_sigma: standard deviation (1σ) of ``1 − M`` for a point on its surface; a smaller value trusts the scan
+            more and odometry less.
+        cutoff: distance from the guess, in σ, beyond which the prior's pull stops growing.
+        coarse_rotation_step_rad, fine_rotation_step_rad: steps of the two searches; the translation step is one field
+            cell.
+        refine_iterations: maximum number of Gauss-Newton steps.
     """
 
     residual_sigma: float
@@ -286,14 +286,14 @@ class Matcher:
             field.values, field.origin, resolution, points, np.array([x, y, yaw]), 1, finer,
             self.fine_rotation_step_rad, guess, information, self.cutoff, gain,
         )  # fmt: skip
-        # The refinement keeps the weight that the prior has at the best pose of the search.
+        # Keep the prior's weight fixed at its value at the best pose of the search.
         error = relative2(guess, np.array([x, y, yaw]))
         information = information / (1.0 + float(information @ error**2) / self.cutoff**2)
         pose, hessian, score, squares = refine(
             field.values, field.origin, resolution, points, np.array([x, y, yaw]), guess, information, weight,
             self.refine_iterations, 3 * resolution, 2 * self.coarse_rotation_step_rad,
         )  # fmt: skip
-        # The residuals tell how good the fit is: a poor one has a wide covariance.
+        # The residuals measure the quality of the fit: a poor fit gets a wide covariance.
         variance = max(squares / max(len(points) - 3, 1), 1e-3) * weight
         covariance = variance * np.linalg.inv(hessian)
         pose[2] = wrap_angle(float(pose[2]))

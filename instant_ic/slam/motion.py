@@ -1,4 +1,6 @@
-"""What the wheels say against what the scans say: slip, a robot stuck, pushed or carried, and how it really turns."""
+"""Compares wheel odometry with scan matching: detects slip and a robot that is stuck, pushed or carried; estimates the
+turn factor.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +14,17 @@ from instant_ic.slam.scan import FloatArray
 
 
 class MotionState(enum.StrEnum):
-    """How the robot moves."""
+    """Motion state of the robot."""
 
     NORMAL = "normal"
     SLIPPING = "slipping"
     """The tracks turn clearly farther than the robot moves."""
     STUCK = "stuck"
-    """The tracks turn, the robot stands."""
+    """The tracks turn, but the robot does not move."""
     PUSHED = "pushed"
-    """The robot moves, the tracks stand."""
+    """The robot moves, but the tracks do not."""
     CARRIED = "carried"
-    """The tracks stand, and the scan shows another place, or none that is known."""
+    """The tracks do not turn, and the scan shows another place or an unknown one."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +38,15 @@ class _Step:
 
 
 class MotionMonitor:
-    """Compares odometry steps with matched ones over the last ``window_s``.
+    """Compares odometry steps with matched steps over the last ``window_s``.
 
     Attributes:
         state: see `MotionState`.
-        slip: share of the tracks' way that was lost over the window, 0..1; negative where the robot went farther.
-        turn_factor: encoder yaw over true yaw, from all turns so far, newer ones count more. The effective track width
-            that makes the encoders right is the one in use times this factor.
-        turn_factor_sigma: one standard deviation of it; inf before the first turn.
+        slip: share of the track distance lost over the window, 0..1; negative if the robot moved farther than the
+            tracks.
+        turn_factor: encoder yaw over true yaw, from all turns so far, weighted towards recent ones. The correct
+            effective track width is the one in use times this factor.
+        turn_factor_sigma: its standard deviation (1σ); inf before the first turn.
     """
 
     def __init__(self, config: MotionConfig) -> None:
@@ -54,19 +57,19 @@ class MotionMonitor:
         self.turn_factor_sigma = math.inf
         self._steps: deque[_Step] = deque()
         self._span_s = 0.0
-        # Sums of the regression of encoder yaw on matched yaw, in blocks of half a radian or so.
+        # Sums of the regression of encoder yaw on matched yaw, in blocks of about half a radian.
         self._block_wheels = self._block_seen = 0.0
         self._block_turned = 0.0
         self._squares = self._products = self._errors = self._weight = 0.0
 
     def update(self, wheels: FloatArray, seen: FloatArray, elapsed_s: float, matched: bool) -> MotionState:
-        """Take in a step.
+        """Add a step and return the motion state.
 
         Args:
-            wheels: odometry's (3,), in the base's frame.
-            seen: the matched one (3,).
-            elapsed_s: its time.
-            matched: whether the scan was placed at all.
+            wheels: odometry step (3,), in the base's frame.
+            seen: matched step (3,).
+            elapsed_s: duration of the step.
+            matched: whether the scan was matched.
         """
         wheels_m = math.copysign(math.hypot(wheels[0], wheels[1]), wheels[0])
         seen_m = math.copysign(math.hypot(seen[0], seen[1]), seen[0])
@@ -114,7 +117,7 @@ class MotionMonitor:
         wheels, seen = self._block_wheels, self._block_seen
         self._block_wheels = self._block_seen = self._block_turned = 0.0
         if abs(seen) < 0.3 or abs(wheels) > 3 * abs(seen):
-            return  # to and fro, or a robot that was stuck: says nothing about the width
+            return  # turning back and forth, or a stuck robot: no information about the track width
         keep = self.config.turn_memory
         error = wheels - self.turn_factor * seen
         self._squares = keep * self._squares + seen * seen

@@ -1,7 +1,7 @@
-"""Occupancy grid by ray casting: log-odds cells, grows with the map, updated scan by scan.
+"""Occupancy grid by ray casting: log-odds cells, updated scan by scan; the grid grows with the map.
 
-Log-odds as in Thrun, Burgard, Fox, Probabilistic Robotics, 9.2. A scan changes a cell at most once, and a hit outweighs
-the rays of the same scan that pass through the cell, so that walls met at a grazing angle stay.
+Log-odds as in Thrun, Burgard, Fox, Probabilistic Robotics, 9.2. A scan changes a cell at most once. A hit outweighs the
+rays of the same scan that pass through the cell, so that walls seen at a grazing angle are kept.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class OccupancyGrid(NamedTuple):
 
     Attributes:
         values: int8 (H, W), −1 unknown, 0..100 probability of being occupied; row 0 has the lowest y.
-        resolution: metres a cell.
+        resolution: metres per cell.
         origin: (2,) map coordinates of the lower left corner of cell (0, 0).
     """
 
@@ -40,7 +40,7 @@ def _log_odds(probability):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _cast(cells, seen, mark, x0, y0, x1, y1, change, low):  # type: ignore[no-untyped-def]
-    """Every cell from (x0, y0) up to, not including, the one of (x1, y1) gets ``change`` (Amanatides and Woo, 1987).
+    """Add ``change`` to every cell from (x0, y0) up to, but excluding, the cell of (x1, y1) (Amanatides and Woo, 1987).
 
     Coordinates in cells; cell i covers i..i + 1.
     """
@@ -70,23 +70,23 @@ def _cast(cells, seen, mark, x0, y0, x1, y1, change, low):  # type: ignore[no-un
 def cast_scan(  # type: ignore[no-untyped-def]
     cells, seen, mark, origin, resolution, pose, laser, points, clear_ends, max_range, hit, miss, low, high
 ):
-    """Enter one scan into log-odds ``cells`` float32 (H, W).
+    """Add one scan to log-odds ``cells`` float32 (H, W).
 
     Args:
         cells: changed in place.
         seen: int32 (H, W), ``mark`` where this scan has changed the cell.
         mark: > 0, grows from scan to scan.
         origin: (2,) corner of cell (0, 0).
-        resolution: metres a cell.
+        resolution: metres per cell.
         pose: map_from_base (3,).
         laser: (2,) the laser's centre in the base frame.
         points: (n, 2) hits in the base frame.
         clear_ends: (m, 2) ends of free rays in the base frame.
-        max_range: metres; hits beyond it only clear the way up to it.
+        max_range: metres; a farther hit only clears the cells up to it.
         hit: log-odds added to the cell of a hit.
         miss: log-odds added to the cells that a ray passes.
-        low: least log-odds of a cell.
-        high: greatest log-odds of a cell.
+        low: minimum log-odds of a cell.
+        high: maximum log-odds of a cell.
     """
     height, width = cells.shape
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
@@ -136,7 +136,7 @@ class OccupancyMap:
 
     Attributes:
         version: grows with every change.
-        clipped: points that fell outside ``max_size_m`` and were left out.
+        clipped: number of points dropped because they lie outside ``max_size_m``.
     """
 
     def __init__(self, config: MapConfig) -> None:
@@ -159,7 +159,7 @@ class OccupancyMap:
         return corner
 
     def insert(self, map_from_base: FloatArray, scan: ScanPoints) -> None:
-        """Enter a scan at a pose (3,)."""
+        """Add a scan at a pose (3,)."""
         self._grow(map_from_base, scan)
         self._mark += 1
         cast_scan(
@@ -169,11 +169,11 @@ class OccupancyMap:
         self.version += 1
 
     def grid(self) -> OccupancyGrid:
-        """The map so far; 0×0 before the first scan."""
+        """Return the current map; 0×0 before the first scan."""
         return OccupancyGrid(_percentages(self._cells, self._seen), self.config.resolution_m, self.origin)
 
     def _grow(self, pose: FloatArray, scan: ScanPoints) -> None:
-        """Make room for what the scan touches, in steps of GROW_CELLS, up to ``max_size_m`` about the map's origin."""
+        """Extend the grid to cover the scan, in steps of GROW_CELLS, up to ``max_size_m`` about the map's origin."""
         cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
         rotation = np.array([[cos_yaw, -sin_yaw], [sin_yaw, cos_yaw]])
         rays = np.concatenate([scan.points, scan.clear_ends, scan.origin[None]]) - scan.origin

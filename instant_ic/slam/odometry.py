@@ -1,4 +1,4 @@
-"""Wheel odometry over time, asked for at the stamps of scans; and the smoothing of map→odom."""
+"""Buffer of wheel odometry, interpolated at scan stamps; and the smoothing of map→odom."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from instant_ic.slam.scan import FloatArray
 
 
 class OdometryBuffer:
-    """The last seconds of odometry: poses odom_from_base (3,) by time.
+    """Recent odometry: poses odom_from_base (3,) by time.
 
     Args:
-        keep_s: how much of the past is kept.
+        keep_s: length of the history in seconds.
     """
 
     def __init__(self, keep_s: float = 10.0) -> None:
@@ -29,7 +29,7 @@ class OdometryBuffer:
         return self._stamps[-1] if self._stamps else None
 
     def add(self, stamp_ns: int, odom_from_base: FloatArray) -> bool:
-        """Append a pose; False, and left out, when it is not newer than the last or not finite."""
+        """Append a pose. Return False, without adding it, if it is not newer than the last or not finite."""
         if not np.isfinite(odom_from_base).all() or (self._stamps and stamp_ns <= self._stamps[-1]):
             return False
         self._stamps.append(stamp_ns)
@@ -40,14 +40,14 @@ class OdometryBuffer:
         return True
 
     def clear(self) -> None:
-        """Forget everything."""
         self._stamps.clear()
         self._poses.clear()
 
     def at(self, stamp_ns: int, extrapolate_s: float = 0.0) -> FloatArray | None:
         """Pose (3,) at a time, along the arc between its neighbours.
 
-        After the newest pose the last motion goes on for at most ``extrapolate_s``. None: the time is not covered.
+        After the newest pose the last motion is extrapolated by at most ``extrapolate_s``. None if the time is not
+        covered.
         """
         if not self._stamps or stamp_ns < self._stamps[0]:
             return None
@@ -66,7 +66,7 @@ class OdometryBuffer:
 
 
 def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
-    """``part`` of a planar step (3,) along the circle that it lies on."""
+    """Fraction ``part`` of a planar step (3,) along its circular arc."""
     turn = float(step[2])
     if abs(turn) < 1e-9:
         return np.array([part * step[0], part * step[1], part * turn])
@@ -80,14 +80,14 @@ def _part_of_arc(step: FloatArray, part: float) -> FloatArray:
 
 
 class CorrectionLimiter:
-    """Lets map_from_odom follow its estimate at a limited speed.
+    """Makes map_from_odom follow its estimate at a limited speed.
 
-    The robot's place in the map then moves on smoothly where a recovered track, or later a closed loop, corrects it by
-    decimetres at once. Ordinary corrections of a few centimetres a scan pass unchanged.
+    A recovered track or a closed loop may correct the pose by decimetres at once; the limiter keeps the robot's pose in
+    the map continuous. Ordinary corrections of a few centimetres per scan pass unchanged.
 
     Args:
-        speed_mps: of the base's place in the map, m/s.
-        yaw_rate_radps: rad/s.
+        speed_mps: limit for the base's position in the map, m/s.
+        yaw_rate_radps: limit for its heading, rad/s.
     """
 
     def __init__(self, speed_mps: float, yaw_rate_radps: float) -> None:
@@ -97,11 +97,11 @@ class CorrectionLimiter:
         self._stamp_ns = 0
 
     def reset(self) -> None:
-        """The next value is taken as it is."""
+        """Pass the next value without limiting it."""
         self._map_from_odom = None
 
     def follow(self, map_from_odom: FloatArray, odom_from_base: FloatArray, stamp_ns: int) -> FloatArray:
-        """The value to broadcast (3,): as near to the estimate as the speed allows, measured at the base."""
+        """Value to broadcast (3,): as close to the estimate as the speed limit allows, measured at the base."""
         if self._map_from_odom is None:
             limited = map_from_odom.copy()
         else:

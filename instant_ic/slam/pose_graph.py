@@ -1,9 +1,9 @@
-"""Pose graph in the plane: Levenberg-Marquardt on sparse normal equations, robust where edges may be wrong.
+"""Pose graph in the plane: Levenberg-Marquardt on sparse normal equations, robust against wrong edges.
 
 Residual of an edge from node a to node b with measured pose z of b in a's frame: ``(Raᵀ(tb − ta) − tz, θb − θa − θz)``
 (Grisetti et al., A tutorial on graph-based SLAM, 2010). Edges that may be wrong are scaled down by dynamic covariance
-scaling (Agarwal et al., ICRA 2013), whose width is narrowed step by step, so that a true edge across a large error is
-not switched off before it could pull.
+scaling (Agarwal et al., ICRA 2013). The kernel width is narrowed in stages, so that a correct edge across a large error
+is not switched off before it can take effect.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from instant_ic.slam.scan import FloatArray
 
 ROBUST_WIDTHS = (1e4, 1e2, 1.0)
-"""Widths of the robust kernel, in multiples of the last one, from stage to stage."""
+"""Widths of the robust kernel per stage, in multiples of the final width."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Edge:
     """A measured pose between two nodes.
 
     Attributes:
-        a: id of the node whose frame it is given in.
+        a: id of the node whose frame the pose is given in.
         b: id of the other node.
         a_from_b: (3,).
         covariance: (3, 3) in a's frame.
-        robust: whether it may be wrong (a closed loop), or must hold (a step of the trajectory).
+        robust: True for an edge that may be wrong (loop closure), False for a step of the trajectory.
     """
 
     a: int
@@ -46,8 +46,8 @@ class Solution:
 
     Attributes:
         poses: (n, 3).
-        chi2: of each edge (m,), not scaled down.
-        weights: what the robust kernel left of each edge (m,), 0..1; 1 for those that are not robust.
+        chi2: of each edge (m,), without robust scaling.
+        weights: weight of each edge after the robust kernel (m,), 0..1; 1 for edges that are not robust.
     """
 
     poses: FloatArray
@@ -67,17 +67,17 @@ def residuals(poses: FloatArray, a: NDArray[np.intp], b: NDArray[np.intp], measu
 def optimise(
     poses: FloatArray, edges: Sequence[Edge], index: dict[int, int], robust_chi2: float = 25.0, iterations: int = 10
 ) -> Solution:
-    """Poses that fit the edges best; the first node stays where it is.
+    """Optimise the poses over all edges; the first node stays fixed.
 
     Args:
-        poses: (n, 3), where to begin.
+        poses: (n, 3), initial values.
         edges: between the nodes.
         index: row in ``poses`` of each node's id.
-        robust_chi2: width of the robust kernel: an edge with this χ² keeps all its weight, beyond it less and less.
-        iterations: at most so many a stage.
+        robust_chi2: width of the robust kernel: an edge keeps its full weight up to this χ², and less beyond it.
+        iterations: maximum number of iterations per stage.
 
     Raises:
-        ValueError: an edge to a node that is not there, or a part of the graph that no edge ties to the first node.
+        ValueError: an edge refers to an unknown node, or part of the graph is not connected to the first node.
     """
     try:
         a = np.array([index[edge.a] for edge in edges], dtype=np.intp)
@@ -126,7 +126,7 @@ def _weights(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> Float
 
 
 def _robust_cost(chi2: FloatArray, robust: NDArray[np.bool_], width: float) -> float:
-    """What dynamic covariance scaling minimises: s²χ² + Φ(1 − s)² summed."""
+    """Cost that dynamic covariance scaling minimises: sum of s²χ² + Φ(1 − s)²."""
     scale = _weights(chi2, robust, width)
     missing = 0.0 if math.isinf(width) else width * float(((1 - scale) ** 2).sum())
     return float((scale**2 * chi2).sum()) + missing
@@ -140,7 +140,7 @@ def _step(
     information: FloatArray,
     damping: float,
 ) -> FloatArray:
-    """Damped Gauss-Newton step (n, 3); NaN where the system is singular."""
+    """Damped Gauss-Newton step (n, 3); NaN if the system is singular."""
     from scipy.sparse import csc_matrix
     from scipy.sparse.linalg import splu
 

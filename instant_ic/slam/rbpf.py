@@ -1,8 +1,8 @@
-"""A Rao-Blackwellised particle filter: the method the paper used (GMapping), with its parameter names.
+"""Rao-Blackwellised particle filter: the paper's method (GMapping), with GMapping's parameter names.
 
-Each particle is a path with a map of its own. Odometry moves it with noise, hill climbing on its map improves the
-move, the scan's likelihood there is its weight, and the best survive when the weights become too unequal (Grisetti,
-Stachniss, Burgard, 2007). Between two updates the pose follows odometry.
+Each particle is a path with its own map. Odometry moves a particle with added noise, and hill climbing on its map
+improves the pose. The scan likelihood at that pose is the particle's weight. The filter resamples when the weights
+become too unequal (Grisetti, Stachniss, Burgard, 2007). Between two updates the pose follows odometry.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
 from instant_ic.slam.tile_maps import TileMaps, climb
 
 OCCUPIED = 0.25
-"""A cell is drawn as occupied when so many of the beams that met it ended in it (slam_gmapping's occ_thresh)."""
+"""Minimum share of hits among the beams at a cell for it to be occupied (slam_gmapping's occ_thresh)."""
 
 
 @dataclass(frozen=True)
 class _Update:
-    """Poses of all particles after an update (n, 3), and which one each came from (n,)."""
+    """Poses of all particles after an update (n, 3), and the parent index of each (n,)."""
 
     poses: FloatArray
     parents: NDArray[np.intp]
@@ -39,7 +39,7 @@ class _Update:
 
 @dataclass(frozen=True)
 class _PathAnchor:
-    """An update on the path of whichever particle is best when one asks."""
+    """An update on the path of the particle that is best when the pose is read."""
 
     slam: ParticleSlam
     index: int
@@ -50,7 +50,7 @@ class _PathAnchor:
 
 
 class ParticleSlam:
-    """The filter, with the interface of `instant_ic.slam.backend.Slam`."""
+    """Particle filter with the interface of `instant_ic.slam.backend.Slam`."""
 
     def __init__(self, config: SlamConfig) -> None:
         self.config = config
@@ -78,15 +78,16 @@ class ParticleSlam:
 
     @property
     def map_clipped(self) -> int:
-        """Cells outside the largest map."""
+        """Number of cells outside the largest allowed map."""
         return int(self.maps.counters[1])
 
     def process(
         self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
     ) -> SlamResult:
-        """Place a scan: by odometry since the last update, or by the filter when the robot has moved far enough.
+        """Estimate the pose of a scan: by odometry since the last update, or by the filter once the robot has moved far
+        enough.
 
-        Without odometry, scan matching against recent scans (the graph's front end) stands in for it.
+        Without odometry, scan matching against recent scans (the front end of the graph method) is the fallback.
         """
         if self._stamp_ns is not None and scan.stamp_ns <= self._stamp_ns:
             return self._result(SlamStatus.TIME_BACKWARDS, 0.0, False)
@@ -137,32 +138,32 @@ class ParticleSlam:
         return self._path[1]
 
     def grid(self) -> OccupancyGrid:
-        """The best particle's map: −1, 0 or 100."""
+        """Map of the best particle: −1, 0 or 100."""
         visits, hits, corner = self.maps.grid(self._best)
         values = np.where(hits > OCCUPIED * visits, 100, 0).astype(np.int8)
         values[visits == 0] = -1
         return OccupancyGrid(values, self.maps.delta, corner)
 
     def background_job(self) -> Callable[[], Any] | None:
-        """There is none."""
+        """Return None: this method has no background jobs."""
         return None
 
     def take_over(self, outcome: Any) -> None:
-        """Nothing: there are no background jobs."""
+        """Do nothing: there are no background jobs."""
 
     def finish(self) -> None:
-        """Nothing is left to do."""
+        """Do nothing: no work is pending."""
 
     def save(self, stem: Path) -> list[Path]:
-        """Write the map, without a graph: this method has none."""
+        """Write the map, without a graph."""
         return save_grid(stem, self.grid())
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
-        """Refused: this method uses no saved map."""
+        """Raise ValueError: this method does not support saved maps."""
         raise ValueError("backend rbpf cannot use a saved map")
 
     def figures(self) -> dict[str, object]:
-        """Updates, effective particles, resamplings, map tiles."""
+        """Counts of updates, effective particles, resamplings and map tiles."""
         return {
             "updates": len(self._updates),
             "neff": round(self._effective(), 1),
@@ -173,7 +174,7 @@ class ParticleSlam:
     # -- the filter -------------------------------------------------------------------------------
 
     def _update(self, scan: ScanPoints, step: FloatArray) -> float:
-        """Move, match, weigh, map, resample; the best particle's mean score a beam."""
+        """Move, match, weigh, map, resample; return the best particle's mean score per beam."""
         gmapping, maps = self.particle_config, self.maps
         ranges = np.hypot(*(scan.points - scan.origin).T)
         near = np.ascontiguousarray(scan.points[ranges <= gmapping.maxUrange][:: gmapping.lskip + 1])
@@ -202,7 +203,7 @@ class ParticleSlam:
         return best
 
     def _draw_motion(self, step: FloatArray) -> None:
-        """Each particle moves by the odometry step and noise of its own (GMapping's motion model)."""
+        """Move each particle by the odometry step plus its own noise (GMapping's motion model)."""
         noise = self.particle_config
         dx, dy, turn = abs(float(step[0])), abs(float(step[1])), abs(float(step[2]))
         cross = 0.3 * noise.srr
@@ -217,7 +218,7 @@ class ParticleSlam:
             self._poses[k] = compose2(self._poses[k], step + sigma * draw)
 
     def _weights(self) -> FloatArray:
-        """Normalised weights (n,): the log-likelihoods, smoothed by ``ogain``."""
+        """Normalised weights (n,) from the log-likelihoods, smoothed by ``ogain``."""
         config = self.particle_config
         weights = np.exp((self._log_weights - self._log_weights.max()) / (config.ogain * config.particles))
         normalised: FloatArray = weights / weights.sum()
@@ -227,7 +228,7 @@ class ParticleSlam:
         return float(1.0 / (self._weights() ** 2).sum())
 
     def _resample(self) -> None:
-        """Systematic resampling; every particle weighs the same afterwards."""
+        """Systematic resampling; all particles have the same weight afterwards."""
         count = self.particle_config.particles
         places = (self._rng.random() + np.arange(count)) / count
         parents = np.minimum(np.searchsorted(np.cumsum(self._weights()), places), count - 1)

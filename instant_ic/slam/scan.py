@@ -14,8 +14,8 @@ FloatArray = NDArray[np.float64]
 class Scan:
     """One scan, as in sensor_msgs/LaserScan, ranges by REP-117.
 
-    ``ranges`` is (n,) in metres: −inf too close, NaN erroneous, +inf nothing within range. Beam ``i`` points to
-    ``angle_min + i·angle_increment`` radians in the laser's frame; all beams belong to ``stamp_ns``.
+    ``ranges`` is (n,) in metres: −inf too close, NaN erroneous, +inf no return within range. Beam ``i`` points to
+    ``angle_min + i·angle_increment`` radians in the laser's frame. All beams are treated as measured at ``stamp_ns``.
     """
 
     ranges: NDArray[np.floating]
@@ -36,13 +36,13 @@ class Scan:
 
 @dataclass(frozen=True)
 class ScanPoints:
-    """What SLAM keeps of a scan, in the robot's base frame.
+    """Points of a scan used by SLAM, in the robot's base frame.
 
     Attributes:
         points: hits in beam order, (n, 2).
         joined: (n,) whether point ``i`` continues the surface of point ``i - 1``.
         origin: the laser's centre, (2,).
-        clear_ends: ends of the rays that met nothing, (m, 2).
+        clear_ends: ends of the rays without return, (m, 2).
     """
 
     points: FloatArray
@@ -57,10 +57,10 @@ COLLINEAR_GAP_RATIO = 2.0
 
 
 def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArray[np.bool_]:
-    """Which points (n, 2) continue the surface of the one before.
+    """Which points (n, 2) continue the surface of the previous one.
 
-    Those of neighbouring beams that are near each other; and, for a wall seen at a grazing angle, where the hits lie
-    metres apart, those that stand in line with the next hit to either side.
+    Points of neighbouring beams are joined if they are close together. On a wall seen at a grazing angle, where hits
+    lie metres apart, points are also joined if they are in line with the next hit on either side.
     """
     joined = np.zeros(len(points), dtype=np.bool_)
     if len(points) < 2:
@@ -70,7 +70,7 @@ def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArra
     neighbours = np.diff(beams) == 1
     in_line = np.zeros(len(step), dtype=np.bool_)
     if len(step) > 1:
-        # How far the far end of one step lies from the line of the step beside it; shared by both steps.
+        # Distance of the far end of one step from the line of the adjacent step; shared by both steps.
         cross = np.abs(step[:-1, 0] * step[1:, 1] - step[:-1, 1] * step[1:, 0])
         forward = (step[:-1] * step[1:]).sum(axis=1) > 0
         straight = neighbours[:-1] & neighbours[1:] & forward
@@ -83,10 +83,10 @@ def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArra
 
 
 def scan_points(scan: Scan, base_from_laser: FloatArray, join_gap_m: float, clear_m: float) -> ScanPoints:
-    """Hits and free rays of ``scan``; a hit is what ``range_min <= r <= range_max`` (REP-117).
+    """Hits and free rays of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
 
-    Neighbouring beams whose hits lie no more than ``join_gap_m`` apart, or in a line, are one surface. Rays of +inf are
-    free for ``clear_m`` metres (0: nothing is known of them).
+    Neighbouring beams whose hits lie no more than ``join_gap_m`` apart, or in a line, are one surface. A ray of +inf is
+    free for ``clear_m`` metres (0: unknown).
     """
     ranges = np.asarray(scan.ranges, dtype=np.float64)
     angles = scan.angle_min + scan.angle_increment * np.arange(ranges.size) + base_from_laser[2]
@@ -104,13 +104,13 @@ def scan_points(scan: Scan, base_from_laser: FloatArray, join_gap_m: float, clea
 def thin(points: FloatArray, joined: NDArray[np.bool_], spacing_m: float, max_points: int) -> FloatArray:
     """Points for matching: at least ``spacing_m`` apart along a surface, at most ``max_points``, evenly chosen.
 
-    Without this a near wall, which many beams meet, outweighs the far ones that fix the heading.
+    Without thinning, a near wall hit by many beams outweighs the far walls that determine the heading.
     """
     if len(points) == 0:
         return points
     step = np.zeros(len(points))
     step[1:] = np.where(joined[1:], np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)), np.inf)
-    # Arc length along each surface; a point stays where the length enters a new stretch of spacing_m.
+    # Arc length along each surface; a point is kept where the length enters a new interval of spacing_m.
     step[~np.isfinite(step)] = spacing_m
     stretch = np.floor(np.cumsum(step) / spacing_m) if spacing_m > 0 else np.arange(len(points), dtype=np.float64)
     keep = np.ones(len(points), dtype=np.bool_)

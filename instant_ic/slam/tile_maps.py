@@ -1,7 +1,7 @@
-"""Grid maps of many particles that share what they have in common: tiles, copied when one of several writes to them.
+"""Grid maps of many particles with shared tiles: a tile is copied when one of its owners writes to it.
 
-A cell counts how often beams passed or hit it and sums up where the hits were, as in Grisetti, Stachniss, Burgard
-(Improved techniques for grid mapping with Rao-Blackwellized particle filters, 2007).
+A cell counts how often beams passed or hit it, and sums the hit positions, as in Grisetti, Stachniss, Burgard (Improved
+techniques for grid mapping with Rao-Blackwellized particle filters, 2007).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TILE = 32
 
 @njit(cache=True)
 def _own(table, row, column, references, free, counters, cells):  # type: ignore[no-untyped-def]
-    """The tile at a place of one particle's table, its own to write to; −1 when none is left."""
+    """Return a writable tile at a place of one particle's table, copied if shared; −1 when no tile is free."""
     tile = table[row, column]
     if tile >= 0 and references[tile] == 1:
         return tile
@@ -58,19 +58,19 @@ def _touch(table, ix, iy, references, free, counters, cells, hit, x, y):  # type
 
 @njit(cache=True)
 def register(table, references, free, counters, cells, delta, pose, laser, points, usable):  # type: ignore[no-untyped-def]
-    """Enter a scan into one particle's map.
+    """Add a scan to one particle's map.
 
     Args:
         table: int32 (n, n) tiles of this particle, −1 where there is none; the map's origin is its middle.
-        references: int32 (t,) how many tables hold each tile.
+        references: int32 (t,) number of tables that hold each tile.
         free: int32 (t,) stack of free tiles.
-        counters: int64 (2,) height of that stack; cells that could not be entered.
+        counters: int64 (2,) height of that stack; number of cells that could not be added.
         cells: float32 (t, TILE, TILE, 4) visits, hits, sum of the hits' x and y.
-        delta: metres a cell.
+        delta: metres per cell.
         pose: map_from_base (3,).
         laser: (2,) the laser's centre in the base frame.
         points: (k, 2) hits in the base frame.
-        usable: farthest range of a hit that counts, metres; others clear up to it.
+        usable: maximum range of a hit, metres; farther hits only clear cells up to this range.
     """
     half = table.shape[0] * TILE // 2
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
@@ -106,7 +106,7 @@ def register(table, references, free, counters, cells, delta, pose, laser, point
 
 @njit(cache=True)
 def _full(table, cells, ix, iy, threshold):  # type: ignore[no-untyped-def]
-    """Tile of a cell that is occupied; −1 where it is free or not known."""
+    """Tile of a cell if the cell is occupied; −1 if it is free or unknown."""
     size = table.shape[0] * TILE
     if ix < 0 or iy < 0 or ix >= size or iy >= size:
         return -1
@@ -120,9 +120,9 @@ def _full(table, cells, ix, iy, threshold):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def score(table, cells, delta, pose, laser, points, kernel, sigma, lsigma):  # type: ignore[no-untyped-def]
-    """How well hits (k, 2) at a pose (3,) lie on the map: the matcher's score, and the log-likelihood of the scan.
+    """Score of hits (k, 2) at a pose (3,) on the map: the matcher's score and the scan's log-likelihood.
 
-    A hit counts when a cell within ``kernel`` cells of it is occupied and the one before it on the beam is not.
+    A hit counts if a cell within ``kernel`` cells of it is occupied and the previous cell on the beam is not.
     """
     half = table.shape[0] * TILE // 2
     cos_yaw, sin_yaw = math.cos(pose[2]), math.sin(pose[2])
@@ -194,11 +194,11 @@ def climb(table, cells, delta, start, laser, points, kernel, sigma, lsigma, lste
 
 
 class TileMaps:
-    """The maps of all particles.
+    """Maps of all particles.
 
     Args:
-        particles: how many.
-        delta: metres a cell.
+        particles: number of particles.
+        delta: metres per cell.
         size_m: side of the square about the origin that a map can cover.
 
     Attributes:
@@ -217,11 +217,11 @@ class TileMaps:
 
     @property
     def tiles(self) -> int:
-        """Tiles in use."""
+        """Number of tiles in use."""
         return len(self.references) - int(self.counters[0])
 
     def register(self, particle: int, pose: FloatArray, laser: FloatArray, points: FloatArray, usable: float) -> None:
-        """Enter a scan into one map; see the kernel."""
+        """Add a scan to one map; see the kernel."""
         self._reserve((math.ceil(2 * usable / self.delta / TILE) + 2) ** 2)
         register(
             self.tables[particle], self.references, self.free, self.counters, self.cells, self.delta, pose, laser,
@@ -229,7 +229,7 @@ class TileMaps:
         )  # fmt: skip
 
     def resample(self, parents: NDArray[np.intp]) -> None:
-        """Particle ``i`` takes over the map of particle ``parents[i]``; nothing is copied but the tables."""
+        """Give particle ``i`` the map of particle ``parents[i]``; only the tables are copied."""
         self.tables = self.tables[parents]
         held = self.tables[self.tables >= 0]
         self.references[:] = np.bincount(held, minlength=len(self.references)).astype(np.int32)
