@@ -1,4 +1,4 @@
-"""Augmentation of a batch of panoramas (torch): what keeps the depth, and what a real camera does to a picture."""
+"""Augmentation of a batch of panoramas (torch): depth-preserving transforms, and the effects of a real camera."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-#: Quantisation of JPEG's luminance at quality 50 (ITU-T T.81, table K.1).
+# Luminance quantisation of JPEG at quality 50 (ITU-T T.81, table K.1).
 _QUANTISATION = (
     (16, 11, 10, 16, 24, 40, 51, 61), (12, 12, 14, 19, 26, 58, 60, 55), (14, 13, 16, 24, 40, 57, 69, 56),
     (14, 17, 22, 29, 51, 87, 80, 62), (18, 22, 37, 56, 68, 109, 103, 77), (24, 35, 55, 64, 81, 104, 113, 92),
@@ -18,11 +18,11 @@ _MAX_GAIN = 2.5
 
 
 def to_brightness(rgb: Tensor, brightness: float) -> Tensor:
-    """Brings each picture's mean byte to ``brightness`` by one factor, as inference does with the manifest's value.
+    """Scale each image's mean byte to ``brightness`` by one factor, as inference does with the manifest's value.
 
     Args:
         rgb: (B, 3, H, W) in 0..1.
-        brightness: mean byte; 0 leaves the pictures as they are.
+        brightness: mean byte; 0 leaves the images unchanged.
     """
     if not brightness:
         return rgb
@@ -31,7 +31,7 @@ def to_brightness(rgb: Tensor, brightness: float) -> Tensor:
 
 
 def turn_and_mirror(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Turns every panorama by a random yaw and mirrors half of them; both are exact on equirect pictures.
+    """Rotate every panorama by a random yaw and mirror half of them; both are exact on equirect images.
 
     Args:
         rgb: (B, 3, H, W).
@@ -52,12 +52,12 @@ def turn_and_mirror(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> t
 
 
 def photograph(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:
-    """What a real panorama camera on a robot adds to a picture (B, 3, H, W) in 0..1; each effect on some pictures.
+    """Add the effects of a real panorama camera on a robot to images (B, 3, H, W) in 0..1; each effect on some images.
 
-    Four in ten pictures change in their colours alone: those of a good camera are not to be forgotten. The others in
-    the order in which things arise: reflections in the floor, the robot or its stand over the bottom, lens
-    (vignetting, blur), sensor (exposure, colours, noise), JPEG. The depth (B, H, W) stays: under the robot it is the
-    floor's, so that the network learns to go on with the floor there.
+    Four in ten images change in colour only, so that the network keeps its accuracy on images of a good camera. The
+    others get the effects in physical order: reflections in the floor, the robot or its stand at the bottom, lens
+    (vignetting, blur), sensor (exposure, colours, noise), JPEG. The depth (B, H, W) is unchanged: below the robot it is
+    the floor's depth, so that the network learns to continue the floor there.
     """
     changed = _some(rgb, floor_reflection(rgb, depth, generator), 0.2, generator)
     changed = _some(changed, robot_body(changed, generator), 0.4, generator)
@@ -80,7 +80,7 @@ def _uniform(like: Tensor, generator: torch.Generator, low: float, high: float, 
 def camera_colours(rgb: Tensor, generator: torch.Generator) -> Tensor:
     """Exposure (over- and under-), contrast, white balance, saturation and sensor noise; (B, 3, H, W) in 0..1.
 
-    Some pictures are changed much, some hardly: the network should do no worse on those of a good camera.
+    Some images change strongly, others hardly, so that accuracy on images of a good camera does not drop.
     """
     strength = _uniform(rgb, generator, 0.0, 1.0)
     gamma = torch.exp(strength * _uniform(rgb, generator, -0.4, 0.5))
@@ -93,17 +93,17 @@ def camera_colours(rgb: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def vignetting(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Darkening towards the seam of the two lenses, which look along some yaw and its opposite."""
+    """Darken towards the seam of the two lenses, which face a random yaw and its opposite."""
     height, width = rgb.shape[-2:]
     yaw = torch.linspace(-math.pi, math.pi, width + 1)[:-1] + math.pi / width
     elevation = math.pi / 2 - (torch.arange(height) + 0.5) * math.pi / height
     turn = 2 * math.pi * torch.rand(rgb.shape[0], 1, 1, generator=generator)
-    across = (torch.cos(elevation)[None, :, None] * torch.cos(yaw[None, None, :] + turn)).abs()  # 1 in a lens's middle
+    across = (torch.cos(elevation)[None, :, None] * torch.cos(yaw[None, None, :] + turn)).abs()  # 1 at a lens centre
     return rgb * (1 - _uniform(rgb, generator, 0.1, 0.45) * ((1 - across) ** 2)[:, None].to(rgb.device))
 
 
 def robot_body(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """A dark body with an uneven rim, up to some elevation below the horizon (the foot of a stand, a robot's deck)."""
+    """Add a dark body with an uneven rim, up to some elevation below the horizon (a stand's foot, a robot's deck)."""
     count, _, height, width = rgb.shape
     yaw = torch.arange(width)[None] * (2 * math.pi / width)
     rim = 4 + 26 * torch.rand(count, 1, generator=generator)  # degrees above the nadir
@@ -122,10 +122,10 @@ def robot_body(rgb: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def floor_reflection(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> Tensor:
-    """A polished floor: what stands above the horizon shows in it, more at grazing angles.
+    """Polished floor: add reflections of everything above the horizon, stronger at grazing angles.
 
-    The floor is taken for what lies as deep as the deepest known pixel. A mirror image is taken from the same
-    elevation above the horizon, which is right for what is far.
+    Pixels as low as the lowest known pixel count as floor. The reflection is read at the same elevation above the
+    horizon, which is exact for distant surfaces only.
     """
     height = rgb.shape[-2]
     elevation = math.pi / 2 - (torch.arange(height, device=rgb.device) + 0.5) * math.pi / height
@@ -139,15 +139,15 @@ def floor_reflection(rgb: Tensor, depth: Tensor, generator: torch.Generator) -> 
 
 
 def blur(rgb: Tensor, generator: torch.Generator) -> Tensor:
-    """Soft lens or a little motion: 3 × 3 mean, mixed in by some share; circular in width."""
+    """Soft lens or slight motion: blend in a 3 × 3 mean by a random share; circular in width."""
     padded = functional.pad(functional.pad(rgb, (1, 1, 0, 0), mode="circular"), (0, 0, 1, 1), mode="replicate")
     return rgb + _uniform(rgb, generator, 0.3, 1.0) * (functional.avg_pool2d(padded, 3, stride=1) - rgb)
 
 
 def jpeg(rgb: Tensor, generator: torch.Generator, quality: tuple[float, float] = (20.0, 85.0)) -> Tensor:
-    """Rounds the cosine coefficients of 8 × 8 blocks as JPEG of a random quality does; colour twice as coarsely.
+    """Round the cosine coefficients of 8 × 8 blocks as JPEG of a random quality does; colour twice as coarsely.
 
-    Height and width are multiples of 8.
+    Height and width must be multiples of 8.
     """
     count, _, height, width = rgb.shape
     k = torch.arange(8, dtype=rgb.dtype, device=rgb.device)

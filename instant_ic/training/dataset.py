@@ -15,12 +15,12 @@ INFO = "dataset.json"
 
 
 class DatasetError(ValueError):
-    """A data folder is missing, incomplete or of another shape than asked for."""
+    """A data folder is missing, incomplete, or its panoramas have another shape than requested."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One panorama: ``rgb`` (H, W, 3) uint8, ``depth_m`` (H, W) radial metres, 0 = unknown; ``world`` its seed."""
+    """One panorama: ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W), radial metres, 0 = unknown; ``world``, its seed."""
 
     rgb: NDArray[np.uint8]
     depth_m: NDArray[np.floating]
@@ -28,7 +28,7 @@ class Sample:
 
 
 class Subset:
-    """Some panoramas of a collection."""
+    """A selection of panoramas from a collection."""
 
     def __init__(self, samples: Any, indices: Sequence[int] | NDArray[np.intp]) -> None:
         self.samples, self.indices = samples, indices
@@ -42,7 +42,7 @@ class Subset:
 
     @classmethod
     def joined(cls, parts: Sequence[Subset]) -> Subset:
-        """All panoramas of several, one collection after the other."""
+        """Concatenate several subsets."""
         places = [(part, index) for part in parts for index in range(len(part))]
         return cls(_Joined(places), range(len(places)))
 
@@ -80,7 +80,7 @@ class PanoramaDataset:
         return int(self.rgb.shape[1]), int(self.rgb.shape[2])
 
     def brightness(self, samples: int = 64) -> float:
-        """Mean byte of about so many panoramas, evenly chosen; for the manifest of a model trained on them."""
+        """Mean byte of about ``samples`` evenly chosen panoramas, for the manifest of a model trained on them."""
         step = max(1, len(self) // samples)
         return round(float(np.mean([self.rgb[i].mean() for i in range(0, len(self), step)])), 1)
 
@@ -88,10 +88,10 @@ class PanoramaDataset:
         return Sample(np.asarray(self.rgb[index]), np.asarray(self.depth[index], np.float32), int(self.world[index]))
 
     def split(self, held_out_share: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices for training and for evaluation; whole worlds are held out, the last ones.
+        """Indices for training and for evaluation. Whole worlds are held out, the last ones.
 
         Raises:
-            ValueError: the share leaves no world on one side.
+            ValueError: the share leaves no world for training or none for evaluation.
         """
         worlds = np.unique(self.world)
         count = max(1, round(len(worlds) * held_out_share))
@@ -104,9 +104,9 @@ class PanoramaDataset:
 def write_dataset(
     folder: str | Path, samples: Iterable[Sample], count: int, size: tuple[int, int], info: dict[str, Any]
 ) -> Iterator[int]:
-    """Writes up to ``count`` samples of ``size`` (height, width); gives the number written after each.
+    """Write up to ``count`` samples of ``size`` (height, width); yield the number written after each.
 
-    What is written so far can be opened at any time; a folder that was cut short just holds fewer samples.
+    The folder can be opened at any time while it is written; if writing is interrupted, it holds fewer samples.
 
     Raises:
         DatasetError: a sample has another shape.

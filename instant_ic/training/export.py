@@ -1,4 +1,4 @@
-"""SliceNet to ONNX with manifest and training record (torch and onnx)."""
+"""Export of SliceNet to ONNX with manifest and training record (torch and onnx)."""
 
 from __future__ import annotations
 
@@ -27,29 +27,29 @@ MAX_HALF_DIFFERENCE = 2e-2
 
 
 class ExportError(RuntimeError):
-    """The exported file does not compute what the network does."""
+    """The exported file's output differs from the network's."""
 
 
 def export_onnx(
     model: SliceNet, path: str | Path, half_weights: bool = False, report: Callable[[str], None] = lambda line: None
 ) -> dict[str, float]:
-    """Writes the network as ONNX of fixed shape and holds it against torch on a random picture.
+    """Export the network as ONNX of fixed shape and compare it with torch on a random image.
 
-    The decoder is folded (:mod:`.folding`), batch norms go into the convolutions before them.
+    The decoder is folded (:mod:`.folding`), and batch norms are folded into the convolutions before them.
 
     Args:
-        model: the network; put into evaluation mode.
-        path: file to write; replaced only when all is well.
-        half_weights: store the weights as float16 (half the size); they are computed with in float32.
-        report: is given a line before each step that takes time.
+        model: the network; switched to evaluation mode.
+        path: file to write; replaced only after all checks have passed.
+        half_weights: store the weights as float16 (half the size); inference computes in float32.
+        report: receives a line before each step that takes time.
 
     Returns:
         ``difference``: largest |onnx - torch| over the largest |torch|, with float32 weights; ``rounding``: the same
-        of torch in float32 and in float64, where the first is not under 1e-5; ``half_difference``: the same of the
-        file with float16 weights, where those are written.
+        for torch in float32 against float64, if the first is not below 1e-5; ``half_difference``: the same for the file
+        with float16 weights, if those are written.
 
     Raises:
-        ExportError: a difference is above what rounding explains, or the network gives no numbers.
+        ExportError: a difference exceeds what rounding explains, or the network's output is not finite.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -65,7 +65,7 @@ def export_onnx(
         plain = Path(folder) / "model.onnx"
         report("torch writes ONNX")
         with warnings.catch_warnings():
-            # The tracing exporter is the fast one here; its successor keeps the LSTM no better.
+            # The tracing exporter is the fast one here; its successor handles the LSTM no better.
             warnings.simplefilter("ignore")
             torch.onnx.export(
                 fold_upsampling(model), (picture,), str(plain), dynamo=False, opset_version=OPSET,
@@ -76,7 +76,7 @@ def export_onnx(
         result = {"difference": _difference(got, expected)}
         told = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
         if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
-            # Weights may amplify rounding beyond any fixed bound; then the exact numbers tell who is wrong.
+            # Weights may amplify rounding beyond any fixed bound; a float64 run then shows which side is wrong.
             report(f"{told}; torch computes it in float64")
             with torch.inference_mode():
                 exact = copy.deepcopy(model).double()(picture.double()).numpy()
@@ -113,7 +113,7 @@ def _difference(got: NDArray[np.floating], expected: NDArray[np.floating]) -> fl
 
 
 def _halve_weights(content: bytes) -> bytes:
-    """Stores large float32 initialisers as float16 behind a Cast, which the runtime folds when it loads."""
+    """Store large float32 initialisers as float16 behind a Cast, which the runtime folds at load time."""
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
@@ -146,11 +146,11 @@ def export_model(
     brightness: float = 0.0,
     report: Callable[[str], None] = lambda line: None,
 ) -> ModelManifest:
-    """Writes ``NAME.onnx``, its manifest ``NAME.yaml`` and, where given, the training record ``NAME.json``.
+    """Write ``NAME.onnx``, its manifest ``NAME.yaml`` and, if given, the training record ``NAME.json``.
 
     Raises:
         ExportError, OSError: as :func:`export_onnx`.
-        ValueError: a value is wrong in a manifest.
+        ValueError: a manifest value is invalid.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

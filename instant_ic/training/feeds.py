@@ -1,6 +1,6 @@
-"""Where the batches of a training come from: files, or worlds that are rendered while it goes on (numpy).
+"""Sources of training batches: files, or worlds rendered during training (numpy).
 
-A batch is a function of its number alone, so that a training that is taken up again sees what it would have seen.
+A batch depends on its number alone, so that a resumed training gets the same batches as an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WORLD_TIMEOUT_S = 600.0
 
 
 class FeedError(RuntimeError):
-    """No more batches come: a renderer ended or takes too long, or there is nothing to draw from."""
+    """No further batches: a renderer exited or timed out, or there are no panoramas."""
 
 
 class Samples(Protocol):
@@ -42,7 +42,7 @@ class Samples(Protocol):
 
 
 class Feed(Protocol):
-    """Batches by number; asked for in rising order."""
+    """Batches by number, requested in ascending order."""
 
     batch_size: int
 
@@ -53,7 +53,7 @@ class Feed(Protocol):
 
     @property
     def steps_an_epoch(self) -> int:
-        """Batches until everything has been seen once."""
+        """Number of batches that cover all panoramas once."""
         ...
 
     def batch(self, step: int) -> Batch: ...
@@ -62,21 +62,21 @@ class Feed(Protocol):
 
 
 def stack(samples: Sequence[Sample]) -> Batch:
-    """Panoramas of one size as a batch."""
+    """Stack panoramas of one size into a batch."""
     return np.stack([s.rgb for s in samples]), np.stack([np.asarray(s.depth_m, np.float32) for s in samples])
 
 
 class FileFeed:
-    """Passes over stored panoramas, each in an order of its own.
+    """Passes over stored panoramas, each in a different order.
 
     Args:
-        samples: where the panoramas are.
-        indices: which of them.
+        samples: the panoramas.
+        indices: indices of the panoramas to use.
         batch_size: of this process.
         seed: of the order.
         rank, ranks: this process among those that train together; each gets its own part of a pass.
         info: recipe.
-        threads: that read at the same time (decoding pictures takes longer than a small network's step).
+        threads: number of reader threads (decoding images takes longer than a training step of a small network).
     """
 
     def __init__(
@@ -117,16 +117,16 @@ class FileFeed:
 
 
 class RenderedFeed:
-    """Draws from a window of worlds that moves on as the training does; processes in the background render ahead.
+    """Samples from a window of worlds that advances with the training; background processes render ahead.
 
     Args:
-        recipe: of the worlds. After the last of them the first comes again.
+        recipe: of the worlds. After the last world the first comes again.
         batch_size: of this process.
         seed: of the choice within the window.
         workers: rendering processes; 0 renders in this one.
         pool: panoramas in the window.
-        reuse: how often each is used on average (turned, mirrored, coloured differently each time).
-        rank, ranks: this process among those that train together; each renders worlds of its own.
+        reuse: average number of uses of a panorama (rotated, mirrored and coloured differently each time).
+        rank, ranks: this process among those that train together; each renders its own worlds.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class RenderedFeed:
 
 
 class MixedFeed:
-    """Each batch is made of one of every feed, of the size that each has."""
+    """Combines feeds: each batch concatenates one batch of every feed."""
 
     def __init__(self, feeds: Sequence[Feed]) -> None:
         self.feeds = list(feeds)
@@ -211,7 +211,7 @@ class MixedFeed:
 
 
 class Ahead:
-    """Makes the next batch in a thread while the present one is trained on."""
+    """Prepares the next batch in a thread while the current one is used."""
 
     def __init__(self, feed: Feed) -> None:
         self.feed = feed
@@ -219,27 +219,27 @@ class Ahead:
         self._made: dict[int, Any] = {}
 
     def batch(self, step: int) -> Batch:
-        """The feed's batch ``step``; its error, if it has one."""
+        """Return batch ``step`` of the feed, or raise the feed's error."""
         ready = self._made.pop(step, None) or self._thread.submit(self.feed.batch, step)
         batch: Batch = ready.result()
         self._made = {step + 1: self._thread.submit(self.feed.batch, step + 1)}
         return batch
 
     def close(self) -> None:
-        """Ends the feed first: a batch that is being waited for would hold this up."""
+        """Close the feed first: a pending batch would block the thread's shutdown."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self.feed.close()
         self._thread.shutdown()
 
 
 class Renderers:
-    """Processes that render worlds in the order of their places; :meth:`world` gives one after the other.
+    """Processes that render worlds in the order of their positions; :meth:`world` returns them one by one.
 
     Args:
         recipe: of the worlds.
         workers: processes; 0 renders in this one.
-        seed_of: world seed of a place 0, 1, 2...
-        first: place to begin with.
+        seed_of: world seed of a position 0, 1, 2...
+        first: position to start with.
     """
 
     def __init__(self, recipe: RoomsConfig, workers: int, seed_of: Callable[[int], int], first: int = 0) -> None:
@@ -251,7 +251,7 @@ class Renderers:
         if workers == 0:
             return
         context = multiprocessing.get_context("spawn")
-        # The light of worlds that never come again would push everything else out of the user's cache.
+        # Baked light of worlds that are rendered only once would evict everything else from the user's cache.
         self._cache = tempfile.TemporaryDirectory(prefix="instant_ic-render-")
         for _ in range(workers):
             asked, given = context.SimpleQueue(), context.Queue()
@@ -271,10 +271,10 @@ class Renderers:
         self._ordered += 1
 
     def world(self) -> list[Sample]:
-        """Panoramas of the next world; none where it has no free place.
+        """Panoramas of the next world; empty if the world has no free place for the camera.
 
         Raises:
-            FeedError: a renderer failed, ended or took longer than ``WORLD_TIMEOUT_S``.
+            FeedError: a renderer failed, exited or took longer than ``WORLD_TIMEOUT_S``.
         """
         place = self._place
         self._place += 1
@@ -300,9 +300,9 @@ class Renderers:
         return list(samples)
 
     def close(self) -> None:
-        """Ends the processes."""
+        """Stop the processes."""
         for process in self._processes:
-            process.kill()  # SIGTERM would wait where one is stopped
+            process.kill()  # SIGTERM would not end a stopped process
         for process in self._processes:
             process.join(10)
         self._processes = []
@@ -317,7 +317,7 @@ class Renderers:
 
 
 def _render(recipe: RoomsConfig, cache: str, parent: int, asked: Any, given: Any) -> None:
-    """Main of a rendering process; ends with its parent."""
+    """Main function of a rendering process; exits with its parent."""
     import signal
     import threading
 
@@ -326,7 +326,7 @@ def _render(recipe: RoomsConfig, cache: str, parent: int, asked: Any, given: Any
             time.sleep(1.0)
         os._exit(1)
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training, which then ends this
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the training, which then stops this process
     threading.Thread(target=watch, daemon=True).start()
     os.environ["XDG_CACHE_HOME"] = cache
     while True:
@@ -334,5 +334,5 @@ def _render(recipe: RoomsConfig, cache: str, parent: int, asked: Any, given: Any
         try:
             given.put((list(render_rooms(recipe, [seed])), None))
         except Exception:
-            given.put(([], traceback.format_exc()))  # for the training, which stops with it
+            given.put(([], traceback.format_exc()))  # the training raises it and stops
             raise

@@ -1,12 +1,13 @@
-"""Folders of panoramas with depth as others publish them: Matterport3D, Stanford 2D-3D-S, Structured3D, and plain ones.
+"""Folders of published panoramas with depth: Matterport3D, Stanford 2D-3D-S, Structured3D, and plain ones.
 
 Sources of the layouts and units (checked 2026-11):
 
-- Stanford 2D-3D-S, its README: 16-bit PNG, 1/512 m, 65535 is missing; in panoramas the distance from the centre.
+- Stanford 2D-3D-S, its README: 16-bit PNG, 1/512 m, 65535 is missing; panoramas hold the distance from the centre.
 - Structured3D, its data_organization.md and README: 16-bit PNG, millimetres, 0 is missing; scenes from 03000 on are for
-  validation, from 03250 on for testing. That it is the distance from the camera is not written there; it is taken so.
-- Matterport3D has no panoramas of depth; users stitch them. The usual script (UniFuse's stitch.m) writes 16-bit PNG of
-  1/4000 m, distance from the camera. 3D60 and Pano3D render them as OpenEXR in metres.
+  validation, from 03250 on for testing. The documents do not say which distance is meant; distance from the camera is
+  assumed.
+- Matterport3D has no depth panoramas; users stitch them. The usual script (UniFuse's stitch.m) writes 16-bit PNG in
+  units of 1/4000 m, distance from the camera. 3D60 and Pano3D render them as OpenEXR in metres.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _MOST_UNREADABLE = 0.01
 
 @dataclass(frozen=True)
 class Pair:
-    """A picture, its depth, the scene that both are of, and whether the data set's own split keeps it from training."""
+    """An image, its depth, their scene, and whether the data set's own split excludes it from training."""
 
     rgb: Path
     depth: Path
@@ -41,12 +42,12 @@ class Pair:
 
 @dataclass(frozen=True)
 class Layout:
-    """How a data set lies on disk.
+    """Directory layout of a data set.
 
     Attributes:
-        looks_like: for people, the files that are looked for.
-        pictures: those of a folder, with the depth file that belongs to each.
-        units_per_m: of a PNG's values.
+        looks_like: description of the expected files, for messages.
+        pictures: lists the images of a folder, each with its depth file.
+        units_per_m: units per metre of the PNG values.
         missing: PNG value of unknown depth, besides 0.
     """
 
@@ -71,7 +72,7 @@ def _stanford(folder: Path) -> Iterator[Pair]:
     for rgb in sorted(folder.glob("area_*/pano/rgb/*_rgb.png")):
         area = rgb.parents[2].name
         depth = rgb.parents[1] / "depth" / (rgb.stem.removesuffix("_rgb") + "_depth.png")
-        yield Pair(rgb, depth, area, held_out=area.startswith("area_5"))  # fold 1, which all publish
+        yield Pair(rgb, depth, area, held_out=area.startswith("area_5"))  # fold 1, used in all publications
 
 
 def _structured(folder: Path) -> Iterator[Pair]:
@@ -79,7 +80,7 @@ def _structured(folder: Path) -> Iterator[Pair]:
         scene = rgb.parents[4].name
         number = scene.removeprefix("scene_")
         if number.isdigit() and int(number) >= 3250:
-            continue  # the test scenes are for neither training nor choosing
+            continue  # the test scenes are used neither for training nor for model selection
         yield Pair(rgb, rgb.with_name("depth.png"), scene, number.isdigit() and int(number) >= 3000)
 
 
@@ -109,15 +110,15 @@ LAYOUTS: dict[str, Layout] = {
 
 @dataclass
 class FolderDataset:
-    """Panoramas of a folder, brought to one size when they are read: pictures by area, depth by the nearest pixel.
+    """Panoramas of a folder, resized on reading: images by area averaging, depth by the nearest pixel.
 
     Attributes:
-        folder: where they are.
+        folder: of the panoramas.
         layout: one of :data:`LAYOUTS`.
         size: height and width.
-        pairs: what was found.
-        alone: pictures without depth, which are left out.
-        unreadable: files that turned out damaged; up to 1 % of the panoramas are passed over with a warning.
+        pairs: images and depth files found.
+        alone: images without depth, which are skipped.
+        unreadable: damaged files; up to 1 % of the panoramas are skipped with a warning.
     """
 
     folder: Path
@@ -129,7 +130,7 @@ class FolderDataset:
 
     @property
     def info(self) -> dict[str, Any]:
-        """For the training record: no path, which says nothing elsewhere."""
+        """Recipe for the training record, without the local path."""
         scenes = {pair.scene for pair in self.pairs}
         return {"kind": self.layout, "folder": self.folder.name, "count": len(self.pairs), "scenes": len(scenes)}
 
@@ -137,10 +138,10 @@ class FolderDataset:
         return len(self.pairs)
 
     def __getitem__(self, index: int) -> Sample:
-        """The panorama; in place of one that cannot be read, the next.
+        """Return the panorama, or the next one if it is not readable.
 
         Raises:
-            DatasetError: over 1 % of the panoramas cannot be read; names the last.
+            DatasetError: over 1 % of the panoramas are not readable; names the last.
         """
         for place in range(index, index + len(self.pairs)):
             at = place % len(self.pairs)
@@ -172,10 +173,11 @@ class FolderDataset:
         return Sample(rgb, depth, index)
 
     def split(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices for training and for evaluation: the data set's own split, or whole scenes, the last ones.
+        """Indices for training and for evaluation: the data set's own split, or else whole scenes, the last ones held
+        out.
 
         Raises:
-            DatasetError: nothing is left for one of them.
+            DatasetError: no panoramas for training or none for evaluation.
         """
         if any(pair.held_out for pair in self.pairs):
             held = np.array([bool(pair.held_out) for pair in self.pairs])
@@ -190,7 +192,7 @@ class FolderDataset:
 
 
 def _png_depth(path: Path, layout: Layout) -> NDArray[np.float32]:
-    """Depth (H, W) in metres, 0 = unknown, of a 16-bit PNG in the data set's own unit."""
+    """Depth (H, W) in metres, 0 = unknown, from a 16-bit PNG in the data set's own unit."""
     import cv2
 
     values = load_image(path, cv2.IMREAD_UNCHANGED)
@@ -202,14 +204,14 @@ def _png_depth(path: Path, layout: Layout) -> NDArray[np.float32]:
 
 
 def open_folder(name: str, size: tuple[int, int]) -> FolderDataset:
-    """Opens ``LAYOUT:FOLDER``.
+    """Open ``LAYOUT:FOLDER``.
 
     Args:
         name: layout (one of :data:`LAYOUTS`) and folder.
-        size: height and width that the panoramas are brought to.
+        size: height and width to which the panoramas are resized.
 
     Raises:
-        DatasetError: an unknown layout, no such folder, or nothing in it that is laid out so.
+        DatasetError: unknown layout, missing folder, or no files in this layout.
     """
     kind, colon, place = name.partition(":")
     if kind not in LAYOUTS or not colon:

@@ -1,9 +1,10 @@
-"""Decoder stages that compute at half the size what they show at full size: the same depth in less time.
+"""Decoder stages computed at half resolution: the same depth in less time.
 
-A stage doubles each pixel and then convolves 3x3. Of nine neighbours in the doubled map only four differ, so the same
-numbers come out of convolving the small map once for each of the two or four pixels that one becomes (Shi et al.,
-"Real-time single image and video super-resolution using an efficient sub-pixel convolutional neural network", CVPR
-2016), and of interleaving the results. The network's last, largest maps are then never padded, copied or reordered.
+A stage doubles each pixel and then applies a 3x3 convolution. Of the nine neighbours in the doubled map only four
+differ. Convolving the small map once per phase (two or four output pixels per input pixel) and interleaving the results
+therefore gives the same numbers (Shi et al., "Real-time single image and video super-resolution using an efficient
+sub-pixel convolutional neural network", CVPR 2016). The network's last and largest maps are then never padded, copied
+or reordered.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from instant_ic.training.slicenet import ConvStage, SliceNet, wrapped_conv
 
 
 class FoldedStage(nn.Module):
-    """What a widening :class:`ConvStage` computes, from a kernel for each phase; for inference only."""
+    """Equivalent of a widening :class:`ConvStage` with one kernel per phase; for inference only."""
 
     def __init__(self, stage: ConvStage) -> None:
         super().__init__()
@@ -51,8 +52,7 @@ class FoldedStage(nn.Module):
 def fold_kernel(kernel: Tensor, upscale: tuple[int, int]) -> Tensor:
     """(O, I, 3, 3) for the doubled map -> (n O, I, 3, 3) for the small one; n = 2 or 4 phases, rows first.
 
-    Along an axis that is doubled the even pixel sees the small map's neighbours (w0, w1 + w2, 0), the odd one
-    (0, w0 + w1, w2).
+    Along a doubled axis the even pixel has the small map's taps (w0, w1 + w2, 0), the odd one (0, w0 + w1, w2).
     """
     phases = [kernel]
     for axis in (2, 3):
@@ -84,7 +84,7 @@ def _whole(even: Tensor, odd: Tensor, axis: int) -> Tensor:
 
 
 def fold_upsampling(model: SliceNet) -> SliceNet:
-    """A copy in evaluation mode whose widening decoder stages are folded; the depth differs by rounding alone."""
+    """Copy in evaluation mode with folded widening decoder stages; the depth differs by rounding only."""
     folded = copy.deepcopy(model).eval()
     for index, stage in enumerate(folded.decoder):
         assert isinstance(stage, ConvStage)

@@ -1,8 +1,8 @@
-"""Made-up interiors of many kinds for the training of depth.
+"""Generated interiors of many kinds for depth training.
 
-``instant_ic.sim.worlds.random_world`` makes rooms and corridors with some furniture. Here are the places where a
-network of such rooms alone fails: halls with pillars, glass fronts, show-cases, rows of shelves, offices, stores, and
-homes with plain walls.
+``instant_ic.sim.worlds.random_world`` generates rooms and corridors with some furniture. This module adds the places
+where a network trained on those alone fails: halls with pillars, glass fronts, display cases, rows of shelves, offices,
+shops, and homes with plain walls.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from instant_ic.sim import furniture, worlds
 from instant_ic.sim.building import SIDES, Building, Finish, Zone
 from instant_ic.sim.world import Material, World, WorldBuilder
 
-#: How often each kind comes.
+# Relative frequency of each kind.
 KINDS: dict[str, float] = {
     "random": 0.30, "corridor": 0.12, "library": 0.10, "exhibition": 0.10, "canteen": 0.06, "office": 0.11,
     "store": 0.06, "home": 0.15,
@@ -30,13 +30,13 @@ def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.45, rays: 
     """Interior of one of :data:`KINDS`; the same seed gives the same world.
 
     Args:
-        seed: of everything.
-        kind: one of :data:`KINDS`; empty: drawn by their shares.
+        seed: of all random choices.
+        kind: one of :data:`KINDS`; empty: chosen at random by frequency.
         light_cell_m: resolution of the baked light.
-        rays: rays a light texel.
+        rays: rays per light texel.
 
     Raises:
-        ValueError: there is no such kind.
+        ValueError: unknown kind.
     """
     rng = np.random.default_rng([29, seed])
     drawn = str(rng.choice(list(KINDS), p=list(KINDS.values())))
@@ -70,7 +70,7 @@ def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.45, rays: 
 
 @dataclass
 class _Floor:
-    """Which parts of a zone's floor are taken; the middle and the doorways stay free."""
+    """Occupied parts of a zone's floor; the middle and the doorways stay free."""
 
     building: Building
     zone: Zone
@@ -88,7 +88,7 @@ class _Floor:
                 self.taken.append((x0 - 0.5, y0 - 0.5, x1 + 0.5, y1 + 0.5))
 
     def take(self, centre: tuple[float, float], size: tuple[float, float], margin: float = 0.0) -> bool:
-        """Takes a rectangle (its extent along x and y) if it lies inside and is free."""
+        """Reserve a rectangle (its extent along x and y) if it lies inside and is free; return True on success."""
         x0, y0, x1, y1 = (centre[0] - size[0] / 2, centre[1] - size[1] / 2,
                           centre[0] + size[0] / 2, centre[1] + size[1] / 2)  # fmt: skip
         z = self.zone
@@ -103,7 +103,9 @@ class _Floor:
     def wall_place(
         self, rng: np.random.Generator, size: tuple[float, float], gap: float = 0.04
     ) -> tuple[tuple[float, float], float] | None:
-        """Free place with its back to a wall: centre, yaw. ``size`` is (depth away from the wall, width along it)."""
+        """Find a free place with its back to a wall: centre, yaw. ``size`` is (depth away from the wall, width along
+        it).
+        """
         z = self.zone
         for _ in range(6):
             side = str(rng.choice(SIDES))
@@ -127,7 +129,7 @@ def _tinted(rng: np.random.Generator, names: tuple[str, ...], lowest: float = 0.
 
 
 def _plain_finish(rng: np.random.Generator) -> Finish:
-    """Nearly white walls and ceiling with little to hold on to, as most real interiors have them."""
+    """Nearly white walls and ceiling with little texture, as in most real interiors."""
     shade = float(rng.uniform(0.85, 1.12))
     wall = Material(str(rng.choice(["white", "paint", "paint:4"])), float(rng.uniform(1.5, 3)), (shade,) * 3)
     base = worlds.random_finish(rng)
@@ -139,7 +141,7 @@ def _finish(rng: np.random.Generator, plain: float) -> Finish:
 
 
 def _hall(rng: np.random.Generator, building: Building, kind: str) -> list[Zone]:
-    """A large room, often with pillars, sometimes open to a second one of another height."""
+    """A large room, often with pillars, sometimes open to a second one of different height."""
     u = rng.uniform
     width, depth = float(u(7, 22)), float(u(6, 16))
     height = float(u(2.6, 6.0) if kind == "store" or rng.random() < 0.3 else u(2.5, 3.6))
@@ -189,7 +191,7 @@ def _pillars(rng: np.random.Generator, build: WorldBuilder, zone: Zone) -> None:
 
 
 def _glass_front(rng: np.random.Generator, building: Building, zone: Zone) -> None:
-    """One or two walls of panes from near the floor to near the ceiling, often brighter than the picture holds."""
+    """One or two walls of panes from near the floor to near the ceiling, often brighter than the image range."""
     frame = _tinted(rng, ("white", "metal"), 0.2, 0.6)
     variant, shine = int(rng.integers(0, 24)), float(rng.uniform(0.9, 4.0))
     bottom, top = float(rng.choice([0.05, 0.4, 0.9])), zone.height - float(rng.uniform(0.08, 0.7))
@@ -207,7 +209,7 @@ def _glass_front(rng: np.random.Generator, building: Building, zone: Zone) -> No
 
 
 def _ceiling(rng: np.random.Generator, building: Building, zone: Zone) -> None:
-    """Lamps in the ceiling, rows of strips or pendants; sometimes beams and ducts under it."""
+    """Lamps in the ceiling, rows of strips or pendants; sometimes beams and ducts below it."""
     build, u = building.builder, rng.uniform
     w, d = zone.x1 - zone.x0, zone.y1 - zone.y0
     style, shine = rng.random(), float(u(2.0, 7.0))
@@ -240,7 +242,7 @@ def _ceiling(rng: np.random.Generator, building: Building, zone: Zone) -> None:
 
 def _show_case(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, float], yaw: float,
                size: tuple[float, float]) -> None:  # fmt: skip
-    """Glass case on a base: one sees its posts and what lies in it, and through it."""
+    """Glass case on a base: its posts and contents are visible, and so is the room behind it."""
     base, top = float(rng.uniform(0.2, 0.9)), float(rng.uniform(1.1, 2.2))
     wood, post = _tinted(rng, ("wood", "white", "metal"), 0.3), _tinted(rng, ("metal", "white"), 0.3, 0.4)
     build.box(at, (*size, base), 0.0, yaw, side=wood, top=_tinted(rng, ("white", "fabric"), 0.3, 0.5))
@@ -264,7 +266,7 @@ def _show_case(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, f
 
 
 def _desk(rng: np.random.Generator, build: WorldBuilder, at: tuple[float, float], yaw: float) -> None:
-    """Desk with a screen, whose chair stands at its own +x."""
+    """Desk with a screen; its chair stands at the desk's own +x."""
     furniture.table(build, at, yaw + math.pi / 2, (float(rng.uniform(1.2, 1.8)), 0.75), _tinted(rng, ("wood", "white")))
     c, s = math.cos(yaw), math.sin(yaw)
     dark = Material("metal", 0.4, (0.12, 0.12, 0.13))
@@ -371,7 +373,7 @@ def _store(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None
 
 
 def _room(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
-    """Bed, sofa, wardrobe, kitchen row, table: what homes have, mostly against the walls."""
+    """Furniture of homes: bed, sofa, wardrobe, kitchen row, table, mostly along the walls."""
     height = floor.zone.height
     if rng.random() < 0.5:
         x, y = floor.zone.centre
@@ -432,7 +434,7 @@ def _corridor(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> N
 
 
 def _clutter(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> None:
-    """Bins, plants, boxes, bags and people-high things anywhere that is free."""
+    """Bins, plants, boxes, bags and person-high objects at random free places."""
     zone = floor.zone
     area = (zone.x1 - zone.x0) * (zone.y1 - zone.y0)
     for _ in range(int(rng.poisson(0.04 * area + 0.3))):
@@ -447,7 +449,7 @@ def _clutter(rng: np.random.Generator, build: WorldBuilder, floor: _Floor) -> No
             leaf = Material("fabric", 0.2, (0.18, 0.4, 0.14))
             for k in range(4):
                 build.box(at, (0.03, 0.5, float(rng.uniform(0.4, 1.1))), 0.3, yaw + 0.8 * k, side=leaf)
-        elif kind < 0.7:  # someone standing
+        elif kind < 0.7:  # a standing person
             build.box(at, (0.22, 0.32, 0.85), 0.0, yaw, side=_tinted(rng, ("fabric",), 0.05, 0.5))
             build.box(at, (0.25, 0.48, 0.6), 0.851, yaw, side=_tinted(rng, ("fabric",), 0.05, 0.5))
             build.box(at, (0.2, 0.16, 0.25), 1.48, yaw, side=Material("white", 0.4, (0.8, 0.6, 0.5)))

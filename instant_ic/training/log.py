@@ -1,4 +1,4 @@
-"""What a training tells while it runs: lines or a progress bar, a CSV, and TensorBoard where it is installed."""
+"""Training log: lines or a progress bar, a CSV file, and TensorBoard if it is installed."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class TrainingLog:
 
     Args:
         checkpoint: the training's checkpoint file.
-        step: where the training begins; rows of a run that was cut off after its last checkpoint are dropped.
-        report: takes lines for people.
+        step: first step of this run; rows after the last checkpoint of an interrupted run are dropped.
+        report: receives human-readable lines.
     """
 
     def __init__(self, checkpoint: Path, step: int, report: Callable[[str], None]) -> None:
@@ -37,7 +37,7 @@ class TrainingLog:
         self._board = _tensorboard(checkpoint.with_suffix(".tensorboard"), step)
 
     def row(self, values: dict[str, Any], line: str) -> None:
-        """Writes one row (keys of :data:`COLUMNS`; others are left out) and tells ``line``."""
+        """Write one row (keys of :data:`COLUMNS`; others are ignored) and report ``line``."""
         self._rows.writerow(values)
         self._file.flush()
         if self._board is not None:
@@ -54,7 +54,7 @@ class TrainingLog:
 
 
 def _tensorboard(folder: Path, step: int) -> Any:
-    """A writer, or None where the package ``tensorboard`` is not installed."""
+    """Create a writer; None if the package ``tensorboard`` is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ModuleNotFoundError:

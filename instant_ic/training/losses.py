@@ -1,4 +1,4 @@
-"""Training losses (torch): each pixel by its solid angle, pixels without truth left out."""
+"""Training losses (torch): pixels are weighted by solid angle; pixels without ground truth are ignored."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ MIN_DEPTH_M = 0.1
 
 
 def berhu(error: Tensor, threshold: float) -> Tensor:
-    """Reverse Huber: |e| up to ``threshold``, (e² + c²) / 2c above; continuous with its slope."""
+    """Reverse Huber: |e| up to ``threshold``, (e² + c²) / 2c above; continuous, with continuous slope."""
     magnitude = error.abs()
     return torch.where(magnitude <= threshold, magnitude, (error**2 + threshold**2) / (2 * threshold))
 
 
 def weighted_mean(values: Tensor, valid: Tensor, row_weights: Tensor) -> Tensor:
-    """Mean of (B, H, W) values over valid pixels, each weighted by its row, (H,); 0 where nothing is valid."""
+    """Mean of (B, H, W) values over valid pixels, each weighted by its row, (H,); 0 if no pixel is valid."""
     weights = valid.to(values.dtype) * row_weights[:, None]
     return (values * weights).sum() / weights.sum().clamp_min(1e-9)
 
@@ -23,8 +23,8 @@ def weighted_mean(values: Tensor, valid: Tensor, row_weights: Tensor) -> Tensor:
 def depth_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor, metres_share: float = 0.1) -> Tensor:
     """|log d - log t| plus a small share of berHu in metres, (B, H, W) in metres, truth 0 = unknown.
 
-    The logarithm counts relative errors, which is what a scaled depth is judged by; it is cut at ``MIN_DEPTH_M``,
-    and the term in metres keeps a gradient there.
+    The logarithm measures relative error, the criterion for scaled depth. It is clipped at ``MIN_DEPTH_M``; the term in
+    metres keeps a gradient there.
     """
     valid = truth > 0
     safe = torch.where(valid, truth, torch.ones_like(truth))
@@ -33,9 +33,9 @@ def depth_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor, metres_sha
 
 
 def edge_loss(predicted: Tensor, truth: Tensor, row_weights: Tensor) -> Tensor:
-    """|∇ log d - ∇ log t| between neighbours in both directions (the panorama's seam included).
+    """|∇ log d - ∇ log t| between neighbours in both directions (including the panorama's seam).
 
-    Keeps walls flat and depth steps sharp, which a loss on single pixels does not ask for.
+    Keeps walls flat and depth discontinuities sharp, which a per-pixel loss does not enforce.
     """
     valid = truth > 0
     log_ratio = predicted.clamp_min(MIN_DEPTH_M).log() - torch.where(valid, truth, 1.0).clamp_min(MIN_DEPTH_M).log()

@@ -1,4 +1,4 @@
-"""Training panoramas: generated interiors, seen from where a robot's camera could be."""
+"""Training panoramas: generated interiors, rendered from possible positions of a robot's camera."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from instant_ic.geometry.poses import pose_matrix
 from instant_ic.training.dataset import Sample
 
 FIRST_HELD_OUT = 900_000
-"""Worlds from this seed on belong to the evaluations (``instant_ic.experiments.depth_worlds``)."""
+"""Worlds from this seed on are reserved for the evaluations (``instant_ic.experiments.depth_worlds``)."""
 INTERIORS = ("wide", "random")
 
 
@@ -29,7 +29,7 @@ class RoomsConfig:
         interiors: ``wide``: ``interiors.interior_world``; ``random``: only ``sim.worlds.random_world``.
         camera_height_m: lowest and highest camera above the floor.
         tilt_deg: standard deviation of roll and pitch.
-        clearance_m: distance from things, lowest and highest.
+        clearance_m: distance from objects, minimum and maximum.
     """
 
     worlds: int = 400
@@ -52,7 +52,7 @@ class RoomsConfig:
 
     @property
     def count(self) -> int:
-        """Panoramas in all."""
+        """Total number of panoramas."""
         return self.worlds * self.poses
 
     def as_dict(self) -> dict[str, Any]:
@@ -62,9 +62,9 @@ class RoomsConfig:
 
 
 def render_rooms(config: RoomsConfig, worlds: Iterable[int] | None = None) -> Iterator[Sample]:
-    """Renders the recipe (or only some world seeds of it); the same recipe gives the same panoramas.
+    """Render the recipe, or only some of its world seeds; the same recipe gives the same panoramas.
 
-    Worlds without a free place are left out, so that fewer samples than ``config.count`` may come.
+    Worlds without a free camera position are skipped, so there may be fewer samples than ``config.count``.
     """
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import World, random_world

@@ -1,11 +1,11 @@
 """SliceNet: depth of an equirect panorama from a sequence of vertical slices.
 
 Pintore et al., "SliceNet: deep dense depth estimation from a single indoor panorama using a slice-based
-representation", CVPR 2021. A panorama of a levelled camera has gravity along its columns, so the features of a
-column are folded into one vector, an LSTM runs over the columns, and a decoder unfolds each column again.
+representation", CVPR 2021. A panorama of a levelled camera has gravity along its columns. The network therefore folds
+the features of a column into one vector, runs an LSTM over the columns, and unfolds each column again in a decoder.
 
 The full-size ResNet-50 model has the published parameter names and shapes, so published checkpoints load
-(:func:`load_checkpoint`). Smaller relatives are described by :class:`SliceNetConfig`.
+(:func:`load_checkpoint`). :class:`SliceNetConfig` describes smaller variants.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 BACKBONES: dict[str, tuple[bool, tuple[int, int, int, int]]] = {
-    # name: (bottleneck blocks?, blocks a stage)
+    # name: (bottleneck blocks?, blocks per stage)
     "resnet18": (False, (2, 2, 2, 2)),
     "resnet34": (False, (3, 4, 6, 3)),
     "resnet50": (True, (3, 4, 6, 3)),
@@ -33,11 +33,11 @@ BACKBONES: dict[str, tuple[bool, tuple[int, int, int, int]]] = {
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 REPLACED = datetime(2021, 8, 13, tzinfo=UTC)
-"""The day on which the authors replaced the weights that they had published."""
+"""Date on which the authors replaced their published weights."""
 
 
 class CheckpointError(ValueError):
-    """A checkpoint file does not hold a SliceNet model that can be loaded."""
+    """A checkpoint file does not hold a loadable SliceNet model."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class SliceNetConfig:
         backbone: ``resnet18``, ``resnet34`` or ``resnet50``.
         height: rows of the input; a power of two, 64 or more. The width is twice that.
         width_multiplier: share of the usual ResNet channels; 1.0 in the published model.
-        lstm_hidden: LSTM features a direction; 512 in the published model.
-        column_stride: the LSTM runs on every n-th column (1, 2, 4) and the last decoder stages double the width
-            too; 1 in the published model.
-        decoder_floor: the fewest channels inside the decoder; 4 in the published model.
+        lstm_hidden: LSTM features per direction; 512 in the published model.
+        column_stride: the LSTM runs on every n-th column (1, 2, 4) and the last decoder stages also double the width; 1
+            in the published model.
+        decoder_floor: minimum number of channels inside the decoder; 4 in the published model.
     """
 
     backbone: str = "resnet50"
@@ -82,7 +82,7 @@ class SliceNetConfig:
 
     @property
     def base_channels(self) -> int:
-        """Channels after the stem, a multiple of 8 so that each contraction to an eighth comes out even."""
+        """Channels after the stem, a multiple of 8 so that each contraction to an eighth is an integer."""
         return max(8, round(64 * self.width_multiplier / 8) * 8)
 
     def as_dict(self) -> dict[str, Any]:
@@ -102,7 +102,7 @@ SMALL = SliceNetConfig(
 
 
 class CircularPad(nn.Module):
-    """Pads the width with the columns of the other edge: the panorama has no left and right border."""
+    """Pads the width with columns from the opposite edge: the panorama has no left and right border."""
 
     def __init__(self, columns: int) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class CircularPad(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) -> (B, C, H, W + 2 columns)."""
-        # Slices and a concatenation, because they export to plain ONNX operators.
+        # Slices and a concatenation export to plain ONNX operators.
         return torch.cat((x[..., -self.columns :], x, x[..., : self.columns]), dim=-1)
 
 
@@ -143,7 +143,7 @@ class BasicBlock(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3 (which strides), 1x1 (ResNet-50)."""
+    """1x1, 3x3 (with the stride), 1x1 (ResNet-50)."""
 
     expansion = 4
 
@@ -204,7 +204,7 @@ class Encoder(nn.Module):
 
 
 class ConvStage(nn.Module):
-    """Circular 3x3 convolution, batch norm, PReLU with a slope a channel; doubles the size first where told."""
+    """Circular 3x3 convolution, batch norm, PReLU with a slope per channel; optionally doubles the size first."""
 
     def __init__(
         self, inputs: int, outputs: int, stride: tuple[int, int] = (1, 1), upscale: tuple[int, int] = (1, 1)
@@ -235,7 +235,7 @@ class Contraction(nn.Module):
         x = self.layer(x)
         height, width = x.shape[-2:]
         if columns != width:
-            # One column of the other edge on each side makes the interpolation circular.
+            # One column from the opposite edge on each side makes the interpolation circular.
             factor = columns // width
             x = torch.cat((x[..., -1:], x, x[..., :1]), dim=-1)
             size = (height, columns + 2 * factor)
@@ -245,7 +245,7 @@ class Contraction(nn.Module):
 
 
 class SlicingModule(nn.Module):
-    """The four contracted levels side by side: one feature vector a column."""
+    """The four contracted levels concatenated: one feature vector per column."""
 
     def __init__(self, channels: list[int]) -> None:
         super().__init__()
@@ -258,7 +258,7 @@ class SlicingModule(nn.Module):
 
 
 class _FeatureExtractor(nn.Module):
-    """Only there for the published parameter names (``feature_extractor.encoder``)."""
+    """Exists only to match the published parameter names (``feature_extractor.encoder``)."""
 
     def __init__(self, config: SliceNetConfig) -> None:
         super().__init__()
@@ -297,7 +297,7 @@ class SliceNet(nn.Module):
         self.set_normalisation()
 
     def set_normalisation(self) -> None:
-        """Mean and spread of ImageNet's colours, which no checkpoint holds."""
+        """Set mean and standard deviation of ImageNet's colours, which no checkpoint holds."""
         self.mean.copy_(torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
         self.std.copy_(torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
 
@@ -333,14 +333,14 @@ def _decoder_stages(config: SliceNetConfig) -> list[ConvStage]:
 
 
 def load_checkpoint(path: str | Path) -> SliceNet:
-    """Loads a checkpoint of ours (``config``, ``state_dict``) or a published one (``kwargs``, ``state_dict``).
+    """Load one of our checkpoints (``config``, ``state_dict``) or a published one (``kwargs``, ``state_dict``).
 
     Only tensors and plain values are unpickled, so a file cannot run code. The authors replaced their weights on
-    2021-08-13: a published file whose own date is earlier is refused (a later date proves nothing).
+    2021-08-13: a published file with an earlier date inside is rejected (a later date proves nothing).
 
     Raises:
-        CheckpointError: the file is no such checkpoint, or its tensors do not fit the network it names; the text says
-            which are missing, unknown, of another shape or no numbers.
+        CheckpointError: the file is not such a checkpoint, or its tensors do not fit the network it names; the message
+            lists missing, unknown, misshapen and non-finite tensors.
     """
     path = Path(path)
     payload = _read(path)
@@ -353,7 +353,7 @@ def load_checkpoint(path: str | Path) -> SliceNet:
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path}: its 'state_dict' does not hold tensors by name")
     config = _config(path, payload)
-    with torch.device("meta"):  # shapes only: nothing is filled with numbers that are replaced at once
+    with torch.device("meta"):  # shapes only: allocates no weights that would be replaced at once
         model = SliceNet(config)
     expected = {key: tuple(value.shape) for key, value in model.state_dict().items()}
     _check_state(f"{path}: does not fit {config.backbone}, {config.height} x {config.width}", state, expected)
@@ -365,12 +365,12 @@ def load_checkpoint(path: str | Path) -> SliceNet:
 
 def _read(path: Path) -> Any:
     try:
-        if zipfile.is_zipfile(path):  # what torch writes; it does not look at the check sums itself
+        if zipfile.is_zipfile(path):  # torch's format; torch itself does not verify the checksums
             with zipfile.ZipFile(path) as archive:
                 if bad := archive.testzip():
                     raise CheckpointError(f"{path}: damaged: {bad} in it has another check sum")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of TorchScript, which is refused below
+            warnings.simplefilter("ignore")  # warnings about TorchScript, which is rejected below
             return torch.load(path, map_location="cpu", weights_only=True)
     except CheckpointError:
         raise
@@ -379,7 +379,7 @@ def _read(path: Path) -> Any:
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:  # torch.load raises anything from EOFError to RuntimeError
-        # Only the first sentence: torch goes on with how to load such a file all the same.
+        # Only the first sentence: torch continues with advice on loading such a file anyway.
         first = re.split(r"\. [A-Z]|\n", str(error))[0] or type(error).__name__
         if refused := re.search(r"GLOBAL ([\w.]+)", str(error)):
             raise CheckpointError(f"{path}: holds more than tensors and plain values ({refused[1]}); it is not loaded, "
@@ -388,7 +388,7 @@ def _read(path: Path) -> Any:
 
 
 def _config(path: Path, payload: dict[str, Any]) -> SliceNetConfig:
-    """The network that a checkpoint names."""
+    """Network configuration that a checkpoint names."""
     key = next((key for key in ("config", "kwargs") if key in payload), None)
     if key is None:
         raise CheckpointError(f"{path}: neither 'config' nor 'kwargs' in the file (it has: {_some(payload)}); cannot "
@@ -413,7 +413,7 @@ def _config(path: Path, payload: dict[str, Any]) -> SliceNetConfig:
 
 
 def _check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[int, ...]]) -> None:
-    """Says in one error all that differs."""
+    """Raise one error that lists all differences."""
     faults = []
     if missing := [key for key in expected if key not in state]:
         faults.append(f"{len(missing)} missing ({_some(missing)})")
@@ -433,6 +433,6 @@ def _check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[
 
 
 def _some(names: Iterable[Any], joint: str = ", ", most: int = 4) -> str:
-    """The first few, and how many more."""
+    """The first ``most`` names, and how many more there are."""
     listed = [str(name) for name in names]
     return joint.join(listed[:most]) + (f"{joint}... {len(listed) - most} more" if len(listed) > most else "")

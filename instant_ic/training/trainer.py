@@ -1,7 +1,7 @@
-"""Trains SliceNet; can be stopped at any time and taken up again, and runs on several GPUs under ``torchrun``.
+"""Trains SliceNet. Training can be stopped and resumed at any time, and runs on several GPUs under ``torchrun``.
 
-The schedule runs over wall time or epochs, whichever ends first: on a machine that is shared, time is what is known
-beforehand. The weights that are evaluated and saved are an exponential average of the trained ones.
+The schedule runs over wall time or epochs, whichever ends first: on a shared machine only the time is known beforehand.
+The evaluated and saved weights are an exponential moving average of the trained ones.
 """
 
 from __future__ import annotations
@@ -31,36 +31,37 @@ from instant_ic.training.slicenet import CheckpointError, SliceNet, SliceNetConf
 from instant_ic.training.weights import Start, fold_norms, unfold_norms
 
 POLE_WEIGHT = 0.1
-"""Least weight of a row in the loss, the mean row being 1. By solid angle alone the rows at the poles are hardly
-trained, and stand as spikes over and under the camera in the point cloud."""
+"""Minimum weight of a row in the loss, with a mean row weight of 1. By solid angle alone the rows at the poles are
+hardly trained, and appear as spikes above and below the camera in the point cloud.
+"""
 TEAM_TIMEOUT = timedelta(minutes=20)
-"""A process that waits longer for the others ends with an error."""
+"""A process that waits longer for the others exits with an error."""
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How to train.
+    """Training parameters.
 
     Attributes:
-        minutes: wall time after which the learning rate has come down and training ends.
-        epochs: passes over the data after which it ends, if that comes first.
-        batch_size: panoramas a step and process.
-        learning_rate: the largest, of AdamW.
+        minutes: wall time of the learning rate schedule, after which training ends.
+        epochs: passes over the data after which training ends, if that comes first.
+        batch_size: panoramas per step and process.
+        learning_rate: maximum, of AdamW.
         weight_decay: of AdamW.
         warmup: share of the schedule in which the learning rate rises.
-        average: decay of the weight average a step.
-        mix: share of the trained weights in the result, the rest are the start's. A short training on other pictures
-            forgets what it does not see; between both ends of the line lies what does well on old and new (Wortsman et
-            al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+        average: decay of the weight average per step.
+        mix: share of the trained weights in the result; the rest are the start weights. A short training on different
+            images degrades the network on data it does not see. Weights between both ends perform well on old and new
+            data (Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
         edge_share: weight of the edge loss.
-        photograph: pictures are augmented with what a real camera adds.
-        brightness: mean byte that each picture is brought to before the network, as inference does; 0: as it is.
-        evaluation_panoramas: how many of the held-out ones are evaluated during training.
+        photograph: augment images with the effects of a real camera.
+        brightness: mean byte to which each image is scaled before the network, as in inference; 0: unchanged.
+        evaluation_panoramas: number of held-out panoramas evaluated during training.
         checkpoint_s: seconds between checkpoints with evaluation.
-        max_range_m: truth beyond it is unknown, output beyond it is cut.
-        mixed_precision: convolutions in bfloat16, or in float16 on a GPU that has no bfloat16.
-        threads: CPU threads. Two on two cores that others use as well are several times slower than one: each
-            of the LSTM's many short steps waits for the slower thread.
+        max_range_m: ground truth beyond it is unknown; output beyond it is clipped.
+        mixed_precision: convolutions in bfloat16, or in float16 on a GPU without bfloat16.
+        threads: CPU threads. On two cores that are also used by others, two threads are several times slower than one:
+            each of the LSTM's many short steps waits for the slower thread.
         seed: of weights, order and augmentation.
     """
 
@@ -101,7 +102,7 @@ class Team:
 
     Attributes:
         device: this process's.
-        rank: its number, ``ranks`` of them in all; number 0 evaluates, reports and saves.
+        rank: index of this process among ``ranks``; process 0 evaluates, reports and saves.
     """
 
     device: torch.device
@@ -110,10 +111,10 @@ class Team:
 
     @classmethod
     def join(cls, device: str = "auto") -> Team:
-        """Joins the processes that ``torchrun`` started, if it did, and picks the device.
+        """Join the process group if ``torchrun`` started one, and select the device.
 
         Args:
-            device: ``auto`` (a GPU of this process's own where there is one, else the CPU) or a torch device.
+            device: ``auto`` (a GPU for this process if there is one, else the CPU) or a torch device.
 
         Raises:
             ValueError: there is no such device.
@@ -143,7 +144,7 @@ class Team:
 
     @property
     def name(self) -> str:
-        """What a record says of the machine."""
+        """Description of the machine for the training record."""
         if self.device.type == "cuda":
             return f"{self.ranks} x {torch.cuda.get_device_name(self.device)}"
         return f"{self.ranks} x CPU ({platform.machine()}, {os.cpu_count()} cores)"
@@ -167,8 +168,9 @@ def update_average(average: nn.Module, model: nn.Module, decay: float) -> None:
 
 
 def mixed(trained: SliceNet, initial: SliceNet, share: float) -> SliceNet:
-    """``share`` of the weights of ``trained``, the rest of ``initial``; with batch norms folded, as their numbers mean
-    different things in each.
+    """Interpolate the weights: ``share`` of ``trained``, the rest of ``initial``.
+
+    Batch norms are folded first, because their numbers mean different things in each network.
     """
     result, start = copy.deepcopy(trained).cpu().eval(), copy.deepcopy(initial).cpu().eval()
     fold_norms(result)
@@ -178,7 +180,7 @@ def mixed(trained: SliceNet, initial: SliceNet, share: float) -> SliceNet:
 
 
 def to_tensors(rgb: np.ndarray, depth: np.ndarray, max_range_m: float, device: torch.device) -> tuple[Tensor, Tensor]:
-    """A batch (B, 3, H, W) in 0..1 and its truth (B, H, W), 0 where it is unknown or too far."""
+    """Convert a batch to tensors: (B, 3, H, W) in 0..1 and ground truth (B, H, W), 0 where unknown or too far."""
     pictures = torch.tensor(rgb).to(device).permute(0, 3, 1, 2).float() / 255.0
     truth = torch.tensor(depth).to(device)
     return pictures, torch.where(torch.isfinite(truth) & (truth <= max_range_m), truth, 0.0)
@@ -186,7 +188,7 @@ def to_tensors(rgb: np.ndarray, depth: np.ndarray, max_range_m: float, device: t
 
 @torch.inference_mode()
 def evaluate(model: SliceNet, samples: Samples, max_range_m: float, brightness: float = 0.0) -> DepthMetrics:
-    """Mean metrics over panoramas, by solid angle, without augmentation, in float32, on the model's device."""
+    """Mean metrics over panoramas, weighted by solid angle, without augmentation, in float32, on the model's device."""
     model.eval()
     device = next(model.parameters()).device
     weights = solid_angle_weights(model.config.height)[:, None]
@@ -201,20 +203,20 @@ def evaluate(model: SliceNet, samples: Samples, max_range_m: float, brightness: 
 
 @dataclass
 class Trainer:
-    """One run of the training; :meth:`run` goes on until the schedule ends or ``stop`` is set.
+    """One training run; :meth:`run` continues until the schedule ends or ``stop`` is set.
 
     Attributes:
         feed: training batches, of ``config.batch_size``.
-        held_out: panoramas for evaluation, of worlds or scenes that the feed does not have.
-        network: what to train.
-        config: how.
+        held_out: panoramas for evaluation, from worlds or scenes that are not in the feed.
+        network: network to train.
+        config: training parameters.
         output: checkpoint file.
         team: the processes of this training; by default this one on the CPU.
-        start: weights to begin with; by default random ones.
-        result: the weights that are evaluated and saved: the average, in the end mixed with the start's.
-        command: for the record, what the user typed.
-        report: takes lines for people.
-        bar: is told the progress 0..1 after each step.
+        start: initial weights; random by default.
+        result: the weights that are evaluated and saved: the average, finally mixed with the start weights.
+        command: the user's command line, for the record.
+        report: receives human-readable lines.
+        bar: receives the progress 0..1 after each step.
         stop: set it to end early.
     """
 
@@ -276,7 +278,7 @@ class Trainer:
 
     @torch.no_grad()
     def _start_at_typical_depth(self, depth: np.ndarray) -> None:
-        """Sets mean and spread of the last norm to those of the data, which Adam's small steps take long to reach."""
+        """Set mean and scale of the last norm to those of the data, which Adam's small steps would reach slowly."""
         known = depth[(depth > 0) & (depth <= self.config.max_range_m)]
         if not len(known):
             raise ValueError("the first batch has no depth within max_range_m")
@@ -287,12 +289,12 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """0..1 through the schedule, by time or epochs."""
+        """Progress through the schedule, 0..1, by time or epochs."""
         by_time = self.elapsed_s / (60 * self.config.minutes)
         return min(1.0, max(by_time, self.step / (self.config.epochs * self.feed.steps_an_epoch)))
 
     def _augmented(self, rgb: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-        """By a generator of this step and process, so that a run that is taken up again does the same."""
+        """Augment with a generator seeded by step and process, so that a resumed run repeats the same augmentation."""
         generator = torch.Generator().manual_seed((self.config.seed << 40) + (self.step << 8) + self.team.rank)
         rgb, depth = turn_and_mirror(rgb, depth, generator)
         if self.config.photograph:
@@ -300,7 +302,7 @@ class Trainer:
         return to_brightness(rgb, self.config.brightness), depth
 
     def train_step(self, progress: float | None = None) -> float:
-        """One step of the optimiser; gives the loss.
+        """Run one optimiser step and return the loss.
 
         Raises:
             RuntimeError: the loss is not finite.
@@ -325,19 +327,19 @@ class Trainer:
         self.scaler.step(self.optimizer)
         self.scaler.update()
         self.step += 1
-        # A young average would remember the start for long.
+        # A smaller decay at first, so that the average does not retain the start weights for long.
         update_average(self.average, self.model, min(self.config.average, (1 + self.step) / (10 + self.step)))
         return float(loss.item())
 
     def _agreed(self) -> tuple[float, bool]:
-        """Progress and whether to stop, as process 0 sees them: all must end at the same step."""
+        """Progress and stop flag of process 0, so that all processes end at the same step."""
         values = torch.tensor([self.progress, float(self.stop)], dtype=torch.float64, device=self.team.device)
         if self.team.ranks > 1:
             distributed.broadcast(values, 0)
         return float(values[0]), bool(values[1])
 
     def run(self) -> DepthMetrics | None:
-        """Trains to the end of the schedule; gives the metrics over all held-out panoramas (process 0 alone)."""
+        """Train to the end of the schedule; return the metrics over all held-out panoramas (process 0 only)."""
         log = TrainingLog(self.output, self.step, self.report) if self.team.rank == 0 else None
         begin = time.monotonic() - self.elapsed_s
         last_checkpoint, last_row, losses = time.monotonic(), (time.monotonic(), self.step), []
@@ -373,11 +375,11 @@ class Trainer:
                 log.close()
 
     def close(self) -> None:
-        """Ends the feed with its processes."""
+        """Close the feed and its processes."""
         self._ahead.close()
 
     def _row(self, log: TrainingLog, losses: list[float], since: float, since_step: int) -> tuple[float, int]:
-        """Writes loss and speed since a time and step; gives the present ones."""
+        """Write loss and speed since a time and step; return the current ones."""
         now, count = time.monotonic(), self.step - since_step
         if count:
             rate = count * self.config.batch_size * self.team.ranks / (now - since)
@@ -416,7 +418,7 @@ class Trainer:
         log.row({**entry, "loss": None}, f"held-out panoramas: {entry}")
 
     def record(self) -> dict[str, Any]:
-        """What made these weights: command, start, data, network, training, device, results (plain values)."""
+        """Origin of the weights: command, start, data, network, training, device, results (plain values)."""
         return {
             "command": self.command,
             "start": self.start.origin if self.start else None,
@@ -434,10 +436,10 @@ class Trainer:
         }
 
     def resume(self, path: Path) -> None:
-        """Takes up a run from its checkpoint.
+        """Resume a run from its checkpoint.
 
         Raises:
-            CheckpointError: the file is no checkpoint of a run with this network.
+            CheckpointError: the file is not a checkpoint of a run with this network.
         """
         try:
             state = torch.load(path, map_location=self.team.device, weights_only=True)

@@ -1,4 +1,4 @@
-"""Weights to begin a training with: from a checkpoint, or back from an ONNX file of ours (torch, onnx)."""
+"""Start weights of a training: from a checkpoint, or from an ONNX file of this project (torch, onnx)."""
 
 from __future__ import annotations
 
@@ -17,20 +17,21 @@ from instant_ic.training.folding import unfold_kernel
 from instant_ic.training.slicenet import CheckpointError, ConvStage, SliceNet, SliceNetConfig, load_checkpoint
 
 _TOLERANCE = 5e-3
-"""Largest difference between the file's depth and that of the network filled from it, over the largest depth: sums of
-taps that the export rounded to float16 are taken apart again (:mod:`folding`)."""
+"""Largest difference between the file's depth and that of the network filled from it, over the largest depth. The
+export rounded sums of kernel taps to float16, and the import splits these sums again (:mod:`folding`).
+"""
 _GATES = (0, 2, 3, 1)
-"""ONNX keeps an LSTM's gates as input, output, forget, cell; torch as input, forget, cell, output."""
+"""ONNX orders an LSTM's gates as input, output, forget, cell; torch as input, forget, cell, output."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a training begins.
+    """Starting point of a training.
 
     Attributes:
         model: with the file's weights.
-        folded: its batch norms were folded into the convolutions: ``unfold_norms`` before it is trained.
-        origin: what a training record says of it: file, SHA-256, and the record of its own training if there is one.
+        folded: its batch norms were folded into the convolutions: call ``unfold_norms`` before training.
+        origin: entry for the training record: file, SHA-256, and the record of its own training if there is one.
     """
 
     model: SliceNet
@@ -39,7 +40,7 @@ class Start:
 
 
 def load_start(path: str | Path, network: SliceNetConfig) -> Start:
-    """Reads the weights of ``network`` from a checkpoint (``.pt``, ``.pth``) or an ONNX file that we exported.
+    """Read the weights of ``network`` from a checkpoint (``.pt``, ``.pth``) or an ONNX file exported by this project.
 
     Raises:
         CheckpointError: the file is missing, damaged, or of another network.
@@ -63,7 +64,7 @@ def load_start(path: str | Path, network: SliceNetConfig) -> Start:
 
 
 def _from_onnx(path: Path, content: bytes, network: SliceNetConfig) -> SliceNet:
-    """The exporter names no weights, but keeps the order in which modules run; the result is held against the file."""
+    """Fill the network from ONNX weights in execution order, as the exporter drops names; verify against the file."""
     import onnx
     import onnxruntime
     from onnx import numpy_helper
@@ -120,14 +121,14 @@ def _from_onnx(path: Path, content: bytes, network: SliceNetConfig) -> SliceNet:
 
 
 def _phases(conv: nn.Conv2d, kernel: NDArray[np.float32], upscale: tuple[int, int]) -> int:
-    """How many kernels the file has for one of the network: several where the export folded a doubling into it."""
+    """Number of kernels in the file for one convolution of the network; several if the export folded a doubling."""
     count = upscale[0] * upscale[1]
     return count if kernel.shape[0] == count * conv.out_channels else 1
 
 
 @torch.inference_mode()
 def _run_order(model: SliceNet) -> dict[str, list[Any]]:
-    """Modules in the order in which they run: convolutions with the norm that follows, PReLUs, layers of the LSTM."""
+    """Modules in execution order: convolutions with their norm, PReLUs, LSTM layers."""
     ran: list[nn.Module] = []
     kinds = (nn.Conv2d, nn.BatchNorm2d, nn.PReLU, nn.LSTM)
     hooks = [
@@ -177,7 +178,7 @@ def _copy_lstm(
 
 @torch.inference_mode()
 def fold_norms(model: SliceNet) -> None:
-    """Takes each batch norm into the convolution before it, without changing what the network computes.
+    """Fold each batch norm into the preceding convolution, without changing the network's output.
 
     Args:
         model: in evaluation mode.
@@ -196,14 +197,14 @@ def fold_norms(model: SliceNet) -> None:
 
 @torch.inference_mode()
 def unfold_norms(model: SliceNet, pictures: Tensor) -> None:
-    """Gives folded batch norms the mean and spread of what they see, without changing what the network computes.
+    """Restore mean and scale of folded batch norms from sample images, without changing the network's output.
 
-    In training a norm divides by the batch's own spread. After the folding its scale is 1, whatever the spread is:
-    trained like that, the first step would break the network.
+    In training a norm divides by the batch's own standard deviation. After folding its scale is 1, whatever the
+    standard deviation is; the first training step would then break the network.
 
     Args:
         model: in evaluation mode.
-        pictures: (B, 3, H, W) in 0..1, the more varied the better.
+        pictures: (B, 3, H, W) in 0..1, as varied as possible.
     """
     sums: dict[nn.BatchNorm2d, list[Tensor]] = {}
 
