@@ -1,1 +1,1 @@
-"""Evaluations and the paper's experiments: their worlds, operators, baselines and figures."""
+"""Evaluations and the paper's experiments: worlds, operators, baselines and figures."""

@@ -1,4 +1,4 @@
-"""Recordings for the calibration, made by the simulator in this process, with a camera whose true place is known."""
+"""Simulated calibration recordings, made in this process, with known camera pose."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ BASE_FROM_LIDAR = pose_matrix(z=0.6)
 BASE_FROM_CAMERA = pose_matrix(z=1.2)
 _STEP_S = 0.02
 _TURN_S = 0.15
-"""Longer than a revolution and the rest of the one before."""
+"""Longer than one revolution plus the rest of the previous one."""
 
 
 def perturbed(pose: Matrix, distance_m: float, angle_deg: float, seed: int) -> Matrix:
-    """A pose (4, 4) moved by a distance and turned by an angle about its own centre, both in random directions."""
+    """Pose (4, 4) shifted by a distance and rotated by an angle about its own centre, both in random directions."""
     rng = np.random.default_rng([53, seed])
     shift, axis = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -45,19 +45,19 @@ def record(
     twist: tuple[float, float] = (0.2, 0.5),
     start: tuple[float, ...] = (),
 ) -> Matrix:
-    """Drives an arc in a simulated world and writes a bag with pictures, revolutions, odometry and mounts.
+    """Drive an arc in a simulated world and write a bag with images, revolutions, odometry and mounts.
 
-    The mounts in the bag are the usual ones, whatever the camera's true place. Odometry is the true pose at 30 Hz. Of
-    the LiDAR only the revolutions around each picture are written. Pictures and revolutions are of different moments,
-    and each ray is of its own.
+    The mounts in the bag are the default ones, whatever the camera's true pose. Odometry is the true pose at 30 Hz.
+    Only the LiDAR revolutions around each image are written. Images and revolutions have different stamps, and each ray
+    has its own.
 
     Args:
         path: folder of the bag.
-        base_from_camera: (4, 4), where the camera really is.
-        world: as ``make_world`` takes it.
-        pictures: their number.
-        size: width and height of a picture.
-        period_s: between pictures.
+        base_from_camera: (4, 4), true pose of the camera.
+        world: as for ``make_world``.
+        pictures: number of images.
+        size: width and height of an image.
+        period_s: time between images.
         twist: m/s and rad/s; (0, 0) stands still.
         start: x, y, yaw of the robot; empty: the world's own.
 

@@ -1,7 +1,7 @@
-"""The paper's "Ours (-depth)": a radiance field learnt from the panorama's colours alone.
+"""The paper's "Ours (-depth)": a radiance field trained on the panorama's colours alone.
 
-Density and colour on the same hash grid and network as the virtual space, composited along each ray (paper, III.B). No
-depth enters, so nothing tells where on its ray a colour belongs: that is what the ablation shows.
+Density and colour use the same hash grid and network as the virtual space and are composited along each ray (paper,
+III.B). Without depth, nothing determines the position of a colour on its ray; the ablation shows the effect.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from instant_ic.vspace.view import check_size, checked_pose, perspective_rays
 Floats = NDArray[np.float32]
 NEAR_M, FAR_M = 0.2, 12.0
 RAYS, SAMPLES = 512, 32
-"""Of a training step: as many field queries as a step of the virtual space has."""
+"""Rays per training step and samples per ray: as many field queries as a step of the virtual space."""
 _DRAWN_SAMPLES = 64
 
 
 class ColourOnlyField:
-    """Trained by ``train``, drawn by ``render``, on one CPU thread."""
+    """Colour-only field, trained by ``train`` and rendered by ``render``, on one CPU thread."""
 
     def __init__(
         self, rgb: NDArray[np.uint8], map_from_camera: NDArray[np.floating], config: VirtualSpaceConfig | None = None
     ) -> None:
-        """Takes a panorama (H, 2 H, 3) uint8 and its pose (4, 4)."""
+        """Create the field for a panorama (H, 2 H, 3) uint8 and its pose (4, 4)."""
         config = config or VirtualSpaceConfig()
-        # A sphere gives the lattice its scale; where surfaces are is not taken from it.
+        # A sphere sets the scale of the lattice; surface positions are not derived from it.
         sphere = np.full((32, 64), FAR_M / 3, np.float32)
         prior = prepare(rgb, sphere, map_from_camera, 0.1, config.geometry, config.panorama_width)
         self._rgb, self._pose = prior.rgb, prior.map_from_camera
@@ -62,7 +62,7 @@ class ColourOnlyField:
         return self._schedule.iteration
 
     def train(self, cpu_seconds: float = math.inf, iterations: int | None = None) -> float:
-        """Trains until the CPU time is spent, the iterations are done or the schedule has ended.
+        """Train until the CPU time is spent, the iterations are done or the schedule has ended.
 
         Returns:
             PSNR of the last step's rays, dB.
@@ -90,8 +90,8 @@ class ColourOnlyField:
         kernels.query(self._p.table, *self._p.network(), *self._lattice, points, out)
         field = out.reshape(RAYS, SAMPLES, 4)
         error, upstream = composite_gradient(field, step, target)
-        # The kernel takes a weighted squared error: this target makes its gradient the one wanted. The weight keeps
-        # target and output of one size, so that their difference keeps its digits.
+        # The kernel takes a weighted squared error; this target makes its gradient equal the desired one. The weight
+        # keeps target and output at the same magnitude, so that their difference keeps its precision.
         weight = np.float32(1 / RAYS)
         aim = out - (upstream / (2 * weight)).reshape(-1, 4)
         same = np.full(len(points), weight, np.float32)
@@ -117,7 +117,7 @@ class ColourOnlyField:
             grad[...] = 0
 
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective picture; depth is the mean over the ray, confidence its opacity."""
+        """Render a perspective image; depth is the mean along the ray, confidence its opacity."""
         check_size(width, height)
         rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
         count = width * height
@@ -143,21 +143,21 @@ class ColourOnlyField:
 
 
 def density(raw: Floats) -> Floats:
-    """Density, 1/m, of the network's fourth output: an exponential as in instant-ngp, bounded."""
+    """Density, 1/m, from the network's fourth output: a bounded exponential as in instant-ngp."""
     return np.asarray(np.exp(np.clip(raw, -10, 6)), np.float32)
 
 
 def _samples(rays: int, samples: int, place: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Depths and the lengths that they stand for, (rays, samples) metres: strata of equal ratio, ``place`` in each."""
+    """Sample depths and their interval lengths, (rays, samples) metres; strata of equal ratio, ``place`` in each."""
     edges = np.geomspace(NEAR_M, FAR_M, samples + 1)
     depth = edges[:-1] * (edges[1:] / edges[:-1]) ** place
     step = np.broadcast_to(np.diff(edges), (rays, samples)).copy()
-    step[:, -1] = 1e3  # what reaches the end is the far wall's
+    step[:, -1] = 1e3  # the rest of the ray belongs to the far wall
     return depth.astype(np.float32), step.astype(np.float32)
 
 
 def composite_gradient(field: Floats, step: Floats, target: Floats) -> tuple[float, Floats]:
-    """Mean squared colour error of composited rays, and its gradient by the field's outputs.
+    """Mean squared colour error of composited rays, and its gradient with respect to the field's outputs.
 
     Args:
         field: (N, S, 4), colours minus 0.5 and raw density; step: (N, S) metres; target: (N, 3), minus 0.5.
@@ -174,9 +174,9 @@ def composite_gradient(field: Floats, step: Floats, target: Floats) -> tuple[flo
     by_colour = 2 * difference / difference.size
     upstream = np.empty_like(field)
     upstream[..., :3] = weight[..., None] * by_colour[:, None]
-    shade = (colour * by_colour[:, None]).sum(axis=2)  # (N, S): what a unit of this sample's weight adds to the error
+    shade = (colour * by_colour[:, None]).sum(axis=2)  # (N, S): error per unit of this sample's weight
     behind = np.cumsum((weight * shade)[:, ::-1], axis=1)[:, ::-1] - weight * shade
-    inside = np.abs(field[..., 3] + 2) < 8  # where the exponential is not cut off
-    # The last sample's weight is what is left, for any density: no gradient there.
+    inside = np.abs(field[..., 3] + 2) < 8  # where the exponential is not clipped
+    # The last sample gets the remaining weight, whatever its density: no gradient there.
     upstream[..., 3] = np.where(inside, sigma * step * (left * shade - behind), 0)
     return float(np.mean(difference**2)), upstream

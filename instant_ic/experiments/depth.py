@@ -1,4 +1,4 @@
-"""Depth of panoramas against the truth: each source of depth as on the robot, before and after scaling."""
+"""Depth of panoramas against ground truth: each depth source as on the robot, before and after scaling."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating]
 _EDGE = 0.2
-"""Where neighbours differ by more than this share, interpolated depth would lie between two surfaces."""
+"""Relative difference of neighbours above which interpolated depth would lie between two surfaces."""
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 class Model(Protocol):
-    """What gives depth: ``depth.model.DepthModel``, or something in its place."""
+    """A depth model: ``depth.model.DepthModel`` or a replacement."""
 
     manifest: ModelManifest
 
     @property
     def provider(self) -> str:
-        """What it runs on."""
+        """Name of the execution provider."""
 
     def estimate(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Depth (h, w) in the model's unit of a panorama (H, W, 3), 0 = unknown."""
 
 
 class DepthEvaluationError(ValueError):
-    """A picture that cannot be scored, or settings that do not go together."""
+    """An image cannot be scored, or the settings contradict each other."""
 
 
 @dataclass(frozen=True)
 class LidarSettings:
-    """The simulated VLP-16 beside the camera; see ``depth_lidar``."""
+    """The simulated VLP-16 next to the camera; see ``depth_lidar``."""
 
     height_m: float = 0.6
     noise_m: float = 0.02
@@ -59,14 +59,14 @@ class LidarSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is scored.
+    """Evaluation settings.
 
     Attributes:
         source: ``network``, ``lidar`` or ``fused``.
-        lidar: measures the truth; None: the network's metres are scored as they are.
+        lidar: simulated LiDAR that measures the ground truth; None: the network's metres are scored unscaled.
         camera_height_m: above the floor.
         method: of the scaler; empty for its default.
-        max_depth_m: truth farther than this is left out; None: all counts.
+        max_depth_m: ground truth beyond this is ignored; None: no limit.
     """
 
     source: str = "fused"
@@ -88,20 +88,21 @@ class Settings:
 
 @dataclass(frozen=True)
 class Scored:
-    """One panorama.
+    """Result for one panorama.
 
     Attributes:
-        name: for people and the report.
-        rgb: (H, W, 3) uint8 the picture.
-        depth_m: (h, w) float32 the result, metres (model's unit where nothing scaled it), 0 = unknown.
-        truth_m: (H', W') float32, 0 = unknown; None where there is none.
+        name: label for the report.
+        rgb: (H, W, 3) uint8 image.
+        depth_m: (h, w) float32 result, metres (the model's unit if it was not scaled), 0 = unknown.
+        truth_m: (H', W') float32, 0 = unknown; None without ground truth.
         points: (N, 3) LiDAR points in the camera's frame; None without LiDAR.
-        before: the network's metres before scaling; None where it gives none, or no truth.
-        after: the result; None without truth. ``weighted`` counts pixels by solid angle, ``shape`` the result
-            after division by its median ratio to the truth: what no scale can mend.
-        sigma_share: share of pixels whose error is within one sigma; None without LiDAR or truth.
-        seconds_model, seconds_source: wall time of the network, and of scaling and fusion; ``cpu_source_s``: what
-            scaling and fusion took of the processor.
+        before: metrics of the network's metres before scaling; None if the network outputs none, or without ground
+            truth.
+        after: metrics of the result; None without ground truth. ``weighted`` counts pixels by solid angle; ``shape``
+            divides the result by its median ratio to the truth first, which shows the error that no scale can remove.
+        sigma_share: share of pixels whose error is within one sigma; None without LiDAR or ground truth.
+        seconds_model, seconds_source: wall time of the network, and of scaling and fusion; ``cpu_source_s``: CPU time
+            of scaling and fusion.
         fit: ``ok``, ``message``, ``scale``, ``shift``, ``quality``, ``relative_sigma``, ``points``; None without LiDAR.
     """
 
@@ -122,11 +123,11 @@ class Scored:
 
     @property
     def seconds(self) -> float:
-        """From picture (and points) to depth."""
+        """Time from image (and points) to depth."""
         return self.seconds_model + self.seconds_source
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values; the metrics after scaling also stand at the top."""
+        """Plain values; the metrics after scaling are repeated at the top level."""
         row: dict[str, Any] = {"name": self.name}
         if self.after is not None:
             row |= self.after.as_dict()
@@ -148,10 +149,10 @@ _KEYS = {"before": "before", "after": "after", "weighted": "after_by_solid_angle
 
 
 class Evaluator:
-    """Scores panoramas one by one, all by the same settings.
+    """Scores panoramas one by one with the same settings.
 
     Raises:
-        DepthEvaluationError: the settings need a model, or another one.
+        DepthEvaluationError: the settings need a model, or a different one.
     """
 
     def __init__(self, settings: Settings, model: Model | None) -> None:
@@ -169,14 +170,15 @@ class Evaluator:
         self._warm = False
 
     def score(self, name: str, rgb: NDArray[np.uint8], truth_m: Floats | None, points: Floats | None = None) -> Scored:
-        """Depth of a level panorama (H, W, 3) uint8, against its true radial depth (H', W') metres, 0 = unknown.
+        """Score the depth of a level panorama (H, W, 3) uint8 against ground-truth radial depth (H', W') metres, 0 =
+        unknown.
 
-        The scores are taken at the truth's pixels. A result of another size is looked up there, bilinear in inverse
-        depth and the nearest pixel at edges. ``points`` (N, 3) in the camera's frame stand in for the simulated
-        measurement of the truth.
+        Scores are computed at the ground truth's pixels. A result of another size is interpolated there, bilinear in
+        inverse depth and with the nearest pixel at edges. ``points`` (N, 3) in the camera's frame replace the simulated
+        LiDAR measurement.
 
         Raises:
-            DepthEvaluationError: no panorama, nothing to compare, or LiDAR without a truth to measure.
+            DepthEvaluationError: not a panorama, nothing to compare, or LiDAR without ground truth to measure.
         """
         settings = self.settings
         for what, array in (("picture", rgb), ("true depth", truth_m)):
@@ -201,14 +203,14 @@ class Evaluator:
                 noise_m=lidar.noise_m, outliers=lidar.outliers, seed=lidar.seed,
             )  # fmt: skip
         if self.model is not None and not self._warm:
-            self.model.estimate(rgb)  # the first run allocates
+            self.model.estimate(rgb)  # warm-up: the first run allocates memory
             self._warm = True
         begin = time.perf_counter()
         raw = self.model.estimate(rgb) if self.model is not None else None
         between, cpu_s = time.perf_counter(), time.process_time()
         sigma = fit = None
         if settings.lidar is None:
-            assert raw is not None  # __init__ and Settings: only the network goes without LiDAR
+            assert raw is not None  # ensured by __init__ and Settings: only the network works without LiDAR
             depth = raw
         else:
             assert points is not None
@@ -235,7 +237,7 @@ class Evaluator:
 
 
 def look_up(depth: Floats, size: tuple[int, ...]) -> NDArray[np.float32]:
-    """Equirect depth (H, W) at the pixels of another size: a plane stays a plane, an edge stays an edge."""
+    """Resample equirect depth to (H, W): planes stay planes, and edges stay sharp."""
     if depth.shape == size:
         return depth.astype(np.float32)
     inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0)
@@ -249,7 +251,7 @@ def look_up(depth: Floats, size: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def nearest(values: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
-    """An equirect array (H, W) at the nearest pixel of each pixel of another size."""
+    """Resample an equirect array to (H, W) by the nearest pixel."""
     rows, columns = (
         ((np.arange(n) + 0.5) * old / n).astype(np.intp) for n, old in zip(size, values.shape, strict=True)
     )
@@ -266,12 +268,12 @@ def _within_sigma(depth: Floats, sigma: Floats, truth: Floats, max_depth_m: floa
 
 
 def report(scored: Sequence[dict[str, Any]], settings: Settings, model: Model | None) -> dict[str, Any]:
-    """Everything as plain values: ``mean`` (after scaling), ``before`` and ``after`` in the mean, then each image.
+    """Report as plain values: ``mean`` (after scaling), means of ``before`` and ``after``, then each image.
 
     Args:
         scored: ``Scored.as_dict`` of each panorama.
-        settings: by which they were scored.
-        model: that was used, if any.
+        settings: settings of the scores.
+        model: the model used, if any.
     """
     means = {key: _mean([row[key] for row in scored if row.get(key)]) for key in _KEYS.values()}
     mean: dict[str, Any] = dict(means["after"] or {})
@@ -305,7 +307,7 @@ def _mean(rows: Sequence[dict[str, Any]]) -> dict[str, float] | None:
 
 
 def _rounded(value: Any) -> Any:
-    """Numbers for JSON: five digits after the point, no infinity."""
+    """Round numbers for JSON to five decimals, and replace infinity."""
     if isinstance(value, float | np.floating):
         return round(float(value), 5) if np.isfinite(value) else None
     return value

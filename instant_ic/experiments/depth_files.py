@@ -1,4 +1,4 @@
-"""Which depth file belongs to which picture."""
+"""Pairs images with their depth files."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ _NEAREST_MEDIAN_M, _FARTHEST_MEDIAN_M = 0.05, 150.0
 
 
 class PairError(ValueError):
-    """Pictures and depth files do not go together; the message names them."""
+    """Images and depth files do not match; the message names them."""
 
 
 def find_pictures(paths: Sequence[Path]) -> list[Path]:
-    """The pictures among files and folders, those of a folder by name and without what ends in ``_depth``.
+    """Images in files and folders; a folder's images are sorted by name, without those ending in ``_depth``.
 
     Raises:
-        PairError: a path is missing, or a folder holds no picture.
+        PairError: a path is missing, or a folder holds no image.
     """
     return _found(paths, PICTURE_SUFFIXES, "picture")
 
 
 def pair(pictures: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, Path | None]]:
-    """Each picture with the depth of the same stem (``room.jpg``, ``room.npy``), or None where there is none.
+    """Pair each image with the depth file of the same stem (``room.jpg``, ``room.npy``), or with None.
 
-    One picture and one depth file belong together whatever they are called. A stem may end in ``_rgb`` or ``_depth``.
+    A single image and a single depth file are paired whatever their names. A stem may end in ``_rgb`` or ``_depth``.
 
     Raises:
-        PairError: a path is missing, no picture has a depth, or two files claim the same one.
+        PairError: a path is missing, no image has a depth file, or two files match the same image.
     """
     if len(pictures) == len(truths) == 1 and truths[0].is_file():
         return [(pictures[0], truths[0])]
@@ -49,15 +49,15 @@ def pair(pictures: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, P
 
 
 def load_truth(path: Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
-    """True radial depth (H, W) in metres, 0 = unknown; see ``depth.files.load_depth``.
+    """Ground-truth radial depth (H, W) in metres, 0 = unknown; see ``depth.files.load_depth``.
 
     Args:
         path: of the file.
-        png_unit_m: metres of one step of a PNG (Stanford2D3D: 1/512, Matterport3D: 1/4000). Its largest value, 65535,
-            is unknown.
+        png_unit_m: metres per PNG unit (Stanford2D3D: 1/512, Matterport3D: 1/4000). The largest value, 65535, is
+            unknown.
 
     Raises:
-        DepthFileError: as ``load_depth``; also when everything is unknown.
+        DepthFileError: as ``load_depth``; also if all pixels are unknown.
     """
     depth = load_depth(path)
     if path.suffix.lower() == ".png":
@@ -68,7 +68,7 @@ def load_truth(path: Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
 
 
 def unit_warning(depth_m: NDArray[np.floating]) -> str:
-    """What looks wrong about the unit of a true depth in metres (0 = unknown); empty where nothing does."""
+    """Warning if a ground-truth depth in metres (0 = unknown) seems to have the wrong unit; otherwise empty."""
     median = float(np.median(depth_m[depth_m > 0]))
     if median < _NEAREST_MEDIAN_M:
         return f"median {median:.4f} m: metres where millimetres belong (a PNG holds millimetres)?"

@@ -1,4 +1,4 @@
-"""What a VLP-16 above or below the camera would measure: from a depth picture alone, or from a world."""
+"""Simulated VLP-16 above or below the camera, measuring a depth image or a world."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.floating]
 AZIMUTHS = 900
-"""Directions of a revolution: 0.4 degrees apart, as at 600 rpm."""
+"""Azimuth steps per revolution: 0.4 degrees, as at 600 rpm."""
 MIN_RANGE_M, MAX_RANGE_M = 0.4, 100.0
 
 
 @dataclass(frozen=True)
 class Errors:
-    """What goes wrong with measured ranges.
+    """Errors of measured ranges.
 
     Attributes:
         noise_m: standard deviation of a range, metres.
-        outliers: share of the points, 0..1, that are somewhere else on their ray: half of them nearer than what is
-            there (dust, rain, mixed pixels), half up to three times as far (glass, mirrors).
+        outliers: share of the points, 0..1, at a wrong range on their ray: half nearer than the surface (dust, rain,
+            mixed pixels), half up to three times as far (glass, mirrors).
         seed: of both.
     """
 
@@ -40,7 +40,7 @@ class Errors:
             raise ValueError(f"outliers must lie between 0 and 1 (got {self.outliers})")
 
     def apply(self, range_m: Floats) -> NDArray[np.float64]:
-        """Measured for true ranges, both (N,) metres."""
+        """Apply the errors to true ranges; both (N,) metres."""
         rng = np.random.default_rng([53, self.seed])
         measured = range_m + rng.normal(0, 1, len(range_m)) * self.noise_m
         wrong = rng.permutation(len(range_m))[: round(self.outliers * len(range_m))]
@@ -59,11 +59,11 @@ def measure(
     outliers: float = 0.0,
     seed: int = 0,
 ) -> NDArray[np.float32]:
-    """One revolution of a LiDAR on the camera's vertical, as far as a level depth picture tells.
+    """Simulate one revolution of a LiDAR on the camera's vertical, from a level depth image.
 
-    LiDAR and camera are on one vertical, so each beam stays in one column of the picture. There the picture is a
-    profile of the room; a beam ends where it first meets it. Where the beam goes behind something that the camera
-    sees (the profile is torn there) or out through unknown pixels, nobody knows what it meets: no point.
+    LiDAR and camera share a vertical axis, so each beam stays in one column of the image. There the image is a profile
+    of the room, and a beam ends where it first meets the profile. A beam gives no point where it passes behind a
+    visible surface (through a depth discontinuity) or through unknown pixels, because its end is unknown.
 
     Args:
         depth_m: (H, W) radial depth of a level panorama, metres; 0 or not finite is unknown.
@@ -75,7 +75,7 @@ def measure(
         (N, 3) points in the camera's frame, metres.
 
     Raises:
-        ValueError: not a depth picture, or a value out of bounds.
+        ValueError: not a depth image, or a value out of bounds.
     """
     if depth_m.ndim != 2 or min(depth_m.shape) < 4:
         raise ValueError(f"depth_m must be (H, W) (got {depth_m.shape})")
@@ -112,7 +112,7 @@ def measure_world(
     camera_height_m: float,
     errors: Errors | None = None,
 ) -> NDArray[np.float32]:
-    """The same by casting rays in a world, also behind what the camera sees; (N, 3) in the camera's frame, metres."""
+    """Simulate a revolution by ray casting, also behind visible surfaces; (N, 3) in the camera's frame, metres."""
     omega, azimuth = np.meshgrid(np.radians(np.linspace(-15, 15, 16)), np.arange(AZIMUTHS) * (2 * math.pi / AZIMUTHS))
     rays = _on_rays(omega.ravel(), azimuth.ravel(), np.ones(omega.size))
     mount = np.array([0.0, 0.0, lidar_height_m - camera_height_m])
@@ -131,26 +131,27 @@ def _on_rays(omega: float | Floats, azimuth: Floats, range_m: Floats) -> NDArray
 
 
 def _measured(points: Floats, errors: Errors, mount: Floats) -> NDArray[np.float32]:
-    """Errors along the rays of points (N, 3) from the LiDAR at ``mount`` (3,)."""
+    """Apply errors along the rays to points (N, 3) from the LiDAR at ``mount`` (3,)."""
     range_m = np.linalg.norm(points, axis=1)
     return (points * (errors.apply(range_m) / range_m)[:, None] + mount).astype(np.float32)
 
 
 def _torn(inverse: Floats, step_rad: float) -> NDArray[np.bool_]:
-    """Whether the surface is torn between each row of (H, W) inverse depth and the next; the last row to the first.
+    """Whether there is a depth discontinuity between each row of (H, W) inverse depth and the next; last row to first.
 
-    Seen under less than 8 degrees, and the inverse depth, which is smooth over any plane, jumps; or under 1 degree.
+    True if the surface is seen at less than 8 degrees and the inverse depth, which is smooth over any plane, jumps; or
+    if it is seen at less than 1 degree.
     """
     following = np.roll(inverse, -1, axis=0)
     jump = np.abs(following - inverse)
-    # Of a right-angled triangle: step_rad * range across the ray, the difference of ranges along it.
+    # Legs of a right-angled triangle: step_rad * range across the ray, the range difference along it.
     slope = jump / np.maximum(step_rad * np.maximum(np.minimum(inverse, following), 1e-9), 1e-12)
     alike = np.maximum(np.roll(jump, 1, axis=0), np.roll(jump, -1, axis=0))
     return (slope > 1 / math.tan(math.radians(1))) | ((slope > 1 / math.tan(math.radians(8))) & (jump > 2 * alike))
 
 
 def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
-    """Columns (H, N) of inverse depth (H, W) at azimuths (N,): between two of a surface, else the nearer one."""
+    """Columns (H, N) of inverse depth (H, W) at azimuths (N,): interpolated on a surface, else the nearer neighbour."""
     width = inverse.shape[1]
     u = (math.pi - azimuth) * (width / (2 * math.pi)) - 0.5
     left = np.floor(u).astype(np.intp)
@@ -164,7 +165,7 @@ def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
 def _bridge_unknown(
     profile: NDArray[np.float64], torn: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Unknown pixels get the known one above (first: below), torn from it: a beam that passes there has no end."""
+    """Fill unknown pixels from above (the first from below) and mark them: beams that pass through them have no end."""
     known = profile > 0
     row = np.where(known, np.arange(len(profile))[:, None], -1)
     above = np.maximum.accumulate(row, axis=0)
@@ -175,7 +176,7 @@ def _bridge_unknown(
 
 
 def _first_crossing(across: Floats, up: Floats, torn: NDArray[np.bool_], omega: float) -> NDArray[np.float64]:
-    """Ranges (N,) at which beams of elevation ``omega`` first meet profiles (H, N); inf at nothing and at a tear."""
+    """Ranges (N,) where beams of elevation ``omega`` first meet profiles (H, N); inf for none or at a discontinuity."""
     side = across * math.sin(omega) - up * math.cos(omega)
     along = across * math.cos(omega) + up * math.sin(omega)
     s0, s1 = side[:-1], side[1:]

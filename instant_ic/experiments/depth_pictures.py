@@ -1,4 +1,4 @@
-"""Sheets to look at: image, prediction, truth and error; and the point cloud from the side and from above."""
+"""Report images: image, prediction, ground truth and error; and the point cloud from the side and from above."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SIDE_ROWS = 380
 _SLAB_M = 0.3
 _WALLS_M = -0.9, 0.6
 _WRONG = 0.5
-"""Relative error at which its colours end."""
+"""Relative error at the end of the colour scale."""
 _GREY = 150
 
 Picture = NDArray[np.uint8]
@@ -33,7 +33,7 @@ class Sheets:
 
     Args:
         path: of the first page.
-        side: point clouds instead of depth pictures.
+        side: show point clouds instead of depth images.
     """
 
     def __init__(self, path: Path, side: bool = False) -> None:
@@ -43,7 +43,7 @@ class Sheets:
         self._rows: list[Picture] = []
 
     def add(self, scored: Scored) -> None:
-        """Adds a panorama; writes a page when it is full.
+        """Add a panorama; write the page when it is full.
 
         Raises:
             OSError: the page cannot be written.
@@ -53,7 +53,7 @@ class Sheets:
             self.close()
 
     def close(self) -> None:
-        """Writes what is waiting; raises as ``add`` does."""
+        """Write the unfinished page; raises as ``add`` does."""
         if not self._rows:
             return
         page = len(self.written) + 1
@@ -67,7 +67,7 @@ class Sheets:
 
 
 def depth_row(scored: Scored) -> Picture:
-    """Image, prediction, and where there is a truth also truth and relative error, side by side; (h, w, 3) RGB."""
+    """Image and prediction, with ground truth and relative error if available, side by side; (h, w, 3) RGB."""
     depth = nearest(scored.depth_m, _SIZE)
     truth = None if scored.truth_m is None else nearest(scored.truth_m, _SIZE)
     reference = depth if truth is None else truth
@@ -87,7 +87,7 @@ def depth_row(scored: Scored) -> Picture:
 
 
 def side_row(scored: Scored) -> Picture:
-    """The point cloud in slices ahead and across, and the walls from above; the truth in grey; (h, w, 3) RGB."""
+    """Point cloud in slices ahead and across, and the walls from above; ground truth in grey; (h, w, 3) RGB."""
     cloud = _cloud(scored.depth_m, scored.rgb)
     truth = None if scored.truth_m is None else _cloud(scored.truth_m, scored.rgb)
     slab = (-_SLAB_M, _SLAB_M)
@@ -107,7 +107,7 @@ def _slice(
     signs: tuple[int, int],
     between: tuple[float, float],
 ) -> Picture:
-    """Points with ``axes[2]`` between two values, ``axes[0]`` to the right, ``axes[1]`` up, on a grid of 1 m."""
+    """Plot points with ``axes[2]`` between two values, ``axes[0]`` to the right, ``axes[1]`` up, on a 1 m grid."""
     drawn = []
     for points, colours in [c for c in (truth, cloud) if c is not None]:
         kept = (points[:, axes[2]] >= between[0]) & (points[:, axes[2]] <= between[1])
@@ -116,7 +116,7 @@ def _slice(
     low, high = np.percentile(every, 0.5, axis=0) - 0.3, np.percentile(every, 99.5, axis=0) + 0.3
     low, high = np.minimum(low, -0.5), np.maximum(high, 0.5)
     scale = min(_SIZE[1] / (high[0] - low[0]), _SIDE_ROWS / (high[1] - low[1]))
-    low = (low + high - np.array([_SIZE[1], _SIDE_ROWS]) / scale) / 2  # the middle in the middle
+    low = (low + high - np.array([_SIZE[1], _SIDE_ROWS]) / scale) / 2  # centre the view
     high = low + np.array([_SIZE[1], _SIDE_ROWS]) / scale
     picture = np.full((_SIDE_ROWS, _SIZE[1], 3), 245, np.uint8)
 
@@ -132,7 +132,8 @@ def _slice(
         picture[(slice(None), at) if axis == 0 else at] = 215
     for number, (points, colours) in enumerate(drawn):
         is_truth = truth is not None and number == 0
-        # A point of the result covers 2 x 2 pixels, one of the truth 1, so that it shows only where the result is off.
+        # A result point covers 2 x 2 pixels and a ground-truth point 1, which is therefore visible only where the
+        # result is wrong.
         for down, right in ((0, 0),) if is_truth else ((0, 0), (0, 1), (1, 0), (1, 1)):
             rows, columns = row(points[:, 1]) + down, column(points[:, 0]) + right
             inside = (rows >= 0) & (rows < _SIDE_ROWS) & (columns >= 0) & (columns < _SIZE[1])
@@ -144,7 +145,7 @@ def _slice(
 
 
 def _cloud(depth_m: NDArray[np.float32], rgb: Picture) -> Cloud:
-    """Points (N, 3) of known depth in the camera's frame, and their colours (N, 3), darker so that white walls show."""
+    """Points (N, 3) of known depth in the camera's frame; colours (N, 3), darkened so that white walls show."""
     height, width = depth_m.shape
     colours = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA))
     known = depth_m > 0
@@ -153,7 +154,7 @@ def _cloud(depth_m: NDArray[np.float32], rgb: Picture) -> Cloud:
 
 
 def _errors(relative: NDArray[np.floating]) -> Picture:
-    """Too near red, too far blue, right white; unknown grey."""
+    """Colour code: too near red, too far blue, correct white, unknown grey."""
     level = np.clip(relative / _WRONG, -1, 1)
     fade = np.clip(255 * (1 - np.abs(np.nan_to_num(level))), 0, 255).astype(np.uint8)
     full = np.full_like(fade, 255)
@@ -164,7 +165,7 @@ def _errors(relative: NDArray[np.floating]) -> Picture:
 
 def _titled(picture: Picture, title: str) -> Picture:
     strip = np.full((_TITLE, picture.shape[1], 3), 255, np.uint8)
-    # OpenCV's letters are ASCII.
+    # OpenCV's font is ASCII only.
     text = title.encode("ascii", "replace").decode()
     cv2.putText(strip, text, (2, _TITLE - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
     return np.vstack([strip, picture])

@@ -1,4 +1,4 @@
-"""Panoramas with true depth that no training may see: the held-out sets of the depth evaluations."""
+"""Held-out panoramas with ground-truth depth for the depth evaluations; training must not use them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 KINDS = ("random", "corridor", "mesh")
 FIRST_SEED = 900_000
-"""Worlds from this seed on are for evaluation; training stays below."""
+"""Worlds from this seed on are for evaluation; training uses smaller seeds."""
 CAMERA_HEIGHT_M = 1.2
 LIDAR_HEIGHT_M = 0.6
 _MESH_POSITIONS = {
     "small_house": ((3.2, -2.2), (-4.6, -0.2), (-5.5, -3.4), (6.3, -2.4), (1.5, 2.2)),
 }
-"""Free places (x, y) of mesh files by their stem; metres."""
+"""Free positions (x, y) in mesh files, by file stem; metres."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Scene:
 
     Attributes:
         name: kind, world and place.
-        renderer: of the world, to measure it by rays too.
+        renderer: of the world, also for ray casting.
         map_from_camera: (4, 4), level.
         rgb: (H, W, 3) uint8.
-        depth_m: (H, W) float32 radial truth; 0 where nothing is hit.
+        depth_m: (H, W) float32 ground-truth radial depth; 0 where the ray hits nothing.
         camera_height_m: above the floor.
     """
 
@@ -51,23 +51,23 @@ class Scene:
 def held_out(
     kind: str, count: int = 20, mesh: str | Path | None = None, height: int = 256
 ) -> Iterator[tuple[str, NDArray[np.uint8], NDArray[np.float32], float]]:
-    """Name, picture (H, W, 3), true radial depth (H, W) and camera height of each panorama; see ``scenes``."""
+    """Name, image (H, W, 3), ground-truth radial depth (H, W) and camera height of each panorama; see ``scenes``."""
     for scene in scenes(kind, count, mesh, height):
         yield scene.name, scene.rgb, scene.depth_m, scene.camera_height_m
 
 
 def scenes(kind: str, count: int = 20, mesh: str | Path | None = None, height: int = 256) -> Iterator[Scene]:
-    """The held-out panoramas of a kind, always the same ones.
+    """The held-out panoramas of a kind; always the same ones.
 
     Args:
-        kind: ``random`` (a world each, seeds from ``FIRST_SEED``), ``corridor`` (places in the corridor of the
-            experiments and its rooms) or ``mesh`` (its known places first, then random free ones).
+        kind: ``random`` (one world per panorama, seeds from ``FIRST_SEED``), ``corridor`` (positions in the corridor of
+            the experiments and its rooms) or ``mesh`` (its known positions first, then random free ones).
         count: panoramas.
         mesh: the file, for ``mesh``.
         height: rows of a panorama; twice as many columns.
 
     Raises:
-        ValueError: an unknown kind, no count, a mesh without a free place, or ``mesh`` and kind do not go together.
+        ValueError: unknown kind, count below 1, a mesh without a free position, or ``mesh`` does not match the kind.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)} (got {kind!r})")
@@ -88,7 +88,7 @@ def _scenes(kind: str, count: int, mesh: Path | None, height: int) -> Iterator[S
             world = random_world(seed)
             try:
                 places = world.sample_free_poses(np.random.default_rng([5, seed]), 1)
-            except ValueError:  # some plans are too full to stand in
+            except ValueError:  # some floor plans have no free position
                 places = np.empty((0, 3))
             for x, y, yaw in places:
                 yield _scene(f"random:{seed}", EquirectRenderer(world), x, y, yaw, height)
@@ -103,7 +103,7 @@ def _scenes(kind: str, count: int, mesh: Path | None, height: int) -> Iterator[S
 
 
 def _places(world: World, count: int, stem: str) -> NDArray[np.float64]:
-    """(count, 3) x, y, yaw: known places first, looking along x; the first ones are the same whatever the count."""
+    """(count, 3) x, y, yaw: known positions first, looking along x; a larger ``count`` only appends."""
     known = [np.array([x, y, 0.0]) for x, y in _MESH_POSITIONS.get(stem, ())][:count]
     rngs = (np.random.default_rng([5, FIRST_SEED, k]) for k in range(count - len(known)))
     return np.array(known + [world.sample_free_poses(rng, 1)[0] for rng in rngs])

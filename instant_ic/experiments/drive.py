@@ -22,18 +22,18 @@ FOOTPRINT_M = (0.60, 0.50)
 
 @dataclass
 class DriveRecord:
-    """What went over the bus while somebody drove."""
+    """Messages recorded during a drive."""
 
     modes: list[int] = field(default_factory=list)
-    """Every change of mode, the first one included (ControlState.REAL, ...)."""
+    """Every change of mode, including the first mode (ControlState.REAL, ...)."""
     reasons: list[str] = field(default_factory=list)
     truth: list[NDArray[np.float64]] = field(default_factory=list)
     """Ground-truth poses of the r-bot, (x, y, yaw) in the world."""
     vbot: list[NDArray[np.float64]] = field(default_factory=list)
-    """Poses of the v-bot in the map while it was driven."""
+    """Poses of the v-bot in the map while it was active."""
     contact: bool = False
     ready_seconds: list[float] = field(default_factory=list)
-    """For each keyframe: seconds from its arrival to a space that is fit to show."""
+    """For each keyframe: seconds from its arrival until the virtual space was ready to be shown."""
     view_stamps_ns: list[int] = field(default_factory=list)
     view_bytes: list[int] = field(default_factory=list)
     view_size: tuple[int, int] = (0, 0)
@@ -89,12 +89,12 @@ class DriveRecorder:
 
     @property
     def ready(self) -> bool:
-        """Whether the virtual space is fit to show."""
+        """Whether the virtual space is ready to be shown."""
         return self.vspace is not None and self.vspace.state == self.vspace.READY
 
 
 def footprint_clearance(pose: NDArray[np.float64], box: tuple[float, float, float, float]) -> float:
-    """Distance in metres between the crawler's footprint and an upright box; 0 when they overlap.
+    """Distance in metres between the crawler's footprint and an axis-aligned box; 0 if they overlap.
 
     Args:
         pose: (x, y, yaw) of the crawler.
@@ -111,9 +111,9 @@ def footprint_clearance(pose: NDArray[np.float64], box: tuple[float, float, floa
 
 @contextlib.asynccontextmanager
 async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float, str], Any]]:
-    """Runs the observer's callbacks beside asyncio code; gives ``await until(condition, timeout_s, what)``.
+    """Run the observer's callbacks beside asyncio code; yield ``await until(condition, timeout_s, what)``.
 
-    Time-outs are seconds of the stack's time.
+    Timeouts are seconds of the stack's time.
     """
     failure: list[BaseException] = []
 
@@ -150,19 +150,19 @@ async def pump(stack: Stack) -> AsyncIterator[Callable[[Callable[[], Any], float
 async def drive_through_obstacle(
     stack: Stack, recorder: DriveRecorder, console_url: str, beyond_x_m: float, speed_mps: float = 0.35
 ) -> None:
-    """Drives straight ahead from the start until the v-bot is past the obstacle, stops there, waits for the r-bot.
+    """Drive straight ahead until the v-bot is past the obstacle, stop there, and wait for the r-bot.
 
-    When a late sensor stops the robot on the way, the operator lets go and drives on, as a person would.
+    If late sensor data stops the robot on the way, the operator releases the controls and continues, as a person would.
 
     Args:
         stack: a running ``launch/sim.yaml`` whose world has an obstacle straight ahead.
         recorder: of the same stack.
-        console_url: the page's address; the drive goes through its WebSocket.
-        beyond_x_m: how far along the map's x the v-bot is driven.
+        console_url: the page's address; the drive uses its WebSocket.
+        beyond_x_m: map x to which the v-bot is driven.
         speed_mps: forward speed.
 
     Raises:
-        StackError: something did not come about in time.
+        StackError: a condition was not met in time.
     """
     control = message_type("ControlState")
     async with pump(stack) as until:

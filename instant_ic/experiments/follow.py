@@ -1,9 +1,11 @@
-"""``ic evaluate follow``: the r-bot behind a v-bot in random rooms, in a closed loop with the library that drives it.
+"""``ic evaluate follow``: the r-bot follows a v-bot in random rooms, in a closed loop with the library code that drives
+it.
 
-Each episode makes a room (``follow_worlds``). A scripted operator drives the v-bot to a goal, round the walls and
+Each episode generates a room (``follow_worlds``). A scripted operator drives the v-bot to a goal, around walls and
 straight through everything else. Costmap, subgoal, navigator and collision monitor are those of the nodes, at the
-nodes' rates; the robot is the simulator's, with slip; its commands come late, its pose wanders by centimetres, its
-LiDAR has 1.5 cm of noise. One revolution is taken as seen at once: motion within it is not part of this.
+nodes' rates. The robot is the simulator's, with slip: its commands are delayed, its pose estimate wanders by
+centimetres, and its LiDAR has 1.5 cm of noise. A revolution is measured at one instant; motion during a revolution is
+not simulated.
 """
 
 from __future__ import annotations
@@ -41,19 +43,20 @@ FloatArray = NDArray[np.float64]
 
 DT_S = 0.05
 REACHED_M, REACHED_RAD = 0.20, math.radians(12.0)
-"""How near the v-bot the r-bot must come in truth: the arbiter's 0.15 m and 10° (switch.*), and the pose's error."""
+"""Largest true distance from r-bot to v-bot at the goal: the arbiter's 0.15 m and 10° (switch.*) plus the pose error.
+"""
 SPARE_M = 0.05
-"""A goal is reachable when the footprint with this much to spare on every side gets there."""
+"""A goal is reachable if the footprint with this margin on every side can get there."""
 TURNING_RAD_S = 0.1
-"""Slower than this the robot does not count as turning when changes of direction are counted."""
+"""Below this yaw rate the robot does not count as turning when changes of direction are counted."""
 LET_GO_M = 0.1
-"""A contact with a person is over when they are this far apart again."""
+"""A contact with a person ends when they are this far apart again."""
 OPERATOR_M_S = 0.4
 
 
 @dataclass
 class Episode:
-    """What came of one drive."""
+    """Result of one drive."""
 
     index: int
     people: int
@@ -63,31 +66,31 @@ class Episode:
     optimum_m: float = math.inf
     driven_m: float = 0.0
     contacts: int = 0
-    """Times that the robot touched a wall or a thing."""
+    """Number of contacts of the robot with a wall or an object."""
     people_contacts: int = 0
-    """Times that the robot drove into a person."""
+    """Number of times the robot drove into a person."""
     people_into_robot: int = 0
-    """Times that a person walked into the robot, which stood or drove off."""
+    """Number of times a person walked into the robot while it stood or drove away."""
     yaw_rate_changes: int = 0
-    """Sign changes of the yaw rate, above TURNING_RAD_S either way."""
+    """Sign changes of the yaw rate beyond TURNING_RAD_S on both sides."""
     clearance_m: float = math.inf
-    """Nearest that the true footprint came to anything that stands still."""
+    """Smallest distance of the true footprint from any static object."""
     reason: str = ""
-    """The follower's last words where the goal was not reached."""
+    """The follower's last message if the goal was not reached."""
     planner_ms: list[float] = field(default_factory=list)
     controller_ms: list[float] = field(default_factory=list)
     costmap_ms: list[float] = field(default_factory=list)
     tracks: dict[str, list[list[float]]] = field(default_factory=dict)
-    """Of ``robot``, ``vbot`` and each person, for the plot."""
+    """Tracks of ``robot``, ``vbot`` and each person, for the plot."""
 
     @property
     def ratio(self) -> float:
-        """Metres driven for each metre of the shortest way."""
+        """Distance driven over the length of the shortest path."""
         return self.driven_m / self.optimum_m
 
 
 class _TimedPlanner(HybridPlanner):
-    """Keeps the CPU time of each plan."""
+    """Records the CPU time of each plan."""
 
     def __init__(self) -> None:
         super().__init__(PlannerConfig(), Footprint())
@@ -101,7 +104,7 @@ class _TimedPlanner(HybridPlanner):
 
 
 class _Drive:
-    """One episode in the making."""
+    """One running episode."""
 
     def __init__(self, seed: int, index: int) -> None:
         self.rng = np.random.default_rng([seed, index])
@@ -139,7 +142,7 @@ class _Drive:
         self.plan_reason = ""
 
     def _map(self) -> StaticMap:
-        """What SLAM would have drawn: walls, free within, unknown without; nothing of the things in the room."""
+        """Map as SLAM would build it: walls, free inside, unknown outside; without the objects in the room."""
         walls = worlds.filled(self.room.shapes[self.room.kinds == 0], self.room.size, 0.05, worlds.IN_THE_WAY_M)
         occupancy = np.full(walls.cells.shape, -1, dtype=np.int8)
         centres = [walls.origin[i] + (np.arange(walls.cells.shape[1 - i]) + 0.5) * 0.05 for i in (0, 1)]
@@ -185,7 +188,7 @@ class _Drive:
         return float(np.hypot(gap[0], gap[1])) <= REACHED_M and abs(wrap_angle(float(gap[2]))) <= REACHED_RAD
 
     def _step(self, k: int) -> None:
-        """A twentieth of a second: people, sensors, the nodes in their order, and the robot."""
+        """Advance by a twentieth of a second: people, sensors, the nodes in their order, and the robot."""
         for person in self.people:
             worlds.walk(self.room, person, self.robot.pose, DT_S, self.rng)
             if k % 4 == 0:
@@ -196,7 +199,7 @@ class _Drive:
             self._see(estimate, publish=k % 4 == 0)
         assert self.costmap is not None and self.published is not None
         command = self._operator()
-        self.vbot.step(command, estimate, DT_S)  # its route leads round the walls
+        self.vbot.step(command, estimate, DT_S)  # its route avoids the walls
         prediction = self.predictor.predict(self.vbot.pose, self.vbot.velocity, command, self.costmap)
         subgoal = choose_subgoal(self.costmap, self.vbot.pose, prediction, command[0] >= 0, self.walls, SubgoalConfig())
         wanted = (0.0, 0.0)
@@ -217,7 +220,9 @@ class _Drive:
         self._move(sent)
 
     def _operator(self) -> tuple[float, float]:
-        """Steers the v-bot along its route: turns towards a point 0.4 m ahead and drives; hands off at the end."""
+        """Steer the v-bot along its route: turn towards a point 0.4 m ahead and drive; release the controls at the
+        goal.
+        """
         pose, route = self.vbot.pose, self.room.route
         if float(np.linalg.norm(route[-1] - pose[:2])) < 0.1:
             return 0.0, 0.0
@@ -250,7 +255,7 @@ class _Drive:
         self.seen = np.concatenate([hits, sweep.nearest])
 
     def _close_points(self, estimate: FloatArray) -> FloatArray:
-        """What the collision monitor is given (``Arbiter`` does the same)."""
+        """Points for the collision monitor (``Arbiter`` selects the same ones)."""
         assert self.costmap is not None
         c, s = math.cos(estimate[2]), math.sin(estimate[2])
         seen = (self.seen - estimate[:2]) @ np.array([[c, -s], [s, c]])
@@ -271,7 +276,7 @@ class _Drive:
                 self.touching.discard(i)
             elif gap <= 0.0 and i not in self.touching:
                 self.touching.add(i)
-                # Whose doing it is: had the robot stood still, would they be as near?
+                # Who caused the contact: would they be as close if the robot had not moved?
                 closer = worlds.gap_to_robot(person.place, before)[0] - gap
                 if closer > 0.05 * DT_S:
                     self.episode.people_contacts += 1
@@ -279,7 +284,7 @@ class _Drive:
                     self.episode.people_into_robot += 1
 
     def _clearance(self, pose: FloatArray) -> float:
-        """Metres from the footprint's outline to the nearest thing that stands still."""
+        """Distance in metres from the footprint's outline to the nearest static object."""
         outline = Footprint(worlds.LENGTH_M, worlds.WIDTH_M).points(0.05)
         c, s = math.cos(pose[2]), math.sin(pose[2])
         index = self.mask.index(outline @ np.array([[c, s], [-s, c]]) + pose[:2])
@@ -288,12 +293,12 @@ class _Drive:
 
 
 def run_episode(seed: int, index: int) -> Episode:
-    """One drive; the same for the same seed and index, times apart."""
+    """Run one drive; the same seed and index give the same result, except for times."""
     return _Drive(seed, index).run()
 
 
 def prepare() -> None:
-    """Compiles the kernels, so that no episode counts that time."""
+    """Compile the kernels, so that no episode includes the compile time."""
     warm_up()
     drive = _Drive(0, 0)
     for k in range(8):
@@ -303,11 +308,11 @@ def prepare() -> None:
 def evaluate(
     episodes: int, seed: int, jobs: int, on_episode: Callable[[Episode], None] | None = None, timeout_s: float = 3600.0
 ) -> list[Episode]:
-    """Drives all episodes, ``jobs`` at a time, each in a process of its own where more than one.
+    """Run all episodes, ``jobs`` in parallel; with more than one job, each in its own process.
 
     Raises:
-        ValueError: nothing to do.
-        TimeoutError: they took longer than ``timeout_s``.
+        ValueError: no episodes.
+        TimeoutError: the episodes took longer than ``timeout_s``.
         RuntimeError: a process died.
     """
     from concurrent.futures import as_completed
@@ -389,7 +394,7 @@ def _of(measure: Callable[[FloatArray], Any], values: FloatArray) -> float:
 
 
 def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
-    """The summary, and each episode without its tracks and times, as JSON takes it."""
+    """The summary and each episode without its tracks and times, ready for JSON."""
     left_out = {"tracks", "planner_ms", "controller_ms", "costmap_ms"}
     rows = []
     for episode in episodes:
@@ -402,7 +407,7 @@ def report(episodes: list[Episode], seed: int) -> dict[str, Any]:
 
 
 def plot(episodes: list[Episode], seed: int, path: Path, most: int = 12) -> None:
-    """A sheet of episodes as PNG, the worst first: contacts, goals not reached, long ways."""
+    """Write a PNG overview of episodes, the worst first: contacts, goals not reached, long paths."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle

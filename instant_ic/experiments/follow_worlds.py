@@ -1,7 +1,7 @@
-"""Rooms for ``ic evaluate follow``: walls with doors, boxes, low and hanging things, people; a LiDAR in them.
+"""Rooms for ``ic evaluate follow``: walls with doors, boxes, low and hanging objects, people; and a simulated LiDAR.
 
-Everything here is worked out from the shapes themselves and shares no code with what is measured: the LiDAR, the
-contact with people, and the shortest way for the true footprint.
+Everything is computed from the shapes themselves and shares no code with the code under evaluation: the LiDAR, contacts
+with people, and the shortest path of the true footprint.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ RANGE_MIN_M, RANGE_MAX_M = 0.40, 30.0
 SCAN_BAND_M = (0.10, 1.30)
 """Heights of the flat scan (config/lidar.yaml)."""
 IN_THE_WAY_M = (0.05, 1.25)
-"""Heights in which a thing is run into: the crawler with its mast."""
+"""Height range in which an object blocks the robot: the crawler with its mast."""
 LENGTH_M, WIDTH_M = 0.60, 0.50
 WALL_M = 0.10
 PERSON_M = 0.22
 """Radius of a person."""
 KINDS = ("wall", "box", "low", "hanging")
 BLIND_M = LIDAR_HEIGHT_M / math.tan(math.radians(15.0))
-"""Nearer than this the lowest beam of a standing VLP-16 does not reach the floor."""
+"""Within this distance the lowest beam of a standing VLP-16 does not reach the floor."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Room:
     """A floor plan with heights.
 
     Attributes:
-        size: (2,) metres; the room reaches from (0, 0) to here.
+        size: (2,) metres; the room extends from (0, 0) to this corner.
         shapes: (N, 7) centre x, y, half length, half width, yaw, lowest and highest z.
         kinds: (N,) index into KINDS.
         start: (3,) pose of the r-bot.
-        goal: (2,) where the v-bot is driven.
-        route: (M, 2) the v-bot's way there: round walls, through everything else.
+        goal: (2,) goal of the v-bot.
+        route: (M, 2) the v-bot's path to the goal: around walls, through everything else.
     """
 
     size: FloatArray
@@ -60,13 +60,13 @@ class Room:
 
 @dataclass
 class Person:
-    """Somebody who walks from place to place.
+    """A person who walks from place to place.
 
     Attributes:
         place: (2,) metres.
-        target: (2,) where to.
+        target: (2,) current destination.
         speed: m/s.
-        looks: stops before a robot in the way; else walks on, into it.
+        looks: True: stops before a robot in the way; False: walks into it.
     """
 
     place: FloatArray
@@ -78,7 +78,7 @@ class Person:
 
 
 def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[float, float]) -> OccupancyMask:
-    """Cells whose centre lies in a shape that reaches into a band of heights."""
+    """Cells whose centre lies in a shape that overlaps the height range ``band``."""
     margin = 0.5
     columns, rows = np.ceil((size + 2 * margin) / cell_m).astype(int)
     x = -margin + (np.arange(columns) + 0.5) * cell_m
@@ -100,10 +100,10 @@ def filled(shapes: FloatArray, size: FloatArray, cell_m: float, band: tuple[floa
 
 
 def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> Room:
-    """A random room in which the goal is at least 5 m from the start, by a way round the walls.
+    """Generate a random room whose goal is at least 5 m from the start, by a path around the walls.
 
     Raises:
-        ValueError: no such room came up within ``attempts``.
+        ValueError: no such room found within ``attempts``.
     """
     for _ in range(attempts):
         size = np.array([rng.uniform(8.0, 12.0), rng.uniform(7.0, 10.0)])
@@ -115,11 +115,11 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
             shapes.append(_thing(rng, size, kind))
             kinds.append(kind)
         every = np.array(shapes)
-        # What stands in the start or in the goal is taken away.
+        # Remove objects at the start and the goal.
         start = np.array([*rng.uniform([0.8, 0.8], size - 0.8), rng.uniform(-math.pi, math.pi)])
         goal = rng.uniform([0.8, 0.8], size - 0.8)
-        # A robot that has driven to its start has seen what is low round it. One that is put there has not: no beam
-        # reaches that, and nobody could drive by it.
+        # A robot that drove to its start has seen the low objects around it. A robot placed there has not: no beam
+        # reaches them, so no planner could avoid them.
         clear = np.array(
             [
                 k == 0 or (_away(s, start[:2]) > (BLIND_M if KINDS[k] == "low" else 0.6) and _away(s, goal) > 0.6)
@@ -144,7 +144,7 @@ def _walls(rng: np.random.Generator, size: FloatArray) -> tuple[list[Sequence[fl
         (0.0, h / 2, half, h / 2 + half, 0.0, 0.0, 2.5),
         (w, h / 2, half, h / 2 + half, 0.0, 0.0, 2.5),
     ]
-    for _ in range(int(rng.integers(0, 3))):  # walls across, each with a door
+    for _ in range(int(rng.integers(0, 3))):  # walls across the room, each with a door
         across = rng.random() < 0.5
         length, other = (h, w) if across else (w, h)
         at = rng.uniform(2.5, other - 2.5)
@@ -161,7 +161,7 @@ def _thing(rng: np.random.Generator, size: FloatArray, kind: int) -> Sequence[fl
     x, y = rng.uniform([0.4, 0.4], size - 0.4)
     half_x, half_y = rng.uniform(0.1, 0.45), rng.uniform(0.1, 0.45)
     if rng.random() < 0.2:
-        half_x = half_y = rng.uniform(0.03, 0.06)  # a post, a table's leg
+        half_x = half_y = rng.uniform(0.03, 0.06)  # a post or a table leg
     low, high = {1: (0.0, rng.uniform(0.4, 1.8)), 2: (0.0, rng.uniform(0.08, 0.25)), 3: (rng.uniform(0.75, 1.1), 2.0)}[
         kind
     ]
@@ -200,7 +200,7 @@ def look(room: Room, people: Sequence[Person], pose: FloatArray, rng: np.random.
 
 
 def flat_ranges(points: FloatArray) -> FloatArray:
-    """What the driver's ``/scan`` says: (BEAMS,) nearest point within ``SCAN_BAND_M``; +inf where there is none."""
+    """Equivalent of the driver's ``/scan``: (BEAMS,) nearest point within ``SCAN_BAND_M``; +inf if there is none."""
     z = points[:, 2] + LIDAR_HEIGHT_M
     band = points[(z >= SCAN_BAND_M[0]) & (z <= SCAN_BAND_M[1])]
     beams = np.floor((np.arctan2(band[:, 1], band[:, 0]) + math.pi) * BEAMS / (2 * math.pi)).astype(int) % BEAMS
@@ -212,7 +212,7 @@ def flat_ranges(points: FloatArray) -> FloatArray:
 
 @njit(cache=True)
 def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untyped-def]
-    """Horizontal distance (A, R) to the first thing along each azimuth and ring; inf for none."""
+    """Horizontal distance (A, R) to the first object along each azimuth and ring; inf for none."""
     out = np.full((angles.shape[0], slopes.shape[0]), np.inf)
     for a in range(angles.shape[0]):
         dx, dy = math.cos(yaw + angles[a]), math.sin(yaw + angles[a])
@@ -264,7 +264,7 @@ def _cast(shapes, circles, x, y, yaw, angles, slopes):  # type: ignore[no-untype
 
 
 def add_people(room: Room, rng: np.random.Generator, count: int) -> list[Person]:
-    """People at least 2 m from the robot; one in three does not look where he goes."""
+    """Add people at least 2 m from the robot; one in three does not look where they walk."""
     people = []
     for _ in range(count):
         place = free_place(room, rng)
@@ -275,7 +275,7 @@ def add_people(room: Room, rng: np.random.Generator, count: int) -> list[Person]
 
 
 def free_place(room: Room, rng: np.random.Generator) -> FloatArray:
-    """A place (2,) at least 0.4 m from every shape that stands on the ground or hangs low."""
+    """Random position (2,) at least 0.4 m from every shape that stands on the ground or hangs low."""
     while True:
         place = rng.uniform([0.5, 0.5], room.size - 0.5)
         if min(_away(s, place) for s in room.shapes) > 0.4:
@@ -283,7 +283,7 @@ def free_place(room: Room, rng: np.random.Generator) -> FloatArray:
 
 
 def walk(room: Room, person: Person, robot: FloatArray, dt_s: float, rng: np.random.Generator) -> None:
-    """Moves a person by ``dt_s``; one who looks stops half a metre before the robot, and turns round after 3 s."""
+    """Move a person by ``dt_s``. One who looks stops half a metre before the robot, and turns around after 3 s."""
     way = person.target - person.place
     distance = float(np.linalg.norm(way))
     if distance < 0.2 or person.waited_s > 3.0:
@@ -293,12 +293,12 @@ def walk(room: Room, person: Person, robot: FloatArray, dt_s: float, rng: np.ran
     step = heading * person.speed * dt_s
     ahead = person.place + heading * (PERSON_M + 0.1)
     if min(_away(s, ahead) for s in room.shapes) < PERSON_M:
-        person.target = free_place(room, rng)  # a wall: somewhere else
+        person.target = free_place(room, rng)  # blocked by a wall: choose another destination
         return
     gap, direction = gap_to_robot(person.place, robot)
     in_the_way = float(direction @ heading) > 0.0
     if in_the_way and (gap < 0.5 if person.looks else gap <= 0.0):
-        person.waited_s += dt_s  # who does not look stops when he has walked into it
+        person.waited_s += dt_s  # a person who does not look stops after walking into the robot
         return
     person.place = person.place + step
     person.waited_s = 0.0
@@ -330,10 +330,10 @@ _STEPS = np.array(
 def shortest_way(
     mask: OccupancyMask, start: FloatArray, goal: FloatArray, cell_m: float, margin_m: float
 ) -> FloatArray | None:
-    """Shortest way (N, 3) of the true footprint with ``margin_m`` to spare on every side; None where there is none.
+    """Shortest path (N, 3) of the true footprint with ``margin_m`` on every side; None if there is none.
 
-    Over 5 cm cells and 16 headings, with steps along the heading, both ways, and turns on the spot, which cost next to
-    nothing. Steps in 16 directions make a straight way at most 1.4 % longer than it is.
+    Search over 5 cm cells and 16 headings, with steps along the heading in both directions and turns on the spot at
+    nearly no cost. With 16 directions, a straight path is at most 1.4 % too long.
     """
     import cv2
 
@@ -356,7 +356,7 @@ def shortest_way(
         (np.stack([start[:2], goal[:2]]) - mask.origin) / step
     ).astype(int)[:, ::-1]
     turn = round(float(start[2]) / (math.pi / 8)) % 16
-    if not free[turn, start_row, start_column]:  # it stands there: the heading may be half a bin off
+    if not free[turn, start_row, start_column]:  # the robot stands there: its heading may be half a bin off
         fits = np.flatnonzero(free[:, start_row, start_column])
         if fits.size == 0:
             return None
@@ -372,7 +372,7 @@ def shortest_way(
 
 @njit(cache=True)
 def _dijkstra(free, steps, turn, row, column, goal_row, goal_column):  # type: ignore[no-untyped-def]
-    """Cells (N, 3) heading, row, column from the start to the goal at any heading; (0, 3) when there is no way."""
+    """Path cells (N, 3) heading, row, column from the start to the goal at any heading; (0, 3) if there is none."""
     headings, height, width = free.shape
     best = np.full(free.size, np.inf)
     parent = np.full(free.size, -1, dtype=np.int64)
@@ -401,7 +401,7 @@ def _dijkstra(free, steps, turn, row, column, goal_row, goal_column):  # type: i
                 price = 0.02
             if y < 0 or x < 0 or y >= height or x >= width or not free[other, y, x]:
                 continue
-            knight = k < 2 and abs(dx) + abs(dy) == 3  # it passes between two cells
+            knight = k < 2 and abs(dx) + abs(dy) == 3  # a knight's move passes between two cells
             if knight and not (free[h, r + dy // 2, c + dx // 2] and free[h, r + (dy + 1) // 2, c + (dx + 1) // 2]):
                 continue
             new = best[state] + price

@@ -1,6 +1,6 @@
-"""A bad network in user space: a TCP proxy with delay, jitter, limited rate, stalls and cuts, for tests and benchmarks.
+"""Simulated bad network in user space: a TCP proxy with delay, jitter, limited rate, stalls and outages.
 
-It acts on the byte stream, so what a lost packet looks like to TCP's users is a stall: everything behind it waits.
+It acts on the byte stream. TCP users see a lost packet as a stall: everything behind it waits.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from typing import Self
 
 @dataclass(frozen=True)
 class Impairment:
-    """What the network does to each direction.
+    """Impairment of each direction.
 
     Attributes:
         delay_s: one way.
-        jitter_s: added to it, uniform in ±; the order of bytes is kept.
+        jitter_s: added to the delay, uniform in ±; the order of bytes is kept.
         rate_bytes_s: 0 is unlimited.
-        stall_share: share of segments that wait ``stall_s``, as one does whose packet was lost.
-        stall_s: a retransmission's time.
-        queue_bytes: of a router; when it is full the sender is held up.
+        stall_share: share of segments delayed by ``stall_s``, like a segment whose packet was lost.
+        stall_s: duration of a retransmission.
+        queue_bytes: router queue; when it is full the sender is blocked.
     """
 
     delay_s: float = 0.0
@@ -53,11 +53,11 @@ class _Way:
 
 
 class ImpairedLink:
-    """Listens on a port of its own and forwards to ``target``; a context manager.
+    """Context manager that listens on its own port and forwards to ``target``.
 
     Args:
         target: host and port.
-        impairment: of both directions; may be exchanged while it runs.
+        impairment: of both directions; may be replaced while the link runs.
         host, port: address to listen on; port 0 takes a free one.
         seed: of jitter and stalls.
     """
@@ -83,14 +83,14 @@ class ImpairedLink:
         self._thread = threading.Thread(target=self._run, name="impaired link", daemon=True)
 
     def __enter__(self) -> Self:
-        """Starts it."""
+        """Start the link."""
         self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends it and every connection."""
+        """Stop the link and close every connection."""
         self._stop.set()
         self._thread.join(5)
         self._listener.close()
@@ -98,19 +98,19 @@ class ImpairedLink:
 
     @property
     def connections(self) -> int:
-        """How many connections there are now."""
+        """Number of open connections."""
         return len(self._ways) // 2
 
     def stall(self, seconds: float) -> None:
-        """Nothing moves for a while; no byte is lost."""
+        """Stop forwarding for a while; no byte is lost."""
         self._stalled_until = time.monotonic() + seconds
 
     def cut(self) -> None:
-        """A hole: bytes vanish, nobody is told, new connections get no answer; until :meth:`mend`."""
+        """Simulate an outage until :meth:`mend`: bytes are dropped silently, and new connections get no answer."""
         self._cut = True
 
     def mend(self) -> None:
-        """The network is back; connections that were there stay dead, as after a long outage."""
+        """End the outage; earlier connections stay dead, as after a long outage."""
         self._drop_all()
         self._cut = False
 
@@ -126,7 +126,7 @@ class ImpairedLink:
             near.close()
             return
         try:
-            far = socket.create_connection(self.target, timeout=0.5)  # everybody else waits meanwhile
+            far = socket.create_connection(self.target, timeout=0.5)  # blocks all other connections meanwhile
         except OSError:
             near.close()
             return
@@ -213,7 +213,7 @@ class ImpairedLink:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one until it is ended: ``python -m instant_ic.experiments.impaired_link 7451 10.0.0.1 7450``."""
+    """Run a link until it is stopped: ``python -m instant_ic.experiments.impaired_link 7451 10.0.0.1 7450``."""
     import argparse
 
     parser = argparse.ArgumentParser(description="TCP proxy that behaves as a bad network.")

@@ -1,4 +1,4 @@
-"""Pictures for people: what was seen beside what was made of it."""
+"""Comparison images for reports: input next to result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from instant_ic.geometry.projections import perspective_directions, sample_equir
 def perspective_crop(
     panorama: NDArray[np.uint8], camera_from_view: NDArray[np.float64], width: int, height: int, hfov_rad: float
 ) -> NDArray[np.uint8]:
-    """What a pinhole camera at the panorama's centre would show.
+    """Pinhole view from the panorama's centre.
 
     Args:
         panorama: (H, W, 3).
@@ -28,20 +28,20 @@ def perspective_crop(
 
 
 def psnr_db(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Peak signal-to-noise ratio of two 8-bit pictures, dB; inf where they are equal."""
+    """Peak signal-to-noise ratio of two 8-bit images, dB; inf if they are equal."""
     error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
     return float("inf") if error == 0 else 10 * float(np.log10(255.0**2 / error))
 
 
 def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Pearson's correlation of two pictures' values, −1..1; 0 where one of them is uniform."""
+    """Pearson correlation of two images' values, −1..1; 0 if one of them is uniform."""
     x, y = (picture.astype(np.float64).ravel() - float(picture.mean()) for picture in (a, b))
     norm = float(np.sqrt((x @ x) * (y @ y)))
     return float(x @ y) / norm if norm > 0 else 0.0
 
 
 def save_view_strip(path: Path, rows: Sequence[tuple[str, NDArray[np.uint8], NDArray[np.uint8]]]) -> None:
-    """Rows of (label, rendered view, the photo's own crop), side by side."""
+    """Save rows of (label, rendered view, crop of the photo), side by side."""
     figure, axes = new_figure(len(rows), 2, (10.0, 2.95 * len(rows)))
     for (label, view, crop), (left, right) in zip(rows, axes, strict=True):
         for axis, picture, title in ((left, view, f"virtual space, {label}"), (right, crop, "photo")):
@@ -52,7 +52,7 @@ def save_view_strip(path: Path, rows: Sequence[tuple[str, NDArray[np.uint8], NDA
 
 
 def save_depth(path: Path, panorama: NDArray[np.uint8], depth_m: NDArray[np.float32], title: str) -> None:
-    """The panorama above its depth in colours with a scale in metres; unknown depth is grey."""
+    """Save the panorama above its depth in colours with a scale in metres; unknown depth is grey."""
     import matplotlib
 
     figure, axes = new_figure(2, 1, (9.0, 9.4))
@@ -76,11 +76,11 @@ def save_map(
     robot: tuple[float, float, float] | None = None,
     paths: dict[str, NDArray[np.float64]] | None = None,
 ) -> None:
-    """An occupancy grid (−1 unknown, 0..100) with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
+    """Save an occupancy grid (−1 unknown, 0..100) with the robot's pose (x, y, yaw) and named paths (N, ≥2)."""
     figure, axes = new_figure(1, 1, (7.0, 7.0))
     axis = axes[0, 0]
-    # Three tones by where the evidence points, a little by how strong it is: one look of a standing robot is weak
-    # evidence everywhere, and would be grey on grey.
+    # Three tones by the sign of the evidence, shaded slightly by its strength: a standing robot provides weak evidence
+    # everywhere, which a linear scale would show as grey on grey.
     shade = np.where(grid < 50, 1.0 - 0.15 * grid / 50.0, 0.35 * (100 - grid) / 50.0)
     shade = np.where(grid < 0, 0.7, shade)
     height, width = grid.shape
@@ -106,7 +106,7 @@ def save_map(
 
 
 def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any, NDArray[Any]]:
-    """A figure of ``size`` inches and its axes (rows, columns); it draws without a display."""
+    """A figure of ``size`` inches and its axes (rows, columns); needs no display."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -116,6 +116,6 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Any,
 
 
 def save_figure(figure: Any, path: Path) -> None:
-    """Writes a figure, and its folder where there is none."""
+    """Write a figure, creating its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

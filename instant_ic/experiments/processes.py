@@ -1,4 +1,4 @@
-"""A pool of processes none of which outlives its block, at whatever stage of its start-up the block ends."""
+"""A process pool that leaves no process behind when its block ends, at any stage of start-up."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
 _GONE_S = 30.0
-"""A killed process is gone at once; longer means that the kernel holds it (a hung file system)."""
+"""A killed process is normally gone at once; a longer wait means that the kernel holds it (a hung file system)."""
 
 
 class _Spawned(SpawnContext):
-    """Spawns processes and keeps each, also one whose start an interrupt cut short."""
+    """Spawns processes and keeps track of each, including one whose start was interrupted."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -32,18 +32,18 @@ class _Spawned(SpawnContext):
 
 @contextlib.contextmanager
 def process_pool(count: int, prepare: Callable[[], None]) -> Iterator[ProcessPoolExecutor]:
-    """Yield a pool of ``count`` processes, each of which calls ``prepare`` first; all are gone when the block is left.
+    """Yield a pool of ``count`` processes that call ``prepare`` first; all are gone when the block is left.
 
-    They are killed: SIGTERM waits where a process is stopped, and does nothing where this program was started with it
-    ignored. That a process is gone is read from its sentinel: the pool's own thread may have collected the exit status
-    first, and ``exitcode`` is None then for a moment.
+    The processes are killed: SIGTERM has no effect on a stopped process, or if this program was started with SIGTERM
+    ignored. The sentinel shows that a process is gone: the pool's own thread may have collected the exit status first,
+    and ``exitcode`` is then None for a moment.
 
     Raises:
         RuntimeError: at the end of the block, a process is still there ``30 s`` after it was killed.
     """
     context = _Spawned()
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_begin, initargs=(prepare,))
-    # With this end open, the pool's thread would wait for ever for the rest of a result that a killed process began.
+    # If this end stayed open, the pool's thread would wait for ever for the rest of a killed process's partial result.
     results = pool._result_queue._writer  # type: ignore[attr-defined]
     try:
         yield pool
@@ -68,13 +68,13 @@ def _wait_until_gone(processes: list[SpawnProcess]) -> None:
 
 
 def _begin(prepare: Callable[[], None]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to all: the one that collects ends the others
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes: the collecting one stops the others
     threading.Thread(target=_end_with_parent, daemon=True).start()
     prepare()
 
 
 def _end_with_parent() -> None:
-    """A parent that was killed can end nobody."""
+    """Exit when the parent dies, because a killed parent cannot stop its children."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

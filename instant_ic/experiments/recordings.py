@@ -1,8 +1,8 @@
 """Real recordings through the real nodes: a LiDAR capture to a map, a panorama photo to a virtual space.
 
 The simulated devices send the recordings over the devices' own protocols, so every driver and node runs as with the
-hardware. Photo and capture are taken to be from different places, so the photo's depth is taken in the model's own
-metres and the LiDAR is not asked (``trust_depth:=true`` of ``launch/sim.yaml``); the summary tells it.
+hardware. Photo and capture are assumed to be from different places. The photo's depth is therefore used in the model's
+own metres, without LiDAR scaling (``trust_depth:=true`` of ``launch/sim.yaml``); the summary states this.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from instant_ic.pace import read as read_pace
 
 _YAWS_DEG = (0, 90, 180, -90)
 _AHEAD_M = 0.4
-"""The last two views are taken from so far beside the photo's place: what the estimated depth makes of it."""
+"""Distance in metres of the last two views from the photo's position, to show the effect of the estimated depth."""
 _WIDTH, _HEIGHT, _FOV = 640, 360, math.radians(90)
 
 
@@ -48,24 +48,24 @@ def evaluate_recordings(
     same_place: bool = False,
     pace: float = 1.0,
 ) -> dict[str, Any]:
-    """Runs ``launch/sim.yaml`` on recordings and writes a bag, pictures and a summary into ``out``.
+    """Run ``launch/sim.yaml`` on recordings; write a bag, images and a summary to ``out``.
 
-    Writes ``bag/`` (rosbag2 MCAP), ``view.png`` (trained view beside the photo's own crop), ``depth.png``,
-    ``map.png``, ``launch.log`` and ``summary.json``, whose content is returned.
+    Writes ``bag/`` (rosbag2 MCAP), ``view.png`` (trained view beside the photo's own crop), ``depth.png``, ``map.png``,
+    ``launch.log`` and ``summary.json``, whose content is returned.
 
     Args:
         pcap: VLP-16 capture.
         panorama: equirect photo.
-        out: folder for what is written.
-        timeout_s: for all of it, in seconds of the stack.
-        tell: called with what is waited for.
-        same_place: photo and capture are of one place and moment: the depth is scaled by the LiDAR, as on the robot.
+        out: output folder.
+        timeout_s: total time limit, in seconds of the stack.
+        tell: called with a description of each wait.
+        same_place: photo and capture are from the same place and time: the LiDAR scales the depth, as on the robot.
         pace: of the stack's time, see :mod:`instant_ic.pace`.
 
     Raises:
         FileNotFoundError: a recording is missing.
-        FileExistsError: ``out`` holds a bag already.
-        StackError: a step did not come about in time.
+        FileExistsError: ``out`` already holds a bag.
+        StackError: a step was not completed in time.
     """
     for path in (pcap, panorama):
         if not path.is_file():
@@ -73,7 +73,7 @@ def evaluate_recordings(
     if (out / "bag").exists():
         raise FileExistsError(f"{out}/bag exists already: choose another folder or take it away")
     out.mkdir(parents=True, exist_ok=True)
-    # Sockets need a short path, which `out` may not be.
+    # Sockets need a short path; `out` may be longer.
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     arguments = {
         **free_ports(),
@@ -125,7 +125,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
 
     wait(is_ready, "a virtual space that is fit to show")
     time_to_ready_s = float(statuses[-1].ready_seconds)
-    # A little longer than fit to show: what an operator sees after the first moments.
+    # Slightly later than ready: the quality an operator sees after the first moments.
     settled = time.monotonic() + 10.0 / stack.pace
     wait(lambda: time.monotonic() > settled, "ten more seconds of training")
     keyframe = keyframes[-1]
@@ -143,7 +143,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
 
         def view_of(number: int = number, request: Any = request) -> Any:
             nonlocal next_try
-            if time.monotonic() > next_try:  # asked again: only the newest request is served
+            if time.monotonic() > next_try:  # repeat the request: only the newest one is served
                 next_try = time.monotonic() + 2.0
                 requests.publish(request)
             return next((v for v in views if v.request_id == number), None)
@@ -154,7 +154,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
         camera_from_view = (inverse(map_from_camera) @ map_from_view)[:3, :3]
         crop = perspective_crop(photo, camera_from_view, rendered.shape[1], rendered.shape[0], _FOV)
         if ahead_m:
-            # Nothing to compare with: the photo was taken elsewhere.
+            # No reference image: the photo was taken elsewhere.
             rows.append((f"{yaw_deg}°, {ahead_m} m ahead of the photo's place", rendered, crop))
             continue
         scores[str(yaw_deg)] = round(psnr_db(rendered, crop), 2)

@@ -1,11 +1,11 @@
-"""SLAM on a log: trajectory, relation error, CPU time a scan.
+"""SLAM on a log: trajectory, relation error, CPU time per scan.
 
-The relation metric is that of Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 2009: a
-relation says how the robot's pose at one time, checked by a person, lay to that at another; the error is what remains
-of `inverse(relation) ∘ relative(estimate)`. It does not punish an early error again in every later pose.
+The relation metric is that of Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 2009. A
+relation is the robot's pose at one time relative to another, verified by a person. The error is the residual of
+`inverse(relation) ∘ relative(estimate)`. An early error does not count again in every later pose.
 
-The trajectory that is measured is the final one, as is usual with this metric: each scan hangs on its keyframe, and
-goes where the last optimisation put that. The poses as they were told online are kept beside it.
+The final trajectory is evaluated, as is usual with this metric: each scan is attached to its keyframe and moves with it
+in the last optimisation. The poses published online are kept beside it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from instant_ic.slam.scan import FloatArray
 
 @dataclass(frozen=True)
 class Relations:
-    """Checked relations: times in seconds (n, 2), relative planar poses (n, 3)."""
+    """Verified relations: times in seconds (n, 2), relative planar poses (n, 3)."""
 
     times_s: FloatArray
     poses: FloatArray
@@ -38,11 +38,11 @@ class Relations:
         return len(self.times_s)
 
     def near(self, times_s: FloatArray, tolerance_s: float) -> int:
-        """How many have both ends within ``tolerance_s`` of one of ``times_s`` (m,)."""
+        """Number of relations with both ends within ``tolerance_s`` of one of ``times_s`` (m,)."""
         return len(self.at_stamps(times_s, tolerance_s))
 
     def at_stamps(self, stamps_s: FloatArray, tolerance_s: float) -> Relations:
-        """Those whose both ends lie within ``tolerance_s`` of one of ``stamps_s`` (m,)."""
+        """Relations with both ends within ``tolerance_s`` of one of ``stamps_s`` (m,)."""
         stamps = np.sort(stamps_s)
         if len(stamps) == 0:
             return Relations(self.times_s[:0], self.poses[:0])
@@ -73,7 +73,7 @@ def _read_columns(path: str | Path, count: int, what: str) -> FloatArray:
 
 
 def read_relations(path: str | Path) -> Relations:
-    """A `.relations` file: ``t1 t2 x y z roll pitch yaw`` a line.
+    """Read a `.relations` file: ``t1 t2 x y z roll pitch yaw`` per line.
 
     Raises:
         LogError: with the line number.
@@ -83,7 +83,7 @@ def read_relations(path: str | Path) -> Relations:
 
 
 def read_stamps(path: str | Path) -> FloatArray:
-    """Times in seconds, one a line, (n,)."""
+    """Read times in seconds, one per line, (n,)."""
     return _read_columns(path, 1, "a stamp")[:, 0]
 
 
@@ -95,7 +95,7 @@ class RelationError:
     rotation_deg: FloatArray
 
     def summary(self) -> dict[str, float | int]:
-        """Mean, standard deviation, median, largest."""
+        """Mean, standard deviation, median and maximum."""
         return {
             "translation_mean_m": float(self.translation_m.mean()),
             "translation_std_m": float(self.translation_m.std()),
@@ -108,7 +108,7 @@ class RelationError:
 
 
 def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> FloatArray:
-    """Poses (m, 3) at ``times_s`` (m,) of a trajectory ``t x y yaw`` (n, 4) with growing times; its ends are held."""
+    """Poses (m, 3) at ``times_s`` (m,) of a trajectory ``t x y yaw`` (n, 4), times ascending; clamped at its ends."""
     yaw = np.interp(times_s, trajectory[:, 0], np.unwrap(trajectory[:, 3]))
     x = np.interp(times_s, trajectory[:, 0], trajectory[:, 1])
     y = np.interp(times_s, trajectory[:, 0], trajectory[:, 2])
@@ -116,10 +116,10 @@ def interpolate_trajectory(trajectory: FloatArray, times_s: FloatArray) -> Float
 
 
 def relation_error(trajectory: FloatArray, relations: Relations) -> RelationError:
-    """Error of a trajectory ``t x y yaw`` (n, 4) against relations inside its time.
+    """Error of a trajectory ``t x y yaw`` (n, 4) against the relations within its time range.
 
     Raises:
-        ValueError: no relation is inside the trajectory's time.
+        ValueError: no relation is within the trajectory's time range.
     """
     inside = ((relations.times_s >= trajectory[0, 0] - 1e-3) & (relations.times_s <= trajectory[-1, 0] + 1e-3)).all(
         axis=1
@@ -141,17 +141,17 @@ def relation_error(trajectory: FloatArray, relations: Relations) -> RelationErro
 
 @dataclass(frozen=True)
 class LogResult:
-    """A log run through SLAM.
+    """Result of running SLAM on a log.
 
     Attributes:
-        trajectory: ``t x y yaw`` (n, 4), one row a scan, map_from_base after the last optimisation, seconds.
-        online: the same with the poses as they were told at once.
-        logger_s: the scans' times by the log's second time column (n,), NaN without one.
-        cpu_ms: CPU milliseconds of the scan thread for each scan (n,), with what it takes over from optimisation.
-        background_ms: CPU milliseconds of loop closing and optimisation that followed each scan (n,).
+        trajectory: ``t x y yaw`` (n, 4), one row per scan, map_from_base after the last optimisation, seconds.
+        online: the same with the poses published online.
+        logger_s: scan times by the log's second time column (n,), NaN without one.
+        cpu_ms: CPU milliseconds of the scan thread per scan (n,), including the transfer of optimisation results.
+        background_ms: CPU milliseconds of loop closure and optimisation after each scan (n,).
         scores: match score of each scan (n,).
-        statuses: how often each status came.
-        slam: the state at the end, for its map.
+        statuses: count of each status.
+        slam: the final state, with its map.
     """
 
     trajectory: FloatArray
@@ -179,7 +179,7 @@ class LogResult:
         }
 
     def relation_times(self, relations: Relations, tolerance_s: float) -> FloatArray:
-        """The scans' times (n,) in the clock that the relations are written in: the log may have two."""
+        """Scan times (n,) in the clock that the relations use; the log may have two."""
         own, logger = self.trajectory[:, 0], self.logger_s
         if np.isfinite(logger).all() and relations.near(logger, tolerance_s) > relations.near(own, tolerance_s):
             return logger
@@ -193,19 +193,19 @@ def run_log(
     use_wheel_odom: bool = True,
     on_scan: Callable[[int], None] | None = None,
 ) -> LogResult:
-    """Run SLAM over a log as fast as it goes; the background work is done between the scans.
+    """Run SLAM over a log as fast as possible; background work runs between the scans.
 
-    A scan whose stamp is not newer than the last one's (clocks of public logs repeat and step back) is taken for one
-    a millisecond later; the trajectory has its own stamp.
+    Clocks of public logs repeat and step back. SLAM gets a scan that is not newer than the previous one with a stamp
+    one millisecond after it; the trajectory keeps the original stamp.
 
     Args:
-        entries: of `instant_ic.slam.logs.read_log`, or anything like it.
+        entries: of `instant_ic.slam.logs.read_log`, or compatible.
         config: defaults when None.
-        use_wheel_odom: False leaves the log's odometry out.
-        on_scan: called with the number of scans done, for a progress bar.
+        use_wheel_odom: False ignores the log's odometry.
+        on_scan: called with the number of processed scans, for a progress bar.
 
     Raises:
-        LogError: no scan in it.
+        LogError: the log has no scan.
     """
     slam = make_slam(config)
     warm_up(config)
@@ -267,9 +267,9 @@ def _from_anchor(result: SlamResult) -> FloatArray:
 def perturb_odometry(
     entries: Iterable[LogEntry], seed: int, noise: float = 0.05, scale: float = 0.02
 ) -> Iterator[LogEntry]:
-    """The log with worse odometry: every step gets Gaussian noise of ``noise`` of its size, and all are too long.
+    """Degrade a log's odometry: Gaussian noise of ``noise`` times each step's size, plus a scale error.
 
-    Translation and rotation are too long, or too short, by ``scale``, which the seed decides for each.
+    Translation and rotation are each too long or too short by ``scale``; the seed decides which.
     """
     rng = np.random.default_rng(seed)
     signs = rng.choice([-1.0, 1.0], 2)
@@ -299,10 +299,10 @@ def evaluate_log(
     tolerance_s: float = 0.006,
     on_scan: Callable[[int], None] | None = None,
 ) -> tuple[dict[str, object], LogResult]:
-    """Run a log and measure it: figures for JSON, and the run itself.
+    """Run SLAM on a log and evaluate it: figures for JSON, and the run itself.
 
-    The figures of the final trajectory have the plain names; ``online_translation_mean_m`` and
-    ``online_rotation_mean_deg`` are of the poses as they were told at once.
+    Figures of the final trajectory have plain names; ``online_translation_mean_m`` and ``online_rotation_mean_deg``
+    refer to the poses published online.
     """
     result = run_log(entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
@@ -321,5 +321,5 @@ def evaluate_log(
 
 
 def write_trajectory(path: Path, trajectory: FloatArray) -> None:
-    """``t x y yaw`` a line, seconds, metres, radians."""
+    """Write ``t x y yaw`` per line, in seconds, metres and radians."""
     np.savetxt(path, trajectory, fmt=("%.6f", "%.5f", "%.5f", "%.6f"))

@@ -1,4 +1,4 @@
-"""Laser scans of a bag, with odometry and the laser's mount, as the log readers give them."""
+"""Laser scans of a bag, with odometry and the laser's mount, in the format of the log readers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SCAN, _ODOMETRY = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path looks like a bag: a folder, or a file with a bag's ending."""
+    """Whether a path looks like a bag: a folder, or a file with a bag's extension."""
     return path.is_dir() or path.suffix in (".mcap", ".db3")
 
 
@@ -27,15 +27,16 @@ def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_
     """Scans of a bag.
 
     Odometry comes from the bag's Odometry topic (``/wheel/odom`` before ``/odom`` before any other), interpolated to
-    the scan's stamp; the mount from ``/tf_static``. A scan outside the time of the odometry has none.
+    the scan's stamp; the mount from ``/tf_static``. A scan outside the odometry's time range has none.
 
     Args:
         path: bag folder or file.
         scan_topic: of type LaserScan; None: ``/scan``, or the only one.
-        base_frame: the robot's frame; where no transform leads to it, the laser is taken to stand in its middle.
+        base_frame: the robot's frame; without a transform to it, the laser is assumed to be mounted at the robot's
+            centre.
 
     Raises:
-        LogError: no bag, no such topic, or a scan that cannot be read.
+        LogError: not a bag, no such topic, or a malformed scan.
     """
     try:
         with BagReader(path) as bag:

@@ -1,7 +1,7 @@
 """SLAM on the simulated crawler: a round trip on slipping tracks, with the scans and encoders of the simulator.
 
-The robot of `instant_ic.sim` drives to waypoints and back, led by its true pose; its tracks lose a random share of
-their way. Scans are what the VLP-16's plane at 0° sees, 10 a second; odometry comes from the encoders alone.
+The robot of `instant_ic.sim` drives to waypoints and back, controlled by its true pose; its tracks lose a random share
+of their motion. Scans are taken in the VLP-16's plane at 0°, 10 per second; odometry comes from the encoders alone.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SCAN_STEPS = 5
 SPEED, TURN_SPEED = 0.5, 0.8
 
 ROUTE = ((0.0, 0.0), (3.0, 0.7), (5.0, 0.7), (10.8, 0.0), (10.8, 8.5), (10.8, 0.0), (5.0, 0.7), (3.0, 0.7), (0.0, 0.0))
-"""Up the simulator's corridor, past the obstacle, round the corner and back."""
+"""Along the simulator's corridor, past the obstacle, around the corner and back."""
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class RoundTrip:
 def round_trip(
     world: World, slip: float = 0.2, seed: int = 0, rounds: int = 2, route: Sequence[tuple[float, float]] = ROUTE
 ) -> RoundTrip:
-    """Drive ``route`` ``rounds`` times with tracks that lose ``slip`` (one standard deviation) of their way.
+    """Drive ``route`` ``rounds`` times with tracks that lose ``slip`` (one standard deviation) of their motion.
 
     Args:
         world: of `instant_ic.sim`.
-        slip: share of a track's way, 0..0.5.
+        slip: share of a track's motion, 0..0.5.
         seed: of slip and noise.
-        rounds: how often.
-        route: points to drive to, in the world.
+        rounds: number of rounds.
+        route: waypoints in the world.
 
     Raises:
-        ValueError: the robot ran into something.
+        ValueError: the robot hit something.
     """
     config = RobotConfig(slip=slip, turn_slip=slip)
     start = (*route[0], math.atan2(route[1][1] - route[0][1], route[1][0] - route[0][0]))
@@ -91,7 +91,7 @@ def round_trip(
 
 
 def _towards(pose: NDArray[np.floating], targets: list[tuple[float, float]]) -> tuple[float, float]:
-    """Speed and yaw rate to the first of ``targets``; reached ones are taken out."""
+    """Speed and yaw rate to the first of ``targets``; targets already reached are removed."""
     while targets and math.hypot(targets[0][0] - pose[0], targets[0][1] - pose[1]) < 0.15:
         targets.pop(0)
     if not targets:
@@ -119,7 +119,7 @@ def evaluate_round_trip(
     use_wheel_odom: bool = True,
     on_scan: Callable[[int], None] | None = None,
 ) -> tuple[dict[str, object], LogResult]:
-    """Run the trip and compare with the truth: figures for JSON, and the run itself."""
+    """Run SLAM on the trip and compare with ground truth: figures for JSON, and the run itself."""
     result = run_log(trip.entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     final_m, final_deg = trajectory_errors(result.trajectory[:, 1:], trip.truth)
     online_m, online_deg = trajectory_errors(result.online[:, 1:], trip.truth)

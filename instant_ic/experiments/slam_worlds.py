@@ -1,7 +1,7 @@
-"""Made-up buildings of plain walls, and logs of drives through them with their true poses.
+"""Generated buildings of plain walls, and logs of drives through them with ground-truth poses.
 
-They stand in for public logs that are not at hand: what they have is long loops, bare corridors, rooms that look
-alike, and the lasers of their time (180° and 361 beams, 240° and 4 m, 8 m maxima).
+They replace public logs that are not available. They have long loops, bare corridors, rooms that look alike, and the
+lasers of those logs (180° and 361 beams, 240° and 4 m, 8 m maxima).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Wall = tuple[float, float, float, float]
 
 @njit(cache=True)
 def cast_rays(walls, x, y, angles):  # type: ignore[no-untyped-def]
-    """Distance to the first wall along each angle (n,), inf where there is none; ``walls`` (m, 4): x0 y0 x1 y1."""
+    """Distance to the first wall along each angle (n,), inf if there is none; ``walls`` (m, 4): x0 y0 x1 y1."""
     out = np.full(angles.shape[0], np.inf)
     for i in range(angles.shape[0]):
         dx, dy = math.cos(angles[i]), math.sin(angles[i])
@@ -46,10 +46,10 @@ class Laser:
     """A planar laser.
 
     Attributes:
-        beams: a scan.
-        field_of_view_deg: 360 for one that turns all round.
+        beams: per scan.
+        field_of_view_deg: 360 for a full circle.
         range_max: metres; beyond it the beam has no return.
-        noise_m: one standard deviation.
+        noise_m: standard deviation (1σ).
         mount: base_from_laser (3,).
     """
 
@@ -61,7 +61,7 @@ class Laser:
 
     @property
     def angles(self) -> FloatArray:
-        """Of the beams in the laser's frame (n,)."""
+        """Beam angles in the laser's frame (n,)."""
         whole = self.field_of_view_deg >= 360
         span = math.radians(self.field_of_view_deg)
         step = span / (self.beams if whole else self.beams - 1)
@@ -79,7 +79,7 @@ LASERS = {
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive: scans with odometry, and where the robot truly was, (n, 3), in the frame of its first pose."""
+    """A drive: scans with odometry, and ground-truth poses (n, 3) in the frame of the first pose."""
 
     entries: list[LogEntry]
     truth: FloatArray
@@ -97,17 +97,17 @@ def drive(
     scale: float = 0.03,
     slip: float = 0.0,
 ) -> Drive:
-    """Drive from waypoint to waypoint, turning on the spot, a scan a step.
+    """Drive from waypoint to waypoint, turning on the spot, with one scan per step.
 
     Args:
         walls: of the world.
         waypoints: at least two.
         laser: see `LASERS`.
-        seed: of all that is random.
+        seed: of all random choices.
         step_m: between scans.
         step_rad: between scans while turning.
-        noise: of each odometry step, as part of its size, one standard deviation.
-        scale: largest systematic error of odometry, translation and rotation each, as part of the size.
+        noise: standard deviation (1σ) of each odometry step, relative to its size.
+        scale: largest systematic odometry error, relative, for translation and rotation each.
         slip: share of steps, 0..1, in which the tracks spin: the encoders count up to half as much again.
     """
     rng = np.random.default_rng(seed)
@@ -168,9 +168,9 @@ def _box(x: float, y: float, w: float, h: float) -> list[Wall]:
 def ring(
     seed: int = 0, width: float = 60.0, depth: float = 45.0, hall: float = 2.2
 ) -> tuple[list[Wall], list[tuple[float, float]]]:
-    """A ring of corridors with closed doors set back in niches and a few open rooms; driven round twice, once back.
+    """A ring of corridors with closed doors set back in niches and a few open rooms; driven twice, once in reverse.
 
-    The walk of the middle line is 2·(width + depth) long; nothing but niches tells one stretch from the next.
+    The centre line is 2·(width + depth) long; only the niches distinguish one stretch from the next.
     """
     rng = np.random.default_rng(seed)
     half = hall / 2
@@ -206,7 +206,7 @@ def ring(
 
 
 def cells(rooms: int = 9, room: float = 4.0, hall: float = 2.0) -> tuple[list[Wall], list[tuple[float, float]]]:
-    """A straight corridor with rooms to one side that are all the same, with the same furniture; some are visited."""
+    """A straight corridor with identical rooms on one side, identically furnished; some are visited."""
     length = rooms * room
     doors = [(k * room + 1.5, 1.0) for k in range(rooms)]
     walls = _line(0.0, 1.0, length, 1.0, doors) + _line(0.0, 1.0 - hall, length, 1.0 - hall)
@@ -227,7 +227,7 @@ def cells(rooms: int = 9, room: float = 4.0, hall: float = 2.0) -> tuple[list[Wa
 
 
 def office(seed: int = 0) -> tuple[list[Wall], list[tuple[float, float]]]:
-    """Two corridors joined by crossings, offices with furniture on both sides, driven in eights."""
+    """Two corridors joined by crossings, offices with furniture on both sides, driven in figures of eight."""
     rng = np.random.default_rng(seed)
     walls: list[Wall] = [(-1.0, -1.0, -1.0, 13.0), (31.0, -1.0, 31.0, 13.0)]
     crossings = [(0.0, 2.0), (14.0, 2.0), (30.0, 2.0)]
@@ -257,6 +257,6 @@ WORLDS = {"ring": ring, "cells": cells, "office": office}
 
 
 def trajectory_errors(estimate: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance in metres and angle in degrees of each pose (n, 3) from the truth (n, 3)."""
+    """Distance in metres and angle in degrees of each pose (n, 3) from ground truth (n, 3)."""
     rest = np.array([relative2(a, b) for a, b in zip(truth, estimate, strict=True)])
     return np.hypot(rest[:, 0], rest[:, 1]), np.degrees(np.abs(rest[:, 2]))

@@ -1,4 +1,4 @@
-"""A whole stack under a program's control: started from a launch file, watched over the bus, ended as by Ctrl-C."""
+"""Runs a whole stack from a program: starts it from a launch file, observes the bus, stops it as Ctrl-C does."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from instant_ic.launch.process import dies_with_us
 
 T = TypeVar("T")
 _ENOUGH_PER_S = 33e6
-"""Turns of an empty loop a second, on each of two cores, from which on a stack runs in real time with room to spare."""
+"""Empty-loop iterations per second, on each of two cores, above which a stack runs in real time with margin."""
 _SLOWEST_PACE = 0.1
 
 
 class StackError(RuntimeError):
-    """The stack did not start, ended early, or did not do in time what was waited for."""
+    """The stack did not start, exited early, or did not reach an awaited condition in time."""
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    """A port of 127.0.0.1 that nobody uses now."""
+    """A free port of 127.0.0.1."""
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -39,7 +39,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
 
 
 def free_ports() -> dict[str, int]:
-    """Free ports under the names of ``launch/sim.yaml``'s arguments, so that several stacks can run side by side."""
+    """Free ports by argument name of ``launch/sim.yaml``, so that several stacks can run in parallel."""
     return {
         "camera_port": free_port(),
         "lidar_port": free_port(socket.SOCK_DGRAM),
@@ -50,16 +50,16 @@ def free_ports() -> dict[str, int]:
 
 @dataclass(frozen=True)
 class _NoParameters:
-    """An observer has none."""
+    """No parameters."""
 
 
 class Observer(Node[_NoParameters]):
-    """A node inside the watching program; its callbacks run while the program waits in :meth:`Stack.wait_for`."""
+    """Node inside the controlling program; its callbacks run while the program waits in :meth:`Stack.wait_for`."""
 
     name = "observer"
 
     def rest(self, timeout_s: float) -> None:
-        """Sleeps until something has come or is due; for a program that calls :meth:`spin_once` itself."""
+        """Sleep until a message or timer is due; for a program that calls :meth:`spin_once` itself."""
         if self._timers:
             timeout_s = min(timeout_s, (self._timers[0][0] - self.clock.steady_ns()) / 1e9)
         self._wake.wait(max(0.0, timeout_s))
@@ -73,7 +73,7 @@ def _observer(run_dir: Path) -> Observer:
 
 @contextlib.contextmanager
 def observer(run_dir: Path) -> Iterator[Observer]:
-    """An observer of another run directory, as those of a fleet's robots."""
+    """Observer of another run directory, as used by the robots of a fleet."""
     watching = _observer(run_dir)
     try:
         yield watching
@@ -82,10 +82,10 @@ def observer(run_dir: Path) -> Iterator[Observer]:
 
 
 def machine_pace() -> float:
-    """A pace at which this machine can run a whole simulated stack, however slow or busy it is: 1.0 at most.
+    """Pace at which this machine can run a whole simulated stack, under its current load: 1.0 at most.
 
-    Two processes count for a second and a half: what a core does alone for a moment tells little of what two do all
-    the time.
+    Two processes count for one and a half seconds: the momentary speed of one core says little about two cores under
+    continuous load.
     """
     count = (
         "import time\nn, began = 0, time.perf_counter()\n"
@@ -97,14 +97,14 @@ def machine_pace() -> float:
 
 
 class Stack:
-    """Starts a launch file in a run directory of its own.
+    """Starts a launch file in its own run directory.
 
     Args:
         launch_file: name or path, as for ``ic launch``.
         run_dir: run directory; its path must be short (sockets).
         arguments: launch arguments.
-        log_path: where the launcher's output goes (default: ``RUN_DIR/launch.log``).
-        prefix: command that starts the launcher, as ``ip netns exec NAME``.
+        log_path: file for the launcher's output (default: ``RUN_DIR/launch.log``).
+        prefix: command that starts the launcher, such as ``ip netns exec NAME``.
         pace: of the stack's time, see :mod:`instant_ic.pace`.
 
     Example::
@@ -133,7 +133,7 @@ class Stack:
         self.observer: Observer
 
     def __enter__(self) -> Self:
-        """Starts the launcher and the observer."""
+        """Start the launcher and the observer."""
         self.run_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
         words = [f"{key}:={_word(value)}" for key, value in self.arguments.items()]
         launch = [self.launch_file, *words, f"--pace={self.pace:g}"]
@@ -153,28 +153,28 @@ class Stack:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends everything, also after an error."""
+        """Stop everything, also after an error."""
         try:
             self.stop()
         finally:
             self.observer.close()
 
     def collect(self, topic: str, message_class: Any, qos: QoS = SENSOR) -> list[Any]:
-        """A list that the topic's messages are added to while the program waits."""
+        """Return a list that collects the topic's messages while the program waits."""
         messages: list[Any] = []
         self.observer.subscribe(topic, message_class, messages.append, qos)
         return messages
 
     def wait_for(self, condition: Callable[[], T], timeout_s: float, what: str) -> T:
-        """Runs the observer's callbacks until the condition is true, and returns its value.
+        """Run the observer's callbacks until the condition is true, and return its value.
 
         Args:
-            condition: what is waited for.
+            condition: returns a true value when met.
             timeout_s: seconds of the stack's time, as a slow machine needs longer.
-            what: what it is, for the error.
+            what: description of the condition, for the error.
 
         Raises:
-            StackError: time is up, or the launcher ended.
+            StackError: timeout, or the launcher exited.
         """
         deadline = time.monotonic() + timeout_s / self.pace
         while True:
@@ -187,7 +187,7 @@ class Stack:
             time.sleep(0.005)
 
     def check_alive(self, while_waiting_for: str) -> None:
-        """Raises StackError when the launcher has ended."""
+        """Raise StackError if the launcher has exited."""
         assert self.process is not None
         status = self.process.poll()
         if status is not None:
@@ -196,10 +196,10 @@ class Stack:
             )
 
     def stop(self, timeout_s: float = 15.0) -> int:
-        """Ends the stack as Ctrl-C does and returns the launcher's exit status.
+        """Stop the stack as Ctrl-C does and return the launcher's exit status.
 
         Raises:
-            StackError: it did not end in time; it has been killed then.
+            StackError: it did not stop in time and was killed.
         """
         assert self.process is not None
         if self.process.poll() is None:
@@ -207,7 +207,7 @@ class Stack:
         try:
             return self.process.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            # The nodes go with their launcher (PR_SET_PDEATHSIG).
+            # The nodes die with their launcher (PR_SET_PDEATHSIG).
             os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait(10)
             raise StackError(
@@ -215,7 +215,7 @@ class Stack:
             ) from None
 
     def log_tail(self, lines: int = 40) -> str:
-        """The end of the launcher's output."""
+        """Return the last lines of the launcher's output."""
         return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-lines:])
 
 

@@ -1,7 +1,7 @@
-"""``ic evaluate teleop``: an operator drives through corridors with obstacles that he does not look at.
+"""``ic evaluate teleop``: an operator drives through corridors with obstacles that the operator does not look at.
 
-The whole stack runs in simulated time (``teleop_stack``), by illusory control, by a robot that stops at obstacles, and
-by shared control that goes round by itself. Figures are those of ``teleop_figures``.
+The whole stack runs in simulated time (``teleop_stack``) with three methods: illusory control, a robot that stops at
+obstacles, and shared control that drives around them by itself. ``teleop_figures`` computes the figures.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ FloatArray: TypeAlias = NDArray[np.float64]
 
 AT_GOAL_M = 0.35
 READY_S = 10.0
-"""Most that the machine may take to be ready for the first command."""
+"""Longest time until the stack is ready for the first command."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Of one evaluation.
+    """Settings of one evaluation.
 
     Attributes:
         episodes, seed: which drives; the same seed gives the same drives.
@@ -55,8 +55,8 @@ class Settings:
         methods: of ``METHODS``.
         depth: of ``DEPTHS``.
         log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
-        pictures: whether the pictures on either side of a switch are drawn and compared.
-        overrides: ``node.key:=value`` words on top of the shipped parameters.
+        pictures: whether to render and compare the images on either side of a switch.
+        overrides: parameters ``node.key:=value`` on top of the shipped ones.
     """
 
     episodes: int = 50
@@ -75,23 +75,23 @@ class Settings:
             unknown = [name for name in given if name not in allowed]
             if unknown or not given:
                 raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        StackConfig(overrides=self.overrides)  # raises ValueError on a word that is none
+        StackConfig(overrides=self.overrides)  # raises ValueError on a malformed override
 
     def course(self, index: int) -> Course:
-        """Course ``index``.
+        """Return course ``index``.
 
         Raises:
-            ValueError: no such world, or nowhere to drive to in it.
+            ValueError: no such world, or no possible drive in it.
         """
         return _course(self.world, self.seed, index, self.log is not None)
 
 
 _course = functools.lru_cache(maxsize=2)(make_course)
-"""Of one course all methods are driven."""
+"""Cached: all methods drive the same course."""
 
 
 class _Episode:
-    """One drive in the making."""
+    """One running episode."""
 
     def __init__(self, settings: Settings, course: Course, index: int, method: str, filmed: bool = False) -> None:
         seed, words = 1000 * settings.seed + index, settings.overrides
@@ -109,10 +109,10 @@ class _Episode:
         self.contacts = 0
 
     def run(self, on_step: Callable[[SimulatedStack], None] | None = None) -> Drive:
-        """Drives until the goal, the operator's giving up, or the time limit.
+        """Drive until the goal is reached, the operator gives up, or the time limit is over.
 
         Raises:
-            RuntimeError: the machine never got ready.
+            RuntimeError: the stack did not become ready.
         """
         drive, stack, began = self.drive, self.stack, time.process_time()
         with stack:
@@ -158,7 +158,7 @@ class _Episode:
         return command
 
     def _there(self) -> bool:
-        """The operator is done, the r-bot is where he wanted it, and it is shown again."""
+        """Whether the operator is done, and the r-bot is at the goal and is the robot shown."""
         if not self.operator.done or self.stack.page.virtual:
             return False
         if self.recorded:
@@ -185,16 +185,16 @@ class _Episode:
 
 
 def photograph(stack: SimulatedStack, shown: Shown, width: int, height: int, fov_rad: float) -> NDArray[np.uint8]:
-    """The camera's picture as the page shows it: from where it was taken, turned to the heading."""
+    """The camera's image as the page shows it: taken from its own position, rotated to the heading."""
     pose = pose_matrix(shown.pose[0], shown.pose[1], CAMERA_HEIGHT_M, 0.0, 0.0, shown.heading)
     return stack.simulation.renderer.render_perspective(pose, width, height, fov_rad).rgb
 
 
 def decode(jpeg: bytes) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a JPEG.
+    """Decode a JPEG to (H, W, 3) RGB.
 
     Raises:
-        ValueError: it is none.
+        ValueError: not a JPEG.
     """
     import cv2
 
@@ -210,7 +210,7 @@ def run_episode(
     on_step: Callable[[SimulatedStack], None] | None = None,
     methods: tuple[str, ...] = (),
 ) -> list[Drive]:
-    """One course driven by each method in turn; the same for the same settings and index, times apart."""
+    """Drive one course by each method in turn; the same settings and index give the same result, except for times."""
     course = settings.course(index)
     with _quiet():
         filmed = on_step is not None
@@ -219,7 +219,7 @@ def run_episode(
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """The nodes' loggers tell errors only: what they warn of while a robot starts is no news."""
+    """Limit the nodes' loggers to errors: their warnings during start-up are expected."""
     loggers = [logging.getLogger(name) for name in (*NODES, *VSPACE_NODES)]
     levels = [logger.level for logger in loggers]
     try:
@@ -232,7 +232,7 @@ def _quiet() -> Iterator[None]:
 
 
 def prepare() -> None:
-    """Compiles the kernels that the nodes compile at their start elsewhere, so that no episode counts that time."""
+    """Compile the kernels that the nodes otherwise compile at start-up, so that no episode includes that time."""
     warm_up()
 
 
@@ -243,19 +243,19 @@ def evaluate(
     timeout_s: float = 7200.0,
     done: Sequence[Drive] = (),
 ) -> list[Drive]:
-    """Drives all courses by all methods, ``jobs`` drives at a time, each process one where more than one.
+    """Drive all courses by all methods, ``jobs`` drives in parallel; with more than one job, each in its own process.
 
     Args:
-        settings: what is driven.
-        jobs: drives at a time.
-        on_drive: called with each drive as it ends.
-        timeout_s: for all.
-        done: drives that need not be driven again.
+        settings: of the evaluation.
+        jobs: parallel drives.
+        on_drive: called with each finished drive.
+        timeout_s: for all drives.
+        done: finished drives, which are not repeated.
 
     Raises:
         ValueError: nothing to do, no such world, no such log.
-        TimeoutError: they took longer than ``timeout_s``.
-        RuntimeError: a process died, or a robot never got ready.
+        TimeoutError: the drives took longer than ``timeout_s``.
+        RuntimeError: a process died, or a stack did not become ready.
     """
     from concurrent.futures import as_completed
     from concurrent.futures.process import BrokenProcessPool
@@ -263,7 +263,7 @@ def evaluate(
     if jobs < 1:
         raise ValueError(f"jobs must be at least 1 (got {jobs})")
     if settings.log is not None:
-        read_commands(settings.log)  # before anything is started
+        read_commands(settings.log)  # fail before anything is started
     drives = list(done)
     known = {(drive.index, drive.method) for drive in drives}
     tasks = [(i, name) for i in range(settings.episodes) for name in settings.methods if (i, name) not in known]

@@ -1,4 +1,4 @@
-"""What came of a teleoperated drive: obedience, switches, jumps, freezes; from its log alone."""
+"""Figures of a teleoperated drive, computed from its log alone: obedience, switches, jumps, freezes."""
 
 from __future__ import annotations
 
@@ -18,36 +18,37 @@ from instant_ic.geometry.poses import relative2, wrap_angle
 FloatArray: TypeAlias = NDArray[np.float64]
 
 STEP_S = 0.05
-"""Between two rows of a log."""
+"""Seconds between two rows of a log."""
 TRACK_S = 0.2
-"""Between two places of a track."""
+"""Seconds between two points of a track."""
 LATENCY_S = 0.35
-"""A robot obeys where it does what was commanded at any time of the last so long (and its ramps since)."""
+"""Latency allowed in obedience: a robot obeys if it follows any command of this period (and its ramps since)."""
 TOLERANCE_M_S, TOLERANCE_RAD_S = 0.05, 0.15
-"""How far its speed may be off that: tracks that slip, a speed taken over 0.1 s."""
+"""Tolerance of the speed: tracks slip, and speed is measured over 0.1 s."""
 FLICKER_S = 2.0
-"""A switch that is taken back sooner than this is flicker."""
+"""A switch reversed within this time counts as flicker."""
 MET_M = 1.2
-"""An obstacle counts as met from this far between its centre and that of the shown robot."""
+"""Distance between the centres of an obstacle and the shown robot below which the obstacle counts as met."""
 
 
 @dataclass(frozen=True)
 class Switch:
-    """The picture changes between the camera's and the rendered view.
+    """A change of the shown image between the camera's image and the rendered view.
 
     Attributes:
-        time_s: when.
-        to_virtual: into the virtual space, else back.
-        position_error_m: between the places of the last picture before and the first after, as the stack knows them,
-            less what the shown robot drove from when the one came to when the other did.
-        yaw_error_deg: between the headings of v-bot and r-bot just before it, as the stack knows them, to which the
-            page turns the pictures.
-        true_position_error_m: the same, of the camera's picture where it was truly taken.
-        jump_m: the same, less what the shown robot drove from when the one came up to when the other did: with how
-            long a camera's picture had been there already. What the eye sees, before the page eases it.
-        gap_m: between r-bot and v-bot in that step: the camera's picture is older than the r-bot's pose.
-        psnr_db: between those two pictures; None where they were not drawn.
-        true_yaw_error_deg: with the r-bot's true heading in place of the known one.
+        time_s: time of the switch.
+        to_virtual: True into the virtual space, False back.
+        position_error_m: between the positions of the last image before and the first after, as the stack knows them,
+            minus the distance that the shown robot drove between the arrivals of the two images.
+        yaw_error_deg: between the headings of v-bot and r-bot just before the switch, as the stack knows them; the page
+            rotates the images to these headings.
+        true_position_error_m: as position_error_m, with the true position of the camera's image.
+        jump_m: as true_position_error_m, minus the distance that the shown robot drove between the display times of the
+            two images, which includes how long the camera's image had already been waiting. This is the jump that the
+            eye sees, before the page smooths it.
+        gap_m: between r-bot and v-bot in that step: the camera's image is older than the r-bot's pose.
+        psnr_db: between the two images; None if they were not rendered.
+        true_yaw_error_deg: as yaw_error_deg, with the r-bot's true heading.
     """
 
     time_s: float
@@ -70,22 +71,22 @@ class Drive:
     completed: bool = False
     gave_up: bool = False
     seconds: float = 0.0
-    """From the first command to the r-bot at the goal, or the end."""
+    """From the first command until the r-bot is at the goal, or the end of the drive."""
     way_m: float = 0.0
     driven_m: float = 0.0
     contacts: int = 0
     obstacles: int = 0
-    """That the operator met."""
+    """Number of obstacles that the operator met."""
     detours: int = 0
-    """Times that he was held up, looked and drove round by himself."""
+    """Number of times the operator was blocked, looked, and drove around the obstacle manually."""
     obedience: float = math.nan
     flicker: int = 0
     transitions: int = 0
     mode_seconds: dict[str, float] = field(default_factory=dict)
     disobeyed_seconds: dict[str, float] = field(default_factory=dict)
-    """By mode."""
+    """Seconds of disobedience by mode."""
     virtual_m: float = 0.0
-    """Driven by the v-bot while it was shown."""
+    """Distance driven by the v-bot while it was shown."""
     gap_mean_m: float = math.nan
     gap_max_m: float = math.nan
     longest_freeze_s: float = 0.0
@@ -93,15 +94,16 @@ class Drive:
     keyframes: int = 0
     cpu_s: float = 0.0
     reason: str = ""
-    """The machine's last words where the drive was not completed."""
+    """The stack's last message if the drive was not completed."""
     switches: list[Switch] = field(default_factory=list)
     tracks: dict[str, list[list[float]]] = field(default_factory=dict)
-    """``robot``, ``vbot`` (where it was shown): x, y, yaw each fifth of a second; ``modes``: time and mode from then
-    on, the last one the end. For the plot."""
+    """``robot``, ``vbot`` (while it was shown): x, y, yaw each fifth of a second; ``modes``: start time and mode, the
+    last entry being the end. For the plot.
+    """
 
 
 def shown_poses(log: Log) -> FloatArray:
-    """(N, 3) of the robot that is shown."""
+    """(N, 3) poses of the robot that is shown."""
     virtual = np.array(log.virtual)[:, None]
     return np.where(virtual, np.array(log.vbot), np.array(log.robot))
 
@@ -118,7 +120,7 @@ def shown_speeds(log: Log) -> FloatArray:
 
 
 def ramped(commands: FloatArray, limits: MotionLimits) -> FloatArray:
-    """(N, 2) speeds of a robot that does at once what it is commanded, within its accelerations."""
+    """(N, 2) speeds of a robot that follows its commands at once, within its acceleration limits."""
     speed, out = (0.0, 0.0), np.zeros((len(commands), 2))
     for k, (linear, angular) in enumerate(commands):
         speed = accelerate(speed, (float(linear), float(angular)), limits, STEP_S)
@@ -127,10 +129,10 @@ def ramped(commands: FloatArray, limits: MotionLimits) -> FloatArray:
 
 
 def obeys(log: Log, limits: MotionLimits | None = None) -> FloatArray:
-    """(N,) 1 where the shown robot did what was commanded, 0 where it did not, NaN where nothing was to be done.
+    """(N,) 1 where the shown robot obeyed the command, 0 where it did not, NaN without a command.
 
-    It did where its speed, ahead and about, lies between the least and the greatest that the ramped command had within
-    the last ``LATENCY_S``, give or take ``TOLERANCE_*``. A robot that stands, is slowed, or turns otherwise does not.
+    It obeyed if its forward speed and yaw rate lie between the minimum and maximum of the ramped command within the
+    last ``LATENCY_S``, within ``TOLERANCE_*``. A robot that stands, is slowed down, or turns differently did not.
     """
     commands = np.array(log.command, dtype=np.float64).reshape(-1, 2)
     wanted, speeds = ramped(commands, limits or MotionLimits()), shown_speeds(log)
@@ -146,13 +148,13 @@ def obeys(log: Log, limits: MotionLimits | None = None) -> FloatArray:
 
 
 def obedience(log: Log, limits: MotionLimits | None = None) -> float:
-    """Share of the time under command in which the shown robot obeyed; NaN without commands."""
+    """Share of the commanded time in which the shown robot obeyed; NaN without commands."""
     done = obeys(log, limits)
     return math.nan if np.isnan(done).all() else float(np.nanmean(done))
 
 
 def longest_stall_s(log: Log) -> float:
-    """Longest time that the shown robot stood under a command."""
+    """Longest time that the shown robot stood still under a command."""
     commands, speeds = np.array(log.command).reshape(-1, 2), shown_speeds(log)
     standing = (np.abs(speeds[:, 0]) < 0.01) & (np.abs(speeds[:, 1]) < 0.02) & commands.any(axis=1)
     longest = run = 0
@@ -163,7 +165,7 @@ def longest_stall_s(log: Log) -> float:
 
 
 def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
-    """Longest time that one picture stayed on the screen, up to ``until_s``."""
+    """Longest time that one image stayed on the screen, up to ``until_s``."""
     times = [shown.time_s for shown in pictures if shown.time_s <= until_s]
     if not times:
         return 0.0
@@ -171,7 +173,7 @@ def longest_freeze_s(pictures: list[Shown], until_s: float) -> float:
 
 
 def find_switches(log: Log) -> list[Switch]:
-    """Each change of what is shown; NaN for the places where one of the pictures is missing."""
+    """All changes of the shown view; position errors are NaN if one of the images is missing."""
     found = []
     for k in range(1, len(log.virtual)):
         if log.virtual[k] == log.virtual[k - 1]:
@@ -195,12 +197,12 @@ def find_switches(log: Log) -> list[Switch]:
 
 
 def count_flicker(switches: list[Switch]) -> int:
-    """Switches taken back within ``FLICKER_S``."""
+    """Number of switches reversed within ``FLICKER_S``."""
     return sum(after.time_s - before.time_s < FLICKER_S for before, after in pairwise(switches))
 
 
 def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple[Shown, Shown] | None:
-    """Last picture before a switch, first after; None where one of them is missing."""
+    """Last image before a switch and first after it; None if one of them is missing."""
     for before, after in pairwise(pictures):
         near = abs(after.time_s - time_s) < 1.0
         if near and before.virtual != after.virtual == to_virtual:
@@ -209,9 +211,9 @@ def pictures_at(pictures: list[Shown], time_s: float, to_virtual: bool) -> tuple
 
 
 def picture_errors_m(before: Shown, after: Shown, log: Log) -> tuple[float, float, float]:
-    """How far the places of two pictures are apart that should be one: as known, in truth, and as the eye sees it.
+    """Distances between the positions of two images that should coincide: as known, in truth, and as the eye sees it.
 
-    The shown robot drives from one picture to the next; its mean speed round the switch says how far.
+    The shown robot moves between the two images; its mean speed around the switch gives that distance.
     """
     speeds = shown_speeds(log)[:, 0]
     times = np.array(log.time_s)
@@ -226,7 +228,7 @@ def picture_errors_m(before: Shown, after: Shown, log: Log) -> tuple[float, floa
 
 
 def obstacles_met(log: Log, centres: FloatArray) -> int:
-    """How many obstacles (N, 2) the shown robot came near."""
+    """Number of obstacles (N, 2) that the shown robot came near."""
     if len(centres) == 0 or not log.time_s:
         return 0
     away = np.linalg.norm(shown_poses(log)[:, None, :2] - np.asarray(centres)[None], axis=2)
@@ -234,7 +236,7 @@ def obstacles_met(log: Log, centres: FloatArray) -> int:
 
 
 def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
-    """Fills in what the log tells; pictures' figures of the switches are another's."""
+    """Fill in the figures that follow from the log; image figures of the switches are set elsewhere."""
     drive.obedience = obedience(log)
     drive.switches = find_switches(log)
     drive.flicker = count_flicker(drive.switches)
@@ -268,7 +270,7 @@ def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
 
 
 def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, Any]:
-    """Figures of one method over its episodes; ``stop`` are those of the robot that simply stops."""
+    """Figures of one method over its episodes; ``stop`` are the drives of the robot that only stops."""
     switches = [switch for drive in drives for switch in drive.switches]
     into, back = ([s for s in switches if s.to_virtual == to_virtual] for to_virtual in (True, False))
     obstacles = sum(drive.obstacles for drive in drives)
@@ -327,7 +329,7 @@ def summary(drives: list[Drive], stop: list[Drive] | None = None) -> dict[str, A
 
 
 def targets(figures: dict[str, Any]) -> dict[str, bool | None]:
-    """Which of the targets of illusory control are met; None where nothing happened that could tell."""
+    """Whether each target of illusory control is met; None without data for it."""
 
     def holds(key: str, least: float = -math.inf, most: float = math.inf) -> bool | None:
         value = figures[key]

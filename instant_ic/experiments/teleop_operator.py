@@ -1,4 +1,4 @@
-"""Operators for ``ic evaluate teleop``: one who looks at goals only, and one whose commands were recorded."""
+"""Operators for ``ic evaluate teleop``: a scripted one who looks at goals only, and one with recorded commands."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ CRUISE_M_S, TURN_RAD_S = 0.4, 0.8
 """The console's full speed (config/console.yaml: drive)."""
 REACHED_M = 0.25
 NOTICES_S = 1.5
-"""He has pushed for so long and nothing moves: he looks why."""
+"""Time without motion under a command after which the operator looks for the reason."""
 BACKS_OFF_S, BACKS_OFF_M_S = 2.0, 0.2
 PASSED_M = 2.2
-"""A detour is over so far from where he was held up."""
+"""Distance from the blocked place at which a detour ends."""
 GIVES_UP_AFTER = 4
-"""Detours at one place."""
+"""Number of detours at one place."""
 _AFTER_S = 2.0
 HUMAN_SPARE_M = (0.10, 0.05)
-"""Room that he keeps on a detour on every side; the second where the first does not fit."""
+"""Margin on every side that the operator keeps on a detour; the second if the first does not fit."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What the operator sees and is told.
+    """What the operator sees.
 
     Attributes:
         time_s: simulated.
-        pose: (3,) of the shown robot in the world's frame; the place is as old as the picture.
+        pose: (3,) of the shown robot in the world's frame; the position is as old as the image.
         virtual: the rendered view is shown.
-        stopped: the machine is stopped until the controls are let go.
+        stopped: the robot is stopped until the controls are released.
         speed: (m/s, rad/s) of the shown robot.
-        robot: (3,) true pose of the r-bot: for planning a detour while he looks at it.
+        robot: (3,) true pose of the r-bot, for planning a detour while the operator looks at it.
     """
 
     time_s: float
@@ -58,22 +58,23 @@ class Sight:
 
 
 class Operator(Protocol):
-    """Gives a command twenty times a second."""
+    """Source of commands, called twenty times per second."""
 
     done: bool
-    """Has nothing more to drive."""
+    """All goals or commands are finished."""
     gave_up: bool
 
     def command(self, sight: Sight) -> Twist2:
-        """Linear m/s and angular rad/s."""
+        """Return linear m/s and angular rad/s."""
         ...
 
 
 class ScriptedOperator:
-    """Turns towards the next goal and drives at it, through whatever stands between.
+    """Turns towards the next goal and drives at it, through all obstacles.
 
-    Held up for NOTICES_S in the real view he looks: he backs off, drives round along the shortest way with 10 cm to
-    spare (he sees everything then), and looks at goals again PASSED_M further. In the virtual space he pushes on.
+    Blocked for NOTICES_S in the real view, the operator looks around with full knowledge: backs off, drives around
+    along the shortest path with 10 cm margin, and looks at goals again after PASSED_M. In the virtual space the
+    operator drives on.
     """
 
     def __init__(self, goals: FloatArray, plan: OccupancyMask) -> None:
@@ -88,7 +89,7 @@ class ScriptedOperator:
         self._held_at: list[FloatArray] = []
 
     def command(self, sight: Sight) -> Twist2:
-        """The command for what he sees."""
+        """Return the command for the current view."""
         if self.at < len(self.goals) and _far(sight.pose, self.goals[self.at]) < REACHED_M:
             self.at, self._route = self.at + 1, None
         self.done = self.at == len(self.goals)
@@ -119,7 +120,7 @@ class ScriptedOperator:
         bearing = math.atan2(float(y), float(x))
         turn = min(max(1.5 * bearing, -TURN_RAD_S), TURN_RAD_S)
         if self._route is not None and abs(bearing) > 0.25:
-            return 0.0, turn  # close to things he turns first
+            return 0.0, turn  # near an obstacle, turn first
         return (0.0 if abs(bearing) > 0.6 else CRUISE_M_S), turn
 
     def _watch(self, sight: Sight, wanted: Twist2) -> None:
@@ -147,7 +148,7 @@ class ScriptedOperator:
 
 
 class RecordedOperator:
-    """Commands of a log, each from its time on; what they lead to is seen nowhere."""
+    """Commands of a log by time, independent of what the robot does."""
 
     def __init__(self, log: FloatArray) -> None:
         self.log = log
@@ -156,7 +157,7 @@ class RecordedOperator:
         self._next = 0
 
     def command(self, sight: Sight) -> Twist2:
-        """The command that was given at this time of the log."""
+        """Return the command at this time of the log."""
         if self._began_s is None:
             self._began_s = sight.time_s
         since = sight.time_s - self._began_s
@@ -164,20 +165,20 @@ class RecordedOperator:
             self._next += 1
         self.done = since > self.log[-1, 0]
         row = self.log[self._next - 1] if self._next else None
-        # A log without zeros at a pause: as in the console, a command that is not renewed is over.
+        # A log may lack zeros during a pause: as in the console, a command that is not renewed expires.
         if self.done or row is None or since - row[0] > 0.5:
             return 0.0, 0.0
         return float(row[1]), float(row[2])
 
 
 def read_commands(path: Path) -> FloatArray:
-    """A log of commands (N, 3): seconds from the first that moves the robot, m/s, rad/s.
+    """Read a log of commands (N, 3): seconds from the first that moves the robot, m/s, rad/s.
 
-    From a bag's ``/operator/cmd_vel``, or a CSV file with the columns ``time_s, linear_m_s, angular_rad_s``. What is
-    before the first motion is left out, and what comes later than ``_AFTER_S`` after the last.
+    From a bag's ``/operator/cmd_vel``, or a CSV file with the columns ``time_s, linear_m_s, angular_rad_s``. Rows
+    before the first motion and later than ``_AFTER_S`` after the last are dropped.
 
     Raises:
-        ValueError: no such file, no commands in it, or rows that are none; names file and row.
+        ValueError: no such file, no commands, or malformed rows; names file and row.
     """
     if not path.exists():
         raise ValueError(f"{path}: there is no such bag or CSV file")
@@ -245,7 +246,7 @@ def _read_bag(path: Path) -> list[Sequence[float]]:
 
 
 def make_operator(goals: FloatArray, plan: Callable[[], OccupancyMask], log: FloatArray | None) -> Operator:
-    """The scripted operator, or the recorded one where there is a log."""
+    """The recorded operator if there is a log, else the scripted one."""
     return ScriptedOperator(goals, plan()) if log is None else RecordedOperator(log)
 
 

@@ -1,4 +1,4 @@
-"""Plot and video of ``evaluation.teleop``."""
+"""Plot and video of ``experiments.teleop``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from instant_ic.sim.contact import OccupancyMask
 
 FloatArray: TypeAlias = NDArray[np.float64]
 
-# Of Okabe and Ito, which also the colour-blind can tell apart.
+# Okabe and Ito's palette, distinguishable for colour-blind readers.
 _COLOURS = {"ic": "#0072B2", "stop": "#E69F00", "shared": "#009E73"}
 _MODE_COLOURS = {
     Mode.REAL: "#BBBBBB", Mode.ENTERING: "#F0E442", Mode.VIRTUAL: "#56B4E9", Mode.RETURNING: "#CC79A7",
@@ -44,9 +44,9 @@ FPS = 10
 
 
 def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: Settings, most: int = 4) -> None:
-    """Figures by method, every course's time and obedience, and maps of the courses that went worst.
+    """Save figures by method, every course's time and obedience, and maps of the worst courses.
 
-    Under each map the arbiter's modes over time, a bar a method.
+    Below each map: the arbiter's modes over time, one bar per method.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -80,7 +80,7 @@ def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], setti
 
 
 def _how_well(drives: Sequence[Drive]) -> tuple[float, ...]:
-    """Sorts courses: not completed first, then contacts, flicker, disobedience of the first method."""
+    """Sort key of courses: not completed first, then contacts, flicker, disobedience of the first method."""
     contacts, flicker = (sum(getattr(d, name) for d in drives) for name in ("contacts", "flicker"))
     obedience = drives[0].obedience
     missing = sum(not d.completed for d in drives)
@@ -99,7 +99,7 @@ def _draw_bars(axis: Any, label: str, values: dict[str, float | None]) -> None:
 
 
 def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[Drive], names: Sequence[str]) -> None:
-    """A dot for every drive, by course; a ring where it was not completed, a cross where something was touched."""
+    """Plot a dot per drive, by course; a ring if it was not completed, a cross if it touched something."""
     for name in names:
         of = [d for d in drives if d.method == name]
         at, values = np.array([d.index for d in of]), np.array([getattr(d, key) for d in of])
@@ -116,14 +116,14 @@ def _draw_courses(axis: Any, key: str, label: str, drives: Sequence[Drive], name
 
 
 def _tracks(drives: Sequence[Drive]) -> FloatArray:
-    """(N, 2) all places that robots of these drives have been to."""
+    """(N, 2) all positions of the robots of these drives."""
     return np.concatenate(
         [np.array(t).reshape(-1, 3)[:, :2] for d in drives for n, t in d.tracks.items() if n != "modes"]
     )
 
 
 def _extent(course: Course, drives: Sequence[Drive]) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest corner (2,) of what a map of these drives shows."""
+    """Lowest and highest corner (2,) of the map of these drives."""
     things = [(one.x, one.y) for one in course.obstacles]
     places = np.concatenate([_tracks(drives), course.goals, np.array(things).reshape(-1, 2), [course.world.spawn[:2]]])
     return places.min(axis=0) - _MARGIN_M, places.max(axis=0) + _MARGIN_M
@@ -145,7 +145,7 @@ def _draw_course(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
         for name, style in (("robot", "-"), ("vbot", "--")):
             track = np.array(drive.tracks.get(name, [])).reshape(-1, 3)
             steps = np.linalg.norm(np.diff(track[:, :2], axis=0), axis=1)
-            parts = np.split(track, np.flatnonzero(steps > 0.5) + 1)  # another visit to the virtual space
+            parts = np.split(track, np.flatnonzero(steps > 0.5) + 1)  # split between two visits to the virtual space
             for part in parts:
                 axis.plot(part[:, 0], part[:, 1], style, color=colour, lw=1.2)
         for switch in drive.switches:
@@ -162,13 +162,13 @@ def _draw_course(axis: Any, course: Course, drives: Sequence[Drive]) -> None:
 
 
 def _where(drive: Drive, time_s: float) -> FloatArray:
-    """Place (2,) of the r-bot."""
+    """Position (2,) of the r-bot at a time."""
     track, modes = drive.tracks["robot"], drive.tracks["modes"]
     return np.array(track[min(max(0, round((time_s - modes[0][0]) / TRACK_S)), len(track) - 1)])[:2]
 
 
 def _draw_modes(axis: Any, drives: Sequence[Drive]) -> None:
-    """What the arbiter's mode was, a bar for each method."""
+    """Plot the arbiter's mode over time, one bar per method."""
     for k, drive in enumerate(drives):
         modes = drive.tracks["modes"]
         for (begins, mode), (ends, _) in pairwise(modes):
@@ -199,7 +199,7 @@ def _legend(names: Sequence[str]) -> list[Any]:
 
 
 class Video:
-    """Split view of one drive, picture by picture of simulated time: what the operator sees, and the map.
+    """Split-screen video of one drive in simulated time: the operator's view, and the map.
 
     Raises:
         ValueError: the file cannot be written.
@@ -223,11 +223,11 @@ class Video:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the file."""
+        """Close the file."""
         self._writer.release()
 
     def on_step(self, stack: SimulatedStack) -> None:
-        """Adds a picture where one is due; give it to ``teleop.run_episode``."""
+        """Add a frame when one is due; pass this method to ``teleop.run_episode``."""
         if stack.time_s < self._next_s or not stack.log.pictures or not stack.log.time_s:
             return
         self._next_s = stack.time_s + 1.0 / FPS - 1e-6
@@ -257,7 +257,7 @@ class Video:
 
 
 class _Map:
-    """The floor plan scaled into a square, and the robots on it (BGR)."""
+    """The floor plan scaled to a square, with the robots on it (BGR)."""
 
     def __init__(self, plan: OccupancyMask) -> None:
         rows, columns = np.nonzero(plan.cells)
@@ -270,7 +270,7 @@ class _Map:
         self.base[at[:, 1].clip(0, _MAP - 1), at[:, 0].clip(0, _MAP - 1)] = 140
 
     def pixels(self, points: FloatArray) -> NDArray[np.int32]:
-        """(N, 2) column, row of places (N, 2)."""
+        """(N, 2) column, row of positions (N, 2)."""
         offset = (np.asarray(points) - self.middle) * self.scale * [1, -1] + _MAP / 2
         return np.asarray(np.rint(offset), np.int32)
 

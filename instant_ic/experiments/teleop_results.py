@@ -1,4 +1,4 @@
-"""What ``ic evaluate teleop`` writes down, and takes up again after it was interrupted."""
+"""Results file of ``ic evaluate teleop``, from which an interrupted evaluation resumes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
-    """Figures by method, the targets, and each drive without its tracks, as JSON takes it."""
+    """Figures by method, the targets, and each drive without its tracks, ready for JSON."""
     by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
     stop = by_method.get("stop")
     methods = {name: figures.summary(of, stop if name != "stop" else None) for name, of in by_method.items() if of}
@@ -35,9 +35,9 @@ def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
 
 
 def save(path: Path, drives: Sequence[Drive], settings: Settings) -> None:
-    """Writes the report with the tracks, whole or not at all: whatever ends the program, the file can be read."""
+    """Write the report with the tracks atomically: an interrupted program leaves a readable file."""
     text = json.dumps(report(drives, settings), indent=2)
-    # Tracks are long: a line each.
+    # Tracks are long: one line each.
     rows = (f"    {json.dumps([d.index, d.method, d.tracks], separators=(',', ':'))}" for d in drives)
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -48,10 +48,10 @@ def save(path: Path, drives: Sequence[Drive], settings: Settings) -> None:
 
 
 def load(path: Path, settings: Settings) -> list[Drive]:
-    """The drives of an earlier run with the same settings that these settings ask for, too.
+    """Drives of an earlier run with the same settings, limited to those that these settings request.
 
     Raises:
-        ValueError: the file cannot be read, is no such report, or is one of other settings; names what differs.
+        ValueError: the file is not readable, is not such a report, or has other settings; names the differences.
     """
     try:
         told = json.loads(path.read_text())
@@ -75,12 +75,12 @@ def load(path: Path, settings: Settings) -> list[Drive]:
 
 
 def in_order(drives: Sequence[Drive]) -> list[Drive]:
-    """By course, then method."""
+    """Sort by course, then method."""
     return sorted(drives, key=lambda drive: (drive.index, METHODS.index(drive.method)))
 
 
 def _conditions(settings: Settings) -> dict[str, Any]:
-    """What must be the same for drives to be told of together."""
+    """Settings that must match for drives to be combined in one report."""
     return {
         "seed": settings.seed,
         "world": settings.world,
@@ -92,7 +92,7 @@ def _conditions(settings: Settings) -> dict[str, Any]:
 
 
 def _with_nan(row: dict[str, Any]) -> dict[str, Any]:
-    """JSON has null for what is not known."""
+    """Convert null, JSON's value for unknown, back to NaN."""
     return {key: math.nan if value is None and key != "psnr_db" else value for key, value in row.items()}
 
 

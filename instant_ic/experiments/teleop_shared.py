@@ -1,4 +1,4 @@
-"""Shared control that overrides the operator, to compare illusory control with: the robot goes round by itself."""
+"""Baseline for illusory control: shared control that overrides the operator and drives around obstacles by itself."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from instant_ic.geometry.poses import wrap_angle
 FloatArray: TypeAlias = NDArray[np.float64]
 
 BEHIND_M = 0.3
-"""The goal lies so far behind the first free place: the body has passed the obstacle there."""
+"""Distance of the goal behind the first free position, so that the whole body has passed the obstacle."""
 ARRIVED_M, ALIGNED_RAD = 0.15, math.radians(15.0)
 
 
 class SharedControl(Arbiter):
-    """The arbiter without a virtual space: where its prediction meets an obstacle, planner and follower take over.
+    """Arbiter without a virtual space: where its prediction meets an obstacle, planner and follower take over.
 
-    The goal is the first free place straight on behind the obstacle, in the direction that was commanded; the way
-    there is that of the r-bot in illusory control: the same costmap, planner, follower and collision monitor. The
-    operator's command is not heeded meanwhile, but for letting go, which stops the robot, and driving back, which
-    gives the controls back. They are given back too when the goal is reached, or the commanded way is free again.
+    The goal is the first free position straight behind the obstacle in the commanded direction. The r-bot gets there as
+    in illusory control, with the same costmap, planner, follower and collision monitor. Meanwhile the operator's
+    command is ignored, with two exceptions: releasing the controls stops the robot, and driving back returns control to
+    the operator. Control also returns when the goal is reached or the commanded path is free again.
     """
 
     def __init__(self, config: ArbiterConfig | None = None) -> None:
@@ -42,7 +42,7 @@ class SharedControl(Arbiter):
         self._speed_m_s = 0.0
 
     def step(self, inputs: ArbiterInputs, now_ns: int) -> Decision:
-        """One step, as ``Arbiter.step``; ``command`` is the robot's own while it goes round."""
+        """One step, as ``Arbiter.step``; ``command`` is the planner's command during a detour."""
         decision = super().step(inputs, now_ns)
         command, costmap, pose = decision.operator_command, inputs.costmap, inputs.robot_pose
         if decision.mode != Mode.REAL or costmap is None or pose is None or command[0] < 0.0:
@@ -89,7 +89,7 @@ class SharedControl(Arbiter):
 
 
 def _behind(costmap: Costmap, ahead: Prediction, reach_m: float, max_cost: int) -> FloatArray | None:
-    """Pose (3,) straight on behind what the prediction meets; None where nothing is free within ``reach_m``."""
+    """Pose (3,) straight behind the predicted obstacle; None if no pose within ``reach_m`` is free."""
     if ahead.hit_index is None:
         return None
     line = extend_ahead(ahead.poses[ahead.hit_index], reach_m, costmap.resolution)

@@ -1,12 +1,15 @@
 """The whole stack in one process and in simulated time, for ``ic evaluate teleop``.
 
-Real are the nodes, their parameters and their messages, on a lockstep bus: base driver and motor controller's protocol,
-LiDAR driver (packets in), SLAM, arbiter, v-bot, navigator, console, and for illusory control depth and virtual space.
-Simulated are the robot, its LiDAR and its camera (``sim``). A model are: how late a command reaches the base and a
-picture the page; how old depth is (its network takes no simulated time); and the page itself, which shows what the
-console sends it. The camera's pictures are drawn only where depth takes them: the console and the arbiter get a small
-stand-in at the camera's rate, as all they need of it is its stamp. Rendered views are drawn small, and at full size on
-either side of a switch, where they are compared.
+- Real: the nodes, their parameters and their messages, on a lockstep bus. These are base driver with the motor
+  controller's protocol, LiDAR driver (packets in), SLAM, arbiter, v-bot, navigator and console; for illusory control
+  also depth and virtual space.
+- Simulated: the robot, its LiDAR and its camera (``sim``).
+- Modelled: the delay of commands to the base and of images to the page; the age of depth (its network takes no
+  simulated time); and the page itself, which shows what the console sends.
+
+Camera images are rendered only where depth uses them. The console and the arbiter need only their stamps, and get a
+small placeholder at the camera's rate. Rendered views are small, except on either side of a switch, where they are
+compared at full size.
 """
 
 from __future__ import annotations
@@ -57,30 +60,30 @@ STEP_S = 1 / 60
 START_NS = 1_700_000_000_000_000_000
 CAMERA_HEIGHT_M = 1.2
 _EVERY = 3
-"""Steps between two of the operator's commands (20 Hz)."""
+"""Steps between two commands of the operator (20 Hz)."""
 _FIRST_CUT_S = 0.05
-"""The driver ends revolutions at 180°."""
+"""The driver cuts revolutions at 180°."""
 _OVERDUE_S = 0.5
-"""Of a picture that depth has had for so long nothing comes any more."""
+"""Age at which an image passed to depth no longer leads to a keyframe."""
 _SMALLER = 4
-"""A view that nobody compares is drawn so much smaller each way."""
+"""Scale factor of each side of a view that is not compared."""
 
 
 @dataclass(frozen=True)
 class StackConfig:
-    """What is run, and the delays that the lockstep bus does not have.
+    """Configuration of the stack, and the delays that the lockstep bus does not model.
 
     Attributes:
         method: of ``METHODS``.
-        depth: what depth is made of, of ``DEPTHS``.
+        depth: depth source, of ``DEPTHS``.
         seed: of the robot's slip, the LiDAR's noise and the delays.
-        camera_hz: pictures a second.
-        camera_latency_s: from the exposure to the page, as the simulated camera's.
+        camera_hz: images per second.
+        camera_latency_s: from the exposure to the page, as for the simulated camera.
         depth_latency_s: from the exposure to the keyframe.
-        command_latency_s: from the arbiter to the base, the least and the most; drawn once.
-        panorama: width of the pictures that depth and virtual space get, pixels.
-        whole_views: draw all rendered views at full size, for a film; else those on either side of a switch.
-        overrides: further ``node.key:=value`` words.
+        command_latency_s: minimum and maximum from the arbiter to the base; one value is drawn per stack.
+        panorama: width of the images for depth and virtual space, pixels.
+        whole_views: render all views at full size, for a video; else only those on either side of a switch.
+        overrides: further parameters ``node.key:=value``.
     """
 
     method: str = "ic"
@@ -107,17 +110,17 @@ class StackConfig:
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture on the operator's screen.
+    """An image on the operator's screen.
 
     Attributes:
-        time_s: when it came up.
-        came_s: when it came to the page: at a switch the newest picture is shown that is already there.
-        virtual: a rendered view, else the camera's picture.
-        pose: (3,) of the robot that it was taken from, in the world's frame; of a camera's picture the true one.
-        place: (2,) the same, as the stack knows it.
-        heading: yaw that it is shown at: the page turns the camera's picture to the newest heading.
+        time_s: when it was displayed.
+        came_s: when it arrived at the page; a switch shows the newest image that has already arrived.
+        virtual: True for a rendered view, False for the camera's image.
+        pose: (3,) of the robot from which the image was taken, in the world's frame; the true pose for a camera image.
+        place: (2,) its position, as the stack knows it.
+        heading: yaw at which it is shown: the page rotates the camera's image to the newest heading.
         jpeg, fov_rad: of a rendered view.
-        draw: makes the JPEG of this view at full size.
+        draw: renders the JPEG of this view at full size.
     """
 
     time_s: float
@@ -154,7 +157,7 @@ class _Port:
 
 
 class SilentPage:
-    """Stands in for the console's server; nobody looks at it."""
+    """Replaces the console's server; no page is connected."""
 
     plain_http = False
 
@@ -178,7 +181,7 @@ class SilentPage:
 
 
 class _Page(SilentPage):
-    """Keeps what the console's server is given to show."""
+    """Records what the console's server is given to show."""
 
     def __init__(self, stack: SimulatedStack) -> None:
         self._stack = stack
@@ -196,26 +199,26 @@ class _Page(SilentPage):
             self._stack.on_show()
 
     def send_frame(self, kind: Any, header: dict[str, Any], payload: bytes, client: int | None = None) -> None:
-        if kind.name in ("VIEW", "PANORAMA"):  # and not the map
+        if kind.name in ("VIEW", "PANORAMA"):  # but not the map
             self._stack.on_frame(kind.name == "VIEW", header, payload)
 
 
 @dataclass
 class Log:
-    """What happened, a row each twentieth of a second; poses (x, y, yaw) in the world's frame."""
+    """Events of a drive, one row per twentieth of a second; poses (x, y, yaw) in the world's frame."""
 
     time_s: list[float] = field(default_factory=list)
     mode: list[int] = field(default_factory=list)
     virtual: list[bool] = field(default_factory=list)
-    """The rendered view is shown."""
+    """Whether the rendered view is shown."""
     robot: list[FloatArray] = field(default_factory=list)
     estimate: list[FloatArray] = field(default_factory=list)
     """The r-bot's pose as the stack knows it."""
     vbot: list[FloatArray] = field(default_factory=list)
     yaw_gap_rad: list[float] = field(default_factory=list)
-    """v-bot's heading less the r-bot's true one when the v-bot told it."""
+    """v-bot heading minus the r-bot's true heading at the time of the v-bot's message."""
     known_yaw_gap_rad: list[float] = field(default_factory=list)
-    """The same as the arbiter knows it: to these headings the page turns the pictures."""
+    """The same from the headings the arbiter knows; the page rotates the images to these."""
     command: list[tuple[float, float]] = field(default_factory=list)
     blocked: list[bool] = field(default_factory=list)
     reason: list[str] = field(default_factory=list)
@@ -224,14 +227,15 @@ class Log:
 
 
 class SimulatedStack:
-    """A robot in a world with the nodes that drive it; ``step`` moves everything on by ``STEP_S``."""
+    """A robot in a world with the nodes that drive it; ``step`` advances everything by ``STEP_S``."""
 
     def __init__(self, world: World, config: StackConfig) -> None:
         from instant_ic.sim.simulation import Simulation, SimulationConfig
 
         self.config = config
         self.simulation: Simulation = Simulation(SimulationConfig(seed=config.seed), START_NS, world)
-        # From the driver's first cut on: of the half revolution before it a map is begun that the next fits nowhere in.
+        # Start at the driver's first cut: a map started from the half revolution before it would not match the next
+        # scan.
         self.simulation.scanner.skip_to(_FIRST_CUT_S)
         self.rng = np.random.default_rng([53, config.seed])
         self.start = np.array(world.spawn)
@@ -244,25 +248,25 @@ class SimulatedStack:
         self._commands: deque[tuple[int, Record]] = deque()
         self._steps = 0
         self._next_exposure_s = self._next_depth_s = 0.0
-        self._exposed: deque[tuple[float, FloatArray]] = deque()  # on their way to the page
+        self._exposed: deque[tuple[float, FloatArray]] = deque()  # camera images on their way to the page
         self._for_depth: deque[tuple[float, float, bytes]] = deque()  # due, exposure, JPEG
         self._keyframe_at: FloatArray | None = None
-        self._drawn: dict[int, FloatArray] = {}  # pictures on their way to a keyframe: stamp, r-bot's true pose
-        self._whole: tuple[int, Callable[[], bytes]] | None = None  # newest view: its request, what draws it whole
+        self._drawn: dict[int, FloatArray] = {}  # images on their way to a keyframe: stamp, r-bot's true pose
+        # newest view: its request, and a function that renders it at full size
+        self._whole: tuple[int, Callable[[], bytes]] | None = None
         self._newest: dict[bool, Shown] = {}
         self.bus = LockstepBus(START_NS, keep=False, on_record=self._on_record)
         self._add_nodes()
 
     def close(self) -> None:
-        """Ends the nodes."""
+        """Close the nodes."""
         self.bus.close()
 
     def __enter__(self) -> SimulatedStack:
-        """Closes the nodes at the end of the block."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """See :meth:`__enter__`."""
+        """Close the nodes at the end of the block."""
         self.close()
 
     # -- nodes
@@ -326,13 +330,13 @@ class SimulatedStack:
             self._keyframe_at = self._drawn.pop(of, self._keyframe_at)
 
     def _draw_small(self, do: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """A virtual space's work, but views are drawn small, and it is kept what it takes to draw the newest whole."""
+        """Wrap a virtual space's work: render views small, and keep what the newest needs for rendering at full size."""
 
         def small(node: Any, job: Any) -> Any:
             if job.kind != "draw":
                 return do(node, job)
             as_now = copy.copy(node)
-            as_now.space = copy.copy(node.space)  # drawing changes what it has; keyframes stay as they are
+            as_now.space = copy.copy(node.space)  # rendering changes the space's state; the keyframes stay the same
             self._whole = int(job.message.id), lambda: bytes(do(as_now, job).jpeg)
             width, height = (max(16, int(side) // _SMALLER) for side in (job.message.width, job.message.height))
             return do(node, replace(job, message=replace(job.message, width=width, height=height)))
@@ -345,7 +349,7 @@ class SimulatedStack:
     # -- pictures
 
     def on_frame(self, virtual: bool, header: dict[str, Any], payload: bytes) -> None:
-        """A picture has come to the page."""
+        """Handle an image that arrives at the page."""
         if virtual:
             map_from_camera = matrix_from_quaternion(np.array(header["q"]))
             map_from_camera[:3, 3] = header["p"]
@@ -364,14 +368,14 @@ class SimulatedStack:
             self._show(shown)
 
     def on_show(self) -> None:
-        """The page changes to the other picture: the newest of it that there is, if it is fresh."""
+        """Switch the page to the other kind of image: its newest one, if it is fresh."""
         newest = self._newest.get(self.page.virtual)
         if newest is not None and self.time_s - newest.time_s < 0.5:
             heading = newest.heading if newest.virtual else float(self.robot[2])
             self._show(replace(newest, time_s=self.time_s, heading=heading))
 
     def _show(self, shown: Shown) -> None:
-        """The picture comes up: at a switch it and the one before are drawn whole; what draws others is let go."""
+        """Display an image. At a switch, render it and the previous one at full size; drop the other views' renderers."""
         pictures = self.log.pictures
         if pictures:
             switched = pictures[-1].virtual != shown.virtual
@@ -388,11 +392,11 @@ class SimulatedStack:
                 self._drawn[START_NS + round(now * 1e9)] = self.robot
                 jpeg = self._draw()
                 self._for_depth.append((now + self.config.depth_latency_s, now, jpeg))
-        # What is on its way: the console takes the first off the queue itself.
+        # Images in transit: the console itself takes the first off the queue.
         while self._exposed and now - self._exposed[0][0] >= self.config.camera_latency_s - 1e-9:
             waiting, exposure = len(self._exposed), self._exposed[0][0]
             self._publish_picture("/camera/image/compressed", b"", exposure)
-            if len(self._exposed) == waiting:  # the console is not there
+            if len(self._exposed) == waiting:  # the console is not available
                 self._exposed.popleft()
         while self._for_depth and now >= self._for_depth[0][0] - 1e-9:
             _, exposure, jpeg = self._for_depth.popleft()
@@ -403,13 +407,13 @@ class SimulatedStack:
         self.bus.publish(topic, message)
 
     def _worth_drawing(self) -> bool:
-        """Whether depth looks at a picture taken now, and makes a keyframe of it: none is of a place near here."""
+        """Whether depth would make a keyframe of an image taken now, because there is none near this position."""
         if self.time_s < self._next_depth_s - 1e-9:
             return False
         self._next_depth_s = self.time_s + 1.0 / self._depth_hz
         now_ns = START_NS + round(self.time_s * 1e9)
         wait_ns = (self.config.depth_latency_s + _OVERDUE_S) * 1e9
-        while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not taken
+        while self._drawn and now_ns - next(iter(self._drawn)) > wait_ns:  # not used
             del self._drawn[next(iter(self._drawn))]
         rule = self.nodes["depth_scaler"].config.keyframes
         places = [*self._drawn.values(), *([] if self._keyframe_at is None else [self._keyframe_at])]
@@ -437,7 +441,7 @@ class SimulatedStack:
 
     @property
     def shown_pose(self) -> FloatArray:
-        """Pose (3,) of the robot that is shown: the r-bot's as in the newest picture, at its present heading."""
+        """Pose (3,) of the shown robot: the r-bot's position as in the newest image, with its current heading."""
         if self.page.virtual:
             return self.vbot
         seen = self._newest.get(False)
@@ -445,12 +449,12 @@ class SimulatedStack:
         return np.array([*place, self.robot[2]])
 
     def step(self, operate: Callable[[], tuple[float, float]] | None = None) -> None:
-        """One sixtieth of a second; ``operate`` is asked for the command at 20 Hz."""
+        """Advance by one sixtieth of a second; ``operate`` returns the command at 20 Hz."""
         simulation = self.simulation
         simulation.step(STEP_S)
         now_ns = START_NS + round(simulation.time_s * 1e9)
         self.bus.advance_to(now_ns)
-        # Just after the driver's cut, so that no scan is late for it.
+        # Just after the driver's cut, so that no scan is late.
         packets = simulation.scan_packets() if self._steps % 6 == 3 else []
         if packets:
             scan = VelodyneScan(

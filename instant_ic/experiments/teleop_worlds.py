@@ -21,18 +21,18 @@ FloatArray = NDArray[np.float64]
 
 RANDOM_CORRIDORS = "corridors"
 BODY_M = (0.03, 0.9)
-"""Heights in which a thing is run into, as ``sim.robot.RobotConfig``."""
+"""Height range in which an object blocks the robot, as in ``sim.robot.RobotConfig``."""
 SPARE_M = 0.10
-"""Each obstacle can be passed by the true footprint with this much to spare on every side."""
+"""The true footprint can pass each obstacle with this margin on every side."""
 FIRST_M, APART_M, LAST_M = 3.2, 3.8, 2.4
-"""Metres from the start to the first obstacle, between two, and from the last to the goal, at least."""
+"""Minimum distance in metres from the start to the first obstacle, between two, and from the last to the goal."""
 _TALLER_THAN_THINGS_M = (1.9, 2.2)
 _TALL_M = (1.5, 1.9)
-"""In furnished worlds, what stands in these heights is no hidden thing; a door's lintel is above."""
+"""In furnished worlds, objects in this height range are not hidden from the operator; a door's lintel is above it."""
 _DRIVE_M = (3.5, 10.0)
-"""Of a drive across a furnished world: the shortest, the longest."""
+"""Shortest and longest drive across a furnished world."""
 _ROOM_M = 0.45
-"""Distance from everything at its start and its goal."""
+"""Distance from everything at the start and the goal of such a drive."""
 _LONGEST_THING_M = 1.5
 """Along the operator's line; v-bots pass no more than 3 m (config/control.yaml: max_pass_m)."""
 
@@ -51,12 +51,12 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class Course:
-    """A world, and what the operator wants in it.
+    """A world with the operator's goals.
 
     Attributes:
         world: what the devices see; the robot starts at its ``spawn``.
-        goals: (N, 2) places driven to one after another, in the world's frame.
-        obstacles: what stands in the operator's way.
+        goals: (N, 2) positions to visit in order, in the world's frame.
+        obstacles: objects on the operator's path.
         way_m: metres from the start over the goals.
     """
 
@@ -71,15 +71,16 @@ class Course:
 
 
 def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> Course:
-    """Another random corridor for each index, a drive along the simulator's corridor, or one across any other world.
+    """Create a course: a random corridor per index, a drive along the simulator's corridor, or one across another
+    world.
 
     Args:
         name: ``corridors``, or any name of ``sim.worlds.make_world``.
-        seed, index: which course; the same give the same.
+        seed, index: which course; the same values give the same course.
         from_spawn: start where the simulator starts robots, without goals; for recorded commands.
 
     Raises:
-        ValueError: no such world, or nowhere to drive to in it.
+        ValueError: no such world, or no possible drive in it.
     """
     if name == RANDOM_CORRIDORS:
         course = random_corridor(np.random.default_rng([47, seed, index]), f"corridors {seed}/{index}")
@@ -94,17 +95,17 @@ def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> C
 
 @functools.lru_cache(maxsize=1)
 def _world(name: str) -> World:
-    """Kept for the next course: a mesh with its textures takes seconds to load."""
+    """Cached for the next course: a mesh with its textures takes seconds to load."""
     from instant_ic.sim.worlds import make_world
 
     return make_world(name)
 
 
 def random_corridor(rng: np.random.Generator, name: str, attempts: int = 50) -> Course:
-    """A straight or bent corridor, 2.0 to 2.6 m wide, with one to three boxes, posts or low things in the middle.
+    """A straight or bent corridor, 2.0 to 2.6 m wide, with one to three boxes, posts or low objects in the middle.
 
     Raises:
-        ValueError: no passable corridor came up within ``attempts``.
+        ValueError: no passable corridor found within ``attempts``.
     """
     for _ in range(attempts):
         course = _corridor(rng, name)
@@ -156,7 +157,7 @@ def _corridor(rng: np.random.Generator, name: str) -> Course | None:
 
 
 def _obstacle(rng: np.random.Generator, start: FloatArray, heading: FloatArray, at: float) -> Obstacle:
-    """A box, a post or a low thing across the operator's line, ``at`` metres along it."""
+    """A box, a post or a low object across the operator's line, ``at`` metres along it."""
     kind = str(rng.choice(["box", "box", "post", "low"]))
     aside = float(rng.uniform(-0.2, 0.2))
     x, y = start + at * heading + aside * np.array([-heading[1], heading[0]])
@@ -170,12 +171,12 @@ def _obstacle(rng: np.random.Generator, start: FloatArray, heading: FloatArray, 
 
 
 def floor_plan(world: World, cell_m: float = 0.025) -> OccupancyMask:
-    """Where the robot's body would meet something."""
+    """Cells in which the robot's body would touch something."""
     return world.occupied(*BODY_M, cell_m)
 
 
 def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: float) -> FloatArray | None:
-    """Shortest way (N, 3) of the true footprint over all goals (M, 2); None where there is none."""
+    """Shortest path (N, 3) of the true footprint over all goals (M, 2); None if there is none."""
     way, pose = [np.asarray(start, np.float64)[None]], np.asarray(start, np.float64)
     for goal in goals:
         leg = shortest_way(mask, pose, np.array([*goal, 0.0]), 0.05, spare_m)
@@ -187,9 +188,9 @@ def route(mask: OccupancyMask, start: FloatArray, goals: FloatArray, spare_m: fl
 
 
 def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.2) -> Course:
-    """Any world: the operator drives straight on from its start, as far as the walls let him.
+    """Course in any world: the operator drives straight ahead from the start, as far as the walls allow.
 
-    What is taller than 1.9 m counts as wall, the rest in the way as obstacle.
+    Objects taller than 1.9 m count as walls; the others on the path count as obstacles.
 
     Raises:
         ValueError: a wall is too near.
@@ -210,7 +211,7 @@ def straight_ahead(world: World, most_m: float = 10.0, before_wall_m: float = 1.
 
 
 def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> tuple[Obstacle, ...]:
-    """What stands on the straight way (2,) to (2,) of a robot 0.5 m wide, as boxes across it."""
+    """Objects on the straight path from (2,) to (2,) of a robot 0.5 m wide, as boxes across it."""
     length = float(np.linalg.norm(goal - start))
     heading = (goal - start) / length
     yaw = math.atan2(heading[1], heading[0])
@@ -221,9 +222,9 @@ def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> 
     strip: NDArray[np.bool_] = np.asarray(plan.at(places).reshape(len(steps), -1).any(axis=1))
     begins = np.flatnonzero(strip & ~np.concatenate([[False], strip[:-1]]))
     ends = np.flatnonzero(strip & ~np.concatenate([strip[1:], [False]]))
-    found: list[list[float]] = []  # first and last metre of each
+    found: list[list[float]] = []  # first and last metre of each object
     for first, last in zip(steps[begins], steps[ends], strict=True):
-        if found and first - 0.5 * sum(found[-1]) < 1.0:  # the other side of a hollow one
+        if found and first - 0.5 * sum(found[-1]) < 1.0:  # the far side of a hollow object
             found[-1][1] = float(last)
         else:
             found.append([float(first), float(last)])
@@ -235,13 +236,13 @@ def things_between(plan: OccupancyMask, start: FloatArray, goal: FloatArray) -> 
 
 
 def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Course:
-    """A straight drive between two free places of a furnished world, over things in the way where there are any.
+    """A straight drive between two free positions of a furnished world, preferably through objects.
 
-    No wall and nothing taller than ``_TALL_M`` stands between, the goal can be reached round everything with
-    ``SPARE_M`` to spare, and things on the line leave the robot as much room before and behind them as in a corridor.
+    No wall and nothing taller than ``_TALL_M`` stands between. The goal can be reached around everything with a margin
+    of ``SPARE_M``. Objects on the line leave the robot as much room before and behind them as in a corridor.
 
     Raises:
-        ValueError: no such drive came up within ``attempts``.
+        ValueError: no such drive found within ``attempts``.
     """
     plan, tall = floor_plan(world), world.occupied(*_TALL_M, 0.05)
     away = plan.distance_m()
@@ -275,7 +276,7 @@ def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Cour
 
 
 def _passable(thing: Obstacle, start: FloatArray, goal: FloatArray) -> bool:
-    """Whether there is room before and behind it, and it is no longer than a v-bot passes."""
+    """Whether there is room before and behind an object, and it is no longer than a v-bot can pass."""
     at, half = np.array([thing.x, thing.y]), 0.5 * thing.length
     before, behind = (float(np.linalg.norm(end - at)) - half for end in (start, goal))
     return thing.length <= _LONGEST_THING_M and before >= FIRST_M - 1.0 and behind >= LAST_M - 1.0

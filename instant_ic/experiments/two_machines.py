@@ -1,4 +1,4 @@
-"""Two machines on one: network namespaces joined by a virtual cable that can be slow, lossy, or pulled out."""
+"""Two machines simulated on one: network namespaces joined by a virtual cable that can be slow, lossy or cut."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PORT = 7450
 
 
 def missing() -> str:
-    """What this machine lacks for it; empty if nothing."""
+    """Return what this machine lacks for the simulation; empty if nothing."""
     if os.geteuid() != 0:
         return "network namespaces need root"
     if shutil.which("ip") is None:
@@ -50,10 +50,11 @@ def missing() -> str:
 
 
 class TwoMachines:
-    """Robot and station, each with a network of its own, a run directory and keys; a context manager.
+    """Robot and station with separate networks, run directories and keys; a context manager.
 
-    Delay and loss are made by the kernel (``tc netem``) where it can, else by a proxy on the station's side
-    (:mod:`~instant_ic.experiments.impaired_link`), where a lost packet is a stall of 0.2 s; ``made_by`` tells.
+    The kernel adds delay and loss (``tc netem``) if it can. Otherwise a proxy on the station's side does
+    (:mod:`~instant_ic.experiments.impaired_link`), in which a lost packet is a stall of 0.2 s. ``made_by`` names the
+    method.
 
     Args:
         folder: short path for run directories and keys.
@@ -68,10 +69,10 @@ class TwoMachines:
         self._names = {host: f"ic{host[0]}{os.getpid()}" for host in ("robot", "station")}
         self._proxy: subprocess.Popen[bytes] | None = None
         self.station_target = (ROBOT_ADDRESS, PORT)
-        """Where the station finds the robot's bridge."""
+        """Address of the robot's bridge for the station."""
 
     def __enter__(self) -> Self:
-        """Makes networks and keys."""
+        """Create networks and keys."""
         try:
             self._make_networks()
             self._make_keys()
@@ -83,23 +84,23 @@ class TwoMachines:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Takes everything down."""
+        """Remove everything."""
         self._take_down()
 
     def prefix(self, host: str) -> list[str]:
-        """Command that starts another inside a host's network."""
+        """Command prefix that runs another command inside a host's network."""
         return ["ip", "netns", "exec", self._names[host]]
 
     def run_dir(self, host: str) -> Path:
-        """A host's run directory."""
+        """Return a host's run directory."""
         return self.folder / host[0]
 
     def keys(self, host: str) -> Path:
-        """A host's folder of keys."""
+        """Return a host's key folder."""
         return self.folder / f"k{host[0]}"
 
     def robot(self, **arguments: Any) -> Stack:
-        """The robot's stack, against simulated devices."""
+        """The robot's stack with simulated devices."""
         arguments = {"keys": self.keys("robot"), "listen": f"tcp://{ROBOT_ADDRESS}:{PORT}", **arguments}
         return Stack("sim_robot", self.run_dir("robot"), arguments, prefix=self.prefix("robot"))
 
@@ -110,11 +111,11 @@ class TwoMachines:
         return Stack("station", self.run_dir("station"), arguments, prefix=self.prefix("station"))
 
     def cut(self) -> None:
-        """Pulls the cable out."""
+        """Disconnect the cable."""
         self._ip("-n", self._names["station"], "link", "set", "ics", "down")
 
     def mend(self) -> None:
-        """Puts the cable back."""
+        """Reconnect the cable."""
         self._ip("-n", self._names["station"], "link", "set", "ics", "up")
 
     # -- inside ------------------------------------------------------------------------------------
@@ -145,7 +146,7 @@ class TwoMachines:
         if not any(added):
             self.made_by = "tc netem"
             return
-        self.made_by = "proxy"  # the kernel has no sch_netem
+        self.made_by = "proxy"  # the kernel lacks sch_netem
         words = [str(PORT), ROBOT_ADDRESS, str(PORT), f"--delay-ms={self.delay_ms}", f"--jitter-ms={self.jitter_ms}"]
         module = "instant_ic.experiments.impaired_link"
         self._proxy = subprocess.Popen(
@@ -168,10 +169,10 @@ class TwoMachines:
 
 
 class Hand:
-    """An operator's hand: commands on ``/operator/cmd_vel`` of a stack, 20 a second; a context manager.
+    """Simulated operator: publishes commands on ``/operator/cmd_vel`` of a stack, 20 per second; a context manager.
 
     Args:
-        stack: where; its observer publishes.
+        stack: target; its observer publishes.
     """
 
     def __init__(self, stack: Stack) -> None:
@@ -185,32 +186,32 @@ class Hand:
             self._out.publish(twist_stamped(*self.command, time.time_ns()))
 
     def __enter__(self) -> Self:
-        """Begins to send."""
+        """Start sending."""
         self._thread.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Sends nothing any more."""
+        """Stop sending."""
         self._stop.set()
         self._thread.join(5)
 
 
 @dataclass
 class CutDrive:
-    """What came of :func:`drive_and_cut`; seconds and metres.
+    """Result of :func:`drive_and_cut`; seconds and metres.
 
     Attributes:
-        picture_age_s: from the exposure of the newest picture at the station until then.
+        picture_age_s: from the exposure of the newest image at the station until the cut.
         driven_m: by the operator's command, before the cut.
         stop_s: from the cut to the last motion of the wheels.
-        drift_m: of the robot that stands, until the cable is back and the station linked.
-        relink_s: from the cable's return to the link.
-        driven_again_m: after it.
-        offset_ms, rtt_ms, jitter_ms: of the robot's clock as the station sees it.
-        console: what the station's page missed; empty words where nothing.
-        words: what both bridges said while the cable was out.
+        drift_m: of the stopped robot, until the cable is reconnected and the station linked.
+        relink_s: from reconnecting the cable to the link.
+        driven_again_m: after the link is back.
+        offset_ms, rtt_ms, jitter_ms: of the robot's clock as seen by the station.
+        console: data missing on the station's page; empty if nothing.
+        words: messages of both bridges during the cut.
     """
 
     picture_age_s: float = math.nan
@@ -227,7 +228,7 @@ class CutDrive:
 
 
 class _Diagnoses:
-    """The newest diagnoses on a stack's bus by name: words and values."""
+    """Newest diagnostics on a stack's bus by name: message and values."""
 
     def __init__(self, stack: Stack) -> None:
         self.words: dict[str, str] = {}
@@ -241,10 +242,10 @@ class _Diagnoses:
 
 
 def drive_and_cut(machines: TwoMachines, robot: Stack, station: Stack) -> CutDrive:
-    """The station drives the robot, the cable is pulled while it moves, and put back; then it drives on.
+    """Drive the robot from the station, disconnect the cable while it moves, reconnect it, and drive on.
 
     Raises:
-        StackError: something did not happen in time.
+        StackError: a condition was not met in time.
     """
     result = CutDrive()
     real = message_type("ControlState").REAL
@@ -272,7 +273,7 @@ def drive_and_cut(machines: TwoMachines, robot: Stack, station: Stack) -> CutDri
     def speed() -> float:
         return abs(speeds[-1].twist.twist.linear.x) if speeds else 0.0
 
-    # What the operator needs comes over: picture, state, pose, map, in the console's own judgement.
+    # The operator's data arrives: image, state, pose and map, as judged by the console.
     wait(lambda: pictures and maps, 180, "picture and map at the station")
     names = [f"console: {name}" for name in ("camera", "controller", "pose")]
     wait(lambda: all(seen.words.get(name) == "" for name in names), 120, "console that misses nothing")

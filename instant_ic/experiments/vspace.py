@@ -1,4 +1,4 @@
-"""Reconstruction away from the panorama: PSNR and SSIM against distance and training time (paper, V.A-C, Figs. 3-6)."""
+"""Reconstruction away from the panorama: PSNR and SSIM by distance and training time (paper, V.A-C, Figs. 3-6)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _STRIP_AT_M = (0.5, 1.0, 2.0, 3.0)
 
 @dataclass(frozen=True)
 class Settings:
-    """Of one evaluation.
+    """Settings of one evaluation.
 
     Attributes:
         paths: of ``PATHS``; sources: of ``SOURCES``.
@@ -56,9 +56,9 @@ class Settings:
         times: training times, CPU seconds, at which ``ours`` and ``field`` are measured at the panorama and 1 m ahead.
         size: width and height of the views; fov_deg: their horizontal field of view.
         panorama_width: of the keyframes, pixels.
-        keyframes: 1, or more: each a metre behind the next on the path.
-        step_m, reach_m: distances from the last panorama are multiples of the one up to the other.
-        depth_source: where the depth of ``ours`` comes from, see ``depth.sources``.
+        keyframes: 1, or more, each a metre behind the next on the path.
+        step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
+        depth_source: depth source of ``ours``, see ``depth.sources``.
         seed: of LiDAR noise, training and the changed colours.
     """
 
@@ -98,7 +98,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Row:
-    """One picture: ``seconds`` is what its source took to make ready, CPU seconds."""
+    """One image; ``seconds`` is the preparation time of its source, CPU seconds."""
 
     path: str
     source: str
@@ -107,12 +107,12 @@ class Row:
     ssim: float
     seconds: float
     confidence: float
-    """Share of the picture that a panorama has seen."""
+    """Share of the image that a panorama has seen."""
 
 
 @dataclass
 class Report:
-    """What ``evaluate`` found."""
+    """Result of ``evaluate``."""
 
     world: str
     start: tuple[float, float, float]
@@ -122,10 +122,10 @@ class Report:
     training: list[Row] = field(default_factory=list)
     """``ours`` and ``field`` at the panorama (distance 0) and 1 m ahead by training time, on the first path."""
     strips: dict[str, dict[float, dict[str, Picture]]] = field(default_factory=dict)
-    """Path → distance → source → picture; ``truth`` among them."""
+    """Path → distance → source → image; ``truth`` among the sources."""
 
     def figures(self) -> dict[str, Any]:
-        """For JSON."""
+        """Figures for JSON."""
         return {
             "world": self.world,
             "start": list(self.start),
@@ -147,7 +147,7 @@ class Report:
         return table
 
     def means(self) -> dict[str, dict[str, dict[str, float]]]:
-        """Path → source → mean of PSNR and SSIM from 0.25 m on (at the panorama itself everything is easy)."""
+        """Path → source → mean of PSNR and SSIM from 0.25 m on (at the panorama itself every source is good)."""
         result: dict[str, dict[str, dict[str, float]]] = {}
         for key in ("psnr_db", "ssim"):
             for path, sources in self.table(key).items():
@@ -159,7 +159,7 @@ class Report:
         return result
 
     def verdict(self) -> dict[str, Any]:
-        """The targets: ``ours`` above each simpler source at every distance from 0.25 to 2 m, and beside the warps."""
+        """Target check: ``ours`` against the simpler sources at every distance from 0.25 to 2 m, and against the warps."""
         result: dict[str, Any] = {}
         simpler, warps = ("no-depth", "no-scale", "panorama"), ("depth-warp", "point-warp")
         for path in self.settings.paths:
@@ -190,9 +190,9 @@ class Report:
 
 
 def path_poses(world: World, start: tuple[float, float, float], path: str, distances: Iterable[float]) -> list[Any]:
-    """Camera poses (4, 4) at distances from the start, as the crow flies, looking along the path; ends at an obstacle.
+    """Camera poses (4, 4) at straight-line distances from the start, looking along the path; ends at an obstacle.
 
-    ``curve`` is an arc: of the radii and sides tried the tightest that stays free, else the one that goes furthest.
+    ``curve`` is an arc: the tightest free one of the radii and sides tried, else the one that reaches furthest.
     Negative distances lie behind the start.
     """
     mask = world.occupied(0.03, 1.9, 0.05)
@@ -227,7 +227,7 @@ def path_poses(world: World, start: tuple[float, float, float], path: str, dista
 
 
 def start_pose(world: World, start: tuple[float, float, float] | None) -> tuple[float, float, float]:
-    """The start given, or the world's own, turned to where the straight path is longest.
+    """The given start, or the world's own, rotated to where the straight path is longest.
 
     Raises:
         ValueError: the start is not free.
@@ -248,7 +248,7 @@ def start_pose(world: World, start: tuple[float, float, float] | None) -> tuple[
 
 
 def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
-    """PSNR (dB, at most 99) and SSIM of two pictures (H, W, 3) uint8."""
+    """PSNR (dB, at most 99) and SSIM of two images (H, W, 3) uint8."""
     from skimage.metrics import structural_similarity
 
     from instant_ic.experiments.pictures import psnr_db
@@ -266,16 +266,16 @@ def evaluate(
     tell: Callable[[str, int, int], None] = lambda words, done, total: None,
     config: VirtualSpaceConfig | None = None,
 ) -> Report:
-    """Runs the evaluation.
+    """Run the evaluation.
 
     Args:
-        world: as ``sim.worlds.make_world`` takes it.
+        world: as for ``sim.worlds.make_world``.
         start: (x, y, yaw) of the last panorama; None: the world's own start.
-        tell: called with what is being done, the pictures done and all of them.
+        tell: called with the current activity, the number of finished images and their total.
         config: of the virtual space.
 
     Raises:
-        ValueError: the world, the start or a setting is no good, or the depth of a panorama cannot be scaled.
+        ValueError: world, start or a setting is invalid, or the depth of a panorama cannot be scaled.
     """
     from instant_ic import paths as places
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
@@ -299,7 +299,8 @@ def evaluate(
     report = Report(world, start, settings, {})
     shots_of: dict[str, list[Shot]] = {}
     for path in settings.paths:
-        # Behind the start a path has to be free too; where it ends, fewer keyframes are taken, and the report says so.
+        # The path must also be free behind the start; where it ends, fewer keyframes are taken, and the report states
+        # it.
         back = path_poses(made, start, path, [-float(k) for k in range(settings.keyframes)])
         shots_of[path] = (
             next(iter(shots_of.values()))

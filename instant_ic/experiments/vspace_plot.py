@@ -1,4 +1,4 @@
-"""Plots and strips of pictures of ``evaluation.vspace``."""
+"""Plots and image strips of ``experiments.vspace``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from instant_ic.experiments.pictures import new_figure, save_figure
 from instant_ic.experiments.vspace import Report
 
 _TILE = 320
-"""Width of a strip's pictures, pixels."""
+"""Width of a strip's images, pixels."""
 _LABELS = {"psnr_db": "PSNR, dB", "ssim": "SSIM"}
 
 
 def save_plot(path: Path, report: Report) -> None:
-    """PSNR and SSIM against distance, a row a path, and against training time where it was measured."""
+    """Save PSNR and SSIM by distance, one row per path, and by training time if measured."""
     panels = [*report.settings.paths, *(["time"] if report.training else [])]
     drawn, axes = new_figure(len(panels), 2, (10.0, 3.4 * len(panels)))
     for panel, pair in zip(panels, axes, strict=True):
@@ -41,10 +41,10 @@ def save_plot(path: Path, report: Report) -> None:
 
 
 def save_strip(path: Path, report: Report) -> None:
-    """Pictures: a row each path and distance, the truth first, then the sources.
+    """Save an image strip: one row per path and distance, ground truth first, then the sources.
 
     Raises:
-        ValueError: there is no picture, or the file cannot be written.
+        ValueError: there is no image, or the file cannot be written.
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Sources of ``evaluation.vspace``: what draws a place from a pose, made of keyframes in a simulated world."""
+"""View sources of ``experiments.vspace``: render a place from a pose, using keyframes in a simulated world."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 Picture = NDArray[np.uint8]
 CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
 Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, float]]
-"""Draws the place from a pose (4, 4) at width, height, field of view: picture, and share that a panorama has seen."""
+"""Renders the place from a pose (4, 4) at width, height, field of view; returns image and share seen by a panorama."""
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A keyframe: panorama, its true depth, the model's depth, and the depth that ``ours`` uses."""
+    """A keyframe: panorama, its ground-truth depth, the model's depth, and the depth that ``ours`` uses."""
 
     pose: NDArray[np.float64]
     rgb: Picture
@@ -36,7 +36,7 @@ class Shot:
 
 
 def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: Settings, model: Any) -> Shot:
-    """Panorama from a pose, and its depth: the model's, and as scaled by a simulated VLP-16."""
+    """Take a panorama from a pose with its depth: the model's, and the depth scaled by a simulated VLP-16."""
     from instant_ic.depth.scaler import ScalerConfig
     from instant_ic.depth.sources import DepthSource, SourceConfig
     from instant_ic.experiments.depth_lidar import Errors, measure_world
@@ -55,7 +55,7 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: S
 
 
 def scanned(world: World, seed: int) -> World:
-    """The world as scanned at another time: another exposure and white balance, and each texture's own drift."""
+    """The world as scanned at another time: with different exposure and white balance, and drift per texture."""
     rng = np.random.default_rng([71, seed])
     drift = np.exp(rng.normal(0, 0.12, (int(world.texture.max()) + 1, 3)))[world.texture]
     tint = world.tint * drift * (0.85 * np.array([1.08, 1.0, 0.88]))
@@ -63,7 +63,7 @@ def scanned(world: World, seed: int) -> World:
 
 
 def train(space: Any, cpu_seconds: float) -> None:
-    """Trains until so much CPU time of this process is spent, or the schedule has ended."""
+    """Train until this process has spent the CPU time, or the schedule has ended."""
     start = time.process_time()
     while not space.status.converged and time.process_time() - start < cpu_seconds:
         space.train(iterations=5)
@@ -73,7 +73,10 @@ def point_warp(
     rgb: Picture, depth_m: NDArray[np.floating], pose: NDArray[np.float64], view: NDArray[np.float64],
     width: int, height: int, fov: float,
 ) -> tuple[Picture, float]:  # fmt: skip
-    """The panorama's pixels as points with a z-buffer, holes filled from around; and the share that is no hole."""
+    """Panorama pixels rendered as points with a z-buffer, holes filled from their surroundings.
+
+    Returns the image and the share of pixels that are not holes.
+    """
     import cv2
 
     from instant_ic.geometry.projections import equirect_directions
@@ -98,9 +101,10 @@ def point_warp(
 
 
 def make_space(shots: list[Shot], depth: str, settings: Settings, config: VirtualSpaceConfig) -> Any:
-    """A virtual space with the keyframes, oldest first, by ``scaled``, ``raw`` or ``true`` depth.
+    """A virtual space with the keyframes, oldest first, using ``scaled``, ``raw`` or ``true`` depth.
 
-    The last is not trained yet; those before it are, until they are fit, as on the way (at most ``settings.seconds``).
+    The last keyframe is untrained. The others are trained until they are ready, as during a drive (at most
+    ``settings.seconds``).
     """
     from instant_ic.vspace import VirtualSpace
 
@@ -120,16 +124,16 @@ def make_space(shots: list[Shot], depth: str, settings: Settings, config: Virtua
 
 
 def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
-    """The same, with pictures of the field however young it is."""
+    """The same configuration, but rendering the field however little it is trained."""
     return replace(config, picture=replace(config.picture, field_from_db=config.picture.panorama_until_db))
 
 
 def make_source(
     name: str, shots: list[Shot], settings: Settings, config: VirtualSpaceConfig, before: Callable[[], World]
 ) -> tuple[Drawer, float]:
-    """A source made ready: what draws it, and the CPU seconds that it took.
+    """Prepare a source; return its renderer and the CPU seconds spent.
 
-    ``before`` gives the world as it was when it was scanned.
+    ``before`` returns the world as it was when it was scanned.
     """
     from instant_ic.vspace.warp import PanoramaWarp
 
@@ -183,7 +187,7 @@ def make_source(
 
 
 def depth_figures(shots: list[Shot]) -> dict[str, Any]:
-    """How the last panorama's depth was found, and how far it is off the truth (median and mean, by solid angle)."""
+    """How the last panorama's depth was determined, and its error (median and mean, by solid angle)."""
     import cv2
 
     last = shots[-1]
