@@ -1,10 +1,10 @@
-"""How fast bags are written and read: ours beside rosbags' writer, and what recording costs a stack.
+"""Speed of writing and reading bags, compared with rosbags' writer, and the cost of recording.
 
     python benchmarks/bags.py [--seconds 3] [--folder /tmp] [--out result.json]
 
 Prints JSON. ``write``: messages of each size in one bag, MB/s of payload into the page cache, with and without zstd.
-``read``: the same bag with our reader. ``record``: a publisher process sends 5.5 MB pictures at 30 Hz (and at 20 kB,
-200 Hz) to the recorder node in a process of its own: its CPU in % of one core, and what it lost.
+``read``: the same bag with our reader. ``record``: a publisher process sends 5.5 MB images at 30 Hz (and 20 kB messages
+at 200 Hz) to the recorder node in its own process; reported are the recorder's CPU in % of one core and lost messages.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ IMAGE = "sensor_msgs/msg/Image"
 
 
 def picture(size: int) -> bytes:
-    """Serialized picture of about this size that compresses as photos in raw pixels do: smooth, with noise."""
+    """Serialized image of about this size that compresses like a raw photo: smooth, with noise."""
     from instant_ic.msg import image_message, serialize
 
     height = max(1, int((size / 6) ** 0.5))
@@ -41,7 +41,7 @@ def picture(size: int) -> bytes:
 
 
 def ours(folder: Path, payload: bytes, count: int, compressed: bool) -> None:
-    """Our writer."""
+    """Write with our writer."""
     from instant_ic.bag import BagWriter
 
     with BagWriter(folder, compressed) as writer:
@@ -50,7 +50,7 @@ def ours(folder: Path, payload: bytes, count: int, compressed: bool) -> None:
 
 
 def rosbags(folder: Path, payload: bytes, count: int, compressed: bool) -> None:
-    """The `rosbags` package's."""
+    """Write with the `rosbags` package."""
     from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
     from instant_ic.msg import typestore
@@ -65,7 +65,7 @@ def rosbags(folder: Path, payload: bytes, count: int, compressed: bool) -> None:
 
 
 def foxglove(folder: Path, payload: bytes, count: int, compressed: bool) -> None:
-    """foxglove-sdk's (Rust)."""
+    """Write with foxglove-sdk (Rust)."""
     import foxglove
 
     from instant_ic.bag.metadata import own_schema
@@ -83,7 +83,7 @@ def foxglove(folder: Path, payload: bytes, count: int, compressed: bool) -> None
 def megabytes_a_second(
     function: Callable[[Path, bytes, int, bool], None], root: Path, payload: bytes, compressed: bool, seconds: float
 ) -> tuple[float, float]:
-    """MB/s of payload, best of three runs, and the size of the bag as a share of it."""
+    """MB/s of payload, best of three runs, and the size of the bag relative to it."""
     count, best, share = max(3, int(2e8 * seconds / 3 / len(payload))), 0.0, 1.0
     for _ in range(3):
         folder = root / f"bag{time.monotonic_ns()}"
@@ -135,7 +135,7 @@ transport.close()
 
 
 def recording(root: Path, size: int, hz: float, seconds: float, words: list[str]) -> dict[str, Any]:
-    """CPU and losses of a recorder while a publisher sends."""
+    """CPU and lost messages of a recorder while a publisher sends."""
     from instant_ic.bag import BagReader
 
     run, bag = Path(tempfile.mkdtemp(prefix="ic-")), root / f"record{time.monotonic_ns()}"
@@ -145,7 +145,7 @@ def recording(root: Path, size: int, hz: float, seconds: float, words: list[str]
     ic = [sys.executable, "-m", "instant_ic.cli.main", "bag", "record", "-o", str(bag), "/image", *words]
     recorder = subprocess.Popen(ic, env=environment, stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        # The publisher starts once somebody listens, and the recorder's own start is not counted.
+        # The publisher starts after the recorder has subscribed, so that the recorder's start-up is not counted.
         publisher = subprocess.Popen([sys.executable, "-c", code], env=environment)
         while not (bag / f"{bag.name}.mcap").exists():
             time.sleep(0.05)
@@ -176,7 +176,6 @@ def recording(root: Path, size: int, hz: float, seconds: float, words: list[str]
 
 
 def main() -> None:
-    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=3.0, help="about 200 MB a second of each measurement")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()), help="where the bags go")

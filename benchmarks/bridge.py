@@ -1,11 +1,11 @@
-"""Two machines: latency of commands, age of pictures and state over the bridge and without it, CPU; as JSON.
+"""Bridge between two machines: latency of commands, age of images and state with and without the bridge, CPU; as JSON.
 
-python benchmarks/bridge.py [SECONDS]     # a scenario, default 20
-python benchmarks/bridge.py --cut         # as root: real stacks in two network namespaces, the cable pulled
-python benchmarks/bridge.py --losses      # seconds until the link notices a loss and until it is back
+python benchmarks/bridge.py [SECONDS]     # seconds per scenario, default 20
+python benchmarks/bridge.py --cut         # as root: real stacks in two network namespaces, cable disconnected
+python benchmarks/bridge.py --losses      # seconds until the link detects a loss and until it is back
 
-Commands go 20 times a second from the station to the robot; pictures (200 kB, 10 a second) and states (20 a second) the
-other way. Two bridges with CURVE and the shipped lists, in processes of their own; the network is
+Commands go 20 times per second from the station to the robot; images (200 kB, 10 per second) and states (20 per second)
+the other way. Two bridges with CURVE and the shipped topic lists run in their own processes; the network is
 ``instant_ic.experiments.impaired_link`` in a third.
 """
 
@@ -62,7 +62,7 @@ SCENARIOS: dict[str, list[str] | None] = {
 
 
 class Host:
-    """A node that sends and listens, spinning on a thread of its own."""
+    """A node that publishes and subscribes, spinning on its own thread."""
 
     def __init__(self, run_dir: Path, name: str) -> None:
         self.node: Node[Any] = Observer(
@@ -73,7 +73,7 @@ class Host:
         self.stop = threading.Event()
 
     def listen(self, topic: str, message_class: Any) -> None:
-        """Notes the age of every message when its callback runs."""
+        """Record the age of every message when its callback runs."""
         ages = self.ages_ms.setdefault(topic, [])
         self.node.subscribe(topic, message_class, lambda m: ages.append((time.time_ns() - stamp_ns(m)) / 1e6), SENSOR)
 
@@ -84,7 +84,7 @@ class Host:
             self.node.spin_once()
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the node."""
         self.stop.set()
         self.thread.join(5)
         self.node.close()
@@ -116,7 +116,7 @@ def bridges(folder: Path, network: list[str]) -> Iterator[list[psutil.Process]]:
 
 
 def summary(ages_ms: list[float]) -> dict[str, float]:
-    """Percentiles of ages."""
+    """Percentiles of the ages."""
     if not ages_ms:
         return {"count": 0}
     p50, p99 = np.percentile(ages_ms, [50, 99])
@@ -124,7 +124,7 @@ def summary(ages_ms: list[float]) -> dict[str, float]:
 
 
 def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
-    """One scenario."""
+    """Run one scenario."""
     with tempfile.TemporaryDirectory(prefix="icb") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         processes = [] if network is None else stack.enter_context(bridges(folder, network))
@@ -180,7 +180,7 @@ def run(network: list[str] | None, seconds: float) -> dict[str, Any]:
 
 
 class LinkEnd:
-    """One end of a link alone, with the steady time of each event of it."""
+    """One end of a link on its own, with the monotonic time of each of its events."""
 
     def __init__(self, link_class: Any, *where: Any, name: str, store: KeyStore, exports: Any, imports: Any) -> None:
         self.events: list[tuple[float, Any]] = []
@@ -192,7 +192,7 @@ class LinkEnd:
         self.events.append((time.monotonic(), event.event))
 
     def since(self, begin_s: float, kind: Any) -> float:
-        """Seconds from a moment to the first event of a kind after it.
+        """Seconds from a time to the first later event of a kind.
 
         Raises:
             SystemExit: there is none within 30 s.
@@ -207,7 +207,7 @@ class LinkEnd:
 
 
 def losses(repeat: int) -> dict[str, Any]:
-    """A hole in the network, a robot's bridge that starts again, a key that is revoked: seconds, median and worst."""
+    """Network outage, restart of the robot's bridge, and revocation of a key: seconds, median and worst."""
     seconds: dict[str, list[float]] = {name: [] for name in ("hole_noticed", "hole_back", "restart_back", "revoked")}
     command, state = TopicRule(COMMAND, lane="command", max_age_s=0.25), TopicRule(STATE)
     for _ in range(repeat):
@@ -253,7 +253,7 @@ def losses(repeat: int) -> dict[str, Any]:
 
 
 def cut() -> dict[str, Any]:
-    """Robot and station in two network namespaces; the cable is pulled while the robot drives."""
+    """Robot and station in two network namespaces; the cable is disconnected while the robot drives."""
     if why := missing():
         raise SystemExit(why)
     with tempfile.TemporaryDirectory(prefix="ic2") as name, TwoMachines(Path(name), 20, 5) as machines:
@@ -262,7 +262,6 @@ def cut() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Prints one JSON object."""
     if sys.argv[1:] == ["--cut"]:
         print(json.dumps(cut(), indent=2))
         return

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""The bus beside other middlewares: latency, throughput and fan-out, each transport between processes, in one run.
+"""The bus compared with other middleware: latency, throughput and fan-out between processes, in one run.
 
     python benchmarks/bus.py --json bus.json --plot docs/images/bus_latency.png      (about 12 minutes)
     python benchmarks/bus.py --quick                                                 (about 2 minutes)
 
-Every transport sends the same frames at the same pace, in turns within one run, so that whatever else the machine does
-disturbs all of them alike. Latency is from before the call that sends to after the receiver has read a byte of every
-4096. A transport whose package is missing is «not measured».
+All transports send the same frames at the same pace, alternating within one run, so that other load on the machine
+affects all of them alike. Latency is measured from before the send call until the receiver has read one byte of every
+4096. A transport whose package is missing is "not measured".
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SIZES = {"b100": 100, "k20": 20_000, "k200": 200_000, "m1": 1_200_000, "m5": 5_5
 LABELS = {"b100": "100 B", "k20": "20 kB", "k200": "200 kB", "m1": "1.2 MB", "m5": "5.5 MB"}
 PERIOD_S = {"b100": 0.01, "k20": 0.01, "k200": 0.02, "m1": 0.035, "m5": 0.07}
 FANOUT = 4
-QUIET_S = 0.5  # after so long without a message nothing more is expected
+QUIET_S = 0.5  # no more messages are expected after this time without one
 DEBIAN_PYTHON = "/usr/bin/python3"
 
 NAMES = {
@@ -99,7 +99,7 @@ class Pair:
     address: str
 
     def send(self, topic: str, count: int, period_s: float, seconds: float = 60.0) -> tuple[dict[str, Any], list[Any]]:
-        """Sends and waits until everything that will come has come."""
+        """Send frames and wait until all expected ones have arrived."""
         sent = self.pub.ask({"topic": topic, "count": count, "period_s": period_s, "seconds": seconds})
         got: list[dict[str, Any]] = [sub.ask() for sub in self.subs]
         quiet_s = time.monotonic() + QUIET_S
@@ -112,10 +112,10 @@ class Pair:
         return sent, got
 
     def warm_up(self, topic: str) -> None:
-        """Until every reader hears the publisher.
+        """Wait until every reader receives from the publisher.
 
         Raises:
-            RuntimeError: one never does.
+            RuntimeError: a reader does not.
         """
         heard = [False] * len(self.subs)
         deadline = time.monotonic() + 20.0
@@ -131,7 +131,7 @@ class Pair:
 
 
 def joined(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """Two collections of one receiver as one."""
+    """Merge two collections of one receiver."""
     seconds = a["seconds"] + b["seconds"] if a["count"] and b["count"] else a["seconds"] or b["seconds"]
     return {
         "latencies_us": a["latencies_us"] + b["latencies_us"],
@@ -150,7 +150,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def addresses(transports: list[str], folder: Path) -> Iterator[dict[str, str]]:
-    """Where each transport meets; runs the ROS master while the block lasts."""
+    """Address of each transport; runs the ROS master while the block lasts."""
     found = {
         "ours": str(folder / "ours"),
         "image": str(folder / "image"),
@@ -181,10 +181,10 @@ def addresses(transports: list[str], folder: Path) -> Iterator[dict[str, str]]:
 
 
 def open_pair(transport: str, address: str, topics: dict[str, int], readers: int) -> Pair:
-    """Starts both sides.
+    """Start both sides.
 
     Raises:
-        RuntimeError: the transport is not there or does not work.
+        RuntimeError: the transport is not installed or does not work.
     """
     peers: list[Peer] = []
     try:
@@ -205,7 +205,7 @@ def open_pair(transport: str, address: str, topics: dict[str, int], readers: int
 
 
 def summary(latencies: list[float], sent: int) -> dict[str, Any]:
-    """Figures of one cell of the table."""
+    """Figures of one table cell."""
     if not latencies:
         return {"p50_us": None, "p99_us": None, "received": 0, "sent": sent}
     ordered = sorted(latencies)
@@ -272,7 +272,7 @@ def measure(transports: list[str], rounds: int, count: int, flood_s: float, note
 
 
 def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
-    """What arrives when the sender never waits, by size."""
+    """Throughput by size when the sender never waits."""
     topics = {f"flood_{name}": size for name, size in SIZES.items()}
     pair = open_pair(transport, address, topics, 1)
     try:
@@ -291,7 +291,7 @@ def flood(transport: str, address: str, seconds: float) -> dict[str, Any]:
 
 
 def verdicts(result: dict[str, Any]) -> dict[str, Any]:
-    """The targets, each with its figure."""
+    """Check the targets, each with its figure."""
     latency = result["latency"]
 
     def p50(transport: str, topic: str) -> float | None:
@@ -312,7 +312,7 @@ def verdicts(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """The figures as Markdown."""
+    """Format the figures as Markdown."""
     lines = ["| p50 / p99 in µs | " + " | ".join(LABELS.values()) + " | 5.5 MB to four |", "|---" * 7 + "|"]
     for transport, name in NAMES.items():
         if transport not in result["latency"]:
@@ -330,7 +330,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def plot(result: dict[str, Any], path: Path) -> None:
-    """Latency over size, p50 with p99 above it."""
+    """Plot latency over size, p50 with p99 above it."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -370,7 +370,7 @@ def main() -> int:
         help=", ".join(NAMES),
     )
     args = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the ROS master ends too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # so that the ROS master is stopped too
     started = time.monotonic()
 
     def note(text: str) -> None:

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""One side of one transport, for benchmarks/bus.py; told what to do by JSON lines on standard input.
+"""One side of one transport, for benchmarks/bus.py; controlled by JSON lines on standard input.
 
-Runs under any Python 3.9: rospy lives in Debian's own interpreter. A frame carries the time of sending
-(CLOCK_MONOTONIC, one clock for all processes of a machine) at byte 8. A receiver reads one byte of every 4096 before
-it takes the time, so that no transport gains by not having brought the data yet.
+Runs under any Python 3.9, because rospy needs Debian's own interpreter. A frame carries the send time (CLOCK_MONOTONIC,
+one clock for all processes of a machine) at byte 8. A receiver reads one byte of every 4096 before it takes the time,
+so that a transport gains nothing by delivering data that is not yet in memory.
 
     bus_peer.py TRANSPORT pub|sub TOPIC=BYTES,... ADDRESS
 """
@@ -20,11 +20,11 @@ import time
 KEEP = []  # sessions that must outlive the function that opens them
 STAMP = struct.Struct("<q")
 STAMP_AT = 8
-FRAMES = 8  # a sender takes turns between as many frames, as a camera's driver does
+FRAMES = 8  # a sender cycles through this many frames, as a camera driver does
 
 
 class Receiver:
-    """Latencies of what comes."""
+    """Latencies of the received frames."""
 
     def __init__(self):
         self.latencies = []
@@ -53,8 +53,8 @@ class Receiver:
         return result
 
 
-# Each transport: open_sub(topics, address, receiver) returns what the main thread runs;
-# open_pub(topics, address) returns send(topic, frame).
+# Each transport: open_sub(topics, address, receiver) returns the main thread's function; open_pub(topics, address)
+# returns send(topic, frame).
 
 
 def ours_sub(topics, address, receiver):
@@ -182,7 +182,7 @@ def zmq_curve_pub(topics, address):
 def _zmq_curve(kind, topics, address, receiver):
     import zmq
 
-    # Keys for this measurement only, known to everyone who reads this file.
+    # Keys for this measurement only; they are public.
     public, secret = b"Yne@$w-vo<fVvi]a<NY6T1ed:M$fCG*[IaLV{hID", b"D:)Q[IlAW!ahhC2ac:9*A}h:p?([4%wOTJ%JR%cs"
     socket = zmq.Context().socket(getattr(zmq, kind))
     socket.curve_publickey, socket.curve_secretkey = public, secret
@@ -235,7 +235,7 @@ def _zenoh_sub(topics, address, receiver, shared):
     session = zenoh_session("sub", address, shared)
 
     def on_sample(sample):
-        receiver.got(sample.payload.to_bytes())  # its Python binding has no view into the payload
+        receiver.got(sample.payload.to_bytes())  # its Python binding offers no view of the payload
 
     KEEP.extend(session.declare_subscriber(topic, on_sample) for topic in topics)
     return threading.Event().wait
@@ -311,7 +311,7 @@ def main():
     transport, role, wanted, address = sys.argv[1:]
     topics = {name: int(size) for name, size in (word.split("=") for word in wanted.split(","))}
     out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever a library prints must not stand between the answers
+    os.dup2(2, 1)  # keep output of libraries out of the answers
 
     def answer(value):
         out.write(json.dumps(value) + "\n")

@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""How long a killed publisher or subscriber is away once its new process is up; prints JSON.
+"""Reconnection time of a killed publisher or subscriber after its new process is up; prints JSON.
 
     python benchmarks/bus_restart.py
 
-A publisher sends 200 times a second. Time counts from the moment that the new process has its topic (a start of Python
-takes longer than all that follows) to the first message that passes.
+A publisher sends 200 times per second. The time counts from when the new process has created its topic (starting Python
+takes longer than everything after it) to the first message that arrives.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ threading.Event().wait(60)
 
 
 def killed_and_restarted(code: str, run_dir: str, measure: Callable[[list[int]], float]) -> list[float]:
-    """Milliseconds away, each time the process is killed and started again."""
+    """Reconnection time in milliseconds for each kill and restart of the process."""
     away = []
     for _ in range(REPEATS + 1):
         process = subprocess.Popen([sys.executable, "-c", code, run_dir], stdout=subprocess.PIPE, text=True)

@@ -1,10 +1,11 @@
 #!/usr/bin/env python3
-"""The stack's own topics at twice their rates, `reliable`, for as long as asked: nothing may be lost; prints JSON.
+"""Soak test of the bus: the stack's topics at twice their rates, `reliable`; no message may be lost; prints JSON.
 
     python benchmarks/bus_soak.py --seconds 600 --json soak.json
 
 Three processes publish, three read what the stack's nodes read, and one reads everything, as a recorder does. Each
-message carries its number and the time of sending; lost is what the bus says and what is missing in the numbers.
+message carries its number and send time. Lost messages are those that the bus reports and those missing in the
+numbering.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class Topic(NamedTuple):
     readers: tuple[str, ...]
 
 
-# Rates of docs/benchmarks.md (the camera at its highest), sizes of the messages that the stack sends.
+# Rates of docs/benchmarks.md (the camera at its maximum), sizes of the messages that the stack sends.
 LOAD = {
     "/camera/image/compressed": Topic(30, 200_000, "robot", ("station", "operator")),
     "/lidar/packets": Topic(10, 92_000, "robot", ()),
@@ -81,7 +82,7 @@ def make_node(run_dir: str, name: str) -> Node[None]:
 
 
 def publish(run_dir: str, name: str, seconds: float, factor: float) -> dict[str, Any]:
-    """Publishes this process's share, once everybody listens."""
+    """Publish this process's topics once all readers have subscribed."""
     node = make_node(run_dir, f"{name}_out")
     sent = dict.fromkeys((t for t, topic in LOAD.items() if topic.publisher == name), 0)
     outputs = {topic: node.publisher_raw(topic, TYPE, RELIABLE) for topic in sent}
@@ -112,13 +113,13 @@ def publish(run_dir: str, name: str, seconds: float, factor: float) -> dict[str,
     cpu = time.process_time() - cpu
     not_shared = sum(out.raw.stats.not_shared for out in outputs.values())
     print(json.dumps({"sent": sent, "cpu_s": cpu, "not_shared": not_shared}), flush=True)
-    sys.stdin.read()  # the readers have counted: now the sockets may close
+    sys.stdin.read()  # wait until the readers have counted; the sockets may close after that
     node.close()
     return {}
 
 
 def read(run_dir: str, name: str) -> None:
-    """Reads until standard input ends, then tells what came."""
+    """Read until standard input closes, then report the received messages."""
     import threading
 
     node = make_node(run_dir, f"{name}_in")
@@ -155,7 +156,7 @@ def read(run_dir: str, name: str) -> None:
 
 
 def soak(seconds: float, factor: float) -> dict[str, Any]:
-    """Runs all processes and sums up."""
+    """Run all processes and sum up their reports."""
     with tempfile.TemporaryDirectory(prefix="ic") as run_dir:
 
         def start(*words: str) -> subprocess.Popen[str]:
@@ -170,7 +171,7 @@ def soak(seconds: float, factor: float) -> dict[str, Any]:
             for name, process in publishers.items():
                 assert process.stdout is not None
                 outs[name] = json.loads(process.stdout.readline())
-            time.sleep(1.0)  # what is on the way arrives
+            time.sleep(1.0)  # let messages in transit arrive
             ins = {name: json.loads(process.communicate(timeout=60)[0]) for name, process in readers.items()}
             for process in publishers.values():
                 process.communicate(timeout=60)

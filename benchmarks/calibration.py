@@ -1,9 +1,9 @@
-"""``ic calibrate camera-lidar`` on simulated drives with a camera that hangs elsewhere than its mount says.
+"""``ic calibrate camera-lidar`` on simulated drives with a camera that is displaced from its configured mount.
 
     python benchmarks/calibration.py --worlds corridor random:900004 --seeds 3 --json calibration.json
 
-Each drive is recorded by the simulator in this process (an arc, 16 pictures) with the camera 5 cm and 3 degrees from
-its mount in random directions; the result is compared with where it was.
+The simulator records each drive in this process (an arc, 16 images) with the camera displaced by 5 cm and 3 degrees in
+random directions. The result is compared with the true pose.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""How long ``ic`` takes to answer beside a node, its completion, and the control channel of that node; prints JSON.
+"""Response time of ``ic`` while a node runs, of its completion, and of that node's control channel; prints JSON.
 
 python benchmarks/cli.py                        [--runs N]
 """
@@ -27,7 +27,7 @@ NODE = "bag_recorder"
 
 
 def timed(function: Callable[[], Any], runs: int) -> dict[str, float]:
-    """Smallest, median and largest of some runs, after one that is not counted."""
+    """Minimum, median and maximum over some runs, after one warm-up run."""
     function()
     seconds = []
     for _ in range(runs):
@@ -39,12 +39,11 @@ def timed(function: Callable[[], Any], runs: int) -> dict[str, float]:
 
 
 def command(*words: str, **environment: str) -> Callable[[], Any]:
-    """One call of ``ic`` in a process of its own."""
+    """A call of ``ic`` in its own process."""
     return lambda: subprocess.run([*IC, *words], env={**os.environ, **environment}, capture_output=True, check=True)
 
 
 def main() -> int:
-    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=10)
     runs = parser.parse_args().runs

@@ -1,14 +1,14 @@
-"""What strangers cost the driver: round trip and emergency stop, without and under a flood by other clients.
+"""Effect of other clients on the driver: round trip and emergency stop, with and without a flood.
 
     python benchmarks/console_flood.py                  # 20 clients that send pings as fast as they can
-    python benchmarks/console_flood.py --flood limit    # 20 clients that keep just within the limit of a socket
-    python benchmarks/console_flood.py --flood http     # 20 clients that ask for the page as fast as they can
+    python benchmarks/console_flood.py --flood limit    # 20 clients that stay just within the limit of a socket
+    python benchmarks/console_flood.py --flood http     # 20 clients that request the page as fast as they can
     python benchmarks/console_flood.py --flood connect  # 20 clients that connect as fast as they can
 
 Server, driver and flood are three processes. The flood comes from 127.0.0.2, the driver from 127.0.0.1; ``--same``
-floods from the driver's address. A client that is cut off connects again at once. Round trip: ping to pong, 20 Hz, as
-the page measures it. Stop: from the driver's ``estop`` until it is on the topic, by the machine's monotonic clock.
-JSON, milliseconds; ``ratio`` is flood over quiet.
+floods from the driver's address. A disconnected client reconnects at once. Round trip: ping to pong, 20 Hz, as the page
+measures it. Stop: from the driver's ``estop`` until it is on the topic, by the machine's monotonic clock. Output is
+JSON in milliseconds; ``ratio`` is flood over quiet.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ PATIENT = DriveConfig(watchdog_s=30.0, lease_timeout_s=60.0, beat_timeout_s=30.0
 
 @dataclass
 class Backend:
-    """Keeps when emergency stops reached the topic."""
+    """Records when emergency stops reach the topic."""
 
     stops_s: list[float] = field(default_factory=list)
 
     def on_drive(self, linear: float, angular: float) -> None:
-        """Nothing moves."""
+        """Ignore the command."""
 
     def on_operator(self, there: bool) -> None:
-        """Nobody asks."""
+        """Ignore the operator's presence."""
 
     def on_look(self, look: Any) -> None:
-        """Nothing is rendered."""
+        """Ignore the request: no view is rendered."""
 
     def on_estop(self, stop: bool) -> None:
-        """Where the node publishes."""
+        """Record the time at which the node would publish."""
         if stop:
             self.stops_s.append(time.monotonic())
 
 
 def serve(channel: Connection, max_clients: int) -> None:
-    """The server's process: sends its port, and at the end when the stops came."""
+    """Server process: sends its port, and at the end the times of the stops."""
     backend: Any = Backend()
     server = ConsoleServer(backend, ServerConfig(port=0, max_clients=max_clients, drive=PATIENT))
     server.start()
-    for n in range(4):  # what a running stack has sent: a new client gets it at once
+    for n in range(4):  # data of a running stack, which a new client gets at once
         server.publish(f"state{n}", {"filler": "x" * 400})
     channel.send(server.port)
     channel.recv()
@@ -69,9 +69,9 @@ def serve(channel: Connection, max_clients: int) -> None:
 
 
 def flood(channel: Connection, port: int, kind: str, clients: int, address: str) -> None:
-    """The flood's process: until the channel says so; sends how much it sent, and how often it was cut off."""
+    """Flood process: runs until the channel ends it; returns how much it sent and how often it was disconnected."""
     counts = {"sent": 0, "cut_off": 0}
-    os.nice(19)  # elsewhere it would not cost this machine's time
+    os.nice(19)  # on a real network, the flood would not cost this machine's time
 
     async def one() -> None:
         while True:
@@ -121,7 +121,7 @@ def flood(channel: Connection, port: int, kind: str, clients: int, address: str)
                 pass
 
     async def run() -> None:
-        asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # connections cut off are its daily bread
+        asyncio.get_running_loop().set_exception_handler(lambda *_: None)  # disconnections are expected
         tasks = [asyncio.create_task(one()) for _ in range(clients)]
         await asyncio.to_thread(channel.recv)
         for task in tasks:
@@ -132,11 +132,11 @@ def flood(channel: Connection, port: int, kind: str, clients: int, address: str)
 
 
 async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
-    """Round trips in seconds, and when emergency stops were sent."""
+    """Round trips in seconds, and the times at which emergency stops were sent."""
     trips, stops = [], []
     async with ConsoleClient(f"http://127.0.0.1:{port}/") as driver:
         await driver.acquire()
-        driver._tasks.pop().cancel()  # the beats: they are made here
+        driver._tasks.pop().cancel()  # stop the client's own heartbeat; this function sends it
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
             sent_s = time.monotonic()
@@ -154,7 +154,7 @@ async def drive(port: int, seconds: float) -> tuple[list[float], list[float]]:
 
 
 def summary(values_s: Any) -> dict[str, float]:
-    """Half, 99 of 100, and worst, ms."""
+    """Median, 99th percentile and maximum, ms."""
     values_ms = 1000 * np.asarray(values_s)
     return {
         "p50_ms": round(float(np.median(values_ms)), 2),
@@ -193,7 +193,6 @@ def measure(kind: str | None, clients: int, seconds: float, address: str) -> dic
 
 
 def main() -> None:
-    """Prints the figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flood", choices=("pings", "limit", "http", "connect"), default="pings")
     parser.add_argument("--clients", type=int, default=20)

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Sources of depth on held-out worlds, with and without LiDAR outliers; prints JSON, and a table on the error output.
+"""Depth sources on held-out worlds, with and without LiDAR outliers; prints JSON, and a table on stderr.
 
     python benchmarks/depth.py --mesh house.glb --json depth.json
 
-Worlds that no training may see: random ones, the corridor of the experiments, and a mesh file where one is given. The
-LiDAR is a VLP-16 0.6 m above the floor, 2 cm noise, its rays cast in the world (also behind what the camera sees); the
-camera is level, 1.2 m above the floor. Scores count pixels, ``by_solid_angle`` the same by solid angle.
+The worlds are not used for training: random ones, the corridor of the experiments, and a mesh file if given. The LiDAR
+is a VLP-16 0.6 m above the floor with 2 cm noise; its rays are cast in the world (also behind surfaces the camera
+sees). The camera is level, 1.2 m above the floor. Scores count pixels; ``by_solid_angle`` weights them by solid angle.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TARGET_MRE, TARGET_DELTA1, TARGET_SCALE_MEDIAN, TARGET_SCALE_P95 = 0.08, 0.93, 0
 
 
 class Remembered:
-    """A model that estimates each picture once, and tells what that cost."""
+    """A model that estimates each image once and records the cost."""
 
     def __init__(self, model: DepthModel) -> None:
         self.manifest, self.provider = model.manifest, model.provider
@@ -51,7 +51,7 @@ class Remembered:
 
 
 def evaluators(model: Remembered, share: float, method: str) -> dict[str, Evaluator]:
-    """One for each source; what is as estimated knows no LiDAR and so no outliers."""
+    """One evaluator per source; the unscaled source uses no LiDAR and therefore has no outliers."""
     lidar = LidarSettings(LIDAR_HEIGHT_M, outliers=share)
     made = {
         source: Evaluator(Settings(source, lidar, method=method if source != "lidar" else ""), model)
@@ -111,7 +111,7 @@ def table(results: dict[str, Any]) -> str:
 
 
 def targets(results: dict[str, Any]) -> dict[str, dict[str, bool]]:
-    """For each set with 5 % outliers: which targets the fused source meets."""
+    """Targets met by the fused source, for each set with 5 % outliers."""
     met = {}
     for kind, shares in results.items():
         sources = shares["5 %"]

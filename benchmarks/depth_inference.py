@@ -1,10 +1,10 @@
-"""How long a panorama takes: decoding, preparing, the network; for the shipped model and other SliceNets.
+"""Time per panorama: decoding, preparation, network; for the shipped model and other SliceNets.
 
     python benchmarks/depth_inference.py --json inference.json                       # the shipped model
-    python benchmarks/depth_inference.py --networks resnet18:256 resnet50:512        # random weights: time alone
-    python benchmarks/depth_inference.py --networks small --unfolded                 # as torch exports it by itself
+    python benchmarks/depth_inference.py --networks resnet18:256 resnet50:512        # random weights: time only
+    python benchmarks/depth_inference.py --networks small --unfolded                 # as exported by torch itself
 
-CPU seconds are given beside wall seconds: on a machine that does other things as well they say what the network costs.
+CPU seconds are reported beside wall seconds, because they show the network's cost on a machine with other load.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from instant_ic.training.slicenet import SMALL, SliceNet, SliceNetConfig
 
 
 def seconds(function: Callable[[], Any], runs: int) -> dict[str, float]:
-    """Median wall and CPU seconds, and the fastest, after one run that does not count."""
+    """Median wall and CPU seconds, and the fastest run, after one warm-up run."""
     function()
     wall, cpu = [], []
     for _ in range(runs):
@@ -43,13 +43,13 @@ def seconds(function: Callable[[], Any], runs: int) -> dict[str, float]:
 
 
 def camera_jpeg(height: int) -> bytes:
-    """A panorama with as much detail as a photo has."""
+    """A panorama with as much detail as a photo."""
     coarse = np.random.default_rng(0).integers(0, 256, (height // 8, height // 4, 3), np.uint8)
     return cv2.imencode(".jpg", cv2.resize(coarse, (2 * height, height)), [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
 
 
 def measure(model: DepthModel, data: bytes, runs: int) -> dict[str, Any]:
-    """Each step that the node takes, and all of them."""
+    """Time of each step of the node, and of all steps."""
     size = (2 * model.manifest.input_width, 2 * model.manifest.input_height)
     rgb = decode_rgb(data, *size)
     return {
@@ -62,7 +62,7 @@ def measure(model: DepthModel, data: bytes, runs: int) -> dict[str, Any]:
 
 
 def random_model(network: str, folder: Path, unfolded: bool) -> Path:
-    """A SliceNet of random weights: ``small`` or ``BACKBONE:HEIGHT``."""
+    """A SliceNet with random weights: ``small`` or ``BACKBONE:HEIGHT``."""
     torch.manual_seed(0)
     backbone, _, height = network.partition(":")
     lstm = 512 if backbone == "resnet50" else 256

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Depth models against each other on held-out panoramas; prints JSON, and a table on the error output.
+"""Comparison of depth models on held-out panoramas; prints JSON, and a table on stderr.
 
     python benchmarks/depth_models.py models/slicenet_small.onnx mine.onnx --mesh house.glb
 
-Worlds that no training may see: random ones, the corridor of the experiments, the interiors of all kinds that the
-training draws from (other seeds), and a mesh file where one is given; truth over 16 m is left out. Each model is scored
-as it estimates and after the best one factor for a picture (the median of truth over estimate). A model is better than
-the first where the mean of the kinds' MRE after scaling is lower and no kind's is over 5 % higher.
+The worlds are not used for training: random ones, the corridor of the experiments, interiors of all kinds that the
+training uses (with other seeds), and a mesh file if given. Ground truth over 16 m is ignored. Each model is scored as
+estimated and after the best factor per image (the median of truth over estimate). A model is better than the first if
+its MRE after scaling, averaged over the kinds, is lower and on no kind over 5 % higher.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ Panorama = tuple[np.ndarray, np.ndarray]
 
 
 def interiors(count: int) -> Iterator[Panorama]:
-    """A panorama in each of ``count`` interiors of all kinds."""
+    """One panorama in each of ``count`` interiors of all kinds."""
     seed, made = FIRST_SEED, 0
     while made < count:
         world = interior_world(seed)
         try:
             ((x, y, yaw),) = world.sample_free_poses(np.random.default_rng([5, seed]), 1)
-        except ValueError:  # too full to stand in
+        except ValueError:  # no free position
             pass
         else:
             frame = EquirectRenderer(world).render(pose_matrix(x, y, CAMERA_HEIGHT_M, yaw=yaw), 512, 256)
@@ -61,7 +61,6 @@ def score(model: DepthModel, panoramas: list[Panorama]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("models", type=Path, nargs="+", help="ONNX files; the others are compared with the first")
     parser.add_argument("--mesh", type=Path, help="mesh file for the kind mesh; without one it is left out")

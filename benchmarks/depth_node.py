@@ -1,10 +1,10 @@
-"""What one step of depth_scaler costs for each source, beside one estimate of the shipped network; prints JSON.
+"""Cost of one step of depth_scaler per source, compared with one estimate of the shipped network; prints JSON.
 
     python benchmarks/depth_node.py
 
-CPU time, the median over several panoramas of a generated world: points of a revolution moved to the picture's time,
-scaled, fused, the uncertainty encoded. ``of_an_estimate`` is the share of the network's CPU time in the same run: that
-number does not depend on how fast the machine is or how busy.
+CPU time, the median over several panoramas of a generated world. A step moves the points of a revolution to the image's
+stamp, scales, fuses, and encodes the uncertainty. ``of_an_estimate`` is the share of the network's CPU time in the same
+run; it does not depend on the machine's speed or load.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main() -> None:
         for name in SOURCES:
             source = DepthSource(SourceConfig(source=name))
             if number == 0:
-                source.estimate(raw, points, UP, scene.camera_height_m)  # tables are made once
+                source.estimate(raw, points, UP, scene.camera_height_m)  # warm-up: tables are built once
             begin = time.process_time()
             moved = points_at(points, stamps, 0, lambda ns: pose_matrix(x=1e-9 * ns * 0.01))
             result = source.estimate(raw, moved, UP, scene.camera_height_m)

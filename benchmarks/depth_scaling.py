@@ -1,11 +1,11 @@
-"""Scaling rules on generated worlds that the depth model was not trained on.
+"""Scaling rules on generated worlds that are not used for training the depth model.
 
     python benchmarks/depth_scaling.py --worlds 24 --mesh small_house.glb --json scaling.json
     python benchmarks/depth_scaling.py --worlds 24 --glass 0.3
 
-Each panorama is estimated, scaled by a simulated VLP-16 revolution from 0.6 m under each rule, and compared with the
-rendered truth. Some of the points are outliers at any range. Scale error: how far the median of scaled depth over
-truth, over the whole picture, is from 1.
+Each panorama is estimated, scaled under each rule by a simulated VLP-16 revolution from 0.6 m, and compared with the
+rendered ground truth. Some of the points are outliers at random ranges. The scale error is the deviation from 1 of the
+median ratio of scaled depth to ground truth over the whole image.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ RULES = {
     "sector": ScalerConfig(method="sector"),
 }
 MESH_PLACES = ((3.2, -2.2), (-4.6, -0.2), (-5.5, -3.4), (6.3, -2.4), (1.5, 2.2))
-"""Free places of small_house.glb."""
+"""Free positions in small_house.glb."""
 
 
 def lidar_points(renderer: EquirectRenderer, map_from_lidar: np.ndarray) -> np.ndarray:
-    """(N, 3) points of one revolution in the map: 16 rings, 0.4 degrees, 2 cm noise, 100 m reach."""
+    """(N, 3) points of one revolution in the map: 16 rings, 0.4 degrees, 2 cm noise, 100 m range."""
     elevation, azimuth = np.meshgrid(np.radians(np.arange(-15, 16, 2.0)), np.radians(np.arange(0, 360, 0.4)))
     local = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
@@ -52,9 +52,9 @@ def lidar_points(renderer: EquirectRenderer, map_from_lidar: np.ndarray) -> np.n
 
 
 def spoilt(points: np.ndarray, outliers: float, glass: float, seed: int) -> np.ndarray:
-    """Points (N, 3) around the camera with a share at any range, and a share of the circle behind glass.
+    """Points (N, 3) around the camera with a share at random ranges, and a share of the circle behind glass.
 
-    Through the pane the LiDAR measures what is 1.5 to 4 times as far, and half of the rays do not come back.
+    Through the pane the LiDAR measures 1.5 to 4 times the range, and half of the rays do not return.
     """
     rng = np.random.default_rng(seed)
     points = points.copy()

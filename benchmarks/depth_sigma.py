@@ -1,9 +1,9 @@
-"""Fits how the uncertainty of LiDAR and fused depth grows, and checks it: |error| / sigma is under 1 in 68 % of pixels.
+"""Fits the uncertainty of LiDAR and fused depth, and checks that |error| / sigma is below 1 in 68 % of the pixels.
 
     python benchmarks/depth_sigma.py --mesh ../shared/data/worlds/small_house.glb
 
-The worlds are neither those of the training nor those of the evaluations. The two tables that it prints stand as
-``_SIGMA`` in instant_ic/depth/lidar_depth.py and instant_ic/depth/fusion.py; run it again when the model has changed.
+The worlds are used neither for training nor in the evaluations. The two printed tables are ``_SIGMA`` in
+instant_ic/depth/lidar_depth.py and instant_ic/depth/fusion.py; run the script again after changing the model.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MOST_M = 16.0
 
 
 def worlds(count: int, mesh: Path | None) -> Iterator[tuple[str, World, int]]:
-    """Kind, world and number of places."""
+    """Kind, world and number of positions."""
     for seed in range(FIRST_SEED, FIRST_SEED + count):
         yield "random", random_world(seed), 1
     yield "corridor", corridor_world(5), count // 2
@@ -43,14 +43,14 @@ def worlds(count: int, mesh: Path | None) -> Iterator[tuple[str, World, int]]:
 
 
 def samples(model: DepthModel, count: int, mesh: Path | None) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-    """Kind, and of some pixels of a panorama: origin, features and relative errors, each (N,)."""
+    """Kind, and data of some pixels of a panorama: origin, features and relative errors, each (N,)."""
     rng = np.random.default_rng(99)
     source = DepthSource()
     for kind, world, places in worlds(count, mesh):
         renderer = EquirectRenderer(world)
         try:
             poses = world.sample_free_poses(rng, places)
-        except ValueError:  # too full to stand in
+        except ValueError:  # no free position
             continue
         for number, (x, y, yaw) in enumerate(poses):
             height = float(rng.uniform(0.9, 1.4))
@@ -77,9 +77,9 @@ def samples(model: DepthModel, count: int, mesh: Path | None) -> Iterator[tuple[
 
 
 def fit_sigma(features: np.ndarray, error: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Coefficients (K,) >= 0 of sigma = root of sum (k features)², features (N, K), with SHARE of the errors under it.
+    """Coefficients (K,) >= 0 of sigma = root of sum (k features)², features (N, K), with SHARE of the errors below it.
 
-    Quantile regression of log error: the pinball loss is least where the share is met everywhere.
+    Quantile regression of log error: the pinball loss is minimal where the share is met everywhere.
     """
     used = np.ptp(features, axis=0) > 1e-6
     used[0] = True
@@ -147,7 +147,7 @@ def main() -> None:
 
 
 def _names(taken: dict[str, list[dict[str, np.ndarray]]]) -> list[str]:
-    """Names of the columns."""
+    """Column names."""
     return list(next(iter(taken.values()))[0])
 
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""How old the depth is on its way through the whole simulated stack; prints JSON.
+"""Age of depth in the whole simulated stack; prints JSON.
 
     python benchmarks/depth_stack.py --json depth_stack.json
 
-Starts ``launch/sim.yaml`` at its own pace, waits for a virtual space, then watches while the robot stands and while it
-turns on the spot (new keyframes, so that everything works). Told for each: the time from a panorama's arrival on the
-bus to its depth, and from its stamp (exposure) to its depth; the target is 0.6 s.
+Starts ``launch/sim.yaml`` at its own pace, waits for a virtual space, then measures while the robot stands and while it
+turns on the spot (which creates keyframes and keeps all nodes busy). Reported for each: the time from a panorama's
+arrival on the bus to its depth, and from its stamp (exposure) to its depth; the target is 0.6 s.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TOPICS = ("/depth/raw", "/depth/scaled")
 
 
 class Ages:
-    """Arrivals of panoramas and of their depth, by the panorama's stamp."""
+    """Arrival times of panoramas and of their depth, by the panorama's stamp."""
 
     def __init__(self, stack: Stack) -> None:
         self.pictures: dict[int, float] = {}

@@ -1,9 +1,9 @@
-"""Measures what ``depth.tidy`` makes of a network's depth without a LiDAR and prints JSON.
+"""Measures the effect of ``depth.tidy`` on a network's depth without LiDAR and prints JSON.
 
     python benchmarks/depth_tidy.py [--count 20] [--mesh small_house.glb]
 
-Held-out panoramas as in ``benchmarks/depth.py``. MRE and δ1 of the depth as estimated and tidied, each after the factor
-that fits its picture best, so that shape is compared; and how far the scale is off, as estimated and by the camera's
+Held-out panoramas as in ``benchmarks/depth.py``. Reported are MRE and δ1 of the depth as estimated and tidied, each
+after the best factor per image, so that shape is compared; and the scale error, as estimated and by the camera's
 height.
 """
 
@@ -25,7 +25,7 @@ from instant_ic.experiments.depth_worlds import CAMERA_HEIGHT_M, held_out
 
 
 def shape_and_scale(depth: NDArray[np.floating], truth: NDArray[np.floating]) -> tuple[float, float, float]:
-    """MRE and δ1 after the best factor, and the error of the scale before it."""
+    """MRE and δ1 after the best factor, and the scale error before it."""
     valid = truth > 0
     factor = float(np.median(truth[valid] / depth[valid]))
     found = depth_metrics(depth * factor, truth, valid)

@@ -4,13 +4,13 @@
     nice python benchmarks/endurance.py --minutes 60 --seed 1 --json endurance.json
     python benchmarks/endurance.py --minutes 5 --light --only frozen
 
-An operator drives through the obstacle of the corridor and back, again and again. Every few seconds one thing fails: a
-process is frozen (SIGSTOP) or killed (SIGKILL), a link is cut, the disk of a recording fills, the recorder is killed,
-or the emergency stop is pressed and processes are killed while it is latched. A stack that ended (simulator or launcher
-killed, a required node given up) is started again. Exit status 1 if one of these was seen (``found``):
+An operator drives through the obstacle of the corridor and back, repeatedly. Every few seconds one thing fails: a
+process is frozen (SIGSTOP) or killed (SIGKILL), a link is cut, a recording's disk fills up, the recorder is killed, or
+the emergency stop is pressed and processes are killed while it is latched. A stack that ended (simulator or launcher
+killed, a required node given up) is restarted. Exit status 1 if one of these was found (``found``):
 
     moved       a true speed above 0.02 m/s later than ``--stand`` seconds after the loss of something the robot needs,
-                0.25 s after the emergency stop, or after the operator let go while the thing was lost
+                0.25 s after the emergency stop, or after the operator released the controls during the loss
     orphan      a process of the stack that is still there after its end
     leak        memory or file descriptors of a process that grow steadily
     lost        messages that the recorder had acknowledged 5 s before its end and that its bag does not hold
@@ -66,7 +66,7 @@ FLUSHED_S = 5.0
 DISK_MB = 192
 LARGE_TOPICS = "[/lidar/points, /lidar/packets, /camera/*, /depth/*, /keyframe, /vspace/*, /map]"
 WARM_S, JUDGED_S = 120.0, 300.0
-"""A process's memory is judged from 120 s after its start, and only if that leaves 300 s."""
+"""A process's memory is evaluated from 120 s after its start, and only if that leaves 300 s."""
 LEAK_MB, LEAK_FDS = 24.0, 4.0
 """Growth over the time judged."""
 
@@ -91,16 +91,16 @@ FAULTS = (
     ),
 )
 RARE = ("simulator killed", "launcher killed")
-"""They end the stack, whose start takes longer than many faults."""
+"""These end the stack; its start takes longer than many faults."""
 
 
 @dataclass
 class Figures:
-    """What was done and what was seen."""
+    """Counts of faults and findings."""
 
     faults: Counter[str] = field(default_factory=Counter)
     moving: Counter[str] = field(default_factory=Counter)
-    """Faults that hit a robot in motion."""
+    """Faults while the robot was moving."""
     stacks: int = 0
     ends: Counter[str] = field(default_factory=Counter)
     bags: Counter[str] = field(default_factory=Counter)
@@ -109,7 +109,7 @@ class Figures:
     found: list[dict[str, Any]] = field(default_factory=list)
 
     def report(self, kind: str, fault: str, **details: Any) -> None:
-        """Keep and show something that must not be."""
+        """Record and print a violation."""
         self.found.append({"kind": kind, "fault": fault, **details})
         note(f"FOUND {self.found[-1]}")
 
@@ -160,7 +160,7 @@ class Levels:
 
 
 class Recording:
-    """A recorder of the soak's own on a small disk, where each bag is checked and deleted."""
+    """The benchmark's own recorder on a small disk, where each bag is checked and deleted."""
 
     def __init__(self, rig: Rig, disk: Path, figures: Figures) -> None:
         self._rig, self._disk, self._figures = rig, disk, figures
@@ -188,12 +188,12 @@ class Recording:
 
     @property
     def pid(self) -> int:
-        """Of the recorder."""
+        """Process id of the recorder."""
         assert self._process is not None
         return self._process.pid
 
     def look(self) -> None:
-        """Ask once a second how many messages it has written; start it where it has ended."""
+        """Query once per second how many messages it has written; restart it if it has exited."""
         if self._process is None or time.monotonic() < self._next_s:
             return
         self._next_s = time.monotonic() + 1.0
@@ -210,7 +210,7 @@ class Recording:
                 self.begin()
 
     def end(self, fault: str, killed: bool = False) -> None:
-        """End the recorder, hold the bag against what it had acknowledged, and delete it."""
+        """Stop the recorder, compare the bag with the acknowledged messages, and delete it."""
         assert self._process is not None
         ended_s = time.monotonic()
         self._process.send_signal(signal.SIGKILL if killed else signal.SIGINT)
@@ -244,7 +244,7 @@ class Recording:
         shutil.rmtree(bag, ignore_errors=True)
 
     async def fill_disk(self, seconds: float) -> None:
-        """Fill the disk for `seconds`, then make room again."""
+        """Fill the disk for `seconds`, then free it again."""
         filler = self._disk / "filler"
         with contextlib.suppress(OSError), filler.open("wb") as out:
             while True:
@@ -255,7 +255,7 @@ class Recording:
 
 
 class Soak:
-    """One stack after another until the time is up."""
+    """Runs one stack after another until the time is up."""
 
     def __init__(self, args: argparse.Namespace, factor: float) -> None:
         self.args, self.factor = args, factor
@@ -268,10 +268,10 @@ class Soak:
             self.faults = [f for f in self.faults if not f.startswith(("depth", "nerf"))]
         self.disk: Path | None = None
         self.ending = ""
-        """The fault that is meant to end the present stack."""
+        """The fault that is expected to end the current stack."""
 
     def run(self, folder: Path) -> None:
-        """Run it all; ``folder`` is for bags and logs."""
+        """Run all drives; ``folder`` is for bags and logs."""
         text = LAUNCH.replace("corridor-free", "corridor")
         if not self.args.light:
             text = text.replace("{{name: depth, value: false}}", "{{name: depth, value: true}}")
@@ -311,7 +311,7 @@ class Soak:
     def _stop(self, made: Rig) -> int:
         process = made.stack.process
         assert process is not None
-        if self.ending:  # it ends without being asked
+        if self.ending:  # it exits on its own
             try:
                 return process.wait(30.0)
             except subprocess.TimeoutExpired:
@@ -348,7 +348,7 @@ class Soak:
             recording.look()
 
     async def _one(self, made: Rig, recording: Recording, until: Any) -> None:
-        """Drive for a while, let one thing fail, and see that the robot can be driven again."""
+        """Drive for a while, cause one fault, and check that the robot can be driven again."""
         fault = self.rng.choice(self.faults)
         if fault in RARE and self.rng.random() < 0.8 and len(self.faults) > len(RARE):
             fault = self.rng.choice([f for f in self.faults if f not in RARE])
@@ -372,7 +372,7 @@ class Soak:
         await self._again(made, fault)
 
     async def _onward(self, made: Rig, page: ConsoleClient, until: Any, seconds: float) -> None:
-        """Drive to and fro through the obstacle for `seconds`, and on until the robot moves; 30 s at most."""
+        """Drive back and forth through the obstacle for `seconds`, and on until the robot moves; 30 s at most."""
         began_ns = made.pace.now_ns()
         place = made.truth[-1]
 
@@ -451,7 +451,7 @@ class Soak:
             needed = only_real
         if needed:
             if lets_go and only_real:
-                await asyncio.sleep(made.pace.wait_s(1.0))  # and no old command moves it when the thing is back
+                await asyncio.sleep(made.pace.wait_s(1.0))  # no old command may move the robot once the fault is over
                 back_ns = made.pace.now_ns()
             self._stood(made, fault, lost_ns + round(self.args.stand * 1e9), back_ns)
 
@@ -472,13 +472,13 @@ class Soak:
         self._stood(made, fault, pressed_ns + round(ESTOP_STANDS_S * 1e9), made.pace.now_ns())
 
     async def _again(self, made: Rig, fault: str) -> None:
-        """Have an operator at the page release what is latched, until the robot can be driven again."""
+        """Let an operator at the page release what is latched, until the robot can be driven again."""
         deadline = time.monotonic() + made.pace.wait_s(BACK_S)
         while not (fresh(made) and made.state.mode != ControlState.STOPPED):
             if time.monotonic() > deadline:
                 raise StackError(f"not drivable after {fault}: {made.state.reason}\n{made.stack.log_tail()}")
             with contextlib.suppress(ConnectionError, OSError, TimeoutError, aiohttp.ClientError):
-                async with driver(made) as page:  # an operator who is away ends the virtual drive, and must come back
+                async with driver(made) as page:  # an absent operator ends the virtual drive, and must return
                     await page.stop()
                     if made.state.estop:
                         await page.release_estop()
@@ -499,7 +499,7 @@ class Soak:
 
 
 def fresh(made: Rig) -> bool:
-    """Whether the arbiter's state is of now."""
+    """Whether the arbiter's state is recent."""
     stamp = made.state.header.stamp
     return bool(made.pace.now_ns() - (stamp.sec * 10**9 + stamp.nanosec) < 1e9)
 
@@ -511,7 +511,7 @@ def alive(made: Rig, name: str, other_than: int) -> bool:
 
 @contextlib.contextmanager
 def small_disk(at: Path) -> Iterator[Path | None]:
-    """A disk of ``DISK_MB`` that can be filled; None where this user may not mount one."""
+    """A disk of ``DISK_MB`` that can be filled; None if this user may not mount one."""
     at.mkdir()
     words = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(at)]
     if subprocess.run(words, capture_output=True).returncode:
@@ -526,7 +526,7 @@ def small_disk(at: Path) -> Iterator[Path | None]:
 
 
 def note(text: str) -> None:
-    """Show how far it is."""
+    """Print the progress."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -551,7 +551,7 @@ def main(words: Sequence[str] | None = None) -> int:
     folder = Path(tempfile.mkdtemp(prefix="ic-soak-"))
     note(f"logs and bags in {folder}, pace {factor:g}")
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt):  # what has been seen so far is printed all the same
+    with contextlib.suppress(KeyboardInterrupt):  # after Ctrl-C, the findings so far are still printed
         soak.run(folder)
     figures, levels = soak.figures, soak.levels.judge()
     for name, level in levels.items():

@@ -31,7 +31,7 @@ DELAYS = ("/scan", "/pose", "/map", "/camera/image/compressed", "/lidar/points",
 
 
 def usage(launcher: int) -> dict[str, tuple[float, float]]:
-    """CPU seconds so far and resident MB of every process of the fleet, as GROUP/NODE."""
+    """CPU seconds used and resident MB of every process of the fleet, as GROUP/NODE."""
     found = {}
     for process in psutil.Process(launcher).children(recursive=True):
         try:
@@ -48,13 +48,13 @@ def usage(launcher: int) -> dict[str, tuple[float, float]]:
 
 
 def percentiles(values: list[float]) -> dict[str, float]:
-    """p50 and p99 in ms, and how many there were."""
+    """p50 and p99 in ms, and the number of values."""
     p50, p99 = np.percentile(values, [50, 99])
     return {"p50_ms": round(float(p50), 2), "p99_ms": round(float(p99), 2), "messages": len(values)}
 
 
 def measure(seconds: float, vspace: bool) -> dict[str, Any]:
-    """Runs the fleet and looks at it for some seconds once every robot is seen at the station."""
+    """Run the fleet and measure for some seconds once the station sees every robot."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     arguments = {**free_ports(), "router_port": free_port(), "headless": True, "vspace": vspace}
     started = time.monotonic()
@@ -96,7 +96,7 @@ def measure(seconds: float, vspace: bool) -> dict[str, Any]:
 
 
 def by_node(cpu: dict[str, float]) -> dict[str, float]:
-    """CPU of each kind of node, mean over the robots that have one."""
+    """CPU of each kind of node, averaged over the robots that have one."""
     values = defaultdict(list)
     for name, percent in cpu.items():
         group, _, node = name.partition("/")
@@ -117,7 +117,7 @@ def listen(station: Observer) -> dict[str, list[float]]:
 
 
 def settle(stack: Stack, node: Node[Any], seconds: float) -> None:
-    """Runs the observer's callbacks for some time."""
+    """Run the observer's callbacks for some time."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         node.spin_once()
@@ -126,7 +126,6 @@ def settle(stack: Stack, node: Node[Any], seconds: float) -> None:
 
 
 def main() -> int:
-    """Prints the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=30.0, help="how long to look (default: %(default)s)")
     parser.add_argument("--vspace", action="store_true", help="with depth and the virtual space at the station")

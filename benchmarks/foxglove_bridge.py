@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The Foxglove bridge beside the simulated stack: CPU and memory with nobody and with everything watched; prints JSON.
+"""The Foxglove bridge with the simulated stack: CPU and memory without viewers and with everything viewed; prints JSON.
 
 python benchmarks/foxglove_bridge.py --json foxglove.json
 """
@@ -23,7 +23,7 @@ from instant_ic.experiments.stack import Stack, free_port, free_ports
 
 
 class Viewer:
-    """A client that watches everything and counts."""
+    """A client that subscribes to everything and counts messages."""
 
     def __init__(self, port: int) -> None:
         from websockets.sync.client import connect
@@ -35,7 +35,7 @@ class Viewer:
         self.seen: set[int] = set()
 
     def watch(self, seconds: float) -> None:
-        """Reads for some time; subscribes to what is offered."""
+        """Read for some time; subscribe to all offered channels."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
             try:
@@ -55,14 +55,14 @@ class Viewer:
 
 
 def cpu_percent(process: psutil.Process, during: Any, seconds: float) -> float:
-    """CPU of a process, percent of a core, while something goes on."""
+    """CPU of a process, percent of a core, while ``during`` runs."""
     before, at = sum(process.cpu_times()[:2]), time.monotonic()
     during(seconds)
     return round(100 * (sum(process.cpu_times()[:2]) - before) / (time.monotonic() - at), 1)
 
 
 def measure(seconds: float) -> dict[str, Any]:
-    """Runs the stack without page and virtual space, and looks at the bridge."""
+    """Run the stack without page and virtual space, and measure the bridge."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     port = free_port()
     arguments = {**free_ports(), "headless": True, "vspace": False, "foxglove": True, "foxglove_port": port}
@@ -93,7 +93,6 @@ def measure(seconds: float) -> dict[str, Any]:
 
 
 def main() -> int:
-    """Prints the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="how long to look, twice (default: %(default)s)")
     parser.add_argument("--json", type=Path, help="where to write the figures, beside printing them")

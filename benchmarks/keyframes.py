@@ -1,12 +1,13 @@
-"""What keyframes do to the picture, in simulated worlds with true depth; prints JSON.
+"""Effect of keyframes on rendered views, in simulated worlds with true depth; prints JSON.
 
     python benchmarks/keyframes.py [--mesh house.glb] [--only views,field,unseen,refresh,time]
 
-views: PSNR (dB) and SSIM 2 m from the nearest of one keyframe, three behind each other, and three round the place.
-field: the same of the field alone after --seconds, one field on all keyframes. unseen: pictures with what nobody has
-seen left black, continued from around, and as it is shown. refresh: a drive with a keyframe every 0.75 m; how far a
-picture falls behind what the keyframes before would have shown there, and how much unseen places flicker. time: CPU
-time of each step from a keyframe to its first picture, and of a picture.
+- views: PSNR (dB) and SSIM 2 m from the nearest of one keyframe, three in a row, and three around the place.
+- field: the same for the field alone after --seconds, one field on all keyframes.
+- unseen: views with unseen areas left black, filled from their surroundings, and as shown.
+- refresh: a drive with a keyframe every 0.75 m; how far a view falls behind what the earlier keyframes would have shown
+  there, and how much unseen areas flicker.
+- time: CPU time of each step from a keyframe to its first view, and of a view.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ SIZE, FOV, PANORAMA = (320, 180), math.pi / 2, 1024
 VIEWS = (pose_matrix(2.0), pose_matrix(2.0, 0.3, yaw=0.5), pose_matrix(2.0, yaw=-1.2))
 ASIDE = (*VIEWS, pose_matrix(1.0), pose_matrix(0.5, 0.5, yaw=0.5), pose_matrix(1.0, -0.6, yaw=-0.7))
 PLACES = {"one": (0.0,), "three behind": (-1.5, -0.75, 0.0), "three round": (-1.5, 4.0, 0.0)}
-"""Of the keyframes along x, in the order in which they are taken."""
+"""Positions of the keyframes along x, in order of arrival."""
 STEP_M, KEYFRAME_M, AHEAD_M, WAY_M = 0.05, 0.75, 0.6, 3.0
-"""Of the drive: between pictures, between keyframes, how far the view is ahead of the robot, and how far it goes."""
+"""The drive: distance between views, between keyframes, of the view ahead of the robot, and in total."""
 
 
 def psnr(picture: Any, truth: Any) -> float:
-    """In dB."""
+    """PSNR in dB."""
     return 10 * math.log10(255**2 / max(float(np.mean((picture.astype(float) - truth) ** 2)), 1e-3))
 
 
@@ -45,7 +46,7 @@ def score(picture: Any, truth: Any) -> tuple[float, float]:
 
 
 class World:
-    """A world, and the place in it that all poses are relative to."""
+    """A world, and the position in it to which all poses are relative."""
 
     def __init__(self, renderer: Any, base: Any) -> None:
         self.renderer, self.base = renderer, base
@@ -72,7 +73,7 @@ def views(world: World, _: argparse.Namespace) -> dict[str, Any]:
 
 
 def field(world: World, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The same by the field alone."""
+    """The same with the field alone."""
     config = VirtualSpaceConfig(keyframes=3, picture=PictureConfig(panorama_until_db=0, field_from_db=0))
     return _arrangements(world, lambda: VirtualSpace(config), arguments.seconds)
 
@@ -118,7 +119,7 @@ def unseen(world: World, _: argparse.Namespace) -> dict[str, Any]:
 
 
 def refresh(world: World, _: argparse.Namespace) -> dict[str, Any]:
-    """The drive, with one keyframe and with three: each picture against what it had been without the newest."""
+    """The drive with one keyframe and with three: each view compared with the view without the newest keyframe."""
     result = {}
     for keyframes in (1, 3):
         space, before = warp(keyframes), warp(keyframes)

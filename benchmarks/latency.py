@@ -1,20 +1,24 @@
 #!/usr/bin/env python3
-"""From a key pressed in Chromium to the base, and to the motion shown in the virtual space; prints JSON.
+"""Latency from a key press in Chromium to the base, and to the motion shown in the virtual space; prints JSON.
 
     python benchmarks/latency.py --presses 30 --json latency.json
 
-The nodes are the real ones, each a process of its own, at their rates and with their parameters: console, arbiter and
-virtual_robot for the way to the base; console, virtual_robot and nerf (source warp) for the way to the picture. What
-they hear of the robot is made up here: scan, poses, odometry, pictures, one keyframe, and in the second part the
-arbiter's state. In the whole stack SLAM, depth and the simulator load the machine as well: benchmarks/stack.py has the
-way to the base there.
+The nodes are the real ones, each in its own process, at their rates and with their parameters: console, arbiter and
+virtual_robot for the path to the base; console, virtual_robot and nerf (source warp) for the path to the image. Their
+input from the robot is simulated here: scan, poses, odometry, images, one keyframe, and in the second part the
+arbiter's state. In the whole stack SLAM, depth and the simulator load the machine as well: benchmarks/stack.py measures
+the path to the base there.
 
-Measured from the browser's time of the key event: ``base_ms`` to the command on /cmd_vel; ``shown_forward_ms`` to the
-first drawing from a place 2 mm and more in the commanded direction (half a pixel at the picture's edge, of what is 2 m
-away), ``shown_first_ms`` 0.5 mm and more; ``shown_turn_ms`` to the first drawing with another heading (0.05 degrees and
-more); ``new_view_ms`` to the drawing of the first view that was rendered from another place (0.5 mm and more). The
-robot's own acceleration is in them: 2 mm take 71 ms at 0.8 m/s2. ``steps_ms`` tells where the time goes, ``draws_hz``
-how often the page drew while the v-bot moved.
+All times start at the browser's time of the key event:
+
+- ``base_ms``: to the command on /cmd_vel.
+- ``shown_forward_ms``: to the first frame from a position 2 mm or more in the commanded direction (half a pixel at the
+  image's edge, for objects 2 m away); ``shown_first_ms``: 0.5 mm or more.
+- ``shown_turn_ms``: to the first frame with another heading (0.05 degrees or more).
+- ``new_view_ms``: to the frame with the first view rendered from another position (0.5 mm or more).
+
+They include the robot's own acceleration: 2 mm take 71 ms at 0.8 m/s2. ``steps_ms`` breaks the time down by step, and
+``draws_hz`` is the page's frame rate while the v-bot moved.
 """
 
 from __future__ import annotations
@@ -101,12 +105,12 @@ addEventListener("drawn", ({detail}) => {
 
 
 class Robot:
-    """What the nodes hear of a made-up robot in the demonstration's room; the base obeys at once."""
+    """Simulated input of the nodes from a robot in the demonstration's room; the base follows commands at once."""
 
     def __init__(self, stack: Stack, virtual: bool) -> None:
         self.stack, self.virtual = stack, virtual
         self.stop, self.error = threading.Event(), ""
-        self.marks: dict[str, int] = {}  # step -> when it was first seen since the last press, ns
+        self.marks: dict[str, int] = {}  # step -> time when it was first seen since the last press, ns
         observer = stack.observer
         self.out = {
             topic: observer.publisher(topic, kind, qos=qos)
@@ -180,11 +184,11 @@ class Robot:
                     self.tell(step)
                     step += 1
                 self.stack.observer.rest(due - time.monotonic())
-        except Exception as error:  # noqa: BLE001 - told by whoever waits
+        except Exception as error:  # noqa: BLE001 - reported by whoever waits
             self.error = f"{type(error).__name__}: {error}"
 
     def tell(self, step: int) -> None:
-        """20 times a second."""
+        """Publish the robot's topics, 20 times per second."""
         now, here, send = time.time_ns(), np.eye(4), lambda topic, message: self.out[topic].publish(message)
         tf = message_type("TFMessage")
         if step % 20 == 0:
@@ -197,7 +201,7 @@ class Robot:
         send("/wheel/odom", odometry_message(here, 0.0, 0.0, "odom", "base_link", now))
         if step % 2 == 0:
             angles = 2 * np.pi / 720
-            ranges = np.full(720, 6.0, np.float32)  # free all round
+            ranges = np.full(720, 6.0, np.float32)  # free in all directions
             send("/scan", scan_message(ranges, -np.pi, angles, 0.4, 100.0, "velodyne", now))
             covariance = PoseWithCovariance(pose=pose_message(here), covariance=np.eye(6).ravel() * 1e-4)
             send("/pose", PoseWithCovarianceStamped(header=header("map", now), pose=covariance))
@@ -240,7 +244,7 @@ def vspace_status(now: int) -> Any:
 
 
 def part(virtual: bool, args: argparse.Namespace) -> dict[str, Any]:
-    """One of the two ways, with a stack and a browser of its own."""
+    """Measure one of the two paths, with its own stack and browser."""
     from playwright.sync_api import sync_playwright
 
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
@@ -291,7 +295,7 @@ def press_keys(page: Any, robot: Robot, keys: list[str], args: argparse.Namespac
         page.keyboard.down(key)
         page.wait_for_timeout(500)
         page.keyboard.up(key)
-        page.wait_for_timeout(900 + jitter.uniform(0, 100))  # not in step with any timer
+        page.wait_for_timeout(900 + jitter.uniform(0, 100))  # not in phase with any timer
         row = page.evaluate("presses.at(-1)")
         rows.append(row | {"marks": dict(robot.marks)})
     return rows
@@ -332,7 +336,7 @@ def figures(rows: list[dict[str, Any]], virtual: bool) -> dict[str, Any]:
 
 
 def draws_hz(row: dict[str, Any]) -> float:
-    """Drawings a second in the half second of the press."""
+    """Frames per second in the half second of the press."""
     return sum(0 <= at - row["pressed"] < 500 for at in row["draws"]) / 0.5
 
 
@@ -348,7 +352,8 @@ def main() -> int:
         parser.error("--presses must be 2 or more")
     result: dict[str, Any] = {
         "cores": os.cpu_count(),
-        # 1.0: fast enough for a whole simulated stack in real time. Below, and with other load, latencies are longer.
+        # 1.0: fast enough for a whole simulated stack in real time. Below it, and under other load, latencies are
+        # longer.
         "machine_pace": round(machine_pace(), 2),
         "load_average": round(os.getloadavg()[0], 1),
         "targets_ms": {"base_p50": 40, "shown_p50": 150},

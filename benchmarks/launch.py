@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Start and end of a stack: seconds to every node's RUNNING, CPU of the start and of the launcher; prints JSON.
+"""Start and stop of a stack: seconds until all nodes are RUNNING, CPU of the start and of the launcher; prints JSON.
 
 python benchmarks/launch.py                     launch/sim.yaml without the page
 python benchmarks/launch.py --file replay bag:=drive
@@ -35,13 +35,13 @@ def check_s(file: str, words: list[str], cache: Path) -> float:
 
 
 def cpu_s(process: Any) -> float:
-    """CPU seconds that a process has used."""
+    """CPU seconds used by a process."""
     times = process.cpu_times()
     return float(times.user + times.system)
 
 
 def measure(file: str, arguments: dict[str, str], steady_s: float) -> dict[str, Any]:
-    """One stack from its start to its end."""
+    """Measure one stack from its start to its end."""
     import psutil
 
     from instant_ic.launch import find_launch_file, read_launch_file
@@ -83,7 +83,7 @@ def measure(file: str, arguments: dict[str, str], steady_s: float) -> dict[str, 
 
 
 def killed(file: str, arguments: dict[str, str]) -> dict[str, float]:
-    """How long after the launcher's SIGKILL the last process of the stack is gone."""
+    """Seconds from the launcher's SIGKILL until the last process of the stack is gone."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     try:
         with Stack(file, run_dir, arguments) as stack:
@@ -99,7 +99,6 @@ def killed(file: str, arguments: dict[str, str]) -> dict[str, float]:
 
 
 def main() -> int:
-    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--file", default="sim", help="launch file (default: %(default)s)")
     parser.add_argument("--steady", type=float, default=10.0, metavar="SECONDS", help="time over which CPU is taken")

@@ -1,6 +1,7 @@
-"""CPU time to decode a VLP-16 capture, ours against velodyne_decoder (C++), the file's reading included.
+"""CPU time to decode a VLP-16 capture, including reading the file, compared with velodyne_decoder (C++).
 
-Both read the same file in the same process in turns, so that neither has the warmer machine. Prints one JSON object:
+Both read the same file in the same process, alternating, so that neither benefits from a warmer machine. Prints one
+JSON object:
 
     python benchmarks/lidar.py [capture.pcap] [--runs 15]
 """
@@ -21,13 +22,13 @@ RECORDING = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "vl
 
 
 def ours(path: Path) -> tuple[int, int]:
-    """(revolutions, points) of ours."""
+    """(revolutions, points) with our decoder."""
     revolutions = list(Recording(path, DecoderConfig(min_range=0.1)))
     return len(revolutions), sum(len(revolution.points) for revolution in revolutions)
 
 
 def theirs(path: Path) -> tuple[int, int]:
-    """(scans, points) of velodyne_decoder with the same packed point layout."""
+    """(scans, points) with velodyne_decoder and the same packed point layout."""
     config = vd.Config(model=vd.Model.VLP16)
     config.max_range = 130.0
     scans = list(vd.read_pcap(str(path), config, as_pcl_structs=True))
@@ -35,14 +36,13 @@ def theirs(path: Path) -> tuple[int, int]:
 
 
 def cpu_ms(decode: Callable[[Path], tuple[int, int]], path: Path) -> float:
-    """CPU milliseconds of one decoding of the whole file."""
+    """CPU milliseconds to decode the whole file once."""
     start = time.process_time()
     decode(path)
     return (time.process_time() - start) * 1e3
 
 
 def main() -> None:
-    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path, nargs="?", default=RECORDING)
     parser.add_argument("--runs", type=int, default=15)
@@ -52,7 +52,7 @@ def main() -> None:
 
     (_, our_points), (_, their_points) = ours(args.capture), theirs(args.capture)  # also compiles and warms up
     firings = sum(len(revolution.firing_time) for revolution in Recording(args.capture))
-    revolutions = firings * 55.296e-6 / 0.1  # of 100 ms, so that both are divided by the same
+    revolutions = firings * 55.296e-6 / 0.1  # of 100 ms, so that both are divided by the same number
     samples: dict[str, list[float]] = {"ours": [], "velodyne_decoder": []}
     for _ in range(args.runs):
         samples["ours"].append(cpu_ms(ours, args.capture) / revolutions)

@@ -1,12 +1,13 @@
-"""Measures the virtual space on this machine and prints JSON: kernels, time to quality, pictures, memory.
+"""Measures the virtual space on this machine and prints JSON: kernels, time to quality, rendering, memory.
 
     python benchmarks/nerf.py [--seconds 60] [--world corridor|room] [--only PART ...]
 
-CPU time of the process is measured, not wall time, so that other load on the machine counts little; a machine's own
-speed counts fully, so hash encoding and iterations stand beside a peer's in the same run. The peer is nerfstudio's
-``HashEncoding(implementation="torch")`` where nerfstudio is installed, else ``benchmarks/peer_hash.py``, which does the
-same operations in torch; ``peer`` says which. The scene is the simulator's corridor (true depth, 1024 × 512 panorama),
-or the box room of the tests. What needs a GPU is written ``not measured`` where there is none.
+CPU time of the process is measured instead of wall time, so that other load on the machine has little effect. The
+machine's own speed affects it fully, so hash encoding and iterations are measured beside a peer in the same run. The
+peer is nerfstudio's ``HashEncoding(implementation="torch")`` if nerfstudio is installed, else
+``benchmarks/peer_hash.py``, which performs the same operations in torch; ``peer`` names it. The scene is the
+simulator's corridor (true depth, 1024 × 512 panorama), or the box room of the tests. GPU figures are ``not measured``
+without a GPU.
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ def wall_points(samples: int) -> Any:
 
 
 def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[str, Any]:
-    """CPU nanoseconds a sample of ours and of the peer, all levels counted whole, by turns in one run."""
+    """CPU nanoseconds per sample of our encoding and the peer's, over all levels, alternating in one run."""
     import torch
 
     rng = np.random.default_rng(0)
@@ -82,7 +83,7 @@ def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[st
     cells = np.geomspace(2, 80, levels).astype(np.float32)
     points, focus = wall_points(samples), np.zeros((1, 4), np.float32)
     peer_name, peer = peer_encoding(levels, features, LOG2_TABLE, 16, 640)
-    # The peer's cube is the unit cube.
+    # The peer encodes points of the unit cube.
     unit = torch.from_numpy(points - points.min(axis=0)) / float(np.ptp(points, axis=0).max())
 
     def ours(backward: bool) -> None:
@@ -109,8 +110,10 @@ def hash_encoding(levels: int, features: int, samples: int = 1 << 15) -> dict[st
 
 
 def whole_iteration(repeats: int = 5) -> dict[str, Any]:
-    """CPU milliseconds of a training step of 16 384 samples: ours with its rays, and the peer's encoding with torch's
-    network, autograd and Adam on the same number of samples.
+    """CPU milliseconds of a training step of 16 384 samples.
+
+    Ours includes its rays; the peer is its encoding with torch's network, autograd and Adam on the same number of
+    samples.
     """
     import torch
 
@@ -149,7 +152,7 @@ def whole_iteration(repeats: int = 5) -> dict[str, Any]:
 
 
 def scene(world: str) -> tuple[Any, Any, list[Any], list[Any]]:
-    """Panorama, its pose, and pairs of pose and true picture at the keyframe, 1 m ahead and to the side."""
+    """Panorama, its pose, and pairs of pose and ground-truth image at the keyframe, 1 m ahead and to the side."""
     if world == "room":
         keyframe = np.eye(4)
         poses = [keyframe, pose_matrix(1.0, -0.3), pose_matrix(0.0, -1.0, yaw=0.3)]
@@ -170,7 +173,7 @@ def psnr_db(a: Any, b: Any) -> float:
 
 
 def point_warp(picture: Any, depth_m: Any, pose: Any, view_pose: Any, width: int, height: int) -> Any:
-    """The panorama's pixels as points, nearest first, in a view; holes are filled from around."""
+    """Render the panorama's pixels as points, nearest on top; holes are filled from their surroundings."""
     directions = equirect_directions(*picture.shape[1::-1])
     depth = cv2.resize(depth_m, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)
     points = (directions * depth[..., None]).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3] - view_pose[:3, 3]
@@ -189,7 +192,7 @@ def point_warp(picture: Any, depth_m: Any, pose: Any, view_pose: Any, width: int
 
 
 def against_warp(picture: Any, pose: Any, poses: list[Any], truth: list[Any], iterations: int) -> dict[str, Any]:
-    """PSNR (dB) and SSIM at the views after few iterations, by true depth and by the shipped model's."""
+    """PSNR (dB) and SSIM of the views after few iterations, with true depth and with the shipped model's."""
     estimate = DepthModel.load(paths.shipped_file("models", DEFAULT_MODEL), threads=1).estimate(picture.rgb)
     true = cv2.resize(picture.depth_m, estimate.shape[::-1], interpolation=cv2.INTER_AREA)
     known = (estimate > 0) & (true > 0)
@@ -215,7 +218,7 @@ def against_warp(picture: Any, pose: Any, poses: list[Any], truth: list[Any], it
 
 
 def shown(source: str) -> VirtualSpaceConfig:
-    """``field``: the field alone; ``shown``: as it is by default; ``density``: the field alone, as density."""
+    """``field``: the field alone; ``shown``: the default; ``density``: the field alone, as density."""
     alone = PictureConfig(panorama_until_db=30.0, field_from_db=30.0)
     if source == "shown":
         return VirtualSpaceConfig()
@@ -224,9 +227,9 @@ def shown(source: str) -> VirtualSpaceConfig:
 
 
 def time_to_quality(world: str, seconds: float, source: str) -> dict[str, Any]:
-    """Trains for up to ``seconds`` of CPU (to the schedule's end) and follows the views' PSNR on the way.
+    """Train for up to ``seconds`` of CPU (or the schedule's end) and track the views' PSNR.
 
-    ``within_*_cpu_s`` counts from the keyframe's arrival, its preparation included.
+    ``within_*_cpu_s`` counts from the keyframe's arrival and includes its preparation.
     """
     picture, pose, poses, truth = scene(world)
     space = VirtualSpace(shown(source))
@@ -293,7 +296,7 @@ def geometries(world: str, seconds: float) -> dict[str, Any]:
 
 
 def pictures(world: str, train_ms: float = 30.0) -> dict[str, Any]:
-    """CPU milliseconds of a picture and pictures a second on one thread, alone and with a slice of training each."""
+    """CPU milliseconds per view and views per second on one thread, alone and with a slice of training each."""
     picture, pose, poses, _ = scene(world)
     result: dict[str, Any] = {"train_ms_per_frame": train_ms}
     for source in ("shown", "field", "density"):
@@ -322,8 +325,9 @@ def pictures(world: str, train_ms: float = 30.0) -> dict[str, Any]:
 
 
 def gpu(world: str, seconds: float) -> dict[str, Any] | str:
-    """Time to quality and pictures on a GPU, of the device that ``cuda`` gives; beside tiny-cuda-nn's encoding if it is
-    installed. Wall time: a GPU's work is no CPU time.
+    """Time to quality and rendering on a GPU, with the backend that ``cuda`` selects.
+
+    tiny-cuda-nn's encoding is measured beside it if installed. Wall time is used, because a GPU's work is not CPU time.
     """
     import torch
 
@@ -359,7 +363,7 @@ def gpu(world: str, seconds: float) -> dict[str, Any] | str:
 
 
 def gpu_hash(levels: int, features: int, samples: int = 1 << 18) -> dict[str, Any]:
-    """Nanoseconds a sample, forward and backward, of the peers on the GPU."""
+    """Nanoseconds per sample, forward and backward, of the peers on the GPU."""
     import torch
 
     points = torch.from_numpy(wall_points(samples)).cuda()
@@ -431,7 +435,7 @@ def main() -> None:
 
 
 def cpu_name() -> str:
-    """The processor's name, where Linux tells it."""
+    """The processor's name, if Linux reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

@@ -1,10 +1,10 @@
-"""The virtual space on an NVIDIA GPU: what its targets ask for, of the Triton kernels beside plain torch.
+"""The virtual space on an NVIDIA GPU: the figures of its targets, for the Triton kernels and for plain torch.
 
     python benchmarks/nerf_gpu.py [--world corridor|room] [--seconds 10]
 
-Prints JSON: of the field alone, and ``as_shown``, the panorama's warp at first. Wall time with the GPU waited for;
-medians. Where there is no GPU every figure is "not measured", with the reason. ``start_s`` of ``triton`` counts the
-compilation, unless the kernels are in the cache already (``cache_dir``).
+Prints JSON for the field alone, and ``as_shown``, which starts with the panorama's warp. Wall time after GPU
+synchronisation; medians. Without a GPU every figure is "not measured", with the reason. ``start_s`` of ``triton``
+includes the compilation, unless the kernels are already in the cache (``cache_dir``).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def median_s(call: Callable[[], object], repeats: int = 15) -> float:
 
 
 def quality(config: VirtualSpaceConfig, world: str, seconds: float) -> dict[str, Any]:
-    """Training time until the views are within 1 dB of the last; drawing in between is not counted."""
+    """Training time until the views are within 1 dB of the last; rendering in between is not counted."""
     picture, pose, poses, truth = scene(world)
     space = VirtualSpace(config)
     space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)
@@ -70,14 +70,14 @@ def quality(config: VirtualSpaceConfig, world: str, seconds: float) -> dict[str,
 
 
 def speed(config: VirtualSpaceConfig, world: str) -> dict[str, Any]:
-    """First picture, pictures a second alone and with ten iterations each, and the field's share of a picture."""
+    """First view, views per second alone and with ten iterations each, and the field's share of a view."""
     import torch
 
     picture, pose, poses, _ = scene(world)
     start = time.perf_counter()
     space = VirtualSpace(config)
     started = time.perf_counter() - start
-    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)  # buffers and kernels are there from now on
+    space.set_keyframe(picture.rgb, picture.depth_m, pose, 0.02)  # allocates buffers and compiles kernels
     space.train(iterations=3)
     space.render(poses[1], *SIZES[2], FOV)
     start = time.perf_counter()
@@ -140,7 +140,7 @@ def main() -> None:
             result[device] = {**speed(config, arguments.world), **quality(config, arguments.world, arguments.seconds)}
             shown = dataclasses.replace(config, picture=PictureConfig())
             result[device]["as_shown"] = speed(shown, arguments.world)
-        except RuntimeError as error:  # what one device cannot do must not hide the other's figures
+        except RuntimeError as error:  # a failure of one backend must not hide the other's figures
             result[device] = not_measured(f"{type(error).__name__}: {error}")
     print(json.dumps(result, indent=2))
 

@@ -1,8 +1,8 @@
-"""The hash encoding that ours is measured against: all levels at once in plain torch, gradients by autograd.
+"""Peer of our hash encoding in benchmarks: all levels at once in plain torch, gradients by autograd.
 
-Not nerfstudio's code: the operations of its ``HashEncoding(implementation="torch")`` (one flat table for all levels; of
-each point and level the eight corners hashed, looked up and interpolated axis by axis), written anew, so that the
-benchmark needs no nerfstudio. Where nerfstudio is installed, its own is taken.
+This is not nerfstudio's code. It reimplements the operations of its ``HashEncoding(implementation="torch")`` (one flat
+table for all levels; per point and level, the eight corners are hashed, looked up and interpolated axis by axis), so
+that the benchmark does not need nerfstudio. If nerfstudio is installed, its own encoding is used.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from torch import Tensor
 
 
 class TorchHashEncoding(torch.nn.Module):
-    """Points of the unit cube (N, 3) to features (N, levels · features)."""
+    """Maps points of the unit cube (N, 3) to features (N, levels · features)."""
 
     def __init__(self, levels: int, features: int, log2_table: int, coarsest: int, finest: int) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class TorchHashEncoding(torch.nn.Module):
 def peer_encoding(
     levels: int, features: int, log2_table: int, coarsest: int, finest: int
 ) -> tuple[str, torch.nn.Module]:
-    """Its name and the encoding: nerfstudio's where it is installed."""
+    """Name and encoding: nerfstudio's if it is installed."""
     try:
         from nerfstudio.field_components.encodings import HashEncoding
     except ImportError:

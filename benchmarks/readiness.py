@@ -1,8 +1,8 @@
-"""Holds the expected PSNR of the virtual space against the measured one in simulated worlds; prints JSON.
+"""Compares the expected PSNR of the virtual space with the measured one in simulated worlds; prints JSON.
 
     python benchmarks/readiness.py [--mesh house.glb] [--fit]
 
-Keyframes have the true depth with a smooth error of known size. ``--fit`` finds the gains of ``nerf/readiness.py`` on
+Keyframes have the true depth with a smooth error of known size. ``--fit`` fits the gains of ``nerf/readiness.py`` to
 the random worlds; the corridor and the mesh are for testing only.
 """
 
@@ -43,7 +43,7 @@ def wrong_depth(depth_m: Any, sigma: float, seed: int) -> Any:
 
 
 def samples(kind: str, scene: Scene) -> list[dict[str, Any]]:
-    """Terms and measured PSNR of views ahead and aside."""
+    """Terms and measured PSNR of views ahead and to the side."""
     rows = []
     pose = scene.map_from_camera
     reach = float(scene.depth_m[250:262, 500:524].min()) - 0.5
@@ -68,7 +68,7 @@ def samples(kind: str, scene: Scene) -> list[dict[str, Any]]:
 
 
 def fit(rows: list[dict[str, Any]]) -> list[float]:
-    """Base and gains, none negative, of the least relative error of the squared error; unbiased in dB."""
+    """Base and non-negative gains with the least relative error of the squared error; unbiased in dB."""
     mse = np.array([10 ** (-row["psnr_db"] / 10) for row in rows])
     matrix = np.array([[1e-3, *row["terms"]] for row in rows]) / mse[:, None]
     gains = nnls(matrix, np.ones(len(rows)))[0]

@@ -1,9 +1,9 @@
-"""CPU time of the simulator: milliseconds a panorama and a LiDAR revolution, as JSON.
+"""CPU time of the simulator: milliseconds per panorama and per LiDAR revolution, as JSON.
 
     python benchmarks/sim.py --world corridor
 
 Each figure is CPU time of the calling thread (``time.thread_time``), the median over poses spread over the world, after
-a warm-up call; ``cores_at_5_and_10_hz`` is what 5 panoramas and 10 revolutions a second take together.
+a warm-up call. ``cores_at_5_and_10_hz`` is the load of 5 panoramas and 10 revolutions per second together.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def cpu_ms(call: Callable[[], object]) -> float:
 
 
 def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio of two 8-bit pictures, dB."""
+    """Peak signal-to-noise ratio of two 8-bit images, dB."""
     return float(10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2)))
 
 

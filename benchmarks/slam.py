@@ -1,10 +1,10 @@
-"""Grid SLAM: accuracy and CPU time on the Intel log, on made-up buildings and on the simulated crawler, as JSON.
+"""Grid SLAM: accuracy and CPU time on the Intel log, in generated buildings and on the simulated crawler, as JSON.
 
 python benchmarks/slam.py [--data FOLDER] [--only NAME ...]
 
-Parts: ``box`` (720 beams in a room), ``long`` (the same for ever: does a scan cost more later?), ``intel``,
-``intel_seeds`` (five seeds of worse odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``. All with the
-default parameters. ``--data`` is the folder with intel.log.gz; default ../shared/data/slam2d.
+Parts: ``box`` (720 beams in a room), ``long`` (the same for a long time, to see whether the cost per scan grows),
+``intel``, ``intel_seeds`` (five seeds of degraded odometry), ``intel_rbpf`` (the particle filter), ``worlds``, ``sim``.
+All use the default parameters. ``--data`` is the folder with intel.log.gz; default ../shared/data/slam2d.
 """
 
 from __future__ import annotations
@@ -75,14 +75,14 @@ def room_drive(scans: int, beams: int = 720) -> list[dict[str, object]]:
 def intel(
     entries: list[LogEntry], relations: Relations, seed: int | None = None, backend: str = "graph"
 ) -> dict[str, object]:
-    """The Intel log; ``seed`` makes its odometry worse."""
+    """The Intel log; ``seed`` degrades its odometry."""
     source = entries if seed is None else perturb_odometry(entries, seed)
     report, _ = evaluate_log(source, relations, SlamConfig(backend=backend))
     return {key: report[key] for key in KEPT if key in report}
 
 
 def worlds() -> dict[str, object]:
-    """Made-up buildings: largest and mean error of the online and of the final poses."""
+    """Generated buildings: maximum and mean error of the online and of the final poses."""
     out: dict[str, object] = {}
     for name, made, laser, seed in (
         ("ring of corridors, 210 m, twice and back, SICK 180°", ring(0), "sick180", 0),
@@ -121,7 +121,6 @@ def simulated() -> list[dict[str, object]]:
 
 
 def main() -> None:
-    """Print one JSON object."""
     parts = ("box", "long", "intel", "intel_seeds", "intel_rbpf", "worlds", "sim")
     parser = argparse.ArgumentParser(description="measures the grid SLAM")
     default = Path(__file__).resolve().parents[2] / "shared" / "data" / "slam2d"

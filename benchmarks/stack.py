@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The whole simulated stack on this machine: rates, CPU and memory of each process, latencies; prints JSON.
 
-Drives in a real browser by the keyboard into the white obstacle, through the virtual space, and back.
+Drives with the keyboard of a real browser into the white obstacle, through the virtual space, and back.
 
     python benchmarks/stack.py --json stack.json --screenshots pictures/
 """
@@ -39,7 +39,7 @@ window.addEventListener('keydown', e => {
 
 
 class Probe:
-    """Collects the rates that heartbeats tell."""
+    """Collects the rates published in heartbeats."""
 
     def __init__(self, stack: Stack) -> None:
         self.rates: dict[str, list[float]] = defaultdict(list)
@@ -53,7 +53,7 @@ class Probe:
 
 
 def usage(run_dir: Path) -> dict[str, tuple[float, float]]:
-    """CPU seconds used so far and resident MB of each process, by its node name."""
+    """CPU seconds used and resident MB of each process, by node name."""
     found = {}
     for process in processes_of(run_dir):
         words = process.cmdline()
@@ -93,7 +93,7 @@ def main() -> int:
 
 
 def measure(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace) -> dict[str, Any]:
-    """Runs the drive and gives the figures."""
+    """Run the drive and return the figures."""
     from playwright.sync_api import sync_playwright
 
     control = message_type("ControlState")
@@ -115,7 +115,9 @@ def measure(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace) -> 
         latencies = [press_latency(stack, page, "KeyW" if i % 2 else "KeyS") for i in range(8)]
 
         def hold(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-            """W until then; after a stop by a late sensor lets go and presses again, as an operator does."""
+            """Hold W until the condition is true. After a stop by late sensor data, release and press again, as an
+            operator does.
+            """
             end = time.monotonic() + timeout_s
             while not condition():
                 page.keyboard.down("KeyW")
@@ -177,7 +179,7 @@ def measure(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace) -> 
 
 
 def window(stack: Stack, probe: Probe, run_dir: Path, seconds: float) -> dict[str, Any]:
-    """Rates and load over a time in which nothing is asked of the stack."""
+    """Rates and load over a period without any requests to the stack."""
     before = usage(run_dir), time.monotonic()
     probe.rates.clear()
     probe.collecting = True
@@ -189,12 +191,12 @@ def window(stack: Stack, probe: Probe, run_dir: Path, seconds: float) -> dict[st
 
 
 def mean_rates(probe: Probe) -> dict[str, float]:
-    """Mean of the rates that the heartbeats told."""
+    """Mean of the rates published in heartbeats."""
     return {topic: round(statistics.mean(values), 2) for topic, values in sorted(probe.rates.items())}
 
 
 def cpu_between(before: Any, after: Any) -> dict[str, dict[str, float]]:
-    """CPU in percent of one core, and memory, of each process between two looks."""
+    """CPU in percent of one core, and memory, of each process between two samples."""
     (used0, t0), (used1, t1) = before, after
     return {
         name: {
@@ -206,7 +208,7 @@ def cpu_between(before: Any, after: Any) -> dict[str, dict[str, float]]:
 
 
 def wait(stack: Stack, page: Any, condition: Any, timeout_s: float, what: str) -> None:
-    """As Stack.wait_for, and lets the browser's events run."""
+    """Like Stack.wait_for, but also processes the browser's events."""
 
     def both() -> bool:
         page.wait_for_timeout(20)
@@ -237,14 +239,14 @@ def press_latency(stack: Stack, page: Any, key: str) -> float:
 
 
 def shot(page: Any, args: argparse.Namespace, name: str) -> None:
-    """Saves a picture of the page."""
+    """Save a screenshot of the page."""
     if args.screenshots:
         args.screenshots.mkdir(parents=True, exist_ok=True)
         page.screenshot(path=str(args.screenshots / f"{name}.png"))
 
 
 def note(text: str) -> None:
-    """Tells how far it is."""
+    """Print the progress."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -1,21 +1,22 @@
 #!/usr/bin/env python3
-"""How soon the robot stands when a process, a device or a link is lost; prints JSON.
+"""Stopping time of the robot after a process, a device or a link is lost; prints JSON.
 
     python benchmarks/stopping.py --json stopping.json
     python benchmarks/stopping.py --only arbiter --only "LiDAR packets" --repeat 5
 
-A simulated stack of real processes (no depth, no virtual space: they do not move the robot in REAL) drives through free
-space at 0.38 m/s. Then one thing is lost: a process is frozen (SIGSTOP) or killed (SIGKILL), a device or link is cut,
-the page goes away, or the emergency stop is pressed. Measured from that moment, by the simulator's true motion:
+A simulated stack of real processes (without depth and virtual space, which do not move the robot in REAL) drives
+through free space at 0.38 m/s. Then one thing is lost: a process is frozen (SIGSTOP) or killed (SIGKILL), a device or
+link is cut, the page disconnects, or the emergency stop is pressed. Measured from that moment, by the simulator's true
+motion:
 
     detect_s    to the first sign of the stop: /cmd_vel, the speed commanded to the motor controller, or the true speed
                 falls by a tenth
-    stand_s     to a true speed below 0.01 m/s that stays there
-    distance_m  from the place at the loss to the place where it stands
-    after_m     that it moves in the second after it stands: must be nothing
+    stand_s     to a true speed that stays below 0.01 m/s
+    distance_m  from the position at the loss to the stopping position
+    after_m     motion in the second after it has stopped: must be zero
 
 All times are seconds of the stack, which runs at the pace of the machine (``--pace``, 1.0 on one that is fast enough).
-The time-outs of the console's server and of serial replies go by the machine's clock; they are stretched by the pace.
+The timeouts of the console's server and of serial replies use the machine's clock and are stretched by the pace.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class Truth(NamedTuple):
 
 
 class PacketRelay:
-    """Passes UDP packets on from one port to another of this machine, unless it is cut."""
+    """Forwards UDP packets between two ports of this machine, unless it is cut."""
 
     def __init__(self, source: int, target: int) -> None:
         self.cut = False
@@ -126,22 +127,22 @@ class PacketRelay:
                 data = self._socket.recv(2048)
                 if not self.cut:
                     self._socket.sendto(data, self._target)
-            except (TimeoutError, ConnectionRefusedError):  # nobody sends, or the driver is not there
+            except (TimeoutError, ConnectionRefusedError):  # no sender, or the driver is not running
                 continue
 
     def close(self) -> None:
-        """Ends it."""
+        """Stop forwarding."""
         self._ends.set()
         self._thread.join(2.0)
         self._socket.close()
 
 
 class SerialRelay:
-    """A serial line between the base's driver and the simulated controller that can lose replies or be pulled out."""
+    """Serial line between the base driver and the simulated controller that can lose replies or be disconnected."""
 
     def __init__(self, link: Path, controller: Path) -> None:
         self.mute = False
-        """The controller's replies are lost."""
+        """True: the controller's replies are dropped."""
         self.speeds: list[tuple[int, float]] = []
         """Each request that changes the commanded speed: machine time in ns, encoder counts per second."""
         self._listener = RoboclawEmulator()
@@ -154,7 +155,7 @@ class SerialRelay:
         self._thread.start()
 
     def plug(self) -> None:
-        """Makes the line, under the driver's name for it."""
+        """Create the line under the driver's device name."""
         with self._lock:
             self._master, self._slave = os.openpty()
             tty.setraw(self._slave)
@@ -162,7 +163,7 @@ class SerialRelay:
             self._link.symlink_to(os.ttyname(self._slave))
 
     def pull(self) -> None:
-        """The driver's end is gone, as when the cable is pulled."""
+        """Remove the driver's end, as when the cable is disconnected."""
         with self._lock:
             self._link.unlink(missing_ok=True)
             os.close(self._master)
@@ -170,7 +171,7 @@ class SerialRelay:
             self._master = self._slave = -1
 
     def close(self) -> None:
-        """Ends it."""
+        """Close the line."""
         self._ends.set()
         self._thread.join(2.0)
         for descriptor in (self._master, self._slave, self._far):
@@ -183,7 +184,7 @@ class SerialRelay:
                 with contextlib.suppress(FileNotFoundError):  # the simulator is still starting
                     self._far = os.open(self._controller, os.O_RDWR | os.O_NOCTTY)
                     tty.setraw(self._far)
-            # At the end of the stack, and while the cable is out, there is nobody to pass on to.
+            # At the end of the stack, and while the cable is disconnected, there is no receiver.
             with self._lock, contextlib.suppress(OSError):
                 self._pass_on()
             if self._master < 0 or self._far < 0:
@@ -211,7 +212,7 @@ class SerialRelay:
 
 @dataclass
 class Rig:
-    """A running stack, what is between its parts, and what has been seen of it."""
+    """A running stack, the relays between its parts, and the recorded data."""
 
     stack: Stack
     run_dir: Path
@@ -226,7 +227,7 @@ class Rig:
     pace: pace.Pace = field(default_factory=pace.Pace)
 
     def watch(self) -> None:
-        """Takes in the true motion, the commands and the arbiter's state."""
+        """Record the true motion, the commands and the arbiter's state."""
         observer = self.stack.observer
         observer.subscribe("/ground_truth/odom", message_type("Odometry"), self._on_truth)
         observer.subscribe("/cmd_vel", message_type("TwistStamped"), self._on_command)
@@ -244,7 +245,7 @@ class Rig:
         self.state = message
 
     def ready(self) -> bool:
-        """Whether the arbiter lets the robot be driven now."""
+        """Whether the arbiter currently allows driving."""
         if self.state is None or not self.truth:
             return False
         fresh = self.pace.now_ns() - stamp_ns(self.state) < 0.3e9
@@ -252,10 +253,10 @@ class Rig:
         return fresh and self.state.mode == ControlState.REAL and not held and self.truth[-1].speed < STANDS_M_S
 
     def pid(self, node: str) -> int:
-        """Of a node that runs now.
+        """Process id of a running node.
 
         Raises:
-            StackError: it does not.
+            StackError: it is not running.
         """
         for info in registry.list_nodes(self.run_dir):
             if info.name == node:
@@ -265,7 +266,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something to lose: what breaks it and what mends it, as they act on a rig and the operator's page."""
+    """A fault: functions that cause it and end it, given the rig and the operator's page."""
 
     name: str
     breaks: Callable[[Rig, ConsoleClient], Awaitable[None]]
@@ -273,11 +274,11 @@ class Fault:
 
 
 async def nothing(rig: Rig, page: ConsoleClient) -> None:
-    """Mends what mends itself: the launcher starts a killed process again, and each drive has a page of its own."""
+    """Recovery without action: the launcher restarts a killed process, and each drive has its own page."""
 
 
 def at_once(does: Callable[[Rig], object]) -> Callable[[Rig, ConsoleClient], Awaitable[None]]:
-    """What only touches the rig."""
+    """Wrap a function that needs only the rig."""
 
     async def act(rig: Rig, page: ConsoleClient) -> None:
         does(rig)
@@ -286,7 +287,7 @@ def at_once(does: Callable[[Rig], object]) -> Callable[[Rig, ConsoleClient], Awa
 
 
 def process_faults(node: str) -> list[Fault]:
-    """A node frozen and killed."""
+    """Faults of a node: frozen and killed."""
     frozen: list[int] = []
 
     def freeze(rig: Rig) -> None:
@@ -345,12 +346,12 @@ FAULTS = [
 
 @contextlib.contextmanager
 def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
-    """A started stack with everything between its parts that can be cut."""
+    """A started stack with relays at everything that can be cut."""
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
     ports = {name: free_port() for name in ("camera", "console")}
     ports |= {name: free_port(socket.SOCK_DGRAM) for name in ("lidar", "lidar_link", "position")}
     drive = DriveConfig()
-    # The page's server and the serial port count machine seconds.
+    # The page's server and the serial port use machine time.
     stretched = {key: getattr(drive, key) / factor for key in ("watchdog_s", "beat_timeout_s", "max_command_age_s")}
     params = run_dir / "stretched.yaml"
     serial_s = {"reply_timeout_s": RoboclawConfig().reply_timeout_s / factor}
@@ -378,7 +379,7 @@ def rig(factor: float, log: Path | None, text: str = LAUNCH) -> Iterator[Rig]:
 
 @contextlib.asynccontextmanager
 async def driver(rig: Rig, tries: int = 40) -> AsyncIterator[ConsoleClient]:
-    """A page that drives; the console may just be starting again."""
+    """A page that drives; retries, because the console may just be restarting."""
     page = ConsoleClient(f"http://127.0.0.1:{rig.page_link.port}/")
     for left in reversed(range(tries)):
         try:
@@ -392,20 +393,20 @@ async def driver(rig: Rig, tries: int = 40) -> AsyncIterator[ConsoleClient]:
         await page.acquire(take=True, timeout_s=10.0)
         yield page
     finally:
-        # A connection that was cut ends as it may: the next drive has another.
+        # Errors while closing a cut connection are ignored: the next drive opens its own.
         with contextlib.suppress(OSError, TimeoutError, aiohttp.ClientError, asyncio.CancelledError):
             await asyncio.wait_for(page.close(), 5.0)
 
 
 async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> float:
-    """Drives on the corridor's middle line until the speed has been steady for ``wait_s``; that speed, m/s."""
+    """Drive on the corridor's centre line until the speed has been steady for ``wait_s``; return that speed, m/s."""
     for _ in range(_TRIES):
         await until(rig.ready, 90, "robot that can be driven")
         sign = 1.0 if rig.truth[-1].x < 5.0 else -1.0
 
         def fast(sign: float = sign) -> bool:
             truth = rig.truth[-1]
-            # Back to the middle line, as far as the drive takes it.
+            # Back to the centre line, as far as the drive allows.
             page.drive(sign * SPEED_M_S, max(-0.3, min(0.3, -truth.yaw - sign * 0.5 * truth.y)))
             return truth.speed > 0.97 * SPEED_M_S
 
@@ -414,7 +415,7 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
             page.drive(sign * SPEED_M_S, 0.0)
             began_ns = rig.pace.now_ns()
             await asyncio.sleep(rig.pace.wait_s(wait_s))
-        except StackError:  # a sensor was late on a busy machine: let go, as an operator does, and drive again
+        except StackError:  # a sensor was late on a busy machine: release and drive again, as an operator does
             await page.stop()
             continue
         steady = [truth.speed for truth in rig.truth if truth.at_ns > began_ns]
@@ -426,9 +427,9 @@ async def at_speed(rig: Rig, until: Any, page: ConsoleClient, wait_s: float) -> 
 
 
 async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[str, Any]:
-    """One drive that ends by one fault."""
+    """Run one drive that ends with one fault."""
     async with driver(rig) as page:
-        cruise = await at_speed(rig, until, page, 0.7 + rng.uniform(0.0, 0.1))  # in step with no timer
+        cruise = await at_speed(rig, until, page, 0.7 + rng.uniform(0.0, 0.1))  # not in phase with any timer
         lost_ns = rig.pace.now_ns()
         await fault.breaks(rig, page)
         try:
@@ -449,7 +450,7 @@ async def one(rig: Rig, until: Any, fault: Fault, rng: random.Random) -> dict[st
 
 
 def stands_ns(truth: Sequence[Truth], lost_ns: int) -> int | None:
-    """When the robot began to stand for ``STANDS_S``; None if it has not."""
+    """Time at which the robot began to stand for ``STANDS_S``; None if it has not."""
     began: int | None = None
     for row in truth:
         if row.at_ns < lost_ns:
@@ -464,10 +465,10 @@ def stands_ns(truth: Sequence[Truth], lost_ns: int) -> int | None:
 
 
 def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
-    """The figures of one drive."""
+    """Figures of one drive."""
     rows = [row for row in rig.truth if row.at_ns >= lost_ns]
     start = max((row for row in rig.truth if row.at_ns <= lost_ns), key=lambda row: row.at_ns)
-    gap_s = (lost_ns - start.at_ns) / 1e9  # it drove on for that long before the loss
+    gap_s = (lost_ns - start.at_ns) / 1e9  # driving time between this sample and the loss
     signs = [at for at, speed in rig.commands if at >= lost_ns and speed < 0.9 * cruise]
     signs += [row.at_ns for row in rows if row.speed < 0.9 * cruise]
     requests = [(rig.pace.stamp_ns(at), speed) for at, speed in rig.serial.speeds]
@@ -491,7 +492,7 @@ def measured(rig: Rig, lost_ns: int, cruise: float) -> dict[str, Any]:
 
 
 async def drives(rig: Rig, faults: Sequence[Fault], repeat: int, seed: int) -> dict[str, list[dict[str, Any]]]:
-    """All faults, in turn, again and again."""
+    """Run all faults in turn, repeatedly."""
     rng, found = random.Random(seed), {fault.name: [] for fault in faults}  # type: dict[str, list[dict[str, Any]]]
     async with pump(rig.stack) as until:
         for turn in range(repeat):
@@ -509,7 +510,7 @@ async def drives(rig: Rig, faults: Sequence[Fault], repeat: int, seed: int) -> d
 
 
 def summary(drives: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Median and worst; a drive that found no stand makes the worst None."""
+    """Median and worst; the worst is None if the robot did not stop in one of the drives."""
     result: dict[str, Any] = {"n": len(drives)}
     for key in ("detect_s", "stand_s", "distance_m", "after_m"):
         values = [drive[key] for drive in drives]

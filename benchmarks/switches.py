@@ -1,10 +1,10 @@
-"""What the arbiter did in a recorded drive: states, holds, what jumped at each switch, how regular its sources were.
+"""The arbiter in a recorded drive: states, holds, jumps at each switch, regularity of its inputs.
 
     ic launch sim record:=drive          # drive through the virtual space on the page, then Ctrl-C
     python benchmarks/switches.py drive --json switches.json
 
-Times are those of the stack. What jumps at a switch is read off what the page had: the place of its newest camera
-picture when it was taken, by /tf, against the pose of its newest view; and the headings of the two robots.
+Times are those of the stack. The jump at a switch is computed from the page's data: the position of its newest camera
+image at the exposure, from /tf, against the pose of its newest view; and the headings of the two robots.
 """
 
 from __future__ import annotations
@@ -31,7 +31,6 @@ NAMES = {getattr(ControlState, name): name.lower() for name in ("REAL", "VIRTUAL
 
 
 def main() -> None:
-    """Reads the bag, prints JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("bag", type=Path)
     parser.add_argument("--json", type=Path, help="also write it there")
@@ -84,7 +83,7 @@ def seconds_by_state(states: list[tuple[int, Any]]) -> dict[str, float]:
 
 
 def holds(states: list[tuple[int, Any]]) -> dict[str, float]:
-    """Seconds that a state which moves was held, by the words without their numbers."""
+    """Seconds for which a moving state was held, by message without its numbers."""
     total: Counter[str] = Counter()
     for (at, message), (then, _) in pairwise(states):
         if message.mode != ControlState.STOPPED and message.reason.startswith("stopped: "):
@@ -93,7 +92,7 @@ def holds(states: list[tuple[int, Any]]) -> dict[str, float]:
 
 
 def jump(tree: TransformBuffer, pages: list[tuple[int, Any]], at_ns: int, before: Any, after: Any) -> dict[str, Any]:
-    """What lies between the picture before a switch and the one after it."""
+    """Position and heading difference between the image before a switch and the one after it."""
     had = [message for stamp, message in pages if stamp <= at_ns]
     error_m = math.nan
     if had:

@@ -1,11 +1,10 @@
-"""Measures the pictures of the virtual space against their targets and prints JSON.
+"""Measures the rendered views of the virtual space against their targets and prints JSON.
 
     python benchmarks/vspace.py [--mesh small_house.glb] [--size 640x360] [--seconds 8] [--only speed,resolution]
 
-``speed``: the depth warp, CPU ms a picture, and the first picture after a keyframe. ``resolution``: what a panorama's
-full resolution gives over 1024 × 512 point samples. ``keyframes``: three keyframes against the best warp of the
-nearest. The curves by distance are ``ic evaluate vspace``'s. CPU times are of one thread, so that other load counts
-little.
+``speed``: the depth warp, CPU ms per view, and the first view after a keyframe. ``resolution``: gain of a panorama's
+full resolution over 1024 × 512 point samples. ``keyframes``: three keyframes against the best warp of the nearest one.
+``ic evaluate vspace`` gives the curves by distance. CPU times are of one thread, so that other load has little effect.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ PARTS = ("speed", "resolution", "keyframes")
 
 
 def speed(rgb: Any, depth_m: Any, pose: Any) -> dict[str, Any]:
-    """CPU ms of the warp and of the first picture after a keyframe, 512 × 256 depth as the model gives it."""
+    """CPU ms of the warp and of the first view after a keyframe, with the model's depth size of 512 × 256."""
     warp = PanoramaWarp(rgb, depth_m, pose)
     view = pose @ pose_matrix(1.0)
     result: dict[str, Any] = {}
@@ -63,7 +62,7 @@ def speed(rgb: Any, depth_m: Any, pose: Any) -> dict[str, Any]:
 
 
 def resolution(renderer: EquirectRenderer, pose: Any, depth_m: Any, full: Any, size: tuple[int, int]) -> dict[str, Any]:
-    """PSNR and SSIM 1 m ahead by the panorama: 1024 × 512 point samples, the same area-averaged, full; true depth."""
+    """PSNR and SSIM 1 m ahead by panorama: 1024 × 512 point samples, the same area-averaged, full; true depth."""
     view = pose @ pose_matrix(1.0)
     truth = renderer.render_perspective(view, *size, FOV, supersample=3).rgb
     step = full.shape[1] // 1024
@@ -84,7 +83,7 @@ def resolution(renderer: EquirectRenderer, pose: Any, depth_m: Any, full: Any, s
 
 
 def keyframes(world: str, start: tuple[float, float, float] | None, size: tuple[int, int], seconds: float) -> Any:
-    """Three keyframes, each a metre behind the next, against warps of the nearest, 1 and 2 m on."""
+    """Three keyframes, each a metre behind the next, against warps of the nearest, 1 and 2 m ahead."""
     settings = Settings(
         sources=("ours", "depth-warp", "point-warp"), keyframes=3, step_m=1.0, reach_m=2.0, size=size, seconds=seconds
     )
@@ -125,7 +124,7 @@ def main() -> None:
             if "resolution" in parts:
                 entry["resolution"] = resolution(renderer, pose, depth_m, full, (width, height))
         if "keyframes" in parts:
-            # From the corridor's own start there is no room for two keyframes behind.
+            # Behind the corridor's own start there is no room for two keyframes.
             entry["keyframes"] = keyframes(name, wanted or (0.4, 0.0, 0.0), (width, height), arguments.seconds)
         result[Path(name).name] = entry
     print(json.dumps(result, indent=2))

@@ -41,7 +41,7 @@ def load(file: Path, module_name: str = "") -> type[Node[Any]]:
     if module is None:
         spec = importlib.util.spec_from_file_location(name, file)
         if spec is None or spec.loader is None or not file.is_file():
-            raise NodeFileError(f"{file} is not a Python file")
+            raise NodeFileError(f"{file} {'is not a Python file' if file.is_file() else 'does not exist'}")
         module = sys.modules[name] = importlib.util.module_from_spec(spec)  # dataclasses look up their module
         try:
             spec.loader.exec_module(module)

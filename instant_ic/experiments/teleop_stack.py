@@ -330,7 +330,7 @@ class SimulatedStack:
             self._keyframe_at = self._drawn.pop(of, self._keyframe_at)
 
     def _draw_small(self, do: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Wrap a virtual space's work: render views small, and keep what the newest needs for rendering at full size."""
+        """Wrap a virtual space's work: render views small, and keep what a full-size render of the newest needs."""
 
         def small(node: Any, job: Any) -> Any:
             if job.kind != "draw":
@@ -375,7 +375,7 @@ class SimulatedStack:
             self._show(replace(newest, time_s=self.time_s, heading=heading))
 
     def _show(self, shown: Shown) -> None:
-        """Display an image. At a switch, render it and the previous one at full size; drop the other views' renderers."""
+        """Display an image; at a switch, render it and the previous one at full size. Drop the other views' renderers."""
         pictures = self.log.pictures
         if pictures:
             switched = pictures[-1].virtual != shown.virtual

@@ -159,7 +159,7 @@ class Report:
         return result
 
     def verdict(self) -> dict[str, Any]:
-        """Target check: ``ours`` against the simpler sources at every distance from 0.25 to 2 m, and against the warps."""
+        """Target check: ``ours`` against the simpler sources at every distance from 0.25 to 2 m, and the warps."""
         result: dict[str, Any] = {}
         simpler, warps = ("no-depth", "no-scale", "panorama"), ("depth-warp", "point-warp")
         for path in self.settings.paths:
