@@ -168,7 +168,7 @@ class _Episode:
     def _over(self) -> bool:
         return self.operator.gave_up or (self.ended_s is not None and self.stack.time_s > self.ended_s + 0.5)
 
-    # -- the pictures at a switch
+    # -- images at a switch
 
     def _with_pictures(self, switch: Switch) -> Switch:
         found = figures.pictures_at(self.stack.log.pictures, switch.time_s, switch.to_virtual)

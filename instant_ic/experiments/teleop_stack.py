@@ -346,7 +346,7 @@ class SimulatedStack:
     def _in_world(self, in_map: FloatArray) -> FloatArray:
         return np.asarray(compose2(self.start, in_map))
 
-    # -- pictures
+    # -- images
 
     def on_frame(self, virtual: bool, header: dict[str, Any], payload: bytes) -> None:
         """Handle an image that arrives at the page."""
@@ -375,7 +375,7 @@ class SimulatedStack:
             self._show(replace(newest, time_s=self.time_s, heading=heading))
 
     def _show(self, shown: Shown) -> None:
-        """Display an image; at a switch, render it and the previous one at full size. Drop the other views' renderers."""
+        """Display an image; at a switch, render it and the previous one at full size. Drop other views' renderers."""
         pictures = self.log.pictures
         if pictures:
             switched = pictures[-1].virtual != shown.virtual
