@@ -110,6 +110,7 @@ def read_carmen(path: str | Path, range_max: float | None = None) -> Iterator[Lo
     the middle beam pointing forward. ``ROBOTLASER1`` lines hold their own angles and maximum range. Other messages are
     skipped. The laser's mounting pose is the difference between the two poses of a line, if it is the same on all
     lines. Otherwise the first pose is a corrected one, and the laser is assumed to be mounted at the robot's centre.
+    The odometry is the second pose, the first if the second never changes, or none if neither changes.
 
     Args:
         path: the log, gzip or not.
