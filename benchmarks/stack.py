@@ -115,9 +115,7 @@ def measure(stack: Stack, run_dir: Path, url: str, args: argparse.Namespace) -> 
         latencies = [press_latency(stack, page, "KeyW" if i % 2 else "KeyS") for i in range(8)]
 
         def hold(condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-            """Hold W until the condition is true. After a stop by late sensor data, release and press again, as an
-            operator does.
-            """
+            """Hold W until the condition is true; release and press again after a stop by late sensor data."""
             end = time.monotonic() + timeout_s
             while not condition():
                 page.keyboard.down("KeyW")

@@ -170,12 +170,11 @@ class Evaluator:
         self._warm = False
 
     def score(self, name: str, rgb: NDArray[np.uint8], truth_m: Floats | None, points: Floats | None = None) -> Scored:
-        """Score the depth of a level panorama (H, W, 3) uint8 against ground-truth radial depth (H', W') metres, 0 =
-        unknown.
+        """Score the depth of a level panorama against ground truth.
 
-        Scores are computed at the ground truth's pixels. A result of another size is interpolated there, bilinear in
-        inverse depth and with the nearest pixel at edges. ``points`` (N, 3) in the camera's frame replace the simulated
-        LiDAR measurement.
+        ``rgb`` is (H, W, 3) uint8; ``truth_m`` is the radial depth (H', W') in metres, 0 = unknown. Scores are computed
+        at the ground truth's pixels. A result of another size is interpolated there, bilinear in inverse depth and with
+        the nearest pixel at edges. ``points`` (N, 3) in the camera's frame replace the simulated LiDAR measurement.
 
         Raises:
             DepthEvaluationError: not a panorama, nothing to compare, or LiDAR without ground truth to measure.

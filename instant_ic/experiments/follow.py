@@ -1,5 +1,4 @@
-"""``ic evaluate follow``: the r-bot follows a v-bot in random rooms, in a closed loop with the library code that drives
-it.
+"""``ic evaluate follow``: the r-bot follows a v-bot in random rooms, in a closed loop with the shipped library code.
 
 Each episode generates a room (``follow_worlds``). A scripted operator drives the v-bot to a goal, around walls and
 straight through everything else. Costmap, subgoal, navigator and collision monitor are those of the nodes, at the
@@ -220,9 +219,7 @@ class _Drive:
         self._move(sent)
 
     def _operator(self) -> tuple[float, float]:
-        """Steer the v-bot along its route: turn towards a point 0.4 m ahead and drive; release the controls at the
-        goal.
-        """
+        """Steer the v-bot along its route: turn towards a point 0.4 m ahead and drive; release at the goal."""
         pose, route = self.vbot.pose, self.room.route
         if float(np.linalg.norm(route[-1] - pose[:2])) < 0.1:
             return 0.0, 0.0

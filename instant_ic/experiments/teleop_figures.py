@@ -43,8 +43,8 @@ class Switch:
         yaw_error_deg: between the headings of v-bot and r-bot just before the switch, as the stack knows them; the page
             rotates the images to these headings.
         true_position_error_m: as position_error_m, with the true position of the camera's image.
-        jump_m: as true_position_error_m, minus the distance that the shown robot drove between the display times of the
-            two images, which includes how long the camera's image had already been waiting. This is the jump that the
+        jump_m: as position_error_m, but minus the distance that the shown robot drove between the display times of the
+            two images, which include how long the camera's image had already been waiting. This is the jump that the
             eye sees, before the page smooths it.
         gap_m: between r-bot and v-bot in that step: the camera's image is older than the r-bot's pose.
         psnr_db: between the two images; None if they were not rendered.

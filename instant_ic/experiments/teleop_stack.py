@@ -64,7 +64,7 @@ _EVERY = 3
 _FIRST_CUT_S = 0.05
 """The driver cuts revolutions at 180°."""
 _OVERDUE_S = 0.5
-"""Age at which an image passed to depth no longer leads to a keyframe."""
+"""Time beyond the depth latency after which an image passed to depth no longer leads to a keyframe."""
 _SMALLER = 4
 """Scale factor of each side of a view that is not compared."""
 

@@ -71,8 +71,7 @@ class Course:
 
 
 def make_course(name: str, seed: int, index: int, from_spawn: bool = False) -> Course:
-    """Create a course: a random corridor per index, a drive along the simulator's corridor, or one across another
-    world.
+    """Create a course: a random corridor, a drive along the simulator's corridor, or one across another world.
 
     Args:
         name: ``corridors``, or any name of ``sim.worlds.make_world``.

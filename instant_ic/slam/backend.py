@@ -44,7 +44,7 @@ class Slam(Protocol):
     def process(
         self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
     ) -> SlamResult:
-        """Place a scan."""
+        """Estimate the pose of a scan."""
         ...
 
     def background_job(self) -> Callable[[], Any] | None:

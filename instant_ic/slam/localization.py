@@ -93,9 +93,7 @@ class Localizer:
         self._min_score = config.loop.min_score
 
     def find(self, points: FloatArray) -> Found | None:
-        """Return the only pose where the points (n, 2), in the base frame, fit; None if there is no such pose or
-        several.
-        """
+        """Return the only pose where the points (n, 2), in the base frame, fit; None if none or several fit."""
         if len(points) < 10:
             return None
         few = points[(np.arange(min(len(points), COARSE_POINTS)) * len(points)) // min(len(points), COARSE_POINTS)]

@@ -1,6 +1,4 @@
-"""Compares wheel odometry with scan matching: detects slip and a robot that is stuck, pushed or carried; estimates the
-turn factor.
-"""
+"""Compares wheel odometry with scans: detects slip, a stuck, pushed or carried robot; estimates the turn factor."""
 
 from __future__ import annotations
 

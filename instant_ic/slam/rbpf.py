@@ -84,8 +84,7 @@ class ParticleSlam:
     def process(
         self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
     ) -> SlamResult:
-        """Estimate the pose of a scan: by odometry since the last update, or by the filter once the robot has moved far
-        enough.
+        """Estimate the pose of a scan by odometry, or by the filter once the robot has moved far enough.
 
         Without odometry, scan matching against recent scans (the front end of the graph method) is the fallback.
         """

@@ -173,8 +173,7 @@ class FolderDataset:
         return Sample(rgb, depth, index)
 
     def split(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indices for training and for evaluation: the data set's own split, or else whole scenes, the last ones held
-        out.
+        """Indices for training and for evaluation: the data set's own split, or else the last scenes held out.
 
         Raises:
             DatasetError: no panoramas for training or none for evaluation.

@@ -103,9 +103,7 @@ class _Floor:
     def wall_place(
         self, rng: np.random.Generator, size: tuple[float, float], gap: float = 0.04
     ) -> tuple[tuple[float, float], float] | None:
-        """Find a free place with its back to a wall: centre, yaw. ``size`` is (depth away from the wall, width along
-        it).
-        """
+        """Find a free place with its back to a wall: centre, yaw. ``size`` is (depth from the wall, width along it)."""
         z = self.zone
         for _ in range(6):
             side = str(rng.choice(SIDES))
