@@ -20,7 +20,7 @@ import stat
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -307,7 +307,12 @@ def list_topics(run_dir: Path) -> list[TopicInfo]:
 
 def list_nodes(run_dir: Path) -> list[NodeInfo]:
     """Live nodes, by name."""
-    return [NodeInfo(**entry) for entry in _entries(run_dir / "nodes")]
+    known = {item.name for item in fields(NodeInfo)}
+    found = []
+    for entry in _entries(run_dir / "nodes"):
+        with suppress(TypeError):  # another version of this stack, in another language perhaps, wrote it
+            found.append(NodeInfo(**{key: value for key, value in entry.items() if key in known}))
+    return found
 
 
 def sweep(run_dir: Path) -> int:

@@ -79,9 +79,9 @@ class Settings:
         if self.source != "network" and self.lidar is None:
             raise DepthEvaluationError(f"source {self.source} needs LiDAR points: add --lidar (and --depth)")
         if self.method and self.lidar is None:
-            raise DepthEvaluationError("a method of scaling needs LiDAR points: add --lidar (and --depth)")
+            raise DepthEvaluationError("a scaling method needs LiDAR points: add --lidar (and --depth)")
         if self.method and self.source == "lidar":
-            raise DepthEvaluationError("source lidar scales no network: leave the method out")
+            raise DepthEvaluationError("source lidar does not scale a network: omit the method")
         if not self.camera_height_m > 0 or (self.max_depth_m is not None and not self.max_depth_m > 0):
             raise DepthEvaluationError("camera height and largest depth must be above 0")
 
@@ -192,10 +192,10 @@ class Evaluator:
             if settings.max_depth_m is not None:
                 known &= truth <= settings.max_depth_m
             if not known.any():
-                raise DepthEvaluationError(f"{name}: no valid pixel in the truth")
+                raise DepthEvaluationError(f"{name}: the ground truth has no valid pixel")
         if settings.lidar is not None and points is None:
             if truth is None:
-                raise DepthEvaluationError(f"{name}: there is no true depth for the LiDAR to measure")
+                raise DepthEvaluationError(f"{name}: the simulated LiDAR needs ground-truth depth")
             lidar = settings.lidar
             points = measure(
                 truth, lidar.height_m, settings.camera_height_m,

@@ -63,7 +63,7 @@ def load_truth(path: Path, png_unit_m: float = 1e-3) -> NDArray[np.float32]:
     if path.suffix.lower() == ".png":
         depth = np.where(depth < _PNG_UNKNOWN_M, depth * np.float32(png_unit_m / 1e-3), np.float32(0))
         if not depth.any():
-            raise DepthFileError(f"{path}: no known depth in it: all values are 0 or 65535")
+            raise DepthFileError(f"{path}: contains no known depth: all values are 0 or 65535")
     return depth
 
 
@@ -106,5 +106,5 @@ def _by_stem(paths: Iterable[Path], what: str) -> dict[str, Path]:
     for path in paths:
         other = found.setdefault(_stem(path), path)
         if other != path:
-            raise PairError(f"{other} and {path}: two {what} files of one stem; give the files one by one")
+            raise PairError(f"{other} and {path}: two {what} files with the same stem: pass the files one by one")
     return found

@@ -133,7 +133,7 @@ def make_room(rng: np.random.Generator, hanging: bool, attempts: int = 200) -> R
         if route is None or _length(route) < 5.0:
             continue
         return Room(size, every, kept, start, goal, route[:, :2])
-    raise ValueError(f"no room with a way of 5 m within {attempts} attempts")
+    raise ValueError(f"no room with a path of 5 m found in {attempts} attempts")
 
 
 def _walls(rng: np.random.Generator, size: FloatArray) -> tuple[list[Sequence[float]], list[int]]:

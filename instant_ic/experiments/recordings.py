@@ -71,7 +71,7 @@ def evaluate_recordings(
         if not path.is_file():
             raise FileNotFoundError(f"{path} does not exist")
     if (out / "bag").exists():
-        raise FileExistsError(f"{out}/bag exists already: choose another folder or take it away")
+        raise FileExistsError(f"{out}/bag already exists: choose another folder or remove it")
     out.mkdir(parents=True, exist_ok=True)
     # Sockets need a short path; `out` may be longer.
     run_dir = Path(tempfile.mkdtemp(prefix="ic-"))

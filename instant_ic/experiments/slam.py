@@ -65,10 +65,10 @@ def _read_columns(path: str | Path, count: int, what: str) -> FloatArray:
             except ValueError as error:
                 raise LogError(f"{path}:{number}: {error}") from None
             if len(row) != count:
-                raise LogError(f"{path}:{number}: {what} has {count} numbers, {len(row)} there")
+                raise LogError(f"{path}:{number}: expected {count} numbers for a {what}, found {len(row)}")
             rows.append(row)
     if not rows:
-        raise LogError(f"{path}: no {what} in it")
+        raise LogError(f"{path}: contains no {what}")
     return np.array(rows)
 
 
@@ -242,7 +242,7 @@ def run_log(
         if on_scan is not None:
             on_scan(len(online))
     if not online:
-        raise LogError("no scan in the log")
+        raise LogError("the log contains no scan")
     slam.finish()
     final = [
         pose if anchor is None else compose2(anchor.pose(), there)

@@ -43,7 +43,7 @@ def read_bag(path: Path, scan_topic: str | None = None, base_frame: str = "base_
             types = {summary.topic: summary.type_name for summary in bag.topics}
             topic = _choose(path, types, _SCAN, scan_topic, ("/scan",))
             if topic is None:
-                raise LogError(f"{path}: no topic of type LaserScan in this bag; it has {', '.join(types) or 'none'}")
+                raise LogError(f"{path}: the bag has no topic of type LaserScan, only {', '.join(types) or 'none'}")
             odometry = OdometryBuffer(keep_s=1e9)
             wheels = _choose(path, types, _ODOMETRY, None, ("/wheel/odom", "/odom"))
             transforms = TransformBuffer()
@@ -81,7 +81,7 @@ def _choose(path: Path, types: dict[str, str], kind: str, wanted: str | None, us
     found = sorted(topic for topic, type_name in types.items() if type_name == kind)
     if wanted is not None:
         if wanted not in found:
-            raise LogError(f"{path}: no LaserScan topic {wanted}; there is {', '.join(found) or 'none'}")
+            raise LogError(f"{path}: no LaserScan topic {wanted}; available: {', '.join(found) or 'none'}")
         return wanted
     for topic in usual:
         if topic in found:

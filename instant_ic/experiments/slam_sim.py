@@ -83,7 +83,7 @@ def round_trip(
             truth.append(np.asarray(robot.pose, dtype=np.float64).copy())
         robot.step(kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w)), STEP_S)
         if robot.contact:
-            raise ValueError(f"the simulated robot ran into something at {robot.pose[:2].round(2)}")
+            raise ValueError(f"the simulated robot hit an obstacle at {robot.pose[:2].round(2)}")
         driven += abs(float(robot.twist[0])) * STEP_S
         steps += 1
     origin = truth[0]

@@ -181,10 +181,10 @@ def read_commands(path: Path) -> FloatArray:
         ValueError: no such file, no commands, or malformed rows; names file and row.
     """
     if not path.exists():
-        raise ValueError(f"{path}: there is no such bag or CSV file")
+        raise ValueError(f"{path}: no such bag or CSV file")
     log = _read_csv(path) if path.suffix.lower() == ".csv" else _read_bag(path)
     if len(log) == 0:
-        raise ValueError(f"{path}: no commands in it, only the names of the columns")
+        raise ValueError(f"{path}: contains no commands, only column names")
     table = np.array(log, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
     if bad.size:
@@ -198,7 +198,7 @@ def read_commands(path: Path) -> FloatArray:
         )
     moves = np.flatnonzero(table[:, 1:].any(axis=1))
     if moves.size == 0:
-        raise ValueError(f"{path}: all {len(table)} commands are zero: nobody drove")
+        raise ValueError(f"{path}: all {len(table)} commands are zero")
     table = table[moves[0] :][table[moves[0] :, 0] <= table[moves[-1], 0] + _AFTER_S]
     table[:, 0] -= table[0, 0]
     return table
@@ -210,7 +210,7 @@ def _read_csv(path: Path) -> list[Sequence[float]]:
         reader = csv.DictReader(file)
         missing = [name for name in names if name not in (reader.fieldnames or ())]
         if missing:
-            raise ValueError(f"{path}: column {', '.join(missing)} is missing; needed are {', '.join(names)}")
+            raise ValueError(f"{path}: column {', '.join(missing)} is missing; required: {', '.join(names)}")
         rows: list[Sequence[float]] = []
         for row in reader:
             try:
@@ -232,16 +232,16 @@ def _read_bag(path: Path) -> list[Sequence[float]]:
             types = {one.topic: one.type_name for one in reader.topics}
             if topic not in types:
                 has = ", ".join(sorted(types)) or "none"
-                raise ValueError(f"{path}: {topic} is missing; it was recorded with these topics: {has}")
+                raise ValueError(f"{path}: {topic} is missing; the bag has these topics: {has}")
             if types[topic].rpartition("/")[2] not in ("TwistStamped", "Twist"):
-                raise ValueError(f"{path}: {topic} is of {types[topic]}, not of geometry_msgs/TwistStamped")
+                raise ValueError(f"{path}: {topic} has type {types[topic]}, not geometry_msgs/TwistStamped")
             for message in reader.messages([topic]):
                 twist = twist_values(deserialize(message.payload, message.type_name))
                 rows.append([message.stamp_ns / 1e9, *twist])
     except BagError as error:
         raise ValueError(str(error)) from error
     if not rows:
-        raise ValueError(f"{path}: no message of {topic} in it")
+        raise ValueError(f"{path}: contains no message on {topic}")
     return rows
 
 

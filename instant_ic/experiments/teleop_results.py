@@ -67,7 +67,7 @@ def load(path: Path, settings: Settings) -> list[Drive]:
         ]
     except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         words = f"{type(error).__name__}: {error}"
-        raise ValueError(f"{path}: no report of ic evaluate teleop that a run can go on with ({words})") from error
+        raise ValueError(f"{path}: not a report of ic evaluate teleop that can be resumed ({words})") from error
     for key, wanted in _conditions(settings).items():
         if found[key] != wanted:
             raise ValueError(f"{path}: was driven with {key} {found[key]}, not {wanted}; give another --json")

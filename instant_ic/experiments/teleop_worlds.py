@@ -110,7 +110,7 @@ def random_corridor(rng: np.random.Generator, name: str, attempts: int = 50) -> 
         course = _corridor(rng, name)
         if course is not None:
             return course
-    raise ValueError(f"no passable corridor within {attempts} attempts")
+    raise ValueError(f"no passable corridor found in {attempts} attempts")
 
 
 def _corridor(rng: np.random.Generator, name: str) -> Course | None:

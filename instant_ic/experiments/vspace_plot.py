@@ -61,9 +61,9 @@ def save_strip(path: Path, report: Report) -> None:
                 tiles.append(tile)
             lines.append(np.hstack(tiles))
     if not lines:
-        raise ValueError("the paths end before the first picture of the strip")
+        raise ValueError("the paths end before the first image of the strip")
     if not cv2.imwrite(str(path), np.vstack(lines)[..., ::-1]):
-        raise ValueError(f"{path}: cannot be written as a picture")
+        raise ValueError(f"{path}: cannot be written as an image")
 
 
 def _tile_height(report: Report) -> int:

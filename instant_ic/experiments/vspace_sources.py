@@ -50,7 +50,9 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: S
     source = DepthSource(SourceConfig(source=settings.depth_source, scaler=scaler))
     result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M, rgb)
     if not result.ok:
-        raise ValueError(f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) is not fit: {result.message}")
+        raise ValueError(
+            f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) cannot be scaled: {result.message}"
+        )
     return Shot(pose, rgb, true, raw, result)
 
 

@@ -93,7 +93,7 @@ def make_slam(config: SlamConfig | None = None, map_file: Path | None = None, lo
         raise ValueError("localization needs a saved map: set map_file")
     if config.backend == "rbpf":
         if map_file is not None:
-            raise ValueError("backend rbpf cannot use a saved map: choose backend graph")
+            raise ValueError("backend rbpf does not support saved maps: use backend graph")
         from instant_ic.slam.rbpf import ParticleSlam
 
         return ParticleSlam(config)

@@ -233,9 +233,9 @@ class GridSlam:
         if not np.isfinite(pose).all():
             raise ValueError(f"the pose is not finite: {pose}")
         if self._localizer is None:
-            raise ValueError("there is no saved map in which the robot could be somewhere")
+            raise ValueError("no saved map is loaded: set map_file")
         if self._stamp_ns is None:
-            raise ValueError("no scan has come yet")
+            raise ValueError("no scan received yet")
         if not self.localized:
             self._settle_in(correction(self.map_from_base, pose), np.diag([0.25, 0.25, 0.1]), None)
         elif self.front_end.in_known_map:

@@ -75,7 +75,7 @@ class Localizer:
         self.points = occupied_points(grid)
         free_rows, free_columns = np.nonzero((grid.values >= 0) & (grid.values < 50))
         if len(self.points) == 0 or len(free_rows) == 0:
-            raise ValueError("the map has no occupied or no free cell: nothing to find a place in")
+            raise ValueError("the map has no occupied or no free cell: localisation needs both")
         free = grid.origin + grid.resolution * (np.column_stack([free_columns, free_rows]) + 0.5)
         low = np.minimum(self.points.min(axis=0), free.min(axis=0))
         high = np.maximum(self.points.max(axis=0), free.max(axis=0))

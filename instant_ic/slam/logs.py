@@ -57,7 +57,7 @@ class _Lines(io.TextIOWrapper):
         if not line:
             raise StopIteration
         if len(line) > _MOST_LINE or self._left < 0:
-            raise LogError(f"{self._path}: a line of over {_MOST_LINE} characters, or over {_MOST_LOG} in all")
+            raise LogError(f"{self._path}: a line exceeds {_MOST_LINE} characters, or the log {_MOST_LOG}")
         return line
 
 
@@ -196,17 +196,17 @@ def _pile(readings: FloatArray) -> float:
 
 def _numbers(fields: list[str], what: str, count: int) -> FloatArray:
     if len(fields) < count:
-        raise ValueError(f"{count} {what} announced, {len(fields)} there: the line is cut short")
+        raise ValueError(f"expected {count} {what}, found {len(fields)}: the line is truncated")
     values = np.array([float(text) for text in fields[:count]])
     if not np.isfinite(values).all():
-        raise ValueError(f"{what}: not a finite number among them")
+        raise ValueError(f"{what}: a value is not a finite number")
     return values
 
 
 def _count(text: str, what: str) -> int:
     count = int(text)
     if not 0 <= count <= 100_000:
-        raise ValueError(f"number of {what} out of bounds: {count}")
+        raise ValueError(f"number of {what} out of range: {count}")
     return count
 
 
@@ -244,7 +244,7 @@ def _flaser(fields: list[str], survey: _Survey) -> LogEntry:
     ranges = _numbers(fields[1:], "readings", count)
     tail = fields[1 + count :]
     if len(tail) < 7:
-        raise ValueError(f"two poses and a time must follow the {count} readings, only {len(tail)} fields do")
+        raise ValueError(f"expected two poses and a time after the {count} readings, found {len(tail)} fields")
     poses = _numbers(tail, "pose values", 6)
     increment = math.radians(_FLASER_INCREMENT_DEG.get(count, 180.0 / max(count - 1, 1) if count > 181 else 1.0))
     # 180 of 181 beams: the last one, at +90°, is missing. The same holds for the other even numbers.
@@ -262,7 +262,7 @@ def _robotlaser(fields: list[str], survey: _Survey) -> LogEntry:
     at += 1 + _count(fields[at], "remissions")
     tail = fields[at:]
     if len(tail) < 12:
-        raise ValueError(f"poses, speeds and a time must follow the readings, only {len(tail)} fields do")
+        raise ValueError(f"expected poses, speeds and a time after the readings, found {len(tail)} fields")
     poses = _numbers(tail, "pose values", 6)
     scan = Scan(_no_return(ranges, range_max), start, increment, 0.02, range_max, _stamp_ns(tail[11]))
     return _entry(scan, poses, survey, tail[13:])
@@ -307,7 +307,7 @@ def read_mines(path: str | Path) -> Iterator[LogEntry]:
                 continue
             try:
                 if len(fields) < _MINES_FIRST_RANGE + _MINES_RANGES:
-                    raise ValueError(f"{_MINES_FIRST_RANGE + _MINES_RANGES} columns needed, {len(fields)} there")
+                    raise ValueError(f"expected {_MINES_FIRST_RANGE + _MINES_RANGES} columns, found {len(fields)}")
                 stamp_ns = int(fields[0]) * 1000
                 ticks = int(fields[2]), int(fields[3])
                 columns = fields[_MINES_FIRST_RANGE + _MINES_MARGIN :][: _MINES_RANGES - 2 * _MINES_MARGIN]
@@ -333,4 +333,4 @@ def read_mines(path: str | Path) -> Iterator[LogEntry]:
             )
             yield LogEntry(scan, pose.copy(), np.array([_MINES_LASER_FORWARD_M, 0.0, 0.0]))
     if last_ticks is None:
-        raise LogError(f"{path}: no scan in it")
+        raise LogError(f"{path}: contains no scan")

@@ -95,7 +95,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     except (OSError, ValueError, AttributeError, TypeError, RecursionError, yaml.YAMLError) as error:
         raise MapError(f"map {path} cannot be read: {error}") from None
     if not isinstance(content, dict):
-        raise MapError(f"{path}: keys image, resolution, origin expected")
+        raise MapError(f"{path}: must have the keys image, resolution and origin")
     resolution = _number(path, content, "resolution", None)
     occupied = _number(path, content, "occupied_thresh", OCCUPIED_THRESH)
     free = _number(path, content, "free_thresh", FREE_THRESH)
@@ -111,7 +111,7 @@ def load_grid(path: Path) -> OccupancyGrid:
     ):
         raise MapError(f"{path}: origin must be [x, y, yaw] (got {origin!r})")
     if len(origin) > 2 and abs(origin[2]) > 1e-6:
-        raise MapError(f"{path}: a turned map (origin yaw {origin[2]}) is not supported: turn the picture instead")
+        raise MapError(f"{path}: a rotated map (origin yaw {origin[2]}) is not supported: rotate the image instead")
     mode = content.get("mode", "trinary")
     if mode not in ("trinary", "scale", "raw"):
         raise MapError(f"{path}: mode must be trinary, scale or raw (got {mode!r})")
@@ -124,7 +124,7 @@ def load_grid(path: Path) -> OccupancyGrid:
         raise MapError(f"{path}: image {image} does not exist")
     picture: Any = load_image(image, cv2.IMREAD_GRAYSCALE)
     if picture is None:
-        raise MapError(f"{image} is no picture that can be read")
+        raise MapError(f"{image} cannot be decoded as an image")
     grey = picture[::-1].astype(np.float64)
     values = np.full(grey.shape, -1, dtype=np.int8)
     if mode == "raw":
@@ -209,7 +209,7 @@ def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
         with np.load(path, allow_pickle=False) as file:
             data: dict[str, NDArray[Any]] = dict(file)
         if int(data["version"]) != _GRAPH_VERSION:
-            raise MapError(f"{path} is of version {int(data['version'])}; this program reads {_GRAPH_VERSION}")
+            raise MapError(f"{path}: version {int(data['version'])} is not supported, only {_GRAPH_VERSION}")
         cuts = np.cumsum(data["point_counts"])[:-1]
         points = np.split(data["points"].astype(np.float64), cuts)
         joined = np.split(data["joined"], cuts)
@@ -227,13 +227,13 @@ def load_graph(stem: Path) -> tuple[list[Keyframe], list[Edge]]:
             for k, (a, b) in enumerate(data["edge_ends"])
         ]
     except FileNotFoundError:
-        raise MapError(f"there is no pose graph {path}: a map without it can be driven in, but not continued") from None
+        raise MapError(f"no pose graph {path}: without it, use mode localization") from None
     except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
         if isinstance(error, MapError):
             raise
-        raise MapError(f"{path} is no pose graph, or damaged: {error}") from None
+        raise MapError(f"{path}: not a pose graph, or damaged: {error}") from None
     if not keyframes:
-        raise MapError(f"{path} holds no keyframe")
+        raise MapError(f"{path}: contains no keyframe")
     if any(not 0 <= end < len(keyframes) for edge in edges for end in (edge.a, edge.b)):
-        raise MapError(f"{path} is damaged: an edge leads to a keyframe that is not there")
+        raise MapError(f"{path}: damaged: an edge refers to a missing keyframe")
     return keyframes, edges

@@ -83,7 +83,7 @@ def optimise(
         a = np.array([index[edge.a] for edge in edges], dtype=np.intp)
         b = np.array([index[edge.b] for edge in edges], dtype=np.intp)
     except KeyError as missing:
-        raise ValueError(f"an edge leads to node {missing}, which is not in the graph") from None
+        raise ValueError(f"an edge refers to node {missing}, which is not in the graph") from None
     poses = poses.copy()
     if len(edges) == 0 or len(poses) < 2:
         return Solution(poses, np.zeros(len(edges)), np.ones(len(edges)))
@@ -99,7 +99,7 @@ def optimise(
         for _ in range(iterations):
             step = _step(poses, a, b, error, information * _weights(chi2, robust, width)[:, None, None] ** 2, damping)
             if not np.isfinite(step).all():
-                raise ValueError("the graph falls apart: not every node is tied to the first one")
+                raise ValueError("the graph is not connected: no path from some nodes to the first one")
             trial = poses + step
             trial_error = residuals(trial, a, b, measured)
             trial_chi2 = np.einsum("mi,mij,mj->m", trial_error, information, trial_error)

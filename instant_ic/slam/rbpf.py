@@ -159,7 +159,7 @@ class ParticleSlam:
 
     def set_pose(self, map_from_base: ArrayLike) -> None:
         """Raise ValueError: this method does not support saved maps."""
-        raise ValueError("backend rbpf cannot use a saved map")
+        raise ValueError("backend rbpf does not support saved maps: use backend graph")
 
     def figures(self) -> dict[str, object]:
         """Counts of updates, effective particles, resamplings and map tiles."""

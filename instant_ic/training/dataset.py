@@ -121,7 +121,7 @@ def write_dataset(
         if index == count:
             break
         if sample.rgb.shape != (height, width, 3) or sample.depth_m.shape != (height, width):
-            raise DatasetError(f"sample {index}: rgb {sample.rgb.shape}, depth {sample.depth_m.shape}, wanted {size}")
+            raise DatasetError(f"sample {index}: rgb {sample.rgb.shape}, depth {sample.depth_m.shape}, expected {size}")
         rgb[index], depth[index], world[index] = sample.rgb, sample.depth_m, sample.world
         temporary = folder / (INFO + ".part")
         temporary.write_text(json.dumps({**info, "count": index + 1}, indent=2) + "\n", encoding="utf-8")

@@ -56,14 +56,14 @@ def export_onnx(
     model.eval()
     shape = (1, 3, model.config.height, model.config.width)
     picture = torch.rand(shape, generator=torch.Generator().manual_seed(1))
-    report("torch computes a picture")
+    report("running the network in torch")
     with torch.inference_mode():
         expected = model(picture).numpy()
     if not np.isfinite(expected).all() or not np.ptp(expected):
-        raise ExportError("the network gives no depth: the same number, or none, for every pixel")
+        raise ExportError("the network outputs no depth: all pixels have the same value, or none")
     with tempfile.TemporaryDirectory() as folder:
         plain = Path(folder) / "model.onnx"
-        report("torch writes ONNX")
+        report("exporting to ONNX")
         with warnings.catch_warnings():
             # The tracing exporter is the fast one here; its successor handles the LSTM no better.
             warnings.simplefilter("ignore")
@@ -71,13 +71,13 @@ def export_onnx(
                 fold_upsampling(model), (picture,), str(plain), dynamo=False, opset_version=OPSET,
                 input_names=["image"], output_names=["depth"],
             )  # fmt: skip
-        report("onnxruntime computes the same picture")
+        report("running the network in onnxruntime")
         got = _run(plain, picture.numpy())
         result = {"difference": _difference(got, expected)}
         told = f"largest difference to torch: {result['difference']:.1e} of the largest depth"
         if not result["difference"] < MAX_RELATIVE_DIFFERENCE:
             # Weights may amplify rounding beyond any fixed bound; a float64 run then shows which side is wrong.
-            report(f"{told}; torch computes it in float64")
+            report(f"{told}; running torch in float64")
             with torch.inference_mode():
                 exact = copy.deepcopy(model).double()(picture.double()).numpy()
             result["rounding"] = _difference(expected, exact)
@@ -86,12 +86,12 @@ def export_onnx(
             told += f", while float32 alone costs torch {result['rounding']:.1e} with these weights"
         report(told)
         if half_weights:
-            report("weights to float16, and the picture again")
+            report("converting the weights to float16 and running again")
             plain.write_bytes(_halve_weights(plain.read_bytes()))
             result["half_difference"] = _difference(_run(plain, picture.numpy()), expected)
             if not result["half_difference"] < MAX_HALF_DIFFERENCE:
                 raise ExportError(f"float16 weights change the depth by {result['half_difference']:.1e}")
-            report(f"float16 weights change it by {result['half_difference']:.1e}")
+            report(f"float16 weights change the depth by {result['half_difference']:.1e}")
         beside = path.with_name(f".{path.name}.new")
         try:
             shutil.copyfile(plain, beside)

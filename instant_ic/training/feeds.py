@@ -91,7 +91,7 @@ class FileFeed:
         threads: int = 4,
     ) -> None:
         if len(indices) == 0:
-            raise FeedError("no panorama to train on")
+            raise FeedError("no panoramas for training")
         self.samples, self.indices, self.batch_size = samples, indices, batch_size
         self.seed, self.rank, self.ranks = seed, rank, ranks
         self._info = info or {}
@@ -289,7 +289,7 @@ class Renderers:
             except queue.Empty:
                 if not self._processes[which].is_alive():
                     code = self._processes[which].exitcode
-                    raise FeedError(f"a rendering process ended with {code} at world {self.seed_of(place)}") from None
+                    raise FeedError(f"a rendering process exited with {code} at world {self.seed_of(place)}") from None
                 if time.monotonic() > end:
                     raise FeedError(
                         f"world {self.seed_of(place)} took over {WORLD_TIMEOUT_S:.0f} s to render"

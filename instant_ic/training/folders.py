@@ -153,9 +153,9 @@ class FolderDataset:
                 self.unreadable[at] = str(error)
                 if len(self.unreadable) > _MOST_UNREADABLE * len(self.pairs):
                     raise DatasetError(f"{error} ({len(self.unreadable)} of {len(self.pairs)} panoramas of "
-                                       f"{self.folder} cannot be read)") from error  # fmt: skip
-                warnings.warn(f"passed over: {error}", stacklevel=2)
-        raise DatasetError(f"{self.folder}: no panorama can be read")
+                                       f"{self.folder} are not readable)") from error  # fmt: skip
+                warnings.warn(f"skipped: {error}", stacklevel=2)
+        raise DatasetError(f"{self.folder}: no readable panorama")
 
     def _read(self, index: int) -> Sample:
         import cv2
@@ -167,7 +167,7 @@ class FolderDataset:
         depth = _png_depth(pair.depth, layout) if plain_png else load_depth(pair.depth)
         for path, shape in ((pair.rgb, rgb.shape), (pair.depth, depth.shape)):
             if shape[1] != 2 * shape[0]:
-                raise DatasetError(f"{path}: {shape[1]} x {shape[0]} is no equirect panorama (2 : 1)")
+                raise DatasetError(f"{path}: {shape[1]} x {shape[0]} is not an equirect panorama (2:1)")
         rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
         depth = np.asarray(cv2.resize(depth, (width, height), interpolation=cv2.INTER_NEAREST), np.float32)
         return Sample(rgb, depth, index)
@@ -185,8 +185,8 @@ class FolderDataset:
             last = set(scenes[-max(1, round(len(scenes) * _HELD_OUT_SHARE)) :])
             held = np.array([pair.scene in last for pair in self.pairs])
         if held.all():
-            raise DatasetError(f"{self.folder}: all {len(self)} panoramas are of scenes that are kept for evaluation; "
-                               "training needs others")  # fmt: skip
+            raise DatasetError(f"{self.folder}: all {len(self)} panoramas are in scenes reserved for evaluation; "
+                               "add scenes for training")  # fmt: skip
         return np.flatnonzero(~held), np.flatnonzero(held)
 
 
@@ -197,7 +197,7 @@ def _png_depth(path: Path, layout: Layout) -> NDArray[np.float32]:
     values = load_image(path, cv2.IMREAD_UNCHANGED)
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         what = "damaged" if values is None else f"{values.dtype} of shape {values.shape}"
-        raise DepthFileError(f"{path}: depth must be a PNG of one channel of 16 bits (it is {what})")
+        raise DepthFileError(f"{path}: depth must be a single-channel 16-bit PNG (got {what})")
     known = (values > 0) & (values != layout.missing)
     return np.where(known, values / np.float32(layout.units_per_m), 0).astype(np.float32)
 
@@ -214,7 +214,7 @@ def open_folder(name: str, size: tuple[int, int]) -> FolderDataset:
     """
     kind, colon, place = name.partition(":")
     if kind not in LAYOUTS or not colon:
-        raise DatasetError(f"{name!r}: data are named LAYOUT:FOLDER, LAYOUT one of {', '.join(LAYOUTS)}")
+        raise DatasetError(f"{name!r}: expected LAYOUT:FOLDER with LAYOUT one of {', '.join(LAYOUTS)}")
     folder = Path(place).expanduser()
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such folder")
@@ -225,12 +225,12 @@ def open_folder(name: str, size: tuple[int, int]) -> FolderDataset:
             (o for o, layout in LAYOUTS.items() if any(p.depth.is_file() for p in layout.pictures(folder))), ""
         )
         raise DatasetError(
-            f"{folder}: no panorama with depth laid out as {kind}: {LAYOUTS[kind].looks_like}"
-            + (f" ({len(found)} pictures, the first without {found[0].depth.relative_to(folder)})" if found else "")
+            f"{folder}: no panorama with depth in layout {kind}: {LAYOUTS[kind].looks_like}"
+            + (f" ({len(found)} images, the first without {found[0].depth.relative_to(folder)})" if found else "")
             + (f"; it looks like {other}" if other else "")
         )
     dataset = FolderDataset(folder, kind, size, pairs, [pair.rgb for pair in found if not pair.depth.is_file()])
     if dataset.alone:
-        warnings.warn(f"{folder}: {len(dataset.alone)} pictures have no depth and are left out, the first is "
+        warnings.warn(f"{folder}: {len(dataset.alone)} images have no depth and are skipped; the first is "
                       f"{dataset.alone[0]}", stacklevel=2)  # fmt: skip
     return dataset

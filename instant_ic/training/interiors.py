@@ -42,7 +42,7 @@ def interior_world(seed: int, kind: str = "", light_cell_m: float = 0.45, rays: 
     drawn = str(rng.choice(list(KINDS), p=list(KINDS.values())))
     kind = kind or drawn
     if kind not in KINDS:
-        raise ValueError(f"no interior of kind {kind!r}; there are {', '.join(KINDS)}")
+        raise ValueError(f"unknown kind {kind!r}: choose one of {', '.join(KINDS)}")
     if kind == "random":
         return worlds.random_world(seed, light_cell_m, rays)
     building = Building()

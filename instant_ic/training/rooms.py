@@ -47,7 +47,7 @@ class RoomsConfig:
         if self.interiors not in INTERIORS:
             raise ValueError(f"interiors must be one of {', '.join(INTERIORS)} (got {self.interiors!r})")
         if self.first_world < 0 or self.first_world + self.worlds > FIRST_HELD_OUT:
-            raise ValueError(f"world seeds must lie in 0..{FIRST_HELD_OUT - 1}: the others are for evaluation "
+            raise ValueError(f"world seeds must be in 0..{FIRST_HELD_OUT - 1}: higher ones are for evaluation "
                              f"(got {self.first_world}..{self.first_world + self.worlds - 1})")  # fmt: skip
 
     @property

@@ -368,7 +368,7 @@ def _read(path: Path) -> Any:
         if zipfile.is_zipfile(path):  # torch's format; torch itself does not verify the checksums
             with zipfile.ZipFile(path) as archive:
                 if bad := archive.testzip():
-                    raise CheckpointError(f"{path}: damaged: {bad} in it has another check sum")
+                    raise CheckpointError(f"{path}: damaged: the checksum of {bad} does not match")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about TorchScript, which is rejected below
             return torch.load(path, map_location="cpu", weights_only=True)
@@ -392,7 +392,7 @@ def _config(path: Path, payload: dict[str, Any]) -> SliceNetConfig:
     key = next((key for key in ("config", "kwargs") if key in payload), None)
     if key is None:
         raise CheckpointError(f"{path}: neither 'config' nor 'kwargs' in the file (it has: {_some(payload)}); cannot "
-                              "tell the network's shape. Files from before 2021-08-13 are of no use")  # fmt: skip
+                              "determine the network's shape. Files from before 2021-08-13 lack it")  # fmt: skip
     options = payload[key]
     if not isinstance(options, dict):
         raise CheckpointError(f"{path}: {key!r} must be names and values (got {type(options).__name__})")
@@ -425,11 +425,11 @@ def _check_state(what: str, state: dict[str, Tensor], expected: dict[str, tuple[
         if key in state and tuple(state[key].shape) != shape
     ]
     if shapes:
-        faults.append(f"{len(shapes)} of another shape ({_some(shapes, '; ')})")
+        faults.append(f"{len(shapes)} with another shape ({_some(shapes, '; ')})")
     if faults:
         raise CheckpointError(f"{what}: of {len(expected)} tensors {', '.join(faults)}")
     if bad := [key for key in expected if not bool(torch.isfinite(state[key]).all())]:
-        raise CheckpointError(f"{what}: {len(bad)} tensors hold values that are no numbers ({_some(bad)})")
+        raise CheckpointError(f"{what}: {len(bad)} tensors have non-finite values ({_some(bad)})")
 
 
 def _some(names: Iterable[Any], joint: str = ", ", most: int = 4) -> str:

@@ -128,7 +128,7 @@ class Team:
             raise ValueError(f"device {device!r}: {str(error).splitlines()[0]}") from error
         if chosen.type == "cuda":
             if not torch.cuda.is_available():
-                raise ValueError(f"device {device!r}: torch {torch.__version__} sees no CUDA GPU here")
+                raise ValueError(f"device {device!r}: torch {torch.__version__} finds no CUDA GPU")
             chosen = torch.device("cuda", local if chosen.index is None else chosen.index)
             if chosen.index >= torch.cuda.device_count():
                 raise ValueError(f"device {chosen}: there are {torch.cuda.device_count()} GPUs for process {local}")
@@ -444,7 +444,7 @@ class Trainer:
         try:
             state = torch.load(path, map_location=self.team.device, weights_only=True)
         except FileNotFoundError:
-            raise CheckpointError(f"{path}: no such checkpoint to go on from") from None
+            raise CheckpointError(f"{path}: no such checkpoint to resume from") from None
         except Exception as error:  # torch.load raises anything from KeyError to UnpicklingError
             raise CheckpointError(f"{path}: not a checkpoint of tensors and plain values ({error})") from error
         if not isinstance(state, dict) or "resume" not in state or state.get("config") != self.network.as_dict():

@@ -58,7 +58,7 @@ def load_start(path: str | Path, network: SliceNetConfig) -> Start:
         return Start(_from_onnx(path, content, network), True, origin)
     model = load_checkpoint(path)
     if model.config != network:
-        raise CheckpointError(f"{path}: holds {model.config}, this training is of {network}")
+        raise CheckpointError(f"{path}: contains {model.config}, but the training uses {network}")
     record = torch.load(path, map_location="cpu", weights_only=True).get("record")
     return Start(model, False, {**origin, "record": record} if record else origin)
 

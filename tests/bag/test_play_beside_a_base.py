@@ -51,9 +51,9 @@ def base(run_dir):
     """Puts a live base into the registry, under a name and in a namespace."""
     claims = []
 
-    def start(name="crawler_base", namespace="", module="nodes.crawler_base", command="/cmd_vel", publishes=()):
+    def start(name="crawler_base", namespace="", executable="crawler_base", command="/cmd_vel", publishes=()):
         claims.append(registry.Claim(run_dir / "nodes" / name, f"node {name}"))
-        entry = {"name": name, "module": module, "pid": 1, "started_ns": 1, "params": {}}
+        entry = {"name": name, "executable": executable, "pid": 1, "started_ns": 1, "params": {}}
         entry["publishes"] = dict.fromkeys(publishes, "any/msg/Type")
         claims[-1].write({**entry, "subscribes": {f"{namespace}{command}": "geometry_msgs/msg/TwistStamped"}})
         return claims[-1]
@@ -102,7 +102,7 @@ def test_what_a_robot_acts_on_is_not_played_beside_a_running_base(bag, base, pla
 
 def test_it_is_played_without_a_base_and_where_it_is_left_out_renamed_or_forced(bag, base, player, run_dir):
     all_of_it = bag("/played", *DANGEROUS)
-    base("other", module="nodes.grid_slam")
+    base("other", executable="grid_slam")
     player(all_of_it)
     base("renamed")
     player(all_of_it, exclude=DANGEROUS)
@@ -116,7 +116,7 @@ def test_it_is_played_without_a_base_and_where_it_is_left_out_renamed_or_forced(
 def test_what_a_live_node_publishes_is_not_played_beside_a_running_base(bag, base, player):
     base()
     player(bag("/scan"))  # nobody else publishes it: one node is tried with a bag
-    base("vlp16_driver", module="nodes.vlp16_driver", publishes=("/scan", "/rosout"))
+    base("vlp16_driver", executable="vlp16_driver", publishes=("/scan", "/rosout"))
     with pytest.raises(NodeError, match=r"/scan would reach the robot"):
         player(bag("/scan"))
     player(bag("/rosout", "/played"))

@@ -10,6 +10,7 @@ from instant_ic.bag.convert import ConvertOptions, convert
 from instant_ic.bag.metadata import with_hash
 from instant_ic.bag.replay import ReplayError, ReplayNode, make_node, replay
 from instant_ic.bus import LATCHED, RELIABLE, SENSOR, Node
+from instant_ic.bus.node_files import NodeFileError
 from instant_ic.geometry.transforms import TransformError
 from instant_ic.msg import (
     Bool,
@@ -177,7 +178,7 @@ def test_frame_that_a_slam_broadcasts_in_anothers_place_is_still_fed(bag: Path, 
 
 
 def test_what_cannot_be_replayed_is_told(bag: Path, tmp_path: Path) -> None:
-    with pytest.raises(ReplayError, match="no node 'warp'"):
+    with pytest.raises(NodeFileError, match="no node 'warp'"):
         make_node("warp", None, [])
     with pytest.raises(BagError, match="already exists"):
         replay(bag, [mean_node()], bag)

@@ -178,7 +178,7 @@ def test_graph_of_nodes_and_topics(world):
     world.neighbour("talker").publisher("/chatter", String)
     claim = registry.Claim(world.run_dir / "nodes" / "ears", "node ears")
     try:
-        entry = {"name": "ears", "module": "m", "pid": 1, "started_ns": 1, "params": {}}
+        entry = {"name": "ears", "executable": "m", "pid": 1, "started_ns": 1, "params": {}}
         claim.write({**entry, "publishes": {}, "subscribes": {"/chatter": "any"}})
         client = world.client()
         client.send(op="subscribeConnectionGraph")

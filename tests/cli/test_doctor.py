@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from cli_helpers import talking
 
+from instant_ic import paths
 from instant_ic.cli import doctor
 from instant_ic.cli.doctor import FAIL, OK, WARN, Expectation, Finding
 from instant_ic.cli.main import main
@@ -130,6 +131,7 @@ def test_run_directory_of_somebody_else(tmp_path: Path, monkeypatch: pytest.Monk
 def test_models_and_launch_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for folder in ("launch", "models"):
         (tmp_path / folder).mkdir()
+    (tmp_path / "nodes").symlink_to(paths.share_dir("nodes"))
     monkeypatch.setattr("instant_ic.paths.share_dir", lambda name: tmp_path / name)
     assert one(doctor.check_models()).level == FAIL
     (tmp_path / "models" / "torn.onnx").write_bytes(b"not a model")

@@ -231,9 +231,9 @@ def test_what_cannot_be_scored_says_why():
         evaluator.score("room", np.zeros((100, 100, 3), np.uint8), box_room())
     with pytest.raises(DepthEvaluationError, match=r"room: the true depth is 64 x 64"):
         evaluator.score("room", RGB, np.ones((64, 64)))
-    with pytest.raises(DepthEvaluationError, match="room: no valid pixel"):
+    with pytest.raises(DepthEvaluationError, match="room: the ground truth has no valid pixel"):
         evaluator.score("room", RGB, np.full(SIZE, np.nan))
-    with pytest.raises(DepthEvaluationError, match="room: there is no true depth"):
+    with pytest.raises(DepthEvaluationError, match="room: the simulated LiDAR needs"):
         evaluator.score("room", RGB, None)
 
 
@@ -267,7 +267,7 @@ def test_pictures_and_depth_are_paired_by_stem(tmp_path):
     with pytest.raises(PairError, match="no picture in this folder"):
         find_pictures([tmp_path])
     (gt / "a.npz").touch()
-    with pytest.raises(PairError, match=r"two depth files of one stem"):
+    with pytest.raises(PairError, match=r"two depth files with the same stem"):
         pair(pictures, [gt])
 
 
@@ -379,7 +379,7 @@ def test_command_without_truth_draws_only(folder):
         (("--depth", "{}/a.png", "--lidar", "--outliers", "2"), "outliers must lie"),
         (("--depth", "{}/a.png", "--lidar", "--lidar-height", "-1"), "height must be above 0"),
         (("--depth", "{}/a.png", "--lidar", "--method", "guess"), "method must be one of"),
-        (("--depth", "{}/a.png", "--lidar", "--source", "lidar", "--method", "ransac"), "leave the method out"),
+        (("--depth", "{}/a.png", "--lidar", "--source", "lidar", "--method", "ransac"), "omit the method"),
         (("--depth", "none.npy"), "none.npy: no such file"),
     ],
 )

@@ -211,7 +211,7 @@ class TestResults:
             teleop_results.load(file, teleop.Settings(episodes=2, methods=("ic", "stop"), seed=3))
         for words in ("{}", "[1]", "no JSON", file.read_text()[:-20], file.read_text().replace("contacts", "bumps")):
             file.write_text(words)
-            with pytest.raises(ValueError, match="no report of ic evaluate teleop"):
+            with pytest.raises(ValueError, match="not a report of ic evaluate teleop"):
                 teleop_results.load(file, self.settings)
 
 
@@ -375,7 +375,7 @@ class TestOperator:
             ("time_s,linear_m_s,angular_rad_s\n1,x,0\n", "drive.csv:2: not a row of numbers"),
             ("time_s,linear_m_s,angular_rad_s\n2,1,0\n1,0,0\n", "goes back by 1.000 s at command 2 of 2"),
             ("time_s,linear_m_s,angular_rad_s\n1,0,0\n1,nan,0\n", "command 2 of 2 is not finite"),
-            ("time_s,linear_m_s,angular_rad_s\n1,0,0\n2,0,0\n", "nobody drove"),
+            ("time_s,linear_m_s,angular_rad_s\n1,0,0\n2,0,0\n", "commands are zero"),
         ],
     )
     def test_a_log_that_is_none(self, tmp_path: Path, text: str, words: str) -> None:
@@ -408,8 +408,8 @@ class TestRecordedInABag:
     @pytest.mark.parametrize(
         ("topic", "message", "told"),
         [
-            ("/cmd_vel", "TwistStamped", "/operator/cmd_vel is missing; it was recorded with these topics: /cmd_vel"),
-            ("/operator/cmd_vel", "Bool", "is of std_msgs/msg/Bool, not of geometry_msgs/TwistStamped"),
+            ("/cmd_vel", "TwistStamped", "/operator/cmd_vel is missing; the bag has these topics: /cmd_vel"),
+            ("/operator/cmd_vel", "Bool", "has type std_msgs/msg/Bool, not geometry_msgs/TwistStamped"),
         ],
     )
     def test_another_bag(self, topic: str, message: str, told: str, tmp_path: Path) -> None:
@@ -431,7 +431,7 @@ class TestRecordedInABag:
         (["--jobs", "0"], "jobs must be at least 1"),
         (["--operator", "recorded"], "needs --log"),
         (["--log", "x.csv"], "needs --operator recorded"),
-        (["--operator", "recorded", "--log", "/no/such.csv"], "there is no such bag or CSV file"),
+        (["--operator", "recorded", "--log", "/no/such.csv"], "no such bag or CSV file"),
         (["--video", "film.avi"], "must end in .mp4"),
         (["--resume"], "--resume needs --json"),
         (["-p", "no_node.key:=1"], "expected NODE.KEY:=VALUE"),

@@ -158,7 +158,7 @@ def test_an_entry_of_another_user_is_no_entry(tmp_path):
     run_dir = registry.prepare(tmp_path / "run")
     lock = run_dir / "nodes" / "arbiter.lock"
     lock.write_text("")
-    entry = {"name": "arbiter", "module": "m", "pid": 1, "started_ns": 0, "params": {}}
+    entry = {"name": "arbiter", "executable": "m", "pid": 1, "started_ns": 0, "params": {}}
     lock.with_suffix(".json").write_text(json.dumps(entry))
     with lock.open() as held:
         fcntl.flock(held, fcntl.LOCK_EX)

@@ -103,7 +103,7 @@ def test_the_particle_filter_by_name(log: Path, tmp_path: Path, capsys: pytest.C
     [
         (
             "FLASER 2 1.0 1.0 0 0 0 0 0 0 1.0 h 1\nFLASER 3 1.0 2.0\n",
-            "bad.log:2: FLASER: 3 readings announced, 2 there",
+            "bad.log:2: FLASER: expected 3 readings, found 2",
         ),
         ("hello\n", "bad.log: no FLASER or ROBOTLASER1 line"),
     ],
@@ -191,5 +191,5 @@ def test_the_simulated_crawler_on_slipping_tracks() -> None:
     report, _ = evaluate_round_trip(trip)
     assert report["wheels_end_error_deg"] > 5.0  # what there was to correct
     assert report["end_error_m"] < 0.05 and report["end_error_deg"] < 1.0
-    with pytest.raises(ValueError, match="ran into something"):
+    with pytest.raises(ValueError, match="hit an obstacle"):
         round_trip(world, 0.0, 0, 1, route=((0.0, 0.0), (8.0, 0.0)))  # through the obstacle

@@ -71,13 +71,13 @@ def test_robotlaser_by_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("bad", "what"),
     [
-        ("FLASER 5 1.0 2.0\n", "cut short"),
+        ("FLASER 5 1.0 2.0\n", "truncated"),
         ("FLASER 1 x 0 0 0 0 0 0 1 h 1\n", "could not convert"),
         ("FLASER 1 nan 0 0 0 0 0 0 1 h 1\n", "finite"),
         ("FLASER\n", "empty"),
-        ("FLASER -3 0 0 0 0 0 0 1 h 1\n", "out of bounds"),
+        ("FLASER -3 0 0 0 0 0 0 1 h 1\n", "out of range"),
         ("FLASER 1 1.0 0 0 0 0 0 0 soon h 1\n", "time stamp"),
-        ("ROBOTLASER1 0 1 2\n", "announced"),
+        ("ROBOTLASER1 0 1 2\n", "truncated"),
     ],
 )
 def test_a_bad_line_is_named_by_its_number(tmp_path: Path, bad: str, what: str) -> None:
@@ -208,7 +208,7 @@ def test_mines_by_hand(tmp_path: Path) -> None:
 
 def test_mines_errors_name_the_line(tmp_path: Path) -> None:
     good = mines_line(0, 0, 0, [0] * 682)
-    with pytest.raises(LogError, match=r"m\.dat:2: 706 columns needed, 26 there"):
+    with pytest.raises(LogError, match=r"m\.dat:2: expected 706 columns, found 26"):
         list(read_mines(write(tmp_path / "m.dat", good + mines_line(1, 0, 0, [1, 2]))))
     with pytest.raises(LogError, match=r"n\.dat:1: "):
         list(read_mines(write(tmp_path / "n.dat", good.replace("0 0 0", "0 0 x", 1))))

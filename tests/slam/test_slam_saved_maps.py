@@ -100,12 +100,12 @@ def test_modes_of_map_server(tmp_path: Path, text: str, expected: list[int]) -> 
         ("- 1\n", "keys image"),
         ("image: p.pgm\nresolution: 0\norigin: [0, 0, 0]\n", "resolution must be > 0"),
         ("image: p.pgm\nresolution: x\norigin: [0, 0, 0]\n", "resolution must be a number"),
-        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0.5]\n", "turned map"),
+        ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0.5]\n", "rotated map"),
         ("image: p.pgm\nresolution: .1\norigin: here\n", "origin must be"),
         ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nmode: best\n", "mode must be"),
         ("image: p.pgm\nresolution: .1\norigin: [0, 0, 0]\nfree_thresh: 0.9\n", "free_thresh < occupied_thresh"),
         ("image: none.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "does not exist"),
-        ("image: bad.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "no picture"),
+        ("image: bad.pgm\nresolution: .1\norigin: [0, 0, 0]\n", "cannot be decoded"),
         ("a: [\n", "cannot be read"),
     ],
 )
@@ -142,7 +142,7 @@ def test_faults_of_saving_and_loading(tmp_path: Path) -> None:
         save_grid(tmp_path / "file" / "m", OccupancyGrid(np.zeros((1, 1), np.int8), 0.1, np.zeros(2)))
     with pytest.raises(ValueError, match="needs a saved map"):
         make_slam(localize=True)
-    with pytest.raises(ValueError, match="rbpf cannot"):
+    with pytest.raises(ValueError, match="rbpf does not support"):
         make_slam(SlamConfig(backend="rbpf"), tmp_path / "m")
 
 

@@ -101,7 +101,7 @@ def exported(converted: Path) -> bytes:
 
 def test_convert_writes_model_manifest_and_record(converted: Path) -> None:
     output, told = converted, (converted.parents[1] / "told.txt").read_text()
-    assert "SliceNet resnet18, 128 x 64" in told and "torch writes ONNX" in told
+    assert "SliceNet resnet18, 128 x 64" in told and "exporting to ONNX" in told
     difference = float(told.split("largest difference to torch: ")[1].split()[0])
     assert 0 < difference < 1e-5
     record = json.loads(output.with_suffix(".json").read_text())
@@ -191,5 +191,5 @@ def test_weights_that_amplify_rounding_are_held_against_float64(
 def test_a_network_that_says_nothing_is_refused(tmp_path: Path) -> None:
     model = random_network()
     torch.nn.init.zeros_(model.decoder[-1].layers[1].weight)
-    with pytest.raises(ExportError, match="gives no depth"):
+    with pytest.raises(ExportError, match="outputs no depth"):
         export_onnx(model, tmp_path / "m.onnx")

@@ -151,7 +151,7 @@ def test_worlds_come_in_order_from_processes_and_a_dead_one_is_told() -> None:
         cache = renderers._cache.name
         assert Path(cache).is_dir()
         renderers._processes[0].kill()
-        with pytest.raises(FeedError, match="rendering process ended with -9 at world"):
+        with pytest.raises(FeedError, match="rendering process exited with -9 at world"):
             for _ in range(4):  # those that were already on their way may still come
                 renderers.world()
     assert not Path(cache).exists()

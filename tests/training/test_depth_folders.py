@@ -102,7 +102,7 @@ def test_wrong_names_and_folders_are_told(tmp_path: Path) -> None:
         ("m3d", "LAYOUT:FOLDER"),
         (f"m3d:{tmp_path / 'absent'}", "no such folder"),
         (f"m3d:{tmp_path / 's'}", "SCAN/pano_skybox_color.*it looks like s2d3d"),
-        (f"s3d:{tmp_path}", "no panorama with depth laid out as s3d"),
+        (f"s3d:{tmp_path}", "no panorama with depth in layout s3d"),
     ):
         with pytest.raises(DatasetError, match=words):
             open_folder(name, SIZE)
@@ -111,12 +111,12 @@ def test_wrong_names_and_folders_are_told(tmp_path: Path) -> None:
 def test_pictures_without_depth_are_told_and_left_out(tmp_path: Path) -> None:
     plain(tmp_path)
     picture(tmp_path / "rgb" / "mill" / "c.jpg", 1)
-    with pytest.warns(UserWarning, match=r"1 pictures have no depth and are left out, the first is .*c\.jpg"):
+    with pytest.warns(UserWarning, match=r"1 images have no depth and are skipped; the first is .*c\.jpg"):
         data = open_folder(f"plain:{tmp_path}", SIZE)
     assert len(data) == 2
     for path in (tmp_path / "depth").rglob("*.*"):
         path.unlink()
-    with pytest.raises(DatasetError, match=r"3 pictures, the first without depth/house/a\.png"):
+    with pytest.raises(DatasetError, match=r"3 images, the first without depth/house/a\.png"):
         open_folder(f"plain:{tmp_path}", SIZE)
 
 
@@ -126,11 +126,11 @@ def test_damaged_files_are_told_and_passed_over_until_there_are_many(tmp_path: P
         np.save((tmp_path / "depth").mkdir(exist_ok=True) or tmp_path / "depth" / f"{index:03}.npy", np.ones((4, 8)))
     data = open_folder(f"plain:{tmp_path}", SIZE)
     (tmp_path / "rgb" / "007.png").write_bytes(b"not a picture")
-    with pytest.warns(UserWarning, match=r"passed over: .*007\.png"):
+    with pytest.warns(UserWarning, match=r"skipped: .*007\.png"):
         assert data[7].rgb.max() == 8
     assert data[7].rgb.max() == 8 and list(data.unreadable) == [7]
     picture(tmp_path / "rgb" / "008.png", 8, (4, 6, 3))
-    with pytest.raises(DatasetError, match=r"008\.png: 6 x 4 is no equirect panorama.*2 of 120"):
+    with pytest.raises(DatasetError, match=r"008\.png: 6 x 4 is not an equirect panorama.*2 of 120"):
         data[8]
 
 
@@ -138,7 +138,7 @@ def test_depth_of_eight_bits_is_no_depth(tmp_path: Path) -> None:
     stanford(tmp_path)
     depth = next(tmp_path.rglob("area_1/**/*_depth.png"))
     picture(depth, 9)
-    with pytest.raises(DatasetError, match=r"one channel of 16 bits \(it is uint8 of shape"):
+    with pytest.raises(DatasetError, match=r"single-channel 16-bit PNG \(got uint8 of shape"):
         open_folder(f"s2d3d:{tmp_path}", SIZE)[0]
 
 
@@ -146,5 +146,5 @@ def test_a_folder_of_nothing_but_test_scenes_is_refused(tmp_path: Path) -> None:
     stanford(tmp_path)
     for path in tmp_path.rglob("area_1/**/*.png"):
         path.unlink()
-    with pytest.raises(DatasetError, match="training needs others"):
+    with pytest.raises(DatasetError, match="add scenes for training"):
         open_folder(f"s2d3d:{tmp_path}", SIZE).split()

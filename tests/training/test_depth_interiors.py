@@ -24,7 +24,7 @@ def test_each_kind_is_a_closed_place_to_stand_in(kind: str) -> None:
 
 def test_kinds_are_drawn_by_their_shares_and_unknown_ones_refused() -> None:
     assert sum(KINDS.values()) == pytest.approx(1)
-    with pytest.raises(ValueError, match="no interior of kind 'cave'"):
+    with pytest.raises(ValueError, match="unknown kind 'cave'"):
         interior_world(1, "cave")
 
 

@@ -178,7 +178,7 @@ def test_devices_that_are_not_there() -> None:
         Team.join("gpu")
     if not torch.cuda.is_available():
         assert Team.join("auto").device.type == "cpu"
-        with pytest.raises(ValueError, match="sees no CUDA GPU"):
+        with pytest.raises(ValueError, match="finds no CUDA GPU"):
             Team.join("cuda")
 
 

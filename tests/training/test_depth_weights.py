@@ -80,7 +80,7 @@ def test_checkpoints_of_the_same_network_are_taken(model: SliceNet, tmp_path: Pa
     start = load_start(tmp_path / "a.pt", TINY)
     assert not start.folded and start.origin["record"] == {"steps": 9}
     other = SliceNetConfig(backbone="resnet18", height=64, width_multiplier=0.25, lstm_hidden=8)
-    with pytest.raises(CheckpointError, match="this training is of"):
+    with pytest.raises(CheckpointError, match="but the training uses"):
         load_start(tmp_path / "a.pt", other)
 
 
