@@ -1,6 +1,6 @@
 # make run    set everything up in .venv/ and start the simulated stack
 # make test   format, lint, types and all tests
-# make check  format, lint and types alone
+# make check  format, lint, types and the word list (scripts/check_words.py)
 # make lock   write requirements.lock anew after a change of constraints.txt or pyproject.toml (needs network)
 # make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
 # make clean  take away what these made
@@ -28,6 +28,7 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/python scripts/check_words.py
 
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz $(ARGS)

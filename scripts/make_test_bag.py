@@ -52,7 +52,7 @@ STANDING_S = 0.6
 
 
 class SimulatedPort:
-    """Stands in for the serial port: passes bytes straight to the emulated motor controller."""
+    """Replaces the serial port: passes bytes straight to the emulated motor controller."""
 
     def __init__(self, simulation: Simulation) -> None:
         self._controller = simulation.controller

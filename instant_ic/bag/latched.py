@@ -32,7 +32,7 @@ class LatchedValues:
     """Keeps the last message of each latched topic and publisher.
 
     On ``/tf_static`` every message carries all frames of its publisher. A message replaces the earlier messages whose
-    frames it repeats, whoever published them.
+    frames it repeats, from any publisher.
     """
 
     def __init__(self) -> None:

@@ -449,7 +449,7 @@ class Session:
         return self.refuse(announce, reason)
 
     def refuse(self, announce: Announce, reason: str) -> list[Event]:
-        """Tell the other host that one of its topics is refused."""
+        """Report to the other host that one of its topics is refused."""
         self._incoming[announce.channel].refused = reason
         self._replies.append(Refuse(announce.channel, reason))
         return [Refused(announce.topic, reason, here=True)]

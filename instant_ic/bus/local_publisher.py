@@ -166,7 +166,7 @@ class _Reader:
         self._incoming = self._incoming[whole:]
 
     def retire(self, buffer: SharedBuffer) -> None:
-        """Tell the reader that a buffer will not be used again, so that it can unmap it."""
+        """Announce to the reader that a buffer will not be used again, so that it can unmap it."""
         if buffer.number in self._known:
             self._known.discard(buffer.number)
             frame = HEADER.pack(RETIRED, 0, BUFFER_ID.size, 0, 0) + BUFFER_ID.pack(buffer.number)

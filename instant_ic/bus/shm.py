@@ -94,7 +94,7 @@ class BufferPool:
             most: largest number of buffers.
 
         Returns:
-            The buffer, or None when all are in use; and the closed buffers, which the readers must be told about.
+            The buffer, or None when all are in use; and the closed buffers, which must be announced to the readers.
 
         Raises:
             OSError: there is no memory for another buffer.

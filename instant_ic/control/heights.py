@@ -20,7 +20,7 @@ from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 Cell = TypeVar("Cell", bound=np.generic)
 
 GROUND, OBSTACLE, OVERHEAD, NEAR = 0, 1, 2, 3
-"""Kinds of points: can be driven over, stands in the way, can be passed under, lies on the robot's own body."""
+"""Kinds of points: can be driven over, blocks the way, can be passed under, lies on the robot's own body."""
 AZIMUTHS = 720
 """Number of azimuth bins."""
 FAST = {"contract", "arcp", "afn"}

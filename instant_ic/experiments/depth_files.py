@@ -44,7 +44,7 @@ def pair(pictures: Sequence[Path], truths: Sequence[Path]) -> list[tuple[Path, P
     pairs = [(picture, by_stem.get(_stem(picture))) for picture in pictures]
     if all(truth is None for _, truth in pairs):
         names = ", ".join(sorted(path.name for path in found)[:5]) or "nothing"
-        raise PairError(f"no depth file has the stem of a picture ({pictures[0].name}, ... against {names}, ...)")
+        raise PairError(f"no depth file has the stem of an image ({pictures[0].name}, ... against {names}, ...)")
     return pairs
 
 

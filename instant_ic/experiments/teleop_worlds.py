@@ -268,7 +268,7 @@ def across(world: World, rng: np.random.Generator, attempts: int = 3000) -> Cour
         longest = course
     if longest is None:
         raise ValueError(
-            f"world {world.name!r}: no straight drive of {_DRIVE_M[0]} m between two free places came up in {attempts} "
+            f"world {world.name!r}: no straight drive of {_DRIVE_M[0]} m between two free places in {attempts} "
             f"tries ({len(places) * plan.cell_m**2:.1f} m² are {_ROOM_M} m away from everything and can be reached)"
         )
     return longest

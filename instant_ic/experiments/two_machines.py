@@ -274,7 +274,7 @@ def drive_and_cut(machines: TwoMachines, robot: Stack, station: Stack) -> CutDri
         return abs(speeds[-1].twist.twist.linear.x) if speeds else 0.0
 
     # The operator's data arrives: image, state, pose and map, as judged by the console.
-    wait(lambda: pictures and maps, 180, "picture and map at the station")
+    wait(lambda: pictures and maps, 180, "image and map at the station")
     names = [f"console: {name}" for name in ("camera", "controller", "pose")]
     wait(lambda: all(seen.words.get(name) == "" for name in names), 120, "console that misses nothing")
     result.console = {name: seen.words[name] for name in names}
@@ -309,7 +309,7 @@ def drive_and_cut(machines: TwoMachines, robot: Stack, station: Stack) -> CutDri
         result.relink_s = time.monotonic() - mended_s
         result.drift_m = driven_from(standing)
         count = len(pictures)
-        wait(lambda: len(pictures) > count + 3, 60, "pictures after the cut")
+        wait(lambda: len(pictures) > count + 3, 60, "images after the cut")
         wait(lambda: states[-1].mode == real, 120, "robot that may drive again")
         start = place()
         hand.command = (-0.25, 0.0)

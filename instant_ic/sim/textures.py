@@ -173,7 +173,7 @@ def _brick(rng: np.random.Generator) -> FloatArray:
 
 
 def _blocks(rng: np.random.Generator) -> FloatArray:
-    """Painted concrete blocks."""
+    """Concrete blocks with a coat of paint."""
     n, rows, columns = 512, 10, 5
     y, x = np.mgrid[0:n, 0:n] / n
     row = np.floor(y * rows).astype(int)

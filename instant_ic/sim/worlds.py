@@ -21,7 +21,7 @@ def corridor_world(seed: int = 0, obstacle: bool = True, light_cell_m: float = 0
 
     The corridor is 2.4 m wide and 2.7 m high. It runs 14 m along x from x = -2, then 9 m along +y at its far end. The
     robot starts at the origin and faces +x. The obstacle is a box of 0.5 x 0.5 x 0.8 m, nearly in the colour of the
-    walls. It stands in the middle with its front 4 m ahead, which leaves 0.95 m free on either side.
+    walls. It is in the middle with its front 4 m ahead, which leaves 0.95 m free on either side.
 
     Args:
         seed: changes the posters on the walls and the contents of the rooms, not the floor plan.

@@ -238,7 +238,7 @@ document.addEventListener("visibilitychange", () => { lastFrame = performance.no
 // ---- display -------------------------------------------------------------------------------------
 
 function showBanner() {
-  // A stopped robot starts only once the controls are released, so tell an operator who still holds a key.
+  // A stopped robot starts only once the controls are released, so remind an operator who still holds a key.
   const held = state?.mode === "stopped" && (state.command ?? []).some((value) => value !== 0);
   hud.showBanner(link.connected, everConnected, session.estop || (state?.estop ?? false), held, session.driver, state?.reason ?? "");
 }
