@@ -123,7 +123,7 @@ def test_a_token_bucket_lets_its_rate_through():
     ],
     ids=["pings", "protocol pings", "bad messages", "endless fragments"],
 )
-def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, flood, messages):
+def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, flood, messages, caplog):
     server = serve(max_messages_per_s=100.0)
 
     async def scenario():
@@ -139,8 +139,11 @@ def test_fault_a_flood_closes_its_own_socket_with_a_reason_and_no_other(serve, f
                     await asyncio.wait_for(writer.drain(), 0.01)
                 await asyncio.sleep(0)
             pongs, closed = await replies
-            assert closed[0] == 1008
-            assert closed[1] in ("too many messages", "bad messages")
+            if closed is None:  # what still comes in after the close resets the connection: the frame may be lost
+                assert "sends too many messages" in caplog.text
+            else:
+                assert closed[0] == 1008
+                assert closed[1] in ("too many messages", "bad messages")
             if messages:
                 assert pongs <= 200 + 100 * WAIT_S  # 2 s of them at once, then the rate
             writer.close()
