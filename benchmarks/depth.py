@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
-from instant_ic.experiments.depth import Evaluator, LidarSettings, Settings
+from instant_ic.experiments.depth import DepthSettings, Evaluator, LidarSettings
 from instant_ic.experiments.depth_lidar import Errors, measure_world
 from instant_ic.experiments.depth_pictures import Sheets
 from instant_ic.experiments.depth_worlds import KINDS, LIDAR_HEIGHT_M, Scene, scenes
@@ -54,10 +54,10 @@ def evaluators(model: Remembered, share: float, method: str) -> dict[str, Evalua
     """One evaluator per source; the unscaled source uses no LiDAR and therefore has no outliers."""
     lidar = LidarSettings(LIDAR_HEIGHT_M, outliers=share)
     made = {
-        source: Evaluator(Settings(source, lidar, method=method if source != "lidar" else ""), model)
+        source: Evaluator(DepthSettings(source, lidar, method=method if source != "lidar" else ""), model)
         for source in SOURCES[1:]
     }
-    return made if share else {SOURCES[0]: Evaluator(Settings("network"), model), **made}
+    return made if share else {SOURCES[0]: Evaluator(DepthSettings("network"), model), **made}
 
 
 def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 import torch
 
-from instant_ic.camera.jpeg import decode_rgb
 from instant_ic.depth.manifest import ModelManifest, load_manifest, manifest_path, save_manifest
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
+from instant_ic.limits import decode_rgb
 from instant_ic.paths import shipped_file
 from instant_ic.training.export import OPSET, export_onnx
 from instant_ic.training.slicenet import SMALL, SliceNet, SliceNetConfig

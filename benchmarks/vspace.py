@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from instant_ic.experiments.vspace import Settings, evaluate, path_poses, scores, start_pose
-from instant_ic.experiments.vspace_sources import CAMERA_HEIGHT_M
+from instant_ic.experiments.vspace import evaluate, path_poses, scores, start_pose
+from instant_ic.experiments.vspace_sources import CAMERA_HEIGHT_M, VspaceSettings
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
@@ -84,7 +84,7 @@ def resolution(renderer: EquirectRenderer, pose: Any, depth_m: Any, full: Any, s
 
 def keyframes(world: str, start: tuple[float, float, float] | None, size: tuple[int, int], seconds: float) -> Any:
     """Three keyframes, each a metre behind the next, against warps of the nearest, 1 and 2 m ahead."""
-    settings = Settings(
+    settings = VspaceSettings(
         sources=("ours", "depth-warp", "point-warp"), keyframes=3, step_m=1.0, reach_m=2.0, size=size, seconds=seconds
     )
     report = evaluate(world, settings, start)

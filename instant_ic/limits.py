@@ -7,6 +7,8 @@ import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from instant_ic.jpeg import JpegError, jpeg_size
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -37,8 +39,6 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
     import cv2
     import numpy as np
 
-    from instant_ic.camera.jpeg import JpegError, jpeg_size
-
     content = data if isinstance(data, bytes | bytearray) else data.tobytes()
     if content.startswith(_PNG):
         if not _chunks_fit(content):
@@ -55,6 +55,36 @@ def decode_image(data: bytes | bytearray | NDArray[np.uint8], flags: int) -> NDA
         return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
         return None
+
+
+def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``.
+
+    The decoder reduces the image 2, 4 or 8 times where the result is still large enough, and then computes
+    correspondingly less of the inverse cosine transform. The reduced size is rounded up.
+
+    Raises:
+        JpegError: the data cannot be decoded.
+    """
+    import cv2
+    import numpy as np
+
+    flag = cv2.IMREAD_COLOR
+    try:
+        full_width, full_height = jpeg_size(bytes(data[:65536]))
+    except JpegError:  # may be a PNG
+        full_width, full_height = 0, 0
+    for n, reduced in (
+        (2, cv2.IMREAD_REDUCED_COLOR_2),
+        (4, cv2.IMREAD_REDUCED_COLOR_4),
+        (8, cv2.IMREAD_REDUCED_COLOR_8),
+    ):
+        if full_width >= n * width and full_height >= n * height:
+            flag = reduced
+    bgr = decode_image(data, flag)
+    if bgr is None:
+        raise JpegError(f"cannot be decoded as JPEG or PNG of at most {MOST_PIXELS} pixels")
+    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def load_image(path: str | Path, flags: int) -> NDArray[Any] | None:

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Node, NodeError, main
-from instant_ic.camera.jpeg import JpegError, decode_rgb
 from instant_ic.config.ranges import Positive, PositiveInt, check_ranges
 from instant_ic.depth.manifest import ManifestError
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
 from instant_ic.depth.providers import CHOICES
+from instant_ic.jpeg import JpegError
+from instant_ic.limits import decode_rgb
 from instant_ic.msg import CompressedImage, DepthModelInfo, Image, header, image_message, stamp_ns
 from instant_ic.paths import shipped_file
 

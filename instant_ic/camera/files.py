@@ -5,8 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from instant_ic.camera.config import FilesConfig
-from instant_ic.camera.jpeg import JpegError, check_whole, jpeg_size
 from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.jpeg import JpegError, check_whole, jpeg_size
 from instant_ic.limits import load_image
 
 JPEG_SUFFIXES = (".jpg", ".jpeg")

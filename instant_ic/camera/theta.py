@@ -13,9 +13,9 @@ import urllib3
 
 from instant_ic.camera.config import ThetaConfig
 from instant_ic.camera.http import Session, is_multipart
-from instant_ic.camera.jpeg import JpegError, jpeg_size
 from instant_ic.camera.preview import PreviewParser
 from instant_ic.camera.source import Camera, CameraError, Frame
+from instant_ic.jpeg import JpegError, jpeg_size
 from instant_ic.limits import MOST_PIXELS
 from instant_ic.pace import current
 

@@ -85,7 +85,8 @@ def launch_files(args: Any) -> Iterable[str]:
 @_quiet
 def launch_arguments(args: Any) -> Iterable[str]:
     """``key:=`` arguments of the launch file named earlier on the command line."""
-    from instant_ic.launch.description import find_launch_file, read_arguments
+    from instant_ic.launch.description import find_launch_file
+    from instant_ic.launch.reader import read_arguments
 
     return [f"{argument.name}:=" for argument in read_arguments(find_launch_file(args.file))]
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-OK, WARN, FAIL = "ok", "warn", "fail"
+from instant_ic.cli.finding import FAIL, OK, WARN, Finding
 
 MIN_PYTHON = (3, 11)
 MIN_CORES = 2
@@ -24,23 +24,6 @@ MIN_MEMORY_GB = 4.0
 MIN_DISK_GB = 2.0
 MIN_SHM_MB = 64.0
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Result of a check.
-
-    Attributes:
-        level: OK, WARN (a function will be missing or slow) or FAIL (the stack will not work).
-        subject: what was checked.
-        words: what was found.
-        advice: what to do about it; empty where all is well.
-    """
-
-    level: str
-    subject: str
-    words: str
-    advice: str = ""
 
 
 @dataclass(frozen=True)
@@ -79,7 +62,7 @@ def run_checks(expectation: Expectation, run_dir: Path) -> Iterator[Finding]:
     yield from check_serial(expectation)
     yield from check_camera(expectation)
     yield from check_lidar(expectation)
-    from instant_ic.cli.doctor_running import check_running
+    from instant_ic.cli.doctor_running import check_running  # its packages may be missing
 
     yield from check_running(run_dir)
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from instant_ic import pace
 from instant_ic.bus import ERROR, OK, registry
-from instant_ic.cli.doctor import FAIL, Finding
-from instant_ic.cli.doctor import OK as FINE
-from instant_ic.cli.doctor import WARN as DOUBTFUL
+from instant_ic.cli.finding import FAIL, Finding
+from instant_ic.cli.finding import OK as FINE
+from instant_ic.cli.finding import WARN as DOUBTFUL
 from instant_ic.msg import DiagnosticArray, deserialize
 
 _LONGEST_S = 20.0

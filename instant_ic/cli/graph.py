@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events", "/clock")
 """Topics that every node has; they do not show how the stack is connected."""
 TRANSFORMS = ("/tf", "/tf_static")
-
-_FORMATS = ("svg", "png", "pdf", "dot", "mmd")
 
 
 @dataclass
@@ -86,26 +83,6 @@ def make_graph(
         linked = {node for node, _ in graph.publishes} | {node for _, node in graph.subscribes} | set(only)
         graph.nodes = {node: state for node, state in graph.nodes.items() if node in linked}
     return graph
-
-
-def write(graph: StackGraph, path: Path) -> None:
-    """Write the graph as an image or text; the file suffix selects the format.
-
-    Raises:
-        ValueError: the suffix is not supported.
-        OSError: the file cannot be written.
-    """
-    kind = path.suffix.lstrip(".").lower()
-    if kind not in _FORMATS:
-        raise ValueError(f"{path}: the name must end in one of {', '.join('.' + known for known in _FORMATS)}")
-    if kind == "dot":
-        path.write_text(dot(graph))
-    elif kind == "mmd":
-        path.write_text(mermaid(graph))
-    else:
-        from instant_ic.cli.graph_picture import draw
-
-        draw(graph, path)
 
 
 def rate_words(rate_hz: float | None) -> str:

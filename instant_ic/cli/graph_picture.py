@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from instant_ic.cli.graph import StackGraph, rate_words
+from instant_ic.cli.graph import StackGraph, dot, mermaid, rate_words
 from instant_ic.cli.layered import Layout, Wire, is_bend, lay_out, settle
 
 _STATE_COLOURS = {
@@ -40,6 +40,27 @@ class _Box:
     def row_y(self, topic: str, out: bool) -> float:
         """Vertical offset of a row's centre from the centre of the box, downwards."""
         return -self.height / 2 + _HEAD + _PAD / 2 + (self.rows.index((topic, out)) + 0.5) * _LINE
+
+
+_FORMATS = ("svg", "png", "pdf", "dot", "mmd")
+
+
+def write(graph: StackGraph, path: Path) -> None:
+    """Write the graph as an image or text; the file suffix selects the format.
+
+    Raises:
+        ValueError: the suffix is not supported.
+        OSError: the file cannot be written.
+    """
+    kind = path.suffix.lstrip(".").lower()
+    if kind not in _FORMATS:
+        raise ValueError(f"{path}: the name must end in one of {', '.join('.' + known for known in _FORMATS)}")
+    if kind == "dot":
+        path.write_text(dot(graph))
+    elif kind == "mmd":
+        path.write_text(mermaid(graph))
+    else:
+        draw(graph, path)
 
 
 def draw(graph: StackGraph, path: Path) -> None:

@@ -58,7 +58,7 @@ class LidarSettings:
 
 
 @dataclass(frozen=True)
-class Settings:
+class DepthSettings:
     """Evaluation settings.
 
     Attributes:
@@ -155,7 +155,7 @@ class Evaluator:
         DepthEvaluationError: the settings need a model, or a different one.
     """
 
-    def __init__(self, settings: Settings, model: Model | None) -> None:
+    def __init__(self, settings: DepthSettings, model: Model | None) -> None:
         self.settings = settings
         self.model = model if settings.source != "lidar" else None
         if self.model is None and settings.source != "lidar":
@@ -209,7 +209,7 @@ class Evaluator:
         between, cpu_s = time.perf_counter(), time.process_time()
         sigma = fit = None
         if settings.lidar is None:
-            assert raw is not None  # ensured by __init__ and Settings: only the network works without LiDAR
+            assert raw is not None  # ensured by __init__ and DepthSettings: only the network works without LiDAR
             depth = raw
         else:
             assert points is not None
@@ -266,7 +266,7 @@ def _within_sigma(depth: Floats, sigma: Floats, truth: Floats, max_depth_m: floa
     return float((np.abs(depth[known] - truth[known]) <= sigma[known] * truth[known]).mean())
 
 
-def report(scored: Sequence[dict[str, Any]], settings: Settings, model: Model | None) -> dict[str, Any]:
+def report(scored: Sequence[dict[str, Any]], settings: DepthSettings, model: Model | None) -> dict[str, Any]:
     """Report as plain values: ``mean`` (after scaling), means of ``before`` and ``after``, then each image.
 
     Args:

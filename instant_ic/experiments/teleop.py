@@ -7,12 +7,10 @@ obstacles, and shared control that drives around them by itself. ``teleop_figure
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
@@ -25,17 +23,16 @@ from instant_ic.experiments.processes import process_pool
 from instant_ic.experiments.teleop_figures import Drive, Switch
 from instant_ic.experiments.teleop_operator import Operator, Sight, make_operator, read_commands
 from instant_ic.experiments.teleop_results import in_order
+from instant_ic.experiments.teleop_settings import TeleopSettings
 from instant_ic.experiments.teleop_stack import (
     CAMERA_HEIGHT_M,
-    DEPTHS,
-    METHODS,
     NODES,
     VSPACE_NODES,
     Shown,
     SimulatedStack,
     StackConfig,
 )
-from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, floor_plan, make_course
+from instant_ic.experiments.teleop_worlds import Course, floor_plan
 from instant_ic.geometry.poses import pose_matrix
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -45,55 +42,10 @@ READY_S = 10.0
 """Longest time until the stack is ready for the first command."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Settings of one evaluation.
-
-    Attributes:
-        episodes, seed: which drives; the same seed gives the same drives.
-        world: ``corridors`` (random ones), or a world of the simulator.
-        methods: of ``METHODS``.
-        depth: of ``DEPTHS``.
-        log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
-        pictures: whether to render and compare the images on either side of a switch.
-        overrides: parameters ``node.key:=value`` on top of the shipped ones.
-    """
-
-    episodes: int = 50
-    seed: int = 0
-    world: str = RANDOM_CORRIDORS
-    methods: tuple[str, ...] = METHODS
-    depth: str = "fused"
-    log: Path | None = None
-    pictures: bool = True
-    overrides: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
-        for key, given, allowed in (("methods", self.methods, METHODS), ("depth", (self.depth,), DEPTHS)):
-            unknown = [name for name in given if name not in allowed]
-            if unknown or not given:
-                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        StackConfig(overrides=self.overrides)  # raises ValueError on a malformed override
-
-    def course(self, index: int) -> Course:
-        """Return course ``index``.
-
-        Raises:
-            ValueError: no such world, or no possible drive in it.
-        """
-        return _course(self.world, self.seed, index, self.log is not None)
-
-
-_course = functools.lru_cache(maxsize=2)(make_course)
-"""Cached: all methods drive the same course."""
-
-
 class _Episode:
     """One running episode."""
 
-    def __init__(self, settings: Settings, course: Course, index: int, method: str, filmed: bool = False) -> None:
+    def __init__(self, settings: TeleopSettings, course: Course, index: int, method: str, filmed: bool = False) -> None:
         seed, words = 1000 * settings.seed + index, settings.overrides
         config = StackConfig(method, settings.depth, seed, whole_views=filmed, overrides=words)
         self.settings, self.course = settings, course
@@ -205,7 +157,7 @@ def decode(jpeg: bytes) -> NDArray[np.uint8]:
 
 
 def run_episode(
-    settings: Settings,
+    settings: TeleopSettings,
     index: int,
     on_step: Callable[[SimulatedStack], None] | None = None,
     methods: tuple[str, ...] = (),
@@ -237,7 +189,7 @@ def prepare() -> None:
 
 
 def evaluate(
-    settings: Settings,
+    settings: TeleopSettings,
     jobs: int = 1,
     on_drive: Callable[[Drive], None] | None = None,
     timeout_s: float = 7200.0,
@@ -294,4 +246,4 @@ def evaluate(
     return in_order(drives)
 
 
-__all__ = ["Drive", "Settings", "evaluate", "run_episode"]
+__all__ = ["Drive", "TeleopSettings", "evaluate", "run_episode"]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from instant_ic.control.arbiter import Mode
 from instant_ic.control.footprint import Footprint
 from instant_ic.experiments.pictures import save_figure
-from instant_ic.experiments.teleop import Settings, decode, photograph
+from instant_ic.experiments.teleop import decode, photograph
 from instant_ic.experiments.teleop_figures import TRACK_S, Drive
+from instant_ic.experiments.teleop_settings import TeleopSettings
 from instant_ic.experiments.teleop_stack import METHODS, SimulatedStack
 from instant_ic.experiments.teleop_worlds import Course, floor_plan
 from instant_ic.sim.contact import OccupancyMask
@@ -43,7 +44,9 @@ _PICTURE, _MAP = (640, 360), 360
 FPS = 10
 
 
-def save_plot(path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: Settings, most: int = 4) -> None:
+def save_plot(
+    path: Path, drives: Sequence[Drive], report: dict[str, Any], settings: TeleopSettings, most: int = 4
+) -> None:
     """Save figures by method, every course's time and obedience, and maps of the worst courses.
 
     Below each map: the arbiter's modes over time, one bar per method.

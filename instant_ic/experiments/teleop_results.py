@@ -8,17 +8,15 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from instant_ic.experiments import teleop_figures as figures
 from instant_ic.experiments.teleop_figures import Drive, Switch
+from instant_ic.experiments.teleop_settings import TeleopSettings
 from instant_ic.experiments.teleop_stack import METHODS
 
-if TYPE_CHECKING:
-    from instant_ic.experiments.teleop import Settings
 
-
-def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
+def report(drives: Sequence[Drive], settings: TeleopSettings) -> dict[str, Any]:
     """Figures by method, the targets, and each drive without its tracks, ready for JSON."""
     by_method = {name: [d for d in drives if d.method == name] for name in settings.methods}
     stop = by_method.get("stop")
@@ -34,7 +32,7 @@ def report(drives: Sequence[Drive], settings: Settings) -> dict[str, Any]:
     }
 
 
-def save(path: Path, drives: Sequence[Drive], settings: Settings) -> None:
+def save(path: Path, drives: Sequence[Drive], settings: TeleopSettings) -> None:
     """Write the report with the tracks atomically: an interrupted program leaves a readable file."""
     text = json.dumps(report(drives, settings), indent=2)
     # Tracks are long: one line each.
@@ -47,7 +45,7 @@ def save(path: Path, drives: Sequence[Drive], settings: Settings) -> None:
         beside.unlink(missing_ok=True)
 
 
-def load(path: Path, settings: Settings) -> list[Drive]:
+def load(path: Path, settings: TeleopSettings) -> list[Drive]:
     """Drives of an earlier run with the same settings, limited to those that these settings request.
 
     Raises:
@@ -79,8 +77,8 @@ def in_order(drives: Sequence[Drive]) -> list[Drive]:
     return sorted(drives, key=lambda drive: (drive.index, METHODS.index(drive.method)))
 
 
-def _conditions(settings: Settings) -> dict[str, Any]:
-    """Settings that must match for drives to be combined in one report."""
+def _conditions(settings: TeleopSettings) -> dict[str, Any]:
+    """TeleopSettings that must match for drives to be combined in one report."""
     return {
         "seed": settings.seed,
         "world": settings.world,

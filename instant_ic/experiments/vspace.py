@@ -15,6 +15,7 @@ from instant_ic.experiments.vspace_sources import (
     Drawer,
     Picture,
     Shot,
+    VspaceSettings,
     depth_figures,
     field_alone,
     make_source,
@@ -28,72 +29,9 @@ if TYPE_CHECKING:
     from instant_ic.sim.worlds import World
     from instant_ic.vspace import VirtualSpaceConfig
 
-PATHS = ("straight", "curve")
-SOURCES = {
-    "ours": "depth of the shipped model scaled by the LiDAR, field trained from it",
-    "field": "the same, the field alone from its first step on, never the warp",
-    "true-depth": "the same with the world's own depth: the ceiling",
-    "no-depth": "field trained from colours alone (paper: -depth)",
-    "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
-    "panorama": "the panorama turned, without depth",
-    "depth-warp": "the panorama warped by the depth of `ours`, as a mesh",
-    "point-warp": "the same as points",
-    "true-warp": "mesh warp by the world's own depth",
-    "mesh": "conventional IC: the world scanned beforehand; obstacle not there yet, colours changed",
-}
 CLEARANCE_M = 0.3
 _RADII_M = (2.5, 4.0, 6.0, 10.0, 16.0)
 _STRIP_AT_M = (0.5, 1.0, 2.0, 3.0)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Settings of one evaluation.
-
-    Attributes:
-        paths: of ``PATHS``; sources: of ``SOURCES``.
-        seconds: CPU seconds of training.
-        times: training times, CPU seconds, at which ``ours`` and ``field`` are measured at the panorama and 1 m ahead.
-        size: width and height of the views; fov_deg: their horizontal field of view.
-        panorama_width: of the keyframes, pixels.
-        keyframes: 1, or more, each a metre behind the next on the path.
-        step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
-        depth_source: depth source of ``ours``, see ``depth.sources``.
-        seed: of LiDAR noise, training and the changed colours.
-    """
-
-    paths: tuple[str, ...] = PATHS
-    sources: tuple[str, ...] = ("ours", "no-depth", "no-scale", "panorama", "depth-warp", "mesh")
-    seconds: float = 8.0
-    times: tuple[float, ...] = ()
-    size: tuple[int, int] = (640, 360)
-    fov_deg: float = 90.0
-    panorama_width: int = 2048
-    keyframes: int = 1
-    step_m: float = 0.25
-    reach_m: float = 4.0
-    depth_source: str = "fused"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for key, allowed in (("paths", PATHS), ("sources", tuple(SOURCES))):
-            unknown = [name for name in getattr(self, key) if name not in allowed]
-            if unknown or not getattr(self, key):
-                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
-        if not (self.seconds > 0 and all(t > 0 for t in self.times)):
-            raise ValueError("seconds and times must be > 0")
-        if not (0 < self.step_m <= self.reach_m <= 20):
-            raise ValueError(f"distances must be 0 < step <= reach <= 20 m (got {self.step_m:g}, {self.reach_m:g})")
-        if not 1 <= self.keyframes <= 8:
-            raise ValueError(f"keyframes must be 1 to 8 (got {self.keyframes})")
-        if not 64 <= self.panorama_width <= 8192 or self.panorama_width % 8:
-            raise ValueError(f"panorama width must be 64 to 8192, a multiple of 8 (got {self.panorama_width})")
-        if not 1 <= self.fov_deg < 170:
-            raise ValueError(f"field of view must be from 1 to 170 degrees (got {self.fov_deg:g})")
-
-    @property
-    def distances_m(self) -> list[float]:
-        return [round(i * self.step_m, 6) for i in range(int(self.reach_m / self.step_m + 1e-6) + 1)]
 
 
 @dataclass(frozen=True)
@@ -116,7 +54,7 @@ class Report:
 
     world: str
     start: tuple[float, float, float]
-    settings: Settings
+    settings: VspaceSettings
     depth: dict[str, Any]
     rows: list[Row] = field(default_factory=list)
     training: list[Row] = field(default_factory=list)
@@ -261,7 +199,7 @@ def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
 
 def evaluate(
     world: str,
-    settings: Settings,
+    settings: VspaceSettings,
     start: tuple[float, float, float] | None = None,
     tell: Callable[[str, int, int], None] = lambda words, done, total: None,
     config: VirtualSpaceConfig | None = None,

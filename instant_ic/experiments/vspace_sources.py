@@ -13,15 +13,77 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from instant_ic.depth.sources import DepthResult
-    from instant_ic.experiments.vspace import Settings
     from instant_ic.sim.render import EquirectRenderer
     from instant_ic.sim.worlds import World
     from instant_ic.vspace import VirtualSpaceConfig
 
+PATHS = ("straight", "curve")
+SOURCES = {
+    "ours": "depth of the shipped model scaled by the LiDAR, field trained from it",
+    "field": "the same, the field alone from its first step on, never the warp",
+    "true-depth": "the same with the world's own depth: the ceiling",
+    "no-depth": "field trained from colours alone (paper: -depth)",
+    "no-scale": "the model's depth as it comes, not scaled (paper: -scale)",
+    "panorama": "the panorama turned, without depth",
+    "depth-warp": "the panorama warped by the depth of `ours`, as a mesh",
+    "point-warp": "the same as points",
+    "true-warp": "mesh warp by the world's own depth",
+    "mesh": "conventional IC: the world scanned beforehand; obstacle not there yet, colours changed",
+}
 Picture = NDArray[np.uint8]
 CAMERA_HEIGHT_M, LIDAR_HEIGHT_M = 1.2, 0.6
 Drawer: TypeAlias = Callable[[NDArray[np.float64], int, int, float], tuple[Picture, float]]
 """Renders the place from a pose (4, 4) at width, height, field of view; returns image and share seen by a panorama."""
+
+
+@dataclass(frozen=True)
+class VspaceSettings:
+    """VspaceSettings of one evaluation.
+
+    Attributes:
+        paths: of ``PATHS``; sources: of ``SOURCES``.
+        seconds: CPU seconds of training.
+        times: training times, CPU seconds, at which ``ours`` and ``field`` are measured at the panorama and 1 m ahead.
+        size: width and height of the views; fov_deg: their horizontal field of view.
+        panorama_width: of the keyframes, pixels.
+        keyframes: 1, or more, each a metre behind the next on the path.
+        step_m, reach_m: distances from the last panorama are multiples of ``step_m`` up to ``reach_m``.
+        depth_source: depth source of ``ours``, see ``depth.sources``.
+        seed: of LiDAR noise, training and the changed colours.
+    """
+
+    paths: tuple[str, ...] = PATHS
+    sources: tuple[str, ...] = ("ours", "no-depth", "no-scale", "panorama", "depth-warp", "mesh")
+    seconds: float = 8.0
+    times: tuple[float, ...] = ()
+    size: tuple[int, int] = (640, 360)
+    fov_deg: float = 90.0
+    panorama_width: int = 2048
+    keyframes: int = 1
+    step_m: float = 0.25
+    reach_m: float = 4.0
+    depth_source: str = "fused"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for key, allowed in (("paths", PATHS), ("sources", tuple(SOURCES))):
+            unknown = [name for name in getattr(self, key) if name not in allowed]
+            if unknown or not getattr(self, key):
+                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
+        if not (self.seconds > 0 and all(t > 0 for t in self.times)):
+            raise ValueError("seconds and times must be > 0")
+        if not (0 < self.step_m <= self.reach_m <= 20):
+            raise ValueError(f"distances must be 0 < step <= reach <= 20 m (got {self.step_m:g}, {self.reach_m:g})")
+        if not 1 <= self.keyframes <= 8:
+            raise ValueError(f"keyframes must be 1 to 8 (got {self.keyframes})")
+        if not 64 <= self.panorama_width <= 8192 or self.panorama_width % 8:
+            raise ValueError(f"panorama width must be 64 to 8192, a multiple of 8 (got {self.panorama_width})")
+        if not 1 <= self.fov_deg < 170:
+            raise ValueError(f"field of view must be from 1 to 170 degrees (got {self.fov_deg:g})")
+
+    @property
+    def distances_m(self) -> list[float]:
+        return [round(i * self.step_m, 6) for i in range(int(self.reach_m / self.step_m + 1e-6) + 1)]
 
 
 @dataclass(frozen=True)
@@ -35,7 +97,7 @@ class Shot:
     result: DepthResult
 
 
-def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: Settings, model: Any) -> Shot:
+def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: VspaceSettings, model: Any) -> Shot:
     """Take a panorama from a pose with its depth: the model's, and the depth scaled by a simulated VLP-16."""
     from instant_ic.depth.scaler import ScalerConfig
     from instant_ic.depth.sources import DepthSource, SourceConfig
@@ -102,7 +164,7 @@ def point_warp(
     return np.clip(np.rint(filled), 0, 255).astype(np.uint8), float(seen.mean())
 
 
-def make_space(shots: list[Shot], depth: str, settings: Settings, config: VirtualSpaceConfig) -> Any:
+def make_space(shots: list[Shot], depth: str, settings: VspaceSettings, config: VirtualSpaceConfig) -> Any:
     """A virtual space with the keyframes, oldest first, using ``scaled``, ``raw`` or ``true`` depth.
 
     The last keyframe is untrained. The others are trained until they are ready, as during a drive (at most
@@ -131,7 +193,7 @@ def field_alone(config: VirtualSpaceConfig) -> VirtualSpaceConfig:
 
 
 def make_source(
-    name: str, shots: list[Shot], settings: Settings, config: VirtualSpaceConfig, before: Callable[[], World]
+    name: str, shots: list[Shot], settings: VspaceSettings, config: VirtualSpaceConfig, before: Callable[[], World]
 ) -> tuple[Drawer, float]:
     """Prepare a source; return its renderer and the CPU seconds spent.
 

@@ -5,9 +5,8 @@ from instant_ic.launch.description import (
     LaunchDescription,
     NodeSpec,
     find_launch_file,
-    read_arguments,
-    read_launch_file,
 )
+from instant_ic.launch.reader import read_arguments, read_launch_file
 from instant_ic.launch.source import LaunchFileError, Problem
 
 __all__ = [

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from instant_ic import paths
-from instant_ic.launch.source import LaunchFileError, Problem
 
 HANG_TIMEOUT_S = 10.0
 """Default hang time-out: a node without a heartbeat for longer than this counts as hung."""
@@ -146,61 +145,3 @@ def find_launch_file(name: str) -> Path:
     if path.name == name:
         return paths.shipped_file("launch", name if path.suffix else f"{name}.yaml")
     raise FileNotFoundError(f"{name} does not exist")
-
-
-def read_launch_file(
-    file: Path, arguments: Mapping[str, str] | None = None, run_dir: Path | None = None
-) -> LaunchDescription:
-    """Read and check a launch file with everything that it includes.
-
-    Args:
-        file: the launch file.
-        arguments: values for its ``arg`` entries.
-        run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
-
-    Raises:
-        LaunchFileError: all mistakes found, in file order.
-    """
-    from instant_ic.launch.reader import Reader
-
-    given = dict(arguments or {})
-    reader = Reader(run_dir or paths.run_dir(), given)
-    values = reader.read_top(file)
-    own = {argument.name for argument in reader.arguments}
-    inner = {argument.name: argument.file.name for argument in reader.included}
-    for name in given:
-        if name not in own:
-            hint = f"; {inner[name]} has one: declare it here and hand it to the include" if name in inner else ""
-            text = f"there is no argument {name!r} (arguments: {', '.join(sorted(own)) or 'none'}){hint}"
-            reader.problems.append(Problem(file, 1, text))
-    seen: dict[tuple[Path | None, str], NodeSpec] = {}
-    for node in reader.nodes:
-        key = (node.run_dir, node.name)
-        if key in seen:
-            first = seen[key]
-            text = f"a node named {node.name!r} is already started in line {first.line} of {first.file.name}"
-            reader.problems.append(Problem(node.file, node.line, text))
-        seen.setdefault(key, node)
-    if reader.problems:
-        raise LaunchFileError(sorted(set(reader.problems), key=lambda problem: (str(problem.file), problem.line)))
-    return LaunchDescription(
-        file, tuple(reader.arguments), values or {}, tuple(reader.nodes), tuple(reader.announcements), reader.shutdown
-    )
-
-
-def read_arguments(file: Path, included: bool = False) -> tuple[LaunchArgument, ...]:
-    """The ``arg`` entries of a launch file, whatever else it contains.
-
-    Args:
-        file: the launch file.
-        included: return those of the included files instead, as far as this file leaves them at their defaults.
-
-    Raises:
-        LaunchFileError: the file cannot be read.
-    """
-    from instant_ic.launch.reader import Reader
-
-    reader = Reader(paths.run_dir(), {}, conditions=False)
-    if reader.read_top(file) is None:
-        raise LaunchFileError(reader.problems)
-    return tuple(reader.included if included else reader.arguments)

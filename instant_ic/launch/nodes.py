@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from instant_ic import paths
 from instant_ic.launch.description import HANG_TIMEOUT_S, NodeSpec
@@ -27,9 +29,6 @@ from instant_ic.launch.values import (
     words_of,
 )
 
-if TYPE_CHECKING:
-    from instant_ic.launch.reader import Scope
-
 NODE_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 """Node names that the bus accepts."""
 
@@ -40,6 +39,36 @@ _PROCESS_KEYS = (
 )
 _NODE_KEYS = ("pkg", "exec", "exec_name", "name", "namespace", "param", "remap", "ros_args", "hang_timeout")
 _OUTPUTS = ("both", "screen", "log")
+
+
+@dataclass
+class Scope:
+    """Settings that apply to the actions of one group or file.
+
+    Attributes:
+        context: variables, environment, files.
+        namespace: prefix of its nodes' topics.
+        group: name of its run directory within the stack's; empty: the stack's own.
+        env: variables from ``set_env`` and ``unset_env`` (None).
+        options: ``-p``, ``--params-file`` and ``-r`` arguments for each node.
+        delay_s: wait after the start of the stack.
+    """
+
+    context: Context
+    namespace: str = ""
+    group: str = ""
+    env: dict[str, str | None] = field(default_factory=dict)
+    options: list[str] = field(default_factory=list)
+    delay_s: float = 0.0
+
+    def child(self) -> Scope:
+        """A copy that can change independently."""
+        return dataclasses.replace(self, context=self.context.child(), env=dict(self.env), options=list(self.options))
+
+    @property
+    def run_dir(self) -> Path | None:
+        """Run directory of its nodes; None: the stack's own."""
+        return self.context.run_dir if self.group else None
 
 
 def join_namespace(namespace: str, name: str) -> str:

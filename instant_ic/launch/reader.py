@@ -6,14 +6,21 @@ the reason.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
+from instant_ic import paths
 from instant_ic.launch import nodes
-from instant_ic.launch.description import Announcement, LaunchArgument, NodeSpec, Shutdown, find_launch_file
-from instant_ic.launch.source import Problem, Value, load
+from instant_ic.launch.description import (
+    Announcement,
+    LaunchArgument,
+    LaunchDescription,
+    NodeSpec,
+    Shutdown,
+    find_launch_file,
+)
+from instant_ic.launch.nodes import Scope
+from instant_ic.launch.source import LaunchFileError, Problem, Value, load
 from instant_ic.launch.substitutions import Context, truth
 from instant_ic.launch.values import (
     CONDITION,
@@ -44,36 +51,6 @@ _NOT_HERE = {
     "set_ros_log_dir": "logs lie in the run directory: ic launch --run-dir DIR",
 }
 _TYPES: dict[str, Callable[[str], object]] = {"str": str, "int": int, "float": float, "bool": truth, "path": Path}
-
-
-@dataclass
-class Scope:
-    """Settings that apply to the actions of one group or file.
-
-    Attributes:
-        context: variables, environment, files.
-        namespace: prefix of its nodes' topics.
-        group: name of its run directory within the stack's; empty: the stack's own.
-        env: variables from ``set_env`` and ``unset_env`` (None).
-        options: ``-p``, ``--params-file`` and ``-r`` arguments for each node.
-        delay_s: wait after the start of the stack.
-    """
-
-    context: Context
-    namespace: str = ""
-    group: str = ""
-    env: dict[str, str | None] = field(default_factory=dict)
-    options: list[str] = field(default_factory=list)
-    delay_s: float = 0.0
-
-    def child(self) -> Scope:
-        """A copy that can change independently."""
-        return dataclasses.replace(self, context=self.context.child(), env=dict(self.env), options=list(self.options))
-
-    @property
-    def run_dir(self) -> Path | None:
-        """Run directory of its nodes; None: the stack's own."""
-        return self.context.run_dir if self.group else None
 
 
 class Reader:
@@ -421,3 +398,57 @@ class _Actions:
         reason = text_of(fields.get("reason"), self.context) or "requested by the launch file"
         if self.reader.shutdown is None or self.scope.delay_s < self.reader.shutdown.delay_s:
             self.reader.shutdown = Shutdown(reason, self.scope.delay_s)
+
+
+def read_launch_file(
+    file: Path, arguments: Mapping[str, str] | None = None, run_dir: Path | None = None
+) -> LaunchDescription:
+    """Read and check a launch file with everything that it includes.
+
+    Args:
+        file: the launch file.
+        arguments: values for its ``arg`` entries.
+        run_dir: value of ``$(run-dir)``; default: ``paths.run_dir()``.
+
+    Raises:
+        LaunchFileError: all mistakes found, in file order.
+    """
+    given = dict(arguments or {})
+    reader = Reader(run_dir or paths.run_dir(), given)
+    values = reader.read_top(file)
+    own = {argument.name for argument in reader.arguments}
+    inner = {argument.name: argument.file.name for argument in reader.included}
+    for name in given:
+        if name not in own:
+            hint = f"; {inner[name]} has one: declare it here and hand it to the include" if name in inner else ""
+            text = f"there is no argument {name!r} (arguments: {', '.join(sorted(own)) or 'none'}){hint}"
+            reader.problems.append(Problem(file, 1, text))
+    seen: dict[tuple[Path | None, str], NodeSpec] = {}
+    for node in reader.nodes:
+        key = (node.run_dir, node.name)
+        if key in seen:
+            first = seen[key]
+            text = f"a node named {node.name!r} is already started in line {first.line} of {first.file.name}"
+            reader.problems.append(Problem(node.file, node.line, text))
+        seen.setdefault(key, node)
+    if reader.problems:
+        raise LaunchFileError(sorted(set(reader.problems), key=lambda problem: (str(problem.file), problem.line)))
+    return LaunchDescription(
+        file, tuple(reader.arguments), values or {}, tuple(reader.nodes), tuple(reader.announcements), reader.shutdown
+    )
+
+
+def read_arguments(file: Path, included: bool = False) -> tuple[LaunchArgument, ...]:
+    """The ``arg`` entries of a launch file, whatever else it contains.
+
+    Args:
+        file: the launch file.
+        included: return those of the included files instead, as far as this file leaves them at their defaults.
+
+    Raises:
+        LaunchFileError: the file cannot be read.
+    """
+    reader = Reader(paths.run_dir(), {}, conditions=False)
+    if reader.read_top(file) is None:
+        raise LaunchFileError(reader.problems)
+    return tuple(reader.included if included else reader.arguments)

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from instant_ic.bus.registry import NodeInfo
-from instant_ic.cli.graph import StackGraph, dot, make_graph, mermaid, rate_words, tree, write
+from instant_ic.cli.graph import StackGraph, dot, make_graph, mermaid, rate_words, tree
+from instant_ic.cli.graph_picture import write
 from instant_ic.cli.heartbeats import Flow, Heartbeat
 from instant_ic.cli.layered import is_bend, lay_out, nearest
 

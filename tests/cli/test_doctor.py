@@ -14,7 +14,8 @@ from cli_helpers import talking
 
 from instant_ic import paths
 from instant_ic.cli import doctor
-from instant_ic.cli.doctor import FAIL, OK, WARN, Expectation, Finding
+from instant_ic.cli.doctor import Expectation
+from instant_ic.cli.finding import FAIL, OK, WARN, Finding
 from instant_ic.cli.main import main
 
 

@@ -9,9 +9,10 @@ import pytest
 import tiny_onnx
 
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.camera.jpeg import JpegError, decode_rgb
 from instant_ic.depth.manifest import ModelManifest, save_manifest
 from instant_ic.depth.model import InferenceError
+from instant_ic.jpeg import JpegError
+from instant_ic.limits import decode_rgb
 from instant_ic.msg import compressed_image_message, image_array
 from nodes.depth_estimator import DepthEstimatorConfig, DepthEstimatorNode
 

@@ -15,7 +15,7 @@ from instant_ic.cli.main import main
 from instant_ic.depth.files import DepthFileError
 from instant_ic.depth.metrics import depth_metrics
 from instant_ic.experiments import depth_pictures, depth_worlds
-from instant_ic.experiments.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, look_up, report
+from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, look_up, report
 from instant_ic.experiments.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
 from instant_ic.experiments.depth_lidar import Errors, measure, measure_world
 from instant_ic.experiments.depth_pictures import Sheets
@@ -164,7 +164,7 @@ RGB = np.full((*SIZE, 3), 128, np.uint8)
 def test_scores_before_and_after_scaling():
     truth = box_room((128, 256))
     model = KnownModel(0.5 * box_room((128, 256)))
-    evaluator = Evaluator(Settings("network", LidarSettings()), model)
+    evaluator = Evaluator(DepthSettings("network", LidarSettings()), model)
     scored = evaluator.score("room", RGB, truth)
     # Half the depth everywhere: relative error and error of the scale 0.5, no pixel within 1.25; then mended.
     assert scored.before.mre == pytest.approx(0.5, abs=1e-6)
@@ -187,28 +187,30 @@ def test_scores_before_and_after_scaling():
 
 def test_a_disparity_has_no_metres_before_scaling():
     truth = box_room((128, 256))
-    scored = Evaluator(Settings("network", LidarSettings()), KnownModel(0.4 / truth + 0.1, "disparity")).score(
+    scored = Evaluator(DepthSettings("network", LidarSettings()), KnownModel(0.4 / truth + 0.1, "disparity")).score(
         "room", RGB, truth
     )
     assert scored.before is None
     assert scored.after.mre < 0.02
-    assert report([scored.as_dict()], Settings("network", LidarSettings()), None)["before"] is None
+    assert report([scored.as_dict()], DepthSettings("network", LidarSettings()), None)["before"] is None
 
 
 def test_without_lidar_the_network_s_metres_count():
     truth, raw = box_room(), 1.1 * box_room()
     truth[:8] = 0
-    scored = Evaluator(Settings("network"), KnownModel(raw)).score("room", RGB, truth)
+    scored = Evaluator(DepthSettings("network"), KnownModel(raw)).score("room", RGB, truth)
     assert scored.after == scored.before == depth_metrics(raw, truth)
     assert scored.after.pixels == 56 * 128
     assert scored.fit is None
     assert scored.weighted.mre == pytest.approx(0.1, abs=1e-6)
-    near = Evaluator(Settings("network", max_depth_m=2.0), KnownModel(raw)).score("room", RGB, truth)
+    near = Evaluator(DepthSettings("network", max_depth_m=2.0), KnownModel(raw)).score("room", RGB, truth)
     assert near.after.pixels == int(((truth > 0) & (truth <= 2)).sum())
 
 
 def test_lidar_alone_needs_no_network():
-    scored = Evaluator(Settings("lidar", LidarSettings(outliers=0.05)), None).score("room", RGB, box_room((128, 256)))
+    scored = Evaluator(DepthSettings("lidar", LidarSettings(outliers=0.05)), None).score(
+        "room", RGB, box_room((128, 256))
+    )
     assert scored.before is None
     assert scored.after.delta1 > 0.9
     assert 0 < scored.sigma_share <= 1
@@ -217,16 +219,16 @@ def test_lidar_alone_needs_no_network():
 def test_what_cannot_be_scored_says_why():
     model = KnownModel(box_room())
     with pytest.raises(DepthEvaluationError, match="--lidar"):
-        Settings("fused")
+        DepthSettings("fused")
     with pytest.raises(DepthEvaluationError, match="method"):
-        Settings("network", method="ransac")
+        DepthSettings("network", method="ransac")
     with pytest.raises(DepthEvaluationError, match="above 0"):
-        Settings("network", camera_height_m=0)
+        DepthSettings("network", camera_height_m=0)
     with pytest.raises(DepthEvaluationError, match="needs a model"):
-        Evaluator(Settings("network"), None)
+        Evaluator(DepthSettings("network"), None)
     with pytest.raises(DepthEvaluationError, match="relative"):
-        Evaluator(Settings("network"), KnownModel(box_room(), "relative"))
-    evaluator = Evaluator(Settings("network", LidarSettings()), model)
+        Evaluator(DepthSettings("network"), KnownModel(box_room(), "relative"))
+    evaluator = Evaluator(DepthSettings("network", LidarSettings()), model)
     with pytest.raises(DepthEvaluationError, match=r"room: the picture is 100 x 100"):
         evaluator.score("room", np.zeros((100, 100, 3), np.uint8), box_room())
     with pytest.raises(DepthEvaluationError, match=r"room: the true depth is 64 x 64"):
@@ -239,7 +241,9 @@ def test_what_cannot_be_scored_says_why():
 
 def test_a_network_that_fits_nothing_is_not_ok_and_says_so():
     noise = np.random.default_rng(0).uniform(0.5, 12, (128, 256)).astype(np.float32)
-    scored = Evaluator(Settings("network", LidarSettings()), KnownModel(noise)).score("room", RGB, box_room((128, 256)))
+    scored = Evaluator(DepthSettings("network", LidarSettings()), KnownModel(noise)).score(
+        "room", RGB, box_room((128, 256))
+    )
     assert not scored.fit["ok"]
     assert scored.fit["message"]
 
@@ -292,7 +296,7 @@ def test_a_png_has_its_own_unit_and_unknown_values(tmp_path):
 
 def test_pages_of_pictures(tmp_path, monkeypatch):
     monkeypatch.setattr(depth_pictures, "ROWS", 2)
-    scored = Evaluator(Settings("lidar", LidarSettings()), None).score("raum-ä", RGB, box_room())
+    scored = Evaluator(DepthSettings("lidar", LidarSettings()), None).score("raum-ä", RGB, box_room())
     for side in (False, True):
         sheets = Sheets(tmp_path / f"{side}.png", side)
         for _ in range(3):

@@ -165,7 +165,7 @@ def test_summary_by_hand() -> None:
     standing = teleop_figures.summary(stop)
     assert standing["switches_per_obstacle"] == 0.0 and standing["switch_psnr_db"] is None
     assert not teleop_figures.targets(standing)["one switch each way an obstacle"]
-    settings = teleop.Settings(episodes=2, methods=("ic", "stop"))
+    settings = teleop.TeleopSettings(episodes=2, methods=("ic", "stop"))
     assert teleop_figures.targets(standing)["switch_position_error_m <= 0.02"] is None  # there was no switch
     told = json.loads(json.dumps(teleop_results.report(ic + stop, settings), allow_nan=False))
     assert set(told["methods"]) == {"ic", "stop"} and len(told["each"]) == 4 and "tracks" not in told["each"][0]
@@ -179,7 +179,7 @@ def test_without_obstacles_nothing_is_divided_by_them() -> None:
 
 
 class TestResults:
-    settings = teleop.Settings(episodes=2, methods=("ic", "stop"))
+    settings = teleop.TeleopSettings(episodes=2, methods=("ic", "stop"))
     drives = (
         Drive(
             0, "ic", True, seconds=9.5, way_m=8.0, mode_seconds={"real": 9.5},
@@ -201,14 +201,14 @@ class TestResults:
 
     def test_only_what_is_asked_for_is_taken_up(self, tmp_path: Path) -> None:
         teleop_results.save(tmp_path / "out.json", self.drives, self.settings)
-        fewer = teleop.Settings(episodes=1, methods=("ic", "shared"))
+        fewer = teleop.TeleopSettings(episodes=1, methods=("ic", "shared"))
         assert [d.method for d in teleop_results.load(tmp_path / "out.json", fewer)] == ["ic"]
 
     def test_what_cannot_be_taken_up(self, tmp_path: Path) -> None:
         file = tmp_path / "out.json"
         teleop_results.save(file, self.drives, self.settings)
         with pytest.raises(ValueError, match="driven with seed 0, not 3"):
-            teleop_results.load(file, teleop.Settings(episodes=2, methods=("ic", "stop"), seed=3))
+            teleop_results.load(file, teleop.TeleopSettings(episodes=2, methods=("ic", "stop"), seed=3))
         for words in ("{}", "[1]", "no JSON", file.read_text()[:-20], file.read_text().replace("contacts", "bumps")):
             file.write_text(words)
             with pytest.raises(ValueError, match="not a report of ic evaluate teleop"):
@@ -453,7 +453,7 @@ def short_course() -> teleop_worlds.Course:
 
 @pytest.mark.parametrize("method", ["ic", "stop", "shared"])
 def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp_path: Path) -> None:
-    settings = teleop.Settings(episodes=1, world="corridor", depth="lidar", methods=(method,), pictures=False)
+    settings = teleop.TeleopSettings(episodes=1, world="corridor", depth="lidar", methods=(method,), pictures=False)
     episode = teleop._Episode(settings, short_course, 0, method)
     if method == "shared":  # its film and its plot, once
         with Video(tmp_path / "drive.mp4") as video:

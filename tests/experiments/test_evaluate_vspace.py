@@ -10,7 +10,8 @@ import pytest
 from instant_ic.cli.main import main
 from instant_ic.experiments import box_room, vspace, vspace_sources
 from instant_ic.experiments.colour_only import ColourOnlyField, composite_gradient, density
-from instant_ic.experiments.vspace import Report, Row, Settings, evaluate, path_poses, scores, start_pose
+from instant_ic.experiments.vspace import Report, Row, evaluate, path_poses, scores, start_pose
+from instant_ic.experiments.vspace_sources import VspaceSettings
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.worlds import corridor_world
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
@@ -69,7 +70,7 @@ def rows(source, psnr, ssim):
 
 
 def test_means_and_verdict_by_hand():
-    settings = Settings(paths=("straight",))
+    settings = VspaceSettings(paths=("straight",))
     report = Report("corridor", (0, 0, 0), settings, {})
     report.rows += rows("ours", (40, 30, 28), (1, 0.9, 0.8))
     report.rows += rows("panorama", (40, 20, 29), (1, 0.5, 0.4))
@@ -99,7 +100,7 @@ def test_means_and_verdict_by_hand():
 )
 def test_settings_that_make_no_sense_are_refused(change, words):
     with pytest.raises(ValueError, match=words):
-        Settings(**change)
+        VspaceSettings(**change)
 
 
 def test_the_scanned_world_has_the_same_shape_in_other_colours(world):
@@ -162,7 +163,7 @@ def test_colours_alone_are_learnt_but_not_where_they_are():
 @pytest.fixture(scope="module")
 def report(world):
     made = {"corridor": world, "corridor-free": corridor_world(light_cell_m=0.5, obstacle=False)}
-    settings = Settings(
+    settings = VspaceSettings(
         paths=("straight",), sources=tuple(vspace.SOURCES), seconds=0.2, times=(0.1, 0.2), size=(96, 54),
         panorama_width=256, step_m=1.0, reach_m=1.0,
     )  # fmt: skip

@@ -249,8 +249,8 @@ def _previews() -> list[bytes]:
 
 
 def _parse_preview() -> Callable[[bytes], object]:
-    from instant_ic.camera.jpeg import JpegError, jpeg_size
     from instant_ic.camera.preview import PreviewParser
+    from instant_ic.jpeg import JpegError, jpeg_size
 
     def parse(data: bytes) -> None:
         parser = PreviewParser(max_frame_bytes=2000)
@@ -810,7 +810,7 @@ _SMALL_LAUNCH = b"launch:\n- arg: {name: a, default: b}\n- node: {exec: arbiter,
 
 
 def _parse_launch() -> Callable[[bytes], object]:
-    from instant_ic.launch.description import read_launch_file
+    from instant_ic.launch.reader import read_launch_file
 
     folder = _folder()
     (folder / "small.yaml").write_bytes(_SMALL_LAUNCH)
@@ -883,13 +883,13 @@ def _images() -> list[bytes]:
 
 
 def _parse_image() -> Callable[[bytes], object]:
-    from instant_ic.camera.jpeg import decode_rgb
+    from instant_ic.limits import decode_rgb
 
     return lambda data: decode_rgb(data, 8, 8)
 
 
 def _image_errors() -> tuple[type[BaseException], ...]:
-    from instant_ic.camera.jpeg import JpegError
+    from instant_ic.jpeg import JpegError
 
     return (JpegError,)
 

@@ -29,7 +29,8 @@ def add_parser(subparsers: Any) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the checks and print a line for each."""
     from instant_ic import paths
-    from instant_ic.cli.doctor import FAIL, OK, WARN, run_checks
+    from instant_ic.cli.doctor import run_checks
+    from instant_ic.cli.finding import FAIL, OK, WARN
 
     colours = {OK: "32", WARN: "33", FAIL: "31"} if sys.stdout.isatty() else {}
     counts = {OK: 0, WARN: 0, FAIL: 0}

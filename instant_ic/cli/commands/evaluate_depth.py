@@ -68,7 +68,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     from instant_ic.depth.files import DepthFileError, load_picture
     from instant_ic.depth.manifest import ManifestError
     from instant_ic.depth.model import DEFAULT_MODEL, DepthModel, InferenceError
-    from instant_ic.experiments.depth import DepthEvaluationError, Evaluator, LidarSettings, Settings, report
+    from instant_ic.experiments.depth import DepthEvaluationError, DepthSettings, Evaluator, LidarSettings, report
     from instant_ic.experiments.depth_files import PairError, find_pictures, load_truth, pair, unit_warning
     from instant_ic.experiments.depth_pictures import Sheets
     from instant_ic.paths import shipped_file
@@ -88,7 +88,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     try:
         lidar = LidarSettings(args.lidar_height, args.noise, args.outliers, args.seed) if args.lidar else None
         source = args.source or ("fused" if lidar else "network")
-        settings = Settings(source, lidar, args.camera_height, args.method, args.max_depth)
+        settings = DepthSettings(source, lidar, args.camera_height, args.method, args.max_depth)
         model = None
         if source != "lidar":
             model = DepthModel.load(args.model or shipped_file("models", DEFAULT_MODEL), threads=args.threads)

@@ -120,7 +120,7 @@ def _evaluate(args: argparse.Namespace, console: Any) -> int:
     from instant_ic.experiments import teleop, teleop_results
 
     methods = tuple(name.strip() for name in args.methods.split(",") if name.strip())
-    settings = teleop.Settings(
+    settings = teleop.TeleopSettings(
         args.episodes, args.seed, args.world, methods, args.depth, args.log, overrides=tuple(args.param)
     )
     drives: list[teleop.Drive] = []

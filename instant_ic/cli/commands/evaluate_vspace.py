@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     try:
-        settings = vspace.Settings(
+        settings = vspace.VspaceSettings(
             paths=_words(args.path),
             sources=_words(args.sources),
             seconds=args.seconds,

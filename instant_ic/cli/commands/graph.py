@@ -39,7 +39,8 @@ def show(args: argparse.Namespace) -> int:
     """Print the tree, or write the image."""
     from instant_ic import paths
     from instant_ic.bus import registry
-    from instant_ic.cli.graph import make_graph, tree, write
+    from instant_ic.cli.graph import make_graph, tree
+    from instant_ic.cli.graph_picture import write
     from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node, nobody_runs
 

@@ -1,14 +1,6 @@
-"""Checks and size of a JPEG without decoding it (ITU-T T.81, annex B), and decoding at reduced size."""
+"""Checks and size of a JPEG without decoding it (ITU-T T.81, annex B)."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from instant_ic.limits import MOST_PIXELS, decode_image
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 SOI = b"\xff\xd8"
 EOI = b"\xff\xd9"
@@ -61,33 +53,3 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int]:
             break
         at += 2 + length
     raise JpegError("has no frame header")
-
-
-def decode_rgb(data: bytes | bytearray | NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Decode to (H, W, 3) uint8 RGB of at least ``width`` x ``height``.
-
-    The decoder reduces the image 2, 4 or 8 times where the result is still large enough, and then computes
-    correspondingly less of the inverse cosine transform. The reduced size is rounded up.
-
-    Raises:
-        JpegError: the data cannot be decoded.
-    """
-    import cv2
-    import numpy as np
-
-    flag = cv2.IMREAD_COLOR
-    try:
-        full_width, full_height = jpeg_size(bytes(data[:65536]))
-    except JpegError:  # may be a PNG
-        full_width, full_height = 0, 0
-    for n, reduced in (
-        (2, cv2.IMREAD_REDUCED_COLOR_2),
-        (4, cv2.IMREAD_REDUCED_COLOR_4),
-        (8, cv2.IMREAD_REDUCED_COLOR_8),
-    ):
-        if full_width >= n * width and full_height >= n * height:
-            flag = reduced
-    bgr = decode_image(data, flag)
-    if bgr is None:
-        raise JpegError(f"cannot be decoded as JPEG or PNG of at most {MOST_PIXELS} pixels")
-    return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

@@ -1,0 +1,55 @@
+"""Settings of ``ic evaluate teleop``."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from pathlib import Path
+
+from instant_ic.experiments.teleop_stack import DEPTHS, METHODS, StackConfig
+from instant_ic.experiments.teleop_worlds import RANDOM_CORRIDORS, Course, make_course
+
+
+@dataclass(frozen=True)
+class TeleopSettings:
+    """TeleopSettings of one evaluation.
+
+    Attributes:
+        episodes, seed: which drives; the same seed gives the same drives.
+        world: ``corridors`` (random ones), or a world of the simulator.
+        methods: of ``METHODS``.
+        depth: of ``DEPTHS``.
+        log: a recorded operator's commands: a bag or a CSV file; None: the scripted operator.
+        pictures: whether to render and compare the images on either side of a switch.
+        overrides: parameters ``node.key:=value`` on top of the shipped ones.
+    """
+
+    episodes: int = 50
+    seed: int = 0
+    world: str = RANDOM_CORRIDORS
+    methods: tuple[str, ...] = METHODS
+    depth: str = "fused"
+    log: Path | None = None
+    pictures: bool = True
+    overrides: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.episodes < 1:
+            raise ValueError(f"episodes must be at least 1 (got {self.episodes})")
+        for key, given, allowed in (("methods", self.methods, METHODS), ("depth", (self.depth,), DEPTHS)):
+            unknown = [name for name in given if name not in allowed]
+            if unknown or not given:
+                raise ValueError(f"{key} must be some of {', '.join(allowed)} (got {', '.join(unknown) or 'none'})")
+        StackConfig(overrides=self.overrides)  # raises ValueError on a malformed override
+
+    def course(self, index: int) -> Course:
+        """Return course ``index``.
+
+        Raises:
+            ValueError: no such world, or no possible drive in it.
+        """
+        return _course(self.world, self.seed, index, self.log is not None)
+
+
+_course = functools.lru_cache(maxsize=2)(make_course)
+"""Cached: all methods drive the same course."""
