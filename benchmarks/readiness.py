@@ -2,7 +2,7 @@
 
     python benchmarks/readiness.py [--mesh house.glb] [--fit]
 
-Keyframes have the true depth with a smooth error of known size. ``--fit`` fits the gains of ``nerf/readiness.py`` to
+Keyframes have the true depth with a smooth error of known size. ``--fit`` fits the gains of ``vspace/readiness.py`` to
 the random worlds; the corridor and the mesh are for testing only.
 """
 
