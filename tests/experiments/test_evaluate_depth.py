@@ -288,7 +288,7 @@ def test_a_png_has_its_own_unit_and_unknown_values(tmp_path):
     assert np.allclose(load_truth(path, 1 / 512), [[1, 2], [0, 0]])
     assert np.allclose(load_truth(path), [[0.512, 1.024], [0, 0]])
     cv2.imwrite(str(path), np.full((4, 8), 65535, np.uint16))
-    with pytest.raises(DepthFileError, match=r"a.png: no known depth"):
+    with pytest.raises(DepthFileError, match=r"a.png: contains no known depth"):
         load_truth(path)
     np.save(tmp_path / "b.npy", np.full((4, 8), 70.0))
     assert np.all(load_truth(tmp_path / "b.npy", 1 / 512) == 70)

@@ -164,7 +164,7 @@ def test_colours_alone_are_learnt_but_not_where_they_are():
 def report(world):
     made = {"corridor": world, "corridor-free": corridor_world(light_cell_m=0.5, obstacle=False)}
     settings = VspaceSettings(
-        paths=("straight",), sources=tuple(vspace.SOURCES), seconds=0.2, times=(0.1, 0.2), size=(96, 54),
+        paths=("straight",), sources=tuple(vspace_sources.SOURCES), seconds=0.2, times=(0.1, 0.2), size=(96, 54),
         panorama_width=256, step_m=1.0, reach_m=1.0,
     )  # fmt: skip
     words = []
@@ -175,7 +175,7 @@ def report(world):
 
 def test_every_source_has_its_rows(report):
     report, words = report
-    assert len(report.rows) == len(vspace.SOURCES) * 2
+    assert len(report.rows) == len(vspace_sources.SOURCES) * 2
     assert all(0 < row.psnr_db <= 99 and -1 <= row.ssim <= 1 and row.seconds >= 0 for row in report.rows)
     assert words[-1][1] == words[-1][2] == len(report.rows)
     assert {row.seconds for row in report.training} == {0.1, 0.2}

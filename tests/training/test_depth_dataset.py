@@ -47,7 +47,7 @@ def test_unfinished_folder_opens_and_foreign_ones_do_not(tmp_path: Path) -> None
     assert len(PanoramaDataset(tmp_path / "cut")) == 2
     with pytest.raises(DatasetError, match="not a panorama data folder"):
         PanoramaDataset(tmp_path)
-    with pytest.raises(DatasetError, match="wanted"):
+    with pytest.raises(DatasetError, match="expected"):
         list(write_dataset(tmp_path / "bad", stripes(1, 1, height=4), 1, (8, 16), {}))
 
 

@@ -197,8 +197,8 @@ class Evil:
     [
         ({"bi_rnn__weight_ih_l0": None}, r"of 280 tensors 1 missing \(bi_rnn\.weight_ih_l0\)"),
         ({"extra": torch.zeros(1)}, r"of 280 tensors 1 unknown \(extra\)"),
-        ({"bi_rnn__bias_ih_l0": torch.zeros(3)}, r"1 of another shape .*_l0 is \(3,\) instead of \(64,\)\)"),
-        ({"bi_rnn__bias_ih_l0": torch.full((64,), torch.nan)}, r"1 tensors hold values that are no numbers"),
+        ({"bi_rnn__bias_ih_l0": torch.zeros(3)}, r"1 with another shape .*_l0 is \(3,\) instead of \(64,\)\)"),
+        ({"bi_rnn__bias_ih_l0": torch.full((64,), torch.nan)}, r"1 tensors have non-finite values"),
         ({"bi_rnn__bias_ih_l0": "text"}, "does not hold tensors by name"),
         ({"state_dict": [1]}, "does not hold tensors by name"),
         ({"state_dict": None}, r"no 'state_dict' in the file \(it has: config\)"),

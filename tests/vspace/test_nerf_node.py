@@ -241,7 +241,7 @@ def test_a_pose_far_off_is_drawn_without_confidence_and_told(bus):
     assert near.expected_psnr_db > 20
     bus.publish("/view/request", request_message(2, pose=pose_matrix(x=300.0, yaw=2.0)))
     level, words, _ = diagnosis(bus, "view")
-    assert (level, "far off" in words) == (1, True)
+    assert (level, "far away" in words) == (1, True)
     view = bus.last("/vspace/view")
     assert (view.request_id, view.confidence) == (2, 0)
     assert (len(view.depth_png), view.depth_near_m) == (0, 0)
