@@ -75,7 +75,7 @@ def test_fault_the_token_goes_to_the_log(tmp_path_factory, terminal):
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
         token = re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=(\S{20,})", address)[1].encode()
         # What was logged before a reader of /rosout had found the console is in its log file alone.
-        wait_for(lambda: b"picture from the camera" in heard["/rosout"], "log of the console on /rosout")
+        wait_for(lambda: b"image from the camera" in heard["/rosout"], "log of the console on /rosout")
         wait_for(lambda: heard["/diagnostics"] and heard["/heartbeat"], "diagnostics")
     finally:
         process.send_signal(signal.SIGINT)
