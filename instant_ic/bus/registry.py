@@ -306,12 +306,22 @@ def list_topics(run_dir: Path) -> list[TopicInfo]:
 
 
 def list_nodes(run_dir: Path) -> list[NodeInfo]:
-    """Live nodes, by name."""
+    """Live nodes, by name. Keys that this version does not know are ignored.
+
+    Raises:
+        RegistryError: an entry is incomplete, as of a node of another version. It could be a base: it is not skipped.
+    """
     known = {item.name for item in fields(NodeInfo)}
     found = []
     for entry in _entries(run_dir / "nodes"):
-        with suppress(TypeError):  # another version of this stack, in another language perhaps, wrote it
+        try:
             found.append(NodeInfo(**{key: value for key, value in entry.items() if key in known}))
+        except TypeError as error:
+            name, pid = entry.get("name", "?"), entry.get("pid", "?")
+            raise RegistryError(
+                f"{run_dir / 'nodes'}: entry of node {name} (pid {pid}) is incomplete: stop that node, "
+                "it is of another version"
+            ) from error
     return found
 
 

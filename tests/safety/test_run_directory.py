@@ -180,3 +180,16 @@ def test_a_symbolic_link_where_a_socket_goes_is_replaced_and_not_followed(tmp_pa
     assert stat.S_ISSOCK(path.lstat().st_mode)
     claim.release()
     assert target.read_text() == "precious"
+
+
+def test_an_incomplete_entry_of_a_node_is_named_and_not_skipped(tmp_path):
+    claim = registry.Claim(registry.prepare(tmp_path / "r") / "nodes" / "crawler_base", "node crawler_base")
+    try:
+        entry = {"name": "crawler_base", "pid": 7, "started_ns": 0, "params": {}}
+        claim.write({**entry, "module": "of another version"})
+        with pytest.raises(registry.RegistryError, match=r"node crawler_base \(pid 7\) is incomplete: stop that node"):
+            registry.list_nodes(tmp_path / "r")
+        claim.write({**entry, "executable": "crawler_base", "unknown": 1})
+        assert [node.name for node in registry.list_nodes(tmp_path / "r")] == ["crawler_base"]
+    finally:
+        claim.release()
