@@ -17,11 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
+from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import Relations, evaluate_log, perturb_odometry, read_relations, read_stamps
 from instant_ic.experiments.slam_worlds import LASERS, cells, drive, office, ring, trajectory_errors
 from instant_ic.geometry.poses import compose2
-from instant_ic.slam import GridSlam, Scan, SlamConfig
-from instant_ic.slam.backend import warm_up
+from instant_ic.slam import GridSlam, Scan
+from instant_ic.slam.grid_slam import warm_up
 from instant_ic.slam.logs import LogEntry, read_log
 
 KEPT = (
@@ -73,11 +74,11 @@ def room_drive(scans: int, beams: int = 720) -> list[dict[str, object]]:
 
 
 def intel(
-    entries: list[LogEntry], relations: Relations, seed: int | None = None, backend: str = "graph"
+    entries: list[LogEntry], relations: Relations, seed: int | None = None, particles: ParticleConfig | None = None
 ) -> dict[str, object]:
     """The Intel log; ``seed`` degrades its odometry."""
     source = entries if seed is None else perturb_odometry(entries, seed)
-    report, _ = evaluate_log(source, relations, SlamConfig(backend=backend))
+    report, _ = evaluate_log(source, relations, particles=particles)
     return {key: report[key] for key in KEPT if key in report}
 
 
@@ -142,7 +143,7 @@ def main() -> None:
             if "intel_seeds" in args.only:
                 report["intel_seeds"] = [intel(entries, relations, seed) for seed in range(1, 6)]
             if "intel_rbpf" in args.only:
-                report["intel_rbpf"] = intel(entries, relations, backend="rbpf")
+                report["intel_rbpf"] = intel(entries, relations, particles=ParticleConfig())
         else:
             report["intel"] = f"left out: {args.data / 'intel.log.gz'} is missing"
     if "worlds" in args.only:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from instant_ic.base.config import OdometryNoiseConfig, SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
+from instant_ic.geometry.poses import planar_covariance
 
 UNMEASURED_VARIANCE = 1e6
 """Variance of z, roll and pitch, which encoders do not measure."""
@@ -92,7 +93,7 @@ class WheelOdometry:
             stamp_ns=stamp_ns,
             pose=self._pose.copy(),
             twist=step / dt_s,
-            pose_covariance=_six(self._covariance),
+            pose_covariance=planar_covariance(self._covariance, UNMEASURED_VARIANCE),
             twist_covariance=self._twist_covariance(step, dt_s),
         )
 
@@ -130,17 +131,9 @@ class WheelOdometry:
                 self.noise.w_floor**2 + (self.noise.yaw_per_metre * distance + self.noise.yaw_per_radian * turn) / dt_s,
             ]
         )
-        return _six(planar)
+        return planar_covariance(planar, UNMEASURED_VARIANCE)
 
 
 def unwrap_counts(before: NDArray[np.int64], now: NDArray[np.int64]) -> NDArray[np.int64]:
     """Signed pulses from one unsigned 32-bit count to the next, in the shorter direction."""
     return (now - before + 2**31) % 2**32 - 2**31
-
-
-def _six(planar: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Expand a (3, 3) covariance of x, y, yaw to (6, 6) of x, y, z, rx, ry, rz."""
-    full = np.diag(np.full(6, UNMEASURED_VARIANCE))
-    rows = np.array([0, 1, 5])
-    full[np.ix_(rows, rows)] = planar
-    return full

@@ -16,15 +16,45 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
-from instant_ic.slam import SlamConfig, SlamResult
-from instant_ic.slam.backend import Slam, make_slam, warm_up
-from instant_ic.slam.grid_slam import Anchor
+from instant_ic.slam import GridSlam, OccupancyGrid, Scan, SlamConfig, SlamResult
+from instant_ic.slam.grid_slam import Anchor, warm_up
 from instant_ic.slam.logs import LogEntry, LogError, open_log
 from instant_ic.slam.scan import FloatArray
+
+
+class Slam(Protocol):
+    """What the evaluation uses of a SLAM method: `GridSlam`, or the paper's particle filter."""
+
+    def process(self, scan: Scan, odom_pose: ArrayLike | None, base_from_laser: ArrayLike) -> SlamResult:
+        """Estimate the pose of a scan."""
+        ...
+
+    def background_job(self) -> Callable[[], Any] | None:
+        """Return pending work or None; pass its result to `take_over`."""
+        ...
+
+    def take_over(self, outcome: Any) -> None:
+        """Apply the result of a background job."""
+        ...
+
+    def finish(self) -> None:
+        """Complete all pending work after the last scan."""
+        ...
+
+    def grid(self) -> OccupancyGrid:
+        """Return the map."""
+        ...
+
+    def figures(self) -> dict[str, object]:
+        """Return state figures for reports."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -190,6 +220,7 @@ def run_log(
     entries: Iterable[LogEntry],
     config: SlamConfig | None = None,
     *,
+    particles: ParticleConfig | None = None,
     use_wheel_odom: bool = True,
     on_scan: Callable[[int], None] | None = None,
 ) -> LogResult:
@@ -201,13 +232,14 @@ def run_log(
     Args:
         entries: of `instant_ic.slam.logs.read_log`, or compatible.
         config: defaults when None.
+        particles: run the particle filter instead of the grid SLAM.
         use_wheel_odom: False ignores the log's odometry.
         on_scan: called with the number of processed scans, for a progress bar.
 
     Raises:
         LogError: the log has no scan.
     """
-    slam = make_slam(config)
+    slam: Slam = GridSlam(config) if particles is None else ParticleSlam(particles, config)
     warm_up(config)
     stamps: list[float] = []
     logger: list[float] = []
@@ -295,6 +327,7 @@ def evaluate_log(
     relations: Relations | None = None,
     config: SlamConfig | None = None,
     *,
+    particles: ParticleConfig | None = None,
     use_wheel_odom: bool = True,
     tolerance_s: float = 0.006,
     on_scan: Callable[[int], None] | None = None,
@@ -304,7 +337,7 @@ def evaluate_log(
     Figures of the final trajectory have plain names; ``online_translation_mean_m`` and ``online_rotation_mean_deg``
     refer to the poses published online.
     """
-    result = run_log(entries, config, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
+    result = run_log(entries, config, particles=particles, use_wheel_odom=use_wheel_odom, on_scan=on_scan)
     report: dict[str, object] = {}
     if relations is not None:
         times = result.relation_times(relations, tolerance_s)

@@ -160,3 +160,16 @@ def inverse2(a: ArrayLike) -> Pose2:
 def relative2(a: ArrayLike, b: ArrayLike) -> Pose2:
     """``b`` in the frame of ``a``: ``inverse2(a) ∘ b``."""
     return compose2(inverse2(a), b)
+
+
+def planar_covariance(covariance: NDArray[np.float64], unmeasured: float = 0.0) -> NDArray[np.float64]:
+    """Covariance (6, 6) in the order x y z rx ry rz from one of x, y, yaw (3, 3).
+
+    Args:
+        covariance: (3, 3).
+        unmeasured: variance of z, roll and pitch.
+    """
+    full = np.diag(np.full(6, unmeasured))
+    planar = np.ix_([0, 1, 5], [0, 1, 5])
+    full[planar] = covariance
+    return full

@@ -1,4 +1,4 @@
-"""Grid SLAM in the plane: scan matching, keyframes, occupancy grid. Arrays in, arrays out.
+"""Grid SLAM in the plane: scan matching, keyframes, loop closure, occupancy grid. Arrays in, arrays out.
 
 ```python
 from instant_ic.slam import GridSlam, Scan, SlamConfig
@@ -15,12 +15,11 @@ from instant_ic.slam.config import (
     LoopConfig,
     MapConfig,
     MatchConfig,
-    MotionConfig,
     OdometryNoise,
-    ParticleConfig,
     SlamConfig,
 )
-from instant_ic.slam.grid_slam import GridSlam, SlamResult, SlamStatus
+from instant_ic.slam.front_end import SlamStatus
+from instant_ic.slam.grid_slam import GridSlam, SlamResult
 from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
 from instant_ic.slam.scan import Scan
 
@@ -31,11 +30,9 @@ __all__ = [
     "LoopConfig",
     "MapConfig",
     "MatchConfig",
-    "MotionConfig",
     "OccupancyGrid",
     "OccupancyMap",
     "OdometryNoise",
-    "ParticleConfig",
     "Scan",
     "SlamConfig",
     "SlamResult",

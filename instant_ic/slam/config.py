@@ -1,31 +1,18 @@
-"""Parameters of the grid SLAM: one frozen dataclass per concept. `config/slam.yaml` describes each parameter."""
+"""Parameters of the grid SLAM: one frozen dataclass per concept. Metres, radians, seconds.
+
+Values that depend on the method alone, not on the robot, the sensor or the place, are constants beside the code that
+uses them.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Literal
 
+from instant_ic.config.ranges import NotNegative, Positive, PositiveInt, Range, check_ranges
 
-def _require(config: Any, key: str, condition: bool, rule: str) -> None:
-    if not condition:
-        raise ValueError(f"{type(config).__name__}.{key} must be {rule} (got {getattr(config, key)!r})")
-
-
-def _require_positive(config: Any, *keys: str) -> None:
-    for key in keys:
-        value = getattr(config, key)
-        _require(config, key, math.isfinite(value) and value > 0, "> 0")
-
-
-def _require_not_negative(config: Any, *keys: str) -> None:
-    for key in keys:
-        value = getattr(config, key)
-        _require(config, key, math.isfinite(value) and value >= 0, ">= 0")
-
-
-BACKENDS = ("graph", "rbpf")
+Score = Annotated[float, Range(above=0, below=1)]
 
 
 @dataclass(frozen=True)
@@ -34,238 +21,202 @@ class OdometryNoise:
 
     Translation: ``translation_floor_m + translation_per_m·d``; rotation:
     ``rotation_floor_rad + rotation_per_rad·a + rotation_per_m·d``.
+
+    Attributes:
+        translation_floor_m: constant part of σ in translation, also while standing.
+        translation_per_m: σ in translation per metre of odometry translation; tracks slip.
+        rotation_floor_rad: constant part of σ in heading, also while standing.
+        rotation_per_rad: σ in heading per radian of odometry; skid steering turns less than the encoders.
+        rotation_per_m: σ in heading per metre of odometry translation.
     """
 
-    translation_floor_m: float = 0.01
-    translation_per_m: float = 0.2
-    rotation_floor_rad: float = 0.03
-    rotation_per_rad: float = 0.2
-    rotation_per_m: float = 0.1
+    translation_floor_m: Positive = 0.01
+    translation_per_m: NotNegative = 0.2
+    rotation_floor_rad: Positive = 0.03
+    rotation_per_rad: NotNegative = 0.2
+    rotation_per_m: NotNegative = 0.1
 
     def __post_init__(self) -> None:
-        _require_positive(self, "translation_floor_m", "rotation_floor_rad")
-        _require_not_negative(self, "translation_per_m", "rotation_per_rad", "rotation_per_m")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Local map for scan matching: a likelihood field built from recent keyframes."""
+    """Local map for scan matching: a likelihood field built from recent keyframes.
 
-    resolution_m: float = 0.05
-    sigma_m: float = 0.06
-    surface_sigma_m: float = 0.04
-    keyframes: int = 40
-    max_range_m: float = 25.0
-    join_gap_m: float = 0.3
+    Attributes:
+        resolution_m: cell size; also the translation step of the search.
+        sigma_m: width of a surface; a larger value tolerates larger errors but is less precise.
+        keyframes: number of recent keyframes in the local map; more reduce drift and cost more.
+        max_range_m: farther hits are not matched.
+    """
+
+    resolution_m: Positive = 0.05
+    sigma_m: Positive = 0.06
+    keyframes: PositiveInt = 40
+    max_range_m: Positive = 25.0
 
     def __post_init__(self) -> None:
-        _require_positive(self, "resolution_m", "sigma_m", "surface_sigma_m", "max_range_m")
-        _require_not_negative(self, "join_gap_m")
-        _require(self, "keyframes", self.keyframes >= 1, ">= 1")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """Correlative search and Gauss-Newton refinement."""
+    """Search for the pose of a scan in the local map.
+
+    Attributes:
+        max_points: maximum number of points per scan, evenly chosen; the cost grows with it.
+        min_points: a scan with fewer points is not matched; odometry decides.
+        search_translation_m: half width of the search around the predicted pose; grows with the odometry step.
+        search_rotation_rad: half width of the search in heading; grows with the odometry step.
+        recovery_score: a score below this (0..1) starts the wide search.
+        recovery_translation_m: half width of the wide search.
+        recovery_rotation_rad: half width of the wide search in heading.
+        min_score: below this the scan counts as lost: the pose comes from odometry.
+        free_motion_speed_mps: without odometry: maximum speed of the robot, for the width of the search.
+        free_motion_yaw_rate_radps: without odometry: maximum yaw rate, for the width of the search.
+    """
 
     max_points: int = 240
-    min_points: int = 20
-    point_spacing_m: float = 0.04
-    search_translation_m: float = 0.3
-    search_translation_per_m: float = 0.4
-    search_rotation_rad: float = 0.3
-    search_rotation_per_rad: float = 0.4
-    search_rotation_per_m: float = 0.2
-    coarse_rotation_step_rad: float = 0.02
-    fine_rotation_step_rad: float = 0.005
-    residual_sigma: float = 0.6
-    odometry_cutoff: float = 4.0
-    refine_iterations: int = 20
-    recovery_score: float = 0.6
-    recovery_translation_m: float = 1.2
-    recovery_rotation_rad: float = 1.2
-    min_score: float = 0.35
-    restart_after_lost_scans: int = 10
-    free_motion_speed_mps: float = 1.0
-    free_motion_yaw_rate_radps: float = 1.5
+    min_points: Annotated[int, Range(low=3)] = 20
+    search_translation_m: Positive = 0.3
+    search_rotation_rad: Positive = 0.3
+    recovery_score: Score = 0.6
+    recovery_translation_m: Positive = 1.2
+    recovery_rotation_rad: Positive = 1.2
+    min_score: Score = 0.35
+    free_motion_speed_mps: Positive = 1.0
+    free_motion_yaw_rate_radps: Positive = 1.5
 
     def __post_init__(self) -> None:
-        _require_positive(
-            self,
-            "search_translation_m",
-            "search_rotation_rad",
-            "coarse_rotation_step_rad",
-            "fine_rotation_step_rad",
-            "residual_sigma",
-            "odometry_cutoff",
-            "recovery_translation_m",
-            "recovery_rotation_rad",
-            "free_motion_speed_mps",
-            "free_motion_yaw_rate_radps",
-        )
-        _require_not_negative(
-            self,
-            "point_spacing_m",
-            "search_translation_per_m",
-            "search_rotation_per_rad",
-            "search_rotation_per_m",
-        )
-        _require(self, "min_points", self.min_points >= 3, ">= 3")
-        _require(self, "max_points", self.max_points >= self.min_points, ">= min_points")
-        _require(self, "refine_iterations", self.refine_iterations >= 0, ">= 0")
-        _require(self, "min_score", 0 < self.min_score < 1, "between 0 and 1")
-        _require(self, "recovery_score", self.min_score <= self.recovery_score < 1, "between min_score and 1")
-        _require(self, "restart_after_lost_scans", self.restart_after_lost_scans >= 1, ">= 1")
+        check_ranges(self)
+        if self.max_points < self.min_points:
+            raise ValueError(f"max_points must be >= min_points (got {self.max_points}, {self.min_points})")
+        if self.recovery_score < self.min_score:
+            raise ValueError(f"recovery_score must be >= min_score (got {self.recovery_score}, {self.min_score})")
 
 
 @dataclass(frozen=True)
 class KeyframeConfig:
-    """Motion since the last keyframe after which a scan becomes a keyframe."""
+    """Motion since the last keyframe after which a scan becomes a keyframe.
 
-    distance_m: float = 0.25
-    rotation_rad: float = 0.2
+    Attributes:
+        distance_m: translation after which a scan becomes a keyframe of the map.
+        rotation_rad: rotation after which a scan becomes a keyframe of the map.
+    """
+
+    distance_m: Positive = 0.25
+    rotation_rad: Positive = 0.2
 
     def __post_init__(self) -> None:
-        _require_positive(self, "distance_m", "rotation_rad")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Loop closure and pose graph."""
+    """Loop closure and pose graph.
+
+    Attributes:
+        enabled: false: scan matching without loop closure.
+        max_reach_m: maximum search range in translation; the range itself is 3σ of the drift.
+        max_reach_rad: maximum search range in heading.
+        min_score: minimum match score (0..1) of a loop, and of the robot's place in a saved map.
+    """
 
     enabled: bool = True
-    spacing_m: float = 0.5
-    query_keyframes: int = 10
-    chain_keyframes: int = 20
-    min_chain_keyframes: int = 5
-    chains: int = 2
-    max_range_m: float = 20.0
-    max_points: int = 250
-    sigmas: float = 3.0
-    max_reach_m: float = 10.0
-    max_reach_rad: float = 0.8
-    min_score: float = 0.6
-    min_shape: float = 0.05
-    min_gain: float = 0.35
-    confirmations: int = 3
-    sure_m: float = 0.25
-    sure_rad: float = 0.06
-    step_sigma_m: float = 0.005
-    step_sigma_rad: float = 0.0015
-    same_place: int = 3
-    same_place_m: float = 0.35
-    same_place_rad: float = 0.35
-    loop_sigma_m: float = 0.03
-    loop_sigma_rad: float = 0.01
+    max_reach_m: Positive = 10.0
+    max_reach_rad: Positive = 0.8
+    min_score: Score = 0.6
 
     def __post_init__(self) -> None:
-        _require_positive(
-            self, "spacing_m", "max_range_m", "sigmas", "max_reach_m", "max_reach_rad", "sure_m", "sure_rad",
-            "step_sigma_m", "step_sigma_rad", "same_place_m", "same_place_rad", "loop_sigma_m", "loop_sigma_rad",
-        )  # fmt: skip
-        for key in ("query_keyframes", "chain_keyframes", "min_chain_keyframes", "chains", "confirmations"):
-            _require(self, key, getattr(self, key) >= 1, ">= 1")
-        _require(self, "max_points", self.max_points >= 20, ">= 20")
-        _require(self, "same_place", self.same_place >= 0, ">= 0")
-        for key in ("min_score", "min_gain"):
-            _require(self, key, 0 < getattr(self, key) < 1, "between 0 and 1")
-        _require(self, "min_shape", 0 <= self.min_shape < 1, "between 0 and 1")
-
-
-@dataclass(frozen=True)
-class MotionConfig:
-    """Thresholds for detecting disagreement between wheel odometry and scans."""
-
-    window_s: float = 2.0
-    still_m: float = 0.02
-    still_rad: float = 0.03
-    moved_m: float = 0.1
-    moved_rad: float = 0.15
-    carried_jump_m: float = 0.4
-    slip_share: float = 0.4
-    stuck_share: float = 0.85
-    turn_memory: float = 0.95
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "window_s", "still_m", "still_rad", "carried_jump_m")
-        _require(self, "moved_m", self.moved_m > self.still_m, "> still_m")
-        _require(self, "moved_rad", self.moved_rad > self.still_rad, "> still_rad")
-        _require(self, "slip_share", 0 < self.slip_share < 1, "between 0 and 1")
-        _require(self, "stuck_share", self.slip_share < self.stuck_share < 1, "between slip_share and 1")
-        _require(self, "turn_memory", 0 < self.turn_memory < 1, "between 0 and 1")
-
-
-@dataclass(frozen=True)
-class ParticleConfig:
-    """The particle filter (``backend: rbpf``), with GMapping's parameter names and defaults."""
-
-    particles: int = 30
-    linearUpdate: float = 1.0
-    angularUpdate: float = 0.5
-    resampleThreshold: float = 0.5
-    maxUrange: float = 20.0
-    sigma: float = 0.05
-    kernelSize: int = 1
-    lstep: float = 0.05
-    astep: float = 0.05
-    iterations: int = 5
-    lsigma: float = 0.075
-    ogain: float = 3.0
-    lskip: int = 0
-    minimumScore: float = 0.0
-    srr: float = 0.1
-    srt: float = 0.2
-    str: float = 0.1
-    stt: float = 0.2
-    delta: float = 0.05
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        _require_positive(
-            self, "linearUpdate", "angularUpdate", "maxUrange", "sigma", "lstep", "astep", "lsigma", "ogain", "delta"
-        )
-        _require_not_negative(self, "minimumScore", "srr", "srt", "str", "stt", "lskip", "kernelSize", "seed")
-        _require(self, "particles", self.particles >= 1, ">= 1")
-        _require(self, "iterations", self.iterations >= 0, ">= 0")
-        _require(self, "resampleThreshold", 0 <= self.resampleThreshold <= 1, "between 0 and 1")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
 class MapConfig:
-    """Occupancy grid, built by ray casting from the keyframes."""
+    """Occupancy grid, built by ray casting from the keyframes.
 
-    resolution_m: float = 0.05
-    max_range_m: float = 20.0
-    no_return_clear_m: float = 0.0
-    hit_probability: float = 0.7
-    miss_probability: float = 0.4
-    min_probability: float = 0.03
-    max_probability: float = 0.97
-    max_size_m: float = 400.0
+    Attributes:
+        resolution_m: cell size of /map.
+        max_range_m: maximum length of a ray entered into the map.
+        no_return_clear_m: length cleared by a beam without return; 0: none (glass, black walls).
+        max_size_m: maximum side length of the map, centred on the start.
+    """
+
+    resolution_m: Positive = 0.05
+    max_range_m: Positive = 20.0
+    no_return_clear_m: NotNegative = 0.0
+    max_size_m: Positive = 400.0
 
     def __post_init__(self) -> None:
-        _require_positive(self, "resolution_m", "max_range_m", "max_size_m")
-        _require_not_negative(self, "no_return_clear_m")
-        _require(self, "hit_probability", 0.5 < self.hit_probability < 1, "between 0.5 and 1")
-        _require(self, "miss_probability", 0 < self.miss_probability < 0.5, "between 0 and 0.5")
-        _require(self, "min_probability", 0 < self.min_probability < 0.5, "between 0 and 0.5")
-        _require(self, "max_probability", 0.5 < self.max_probability < 1, "between 0.5 and 1")
-        _require(self, "max_size_m", self.max_size_m >= 2 * self.max_range_m, ">= 2 max_range_m")
+        check_ranges(self)
+        if self.max_size_m < 2 * self.max_range_m:
+            raise ValueError(f"max_size_m must be >= 2 max_range_m (got {self.max_size_m}, {self.max_range_m})")
 
 
 @dataclass(frozen=True)
 class SlamConfig:
-    """All parameters of a SLAM method."""
+    """All parameters of the grid SLAM."""
 
-    backend: str = "graph"
     odometry: OdometryNoise = dataclasses.field(default_factory=OdometryNoise)
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     match: MatchConfig = dataclasses.field(default_factory=MatchConfig)
     keyframe: KeyframeConfig = dataclasses.field(default_factory=KeyframeConfig)
     loop: LoopConfig = dataclasses.field(default_factory=LoopConfig)
     map: MapConfig = dataclasses.field(default_factory=MapConfig)
-    motion: MotionConfig = dataclasses.field(default_factory=MotionConfig)
-    rbpf: ParticleConfig = dataclasses.field(default_factory=ParticleConfig)
+
+
+@dataclass(frozen=True)
+class QueueConfig:
+    """Odometry and time of the scans.
+
+    Attributes:
+        use_wheel_odom: false: LiDAR odometry only; the node then broadcasts odom→base_link itself.
+        odom_wait_s: maximum time that a scan waits for the odometry of its stamp.
+        odom_startup_wait_s: maximum time that the first scans wait for any odometry.
+        odom_extrapolate_s: maximum extrapolation of the last motion after odom_wait_s.
+        max_scan_age_s: older scans are dropped with a warning; after this time without a scan: ERROR.
+        reset_on_time_jump_s: a larger jump back in time starts a new map (a bag played again).
+    """
+
+    use_wheel_odom: bool = True
+    odom_wait_s: NotNegative = 0.1
+    odom_startup_wait_s: NotNegative = 1.0
+    odom_extrapolate_s: NotNegative = 0.2
+    max_scan_age_s: Positive = 1.0
+    reset_on_time_jump_s: Positive = 1.0
 
     def __post_init__(self) -> None:
-        _require(self, "backend", self.backend in BACKENDS, f"one of {', '.join(BACKENDS)}")
+        check_ranges(self)
+
+
+@dataclass(frozen=True)
+class GridSlamConfig(SlamConfig, QueueConfig):
+    """Parameters of the node ``grid_slam``, in addition to those of the method and of the queue.
+
+    Attributes:
+        mode: mapping: make a map, or extend map_file; localization: only localise in map_file.
+        map_file: saved map, NAME or NAME.yaml ("ic map save NAME"); empty: start a new map.
+        map_frame: frame of /map and /pose.
+        odom_frame: frame of the odometry; corrections are published as map_frame → odom_frame.
+        base_frame: frame of the robot, on the ground.
+        map_period_s: minimum period of /map_updates, which holds the changed part of the map.
+        map_full_period_s: minimum period of /map (whole map); raise it for slow links with /map_updates.
+        correction_speed_mps: speed limit of a large correction of map→odom, so that the pose does not jump.
+        correction_yaw_rate_radps: speed limit of a large correction in heading.
+    """
+
+    mode: Literal["mapping", "localization"] = "mapping"
+    map_file: str = ""
+    map_frame: str = "map"
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    map_period_s: Positive = 1.0
+    map_full_period_s: Positive = 1.0
+    correction_speed_mps: Positive = 1.0
+    correction_yaw_rate_radps: Positive = 1.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.mode == "localization" and not self.map_file:
+            raise ValueError("mode localization needs map_file, the map to drive in")

@@ -10,29 +10,48 @@ import numpy as np
 
 from instant_ic.geometry.poses import compose2, relative2, wrap_angle
 from instant_ic.slam.config import SlamConfig
-from instant_ic.slam.keyframes import Keyframe, Trajectory, grown_drift
+from instant_ic.slam.keyframes import Keyframe, Trajectory, grown_drift, turned
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.matcher import Match, Matcher, Window
+from instant_ic.slam.matcher import Match, Window, match_scan
 from instant_ic.slam.scan import FloatArray, ScanPoints, thin
 
 RECOVERY_MARGIN = 0.1
 """Minimum score gain of the wide search over the first search."""
 START_KEYFRAMES = 4
 """Maximum number of keyframes taken at the start pose before the robot moves."""
-
-
+LOST_SCANS = 10
+"""Number of lost scans in a row after which a new local map starts: a second at 10 Hz."""
+WINDOW_PER_M, WINDOW_PER_RAD, TURN_WINDOW_PER_M = 0.4, 0.4, 0.2
+"""Growth of the search window with the odometry step: translation per metre, rotation per radian and per metre; twice
+the default σ of the odometry."""
+STEP_SIGMA_M, STEP_SIGMA_RAD = 0.005, 0.0015
+"""Scan-matching error between keyframes beyond its own covariance."""
 KNOWN_MAP_STEP_M = 2.0
 """Distance in metres after which the local map is rebuilt when localising in a known map."""
 
 
-class TrackStatus(enum.StrEnum):
-    """How the pose of a scan was found."""
+class SlamStatus(enum.StrEnum):
+    """Outcome of processing a scan."""
 
     FIRST = "first"
+    """The first scan: the origin of the map."""
     TRACKED = "tracked"
+    """Matched near the predicted pose."""
     RECOVERED = "recovered"
+    """Matched by the wide search; the odometry error was large."""
     LOST = "lost"
+    """No match; the pose comes from odometry, and its covariance grows."""
     RESTARTED = "restarted"
+    """Lost for several scans; a new local map starts at the odometry pose."""
+    NO_POINTS = "no points"
+    """No points, only infinite ranges, or too few points; the pose comes from odometry."""
+    TIME_BACKWARDS = "time backwards"
+    """Not newer than the previous scan; the scan is ignored and the last pose returned."""
+
+    @property
+    def matched(self) -> bool:
+        """Whether the pose comes from scan matching."""
+        return self in (SlamStatus.FIRST, SlamStatus.TRACKED, SlamStatus.RECOVERED)
 
 
 @dataclass(frozen=True)
@@ -57,7 +76,7 @@ class Track:
     pose: FloatArray
     covariance: FloatArray
     score: float
-    status: TrackStatus
+    status: SlamStatus
     keyframe: Keyframe | None
 
 
@@ -68,17 +87,10 @@ class FrontEnd:
         self.config = config
         self.trajectory = Trajectory()
         self._field = LikelihoodField(config.field, config.match.recovery_translation_m + 0.5)
-        self._matcher = Matcher(
-            config.match.residual_sigma,
-            config.match.odometry_cutoff,
-            config.match.coarse_rotation_step_rad,
-            config.match.fine_rotation_step_rad,
-            config.match.refine_iterations,
-        )
         self._lost_scans = 0
         self._covariance = np.zeros((3, 3))
         self._known: FloatArray | None = None
-        self._drawn_at = np.zeros(2)
+        self._built_at = np.zeros(2)
 
     @property
     def in_known_map(self) -> bool:
@@ -89,7 +101,7 @@ class FrontEnd:
         """Switch to matching against the surfaces (n, 2) of a known map, starting at ``pose`` (3,)."""
         self._known = points
         self._lost_scans = 0
-        self._draw_known(pose)
+        self._build_known(pose)
 
     def guess_from_odometry(self, pose: FloatArray, step: FloatArray) -> Guess:
         """Guess at ``pose`` after an odometry step (3,) in the base's own frame."""
@@ -98,8 +110,8 @@ class FrontEnd:
         translation = noise.translation_floor_m + noise.translation_per_m * distance
         rotation = noise.rotation_floor_rad + noise.rotation_per_rad * turn + noise.rotation_per_m * distance
         window = Window(
-            match.search_translation_m + match.search_translation_per_m * distance,
-            match.search_rotation_rad + match.search_rotation_per_rad * turn + match.search_rotation_per_m * distance,
+            match.search_translation_m + WINDOW_PER_M * distance,
+            match.search_rotation_rad + WINDOW_PER_RAD * turn + TURN_WINDOW_PER_M * distance,
         )
         return Guess(pose, np.array([translation, translation, rotation]), self._within_recovery(window))
 
@@ -125,17 +137,17 @@ class FrontEnd:
         points = self._match_points(scan)
         if len(self.trajectory) == 0:
             keyframe = self._add_keyframe(guess.pose, np.zeros((3, 3)), scan, stamp_ns, dead_reckoned=False)
-            return Track(guess.pose, np.zeros((3, 3)), 1.0, TrackStatus.FIRST, keyframe)
+            return Track(guess.pose, np.zeros((3, 3)), 1.0, SlamStatus.FIRST, keyframe)
 
-        status = TrackStatus.TRACKED
-        match = self._matcher.match(self._field, points, guess.pose, guess.sigma, guess.window)
+        status = SlamStatus.TRACKED
+        match = match_scan(self._field, points, guess.pose, guess.sigma, guess.window)
         if match.score < config.recovery_score or match.at_border:
             recovered = self._recover(points, guess)
             # Unless the first window was too small, the wide search must be clearly better: a window this large always
             # contains a slightly better pose.
             margin = 0.0 if match.at_border else RECOVERY_MARGIN
             if recovered.score >= config.min_score and recovered.score > match.score + margin:
-                match, status = recovered, TrackStatus.RECOVERED
+                match, status = recovered, SlamStatus.RECOVERED
         if match.score < config.min_score:
             return self._lost(scan, guess, match.score, stamp_ns)
 
@@ -143,52 +155,48 @@ class FrontEnd:
         self._covariance = match.covariance
         added: Keyframe | None = None
         if self.in_known_map:
-            if math.hypot(*(match.pose[:2] - self._drawn_at)) > KNOWN_MAP_STEP_M:
-                self._draw_known(match.pose)
+            if math.hypot(*(match.pose[:2] - self._built_at)) > KNOWN_MAP_STEP_M:
+                self._build_known(match.pose)
         elif self._moved(match.pose) or self._first_was_poor(match, status):
             added = self._add_keyframe(match.pose, match.covariance, scan, stamp_ns, dead_reckoned=False)
         return Track(match.pose, match.covariance, match.score, status, added)
 
     def dead_reckon(self, guess: Guess) -> Track:
-        """Use the guess as the pose of a scan that cannot be matched."""
-        return Track(guess.pose, self._grown_covariance(guess), 0.0, TrackStatus.LOST, None)
+        """Use the guess as the pose of a scan with too few points."""
+        return Track(guess.pose, self._grown_covariance(guess), 0.0, SlamStatus.NO_POINTS, None)
 
     def _match_points(self, scan: ScanPoints) -> FloatArray:
         near = (scan.points**2).sum(axis=1) <= self.config.field.max_range_m**2
-        return thin(
-            scan.points[near], scan.joined[near], self.config.match.point_spacing_m, self.config.match.max_points
-        )
+        return thin(scan.points[near], scan.joined[near], self.config.match.max_points)
 
     def _recover(self, points: FloatArray, guess: Guess) -> Match:
         config = self.config.match
         window = Window(config.recovery_translation_m, config.recovery_rotation_rad)
-        return self._matcher.match(self._field, points, guess.pose, guess.sigma, window)
+        return match_scan(self._field, points, guess.pose, guess.sigma, window)
 
     def _lost(self, scan: ScanPoints, guess: Guess, score: float, stamp_ns: int) -> Track:
         """Handle a failed match: continue on odometry, and start a new local map if the failures persist."""
         self._lost_scans += 1
         covariance = self._grown_covariance(guess)
-        if self._lost_scans < self.config.match.restart_after_lost_scans:
-            return Track(guess.pose, covariance, score, TrackStatus.LOST, None)
+        if self._lost_scans < LOST_SCANS:
+            return Track(guess.pose, covariance, score, SlamStatus.LOST, None)
         self._lost_scans = 0
         self._known = None
         keyframe = self._add_keyframe(guess.pose, covariance, scan, stamp_ns, dead_reckoned=True)
-        return Track(guess.pose, covariance, score, TrackStatus.RESTARTED, keyframe)
+        return Track(guess.pose, covariance, score, SlamStatus.RESTARTED, keyframe)
 
     def _grown_covariance(self, guess: Guess) -> FloatArray:
-        cos_yaw, sin_yaw = math.cos(guess.pose[2]), math.sin(guess.pose[2])
-        turn = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
-        self._covariance = self._covariance + turn @ np.diag(guess.sigma**2) @ turn.T
+        self._covariance = self._covariance + turned(np.diag(guess.sigma**2), float(guess.pose[2]))
         return self._covariance
 
-    def _first_was_poor(self, match: Match, status: TrackStatus) -> bool:
+    def _first_was_poor(self, match: Match, status: SlamStatus) -> bool:
         """Whether a robot that has not moved since the start sees more than its map holds.
 
         This happens when the first scan covered half a revolution, before odometry arrived. Without a further keyframe,
         each scan would start a wide search until the robot moves.
         """
         few = len(self.trajectory) < START_KEYFRAMES
-        return few and status is TrackStatus.TRACKED and match.score < self.config.match.recovery_score
+        return few and status is SlamStatus.TRACKED and match.score < self.config.match.recovery_score
 
     def _moved(self, pose: FloatArray) -> bool:
         last = self.trajectory.keyframes[-1].map_from_base
@@ -202,39 +210,32 @@ class FrontEnd:
         step, step_covariance, drift = np.zeros(3), np.zeros((3, 3)), covariance.copy()
         if len(self.trajectory):
             last = self.trajectory.last
+            yaw = float(last.map_from_base[2])
             step = relative2(last.map_from_base, pose)
-            step_covariance = self._step_covariance(covariance, float(last.map_from_base[2]))
-            way = pose[:2] - last.map_from_base[:2]
-            drift = grown_drift(last.drift, way, float(last.map_from_base[2]), step_covariance)
+            step_covariance = turned(covariance, -yaw)
+            step_covariance += np.diag(np.square([STEP_SIGMA_M, STEP_SIGMA_M, STEP_SIGMA_RAD]))
+            drift = grown_drift(last.drift, pose[:2] - last.map_from_base[:2], yaw, step_covariance)
         keyframe = Keyframe(
             stamp_ns, pose.copy(), covariance.copy(), scan, dead_reckoned, step, step_covariance, drift
         )  # fmt: skip
         self.trajectory.add(keyframe)
-        self.redraw()
+        self.rebuild_field()
         return keyframe
 
-    def _step_covariance(self, covariance: FloatArray, yaw: float) -> FloatArray:
-        """Covariance of the match in the frame of a pose with ``yaw``, plus the additional scan-matching error."""
-        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-        turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
-        loop = self.config.loop
-        step: FloatArray = turn @ covariance @ turn.T
-        return step + np.diag(np.square([loop.step_sigma_m, loop.step_sigma_m, loop.step_sigma_rad]))
-
-    def redraw(self) -> None:
+    def rebuild_field(self) -> None:
         """Rebuild the local map from the recent keyframes, for example after their poses were optimised."""
         if self._known is not None:
-            self._draw_known(self._drawn_at)
+            self._build_known(self._built_at)
             return
         recent = self.trajectory.recent(self.config.field.keyframes)
         surfaces = [Surface(k.map_from_base, k.scan.points, k.scan.joined) for k in recent]
-        self._field.draw(recent[-1].map_from_base, surfaces)
+        self._field.rebuild(recent[-1].map_from_base, surfaces)
 
-    def _draw_known(self, centre: FloatArray) -> None:
+    def _build_known(self, centre: FloatArray) -> None:
         assert self._known is not None
-        self._drawn_at = np.array(centre[:2])
+        self._built_at = np.array(centre[:2])
         alone = np.zeros(len(self._known), dtype=np.bool_)
-        self._field.draw(self._drawn_at, [Surface(np.zeros(3), self._known, alone)])
+        self._field.rebuild(self._built_at, [Surface(np.zeros(3), self._known, alone)])
 
 
 def constant_velocity(pose: FloatArray, step: FloatArray, step_s: float, elapsed_s: float) -> FloatArray:

@@ -86,7 +86,13 @@ def grown_drift(drift: FloatArray, way: FloatArray, yaw: float, step_covariance:
     """
     carry = np.eye(3)
     carry[0, 2], carry[1, 2] = -way[1], way[0]
+    grown: FloatArray = carry @ drift @ carry.T + turned(step_covariance, yaw)
+    return grown
+
+
+def turned(covariance: FloatArray, yaw: float) -> FloatArray:
+    """A covariance (3, 3) of a frame with heading ``yaw``, in the frame with heading zero."""
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     turn = np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
-    grown: FloatArray = carry @ drift @ carry.T + turn @ step_covariance @ turn.T
-    return grown
+    result: FloatArray = turn @ covariance @ turn.T
+    return result

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.scan import FloatArray
 
+SURFACE_SIGMA_M = 0.04
+"""Hits within this distance are averaged to one surface; about the range noise of a laser."""
 GAP_WEIGHT = 0.1
 """Weight of an interpolated point between two joined hits, relative to a hit."""
 
@@ -87,7 +89,7 @@ def accumulate(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def draw_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # type: ignore[no-untyped-def]
+def fill_cells(field, weight, sum_x, sum_y, touched, count, sigma, pull):  # type: ignore[no-untyped-def]
     """Fill the field with a Gaussian around the surface in each touched cell.
 
     Args:
@@ -176,7 +178,7 @@ class LikelihoodField:
         self._sum_y = np.zeros((size, size))
         self._touched = np.zeros((200_000, 2), dtype=np.int32)
 
-    def draw(self, centre: FloatArray, surfaces: Sequence[Surface]) -> None:
+    def rebuild(self, centre: FloatArray, surfaces: Sequence[Surface]) -> None:
         """Rebuild the field from ``surfaces``, shifted by whole cells so that ``centre`` (2,) is in the middle."""
         config = self.config
         half = self.values.shape[0] // 2
@@ -190,8 +192,8 @@ class LikelihoodField:
                 self._weight, self._sum_x, self._sum_y, self._touched, count, self.origin, self.resolution,
                 surface.pose, surface.points, surface.joined, margin,
             )  # fmt: skip
-        draw_cells(
+        fill_cells(
             self.values, self._weight, self._sum_x, self._sum_y, self._touched, count, sigma,
-            config.surface_sigma_m / self.resolution,
+            SURFACE_SIGMA_M / self.resolution,
         )  # fmt: skip
         _forget(self._weight, self._sum_x, self._sum_y, self._touched, count)

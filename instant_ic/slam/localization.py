@@ -1,24 +1,31 @@
-"""Global localisation: finds scans anywhere in a known map, without an initial pose."""
+"""Localisation in a saved map, without an initial pose; the map may then be extended."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 
+from instant_ic.geometry.poses import relative2
 from instant_ic.slam.config import SlamConfig
+from instant_ic.slam.keyframes import Keyframe
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.loop_search import POOL, Found, LoopSearch, pool
+from instant_ic.slam.loop_closure import LoopClosure, gather
+from instant_ic.slam.loop_search import POOL, Found, apart, find_place, pool
 from instant_ic.slam.map_files import occupied_points
-from instant_ic.slam.occupancy import OccupancyGrid
+from instant_ic.slam.occupancy import OccupancyGrid, OccupancyMap
+from instant_ic.slam.pose_graph import Edge
 from instant_ic.slam.scan import FloatArray
 
 ROTATIONS = 90
 COARSE_POINTS = 80
 STARTS = 24
 MIN_GAIN = 0.2
+UNKNOWN_STEP = np.diag([100.0, 100.0, 10.0])
+"""Covariance of the motion from the last saved keyframe to the first new one."""
 
 
 @njit(cache=True)
@@ -82,14 +89,13 @@ class Localizer:
         self._centre = (low + high) / 2
         field = replace(config.field, max_range_m=float((high - low).max() / 2 + 1.0))
         self._field = LikelihoodField(field, 0.5)
-        self._field.draw(
+        self._field.rebuild(
             np.array([*self._centre, 0.0]),
             [Surface(np.zeros(3), self.points, np.zeros(len(self.points), dtype=np.bool_))],
         )
         coarse = POOL * self._field.resolution
         self._places = np.unique(np.round(free / coarse).astype(np.int64), axis=0) * coarse
         self._pooled = pool(self._field.values, POOL)
-        self._search = LoopSearch(config.match.residual_sigma)
         self._min_score = config.loop.min_score
 
     def find(self, points: FloatArray) -> Found | None:
@@ -109,14 +115,99 @@ class Localizer:
                 continue
             taken.append(place)
             start = np.array([*place, heading[k]])
-            near = self._search.find(self._field, points, start, 2 * coarse, 2 * math.pi / ROTATIONS)
+            near = find_place(self._field, points, start, 2 * coarse, 2 * math.pi / ROTATIONS)
             if near is not None:
                 found.append(near)
         if not found:
             return None
         found.sort(key=lambda one: -one.score)
         best = found[0]
-        others = [one.score for one in found[1:] if self._search.apart(one.pose, best.pose)]
+        others = [one.score for one in found[1:] if apart(one.pose, best.pose)]
         best = replace(best, runner_up=max(others, default=0.0))
         gain = (best.score - best.runner_up) / max(1.0 - best.runner_up, 1e-6)
         return best if best.score >= self._min_score and gain >= MIN_GAIN else None
+
+
+@dataclass(frozen=True)
+class Place:
+    """Result of a search in the saved map.
+
+    Attributes:
+        keyframe: the keyframe that was searched for.
+        found: its pose; None if not found.
+        map: built from the saved keyframes if the map is to be extended; otherwise None.
+    """
+
+    keyframe: Keyframe
+    found: Found | None
+    map: OccupancyMap | None
+
+
+class SavedMap:
+    """A map from disk, in which the robot is located first.
+
+    Args:
+        config: parameters.
+        grid: the map.
+        graph: its keyframes and edges, to extend the map; None: the map stays unchanged.
+
+    Attributes:
+        grid: the map as read.
+        localizer: finds scans in it.
+        keyframes: saved keyframes; empty if the map stays unchanged.
+        edges: edges between them.
+        located: whether the robot is located in the map.
+    """
+
+    def __init__(
+        self, config: SlamConfig, grid: OccupancyGrid, graph: tuple[list[Keyframe], list[Edge]] | None = None
+    ) -> None:
+        self.grid = grid
+        self.localizer = Localizer(grid, config)
+        self.keyframes, self.edges = graph or ([], [])
+        self.located = False
+        self._config = config
+        self._searched: Keyframe | None = None
+
+    @property
+    def extends(self) -> bool:
+        """Whether the map is extended once the robot is located."""
+        return bool(self.keyframes)
+
+    @property
+    def unchanged(self) -> bool:
+        """Whether the map is still as it was read."""
+        return not (self.extends and self.located)
+
+    def search_job(self, recent: Sequence[Keyframe]) -> Callable[[], Place] | None:
+        """Return a job that searches the map for the recent keyframes; None if the newest was searched for already."""
+        if not recent or recent[-1] is self._searched:
+            return None
+        last = self._searched = recent[-1]
+        query = gather([k.map_from_base for k in recent], [k.scan for k in recent])
+
+        def search() -> Place:
+            found = self.localizer.find(query)
+            return Place(last, found, self.build_map() if found is not None and self.extends else None)
+
+        return search
+
+    def build_map(self) -> OccupancyMap:
+        """Build the occupancy map from the saved keyframes."""
+        built = OccupancyMap(self._config.map)
+        for keyframe in self.keyframes:
+            built.insert(keyframe.map_from_base, keyframe.scan)
+        return built
+
+    def join(self, own: Sequence[Keyframe], covariance: FloatArray) -> LoopClosure:
+        """Tie keyframes ``own``, located with ``covariance`` (3, 3), to the saved graph; return its loop closure."""
+        first = own[0]
+        # The motion from the last saved keyframe is unknown; the first new keyframe is tied by its pose in the map.
+        first.step = relative2(self.keyframes[-1].map_from_base, first.map_from_base)
+        first.step_covariance = UNKNOWN_STEP
+        for keyframe in own:
+            keyframe.drift = covariance
+        loop_closure = LoopClosure(self._config)
+        loop_closure.load(self.keyframes, self.edges)
+        loop_closure.tie(len(self.keyframes), first.map_from_base, covariance)
+        return loop_closure

@@ -14,14 +14,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
-from instant_ic.slam.config import FieldConfig, LoopConfig, SlamConfig
-from instant_ic.slam.keyframes import Keyframe, grown_drift
+from instant_ic.slam.config import SlamConfig
+from instant_ic.slam.keyframes import NO_SCAN, Keyframe, grown_drift, turned
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.loop_search import Found, LoopSearch, spread
+from instant_ic.slam.loop_search import Found, find_place, spread
 from instant_ic.slam.occupancy import OccupancyMap
 from instant_ic.slam.pose_graph import Edge, optimise, residuals
 from instant_ic.slam.scan import FloatArray, ScanPoints
 
+SPACING_M = 0.5
+"""Distance between two searches for a loop."""
+QUERY_KEYFRAMES = 10
+"""Number of recent keyframes that are matched together against older ones: some metres of track have a shape."""
+QUERY_RANGE_M, QUERY_POINTS = 20.0, 250
+"""Farther hits are ignored; maximum number of points of the recent keyframes."""
+CHAIN_KEYFRAMES, MIN_CHAIN_KEYFRAMES = 20, 5
+"""Number of consecutive older keyframes that the recent ones are matched against; fewer than the minimum are not
+reliable."""
+CHAINS = 2
+"""Number of places searched at a time; the drift at the others is larger."""
+SIGMAS = 3.0
+"""Search range in standard deviations of the drift."""
+MIN_SHAPE = 0.05
+"""Minimum ratio of least to most information by direction; about 0 in a bare corridor."""
+MIN_GAIN = 0.35
+"""Share of the second best place's residual that the best place must explain."""
+CONFIRMATIONS = 3
+"""Number of keyframes whose loops must agree before a correction beyond the next limits."""
+SURE_M, SURE_RAD = 0.25, 0.06
+"""A correction below both needs no confirmation: a keyframe spacing and three coarse heading steps."""
+LOOP_SIGMA_M, LOOP_SIGMA_RAD = 0.03, 0.01
+"""Error of a loop closure beyond its own covariance."""
+SAME_PLACE, SAME_PLACE_M, SAME_PLACE_RAD = 3, 0.35, 0.35
+"""A new keyframe is removed if this many older ones lie within this distance and heading difference."""
 OVERLAP_M = 3.0
 """Distance, beyond the pose uncertainty, within which an older keyframe is compared."""
 SETTLED_M, SETTLED_RAD = 0.02, 0.004
@@ -56,6 +81,30 @@ class Outcome:
     merged: list[tuple[int, int, FloatArray]]
     edges: list[Edge]
 
+    def apply(self, keyframes: Sequence[Keyframe]) -> FloatArray | None:
+        """Move, merge and update the trajectory's keyframes, also those added since the update began.
+
+        Returns:
+            The transform (3,) that the newest part of the map has moved by; None if nothing moved.
+        """
+        moved = None
+        newer = keyframes[self.count :]
+        if self.poses is not None:
+            moved = correction(keyframes[self.count - 1].map_from_base, self.poses[-1])
+            for k in self.alive:
+                keyframes[k].map_from_base = self.poses[k]
+            for keyframe in newer:
+                keyframe.map_from_base = compose2(moved, keyframe.map_from_base)
+        for gone, heir, heir_from_gone in self.merged:
+            keyframes[gone].merged_into = (keyframes[heir], heir_from_gone)
+            keyframes[gone].scan = NO_SCAN
+        drift = self.drift
+        for before, keyframe in zip(keyframes[self.count - 1 :], newer, strict=False):
+            way = keyframe.map_from_base[:2] - before.map_from_base[:2]
+            drift = grown_drift(drift, way, float(before.map_from_base[2]), keyframe.step_covariance)
+        keyframes[-1].drift = drift
+        return moved
+
 
 @dataclass(frozen=True)
 class _Candidate:
@@ -65,7 +114,7 @@ class _Candidate:
     travelled_m: float
 
 
-class BackEnd:
+class LoopClosure:
     """Loop closure and pose graph.
 
     Attributes:
@@ -79,7 +128,6 @@ class BackEnd:
         self.edges: list[Edge] = []
         self.closed = 0
         self.refused = 0
-        loop = config.loop
         self._keyframes: list[Keyframe] = []
         self._poses: FloatArray = np.zeros((256, 3))
         self._drifts: list[FloatArray] = []
@@ -87,12 +135,11 @@ class BackEnd:
         self._pending: list[_Candidate] = []
         self._unsettled = 0
         self._searched_at_m = 0.0
-        self._drawn: FloatArray = np.zeros((0, 3))
+        self._built: FloatArray = np.zeros((0, 3))
         self._alive = np.zeros(256, dtype=np.bool_)
         self._merged: list[tuple[int, int, FloatArray]] = []
-        field = replace(config.field, max_range_m=loop.max_range_m)
-        self._field = LikelihoodField(FieldConfig(**vars(field)), loop.max_reach_m + OVERLAP_M)
-        self._search = LoopSearch(config.match.residual_sigma)
+        field = replace(config.field, max_range_m=QUERY_RANGE_M)
+        self._field = LikelihoodField(field, config.loop.max_reach_m + OVERLAP_M)
 
     def __len__(self) -> int:
         return len(self._keyframes)
@@ -113,18 +160,18 @@ class BackEnd:
         for keyframe in new:
             self._add(keyframe)
             here = len(self._keyframes) - 1
-            if self.config.loop.enabled and self._travelled[here] - self._searched_at_m >= self.config.loop.spacing_m:
+            if self.config.loop.enabled and self._travelled[here] - self._searched_at_m >= SPACING_M:
                 self._searched_at_m = self._travelled[here]
                 changed |= self._close(here)
-            self._thin_out(here - self.config.field.keyframes - 2 * self.config.loop.query_keyframes)
+            self._thin_out(here - self.config.field.keyframes - 2 * QUERY_KEYFRAMES)
         if last and self._unsettled:
             changed |= self._optimise(self.edges[len(self.edges) :])
         drift = self._drifts[-1] if self._drifts else np.zeros((3, 3))
-        redrawn = self._redraw(last) if changed or last else None
+        rebuilt = self._rebuild_map(last) if changed or last else None
         merged, self._merged = self._merged, []
         poses = self.poses.copy() if changed else None
         alive = np.flatnonzero(self._alive[: len(self)])
-        return Outcome(len(self), poses, alive, drift, redrawn, merged, list(self.edges))
+        return Outcome(len(self), poses, alive, drift, rebuilt, merged, list(self.edges))
 
     def load(self, keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> None:
         """Start with a saved graph; its first keyframe stays fixed."""
@@ -133,17 +180,13 @@ class BackEnd:
         self.edges = list(edges)
         self._poses[: len(self)] = [keyframe.map_from_base for keyframe in keyframes]
         self._drifts = [keyframe.drift for keyframe in keyframes]
-        self._drawn = self.poses.copy()
+        self._built = self.poses.copy()
 
     def tie(self, here: int, pose: FloatArray, covariance: FloatArray) -> None:
         """Tie keyframe ``here``, added next, to the existing keyframes, at ``pose`` (3,) in their map."""
         near = int(np.argmin(((self.poses[:, :2] - pose[:2]) ** 2).sum(axis=1)))
         yaw = float(self._poses[near, 2])
-        cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-        turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
-        loop = self.config.loop
-        floor = np.diag(np.square([loop.loop_sigma_m, loop.loop_sigma_m, loop.loop_sigma_rad]))
-        self.edges.append(Edge(near, here, relative2(self._poses[near], pose), turn @ covariance @ turn.T + floor))
+        self.edges.append(Edge(near, here, relative2(self._poses[near], pose), _loop_covariance(covariance, yaw)))
 
     # -- keyframes --------------------------------------------------------------------------------
 
@@ -175,36 +218,36 @@ class BackEnd:
     def _close(self, here: int) -> bool:
         """Search for loops that end at keyframe ``here``; return True if poses changed."""
         loop = self.config.loop
-        first = max(0, here - loop.query_keyframes + 1)
+        first = max(0, here - QUERY_KEYFRAMES + 1)
         old = first - self.config.field.keyframes
-        if old < loop.min_chain_keyframes:
+        if old < MIN_CHAIN_KEYFRAMES:
             return False
         pose, drift = self._poses[here], self._drifts[here]
         sigma_m = math.sqrt(max(np.linalg.eigvalsh(drift[:2, :2])[-1], 0.0))
         sigma_rad = math.sqrt(max(drift[2, 2], 0.0))
-        reach_m = min(loop.sigmas * sigma_m + 0.3, loop.max_reach_m)
-        reach_rad = min(loop.sigmas * sigma_rad + 0.1, loop.max_reach_rad)
+        reach_m = min(SIGMAS * sigma_m + 0.3, loop.max_reach_m)
+        reach_rad = min(SIGMAS * sigma_rad + 0.1, loop.max_reach_rad)
         chains = self._chains(pose, old, reach_m + OVERLAP_M)
         if not chains:
             return False
         query = self._query(first, here)
         accepted: list[Edge] = []
-        for chain in chains[: loop.chains]:
+        for chain in chains[:CHAINS]:
             nearest = min(chain, key=lambda k: float(((self._poses[k, :2] - pose[:2]) ** 2).sum()))
             at = chain.index(nearest)
-            half = loop.chain_keyframes // 2
+            half = CHAIN_KEYFRAMES // 2
             members = chain[max(0, at - half) : at + half + 1]
             surfaces = [
                 Surface(self._poses[k], self._keyframes[k].scan.points, self._keyframes[k].scan.joined) for k in members
             ]
-            self._field.draw(pose, surfaces)
-            found = self._search.find(self._field, query, pose, reach_m, reach_rad)
+            self._field.rebuild(pose, surfaces)
+            found = find_place(self._field, query, pose, reach_m, reach_rad)
             if found is None or not self._good(found):
                 continue
             edge = self._edge(nearest, here, found)
             correction = relative2(pose, found.pose)
-            sure = math.hypot(correction[0], correction[1]) <= loop.sure_m and abs(correction[2]) <= loop.sure_rad
-            if sure and reach_m <= 4 * loop.sure_m:
+            sure = math.hypot(correction[0], correction[1]) <= SURE_M and abs(correction[2]) <= SURE_RAD
+            if sure and reach_m <= 4 * SURE_M:
                 accepted.append(edge)
             else:
                 accepted += self._confirm(_Candidate(edge, self._travelled[here]))
@@ -226,32 +269,26 @@ class BackEnd:
         if len(near) == 0:
             return []
         runs = np.split(near, np.flatnonzero(np.diff(near) > 6) + 1)
-        chains = [[int(k) for k in run] for run in runs if len(run) >= self.config.loop.min_chain_keyframes]
+        chains = [[int(k) for k in run] for run in runs if len(run) >= MIN_CHAIN_KEYFRAMES]
         return sorted(chains, key=lambda chain: float(np.trace(self._drifts[chain[0]][:2, :2])))
 
     def _query(self, first: int, here: int) -> FloatArray:
         """Points of the last keyframes in the frame of the newest, (n, 2)."""
         members = range(first, here + 1)
-        return gather([self._poses[k] for k in members], [self._keyframes[k].scan for k in members], self.config.loop)
+        return gather([self._poses[k] for k in members], [self._keyframes[k].scan for k in members])
 
     def _good(self, found: Found) -> bool:
-        loop = self.config.loop
         # In a corridor, two walls give a medium score anywhere along it. The criterion is therefore the share of the
         # remainder, unexplained by the second best pose, that the best pose explains.
         gain = (found.score - found.runner_up) / max(1.0 - found.runner_up, 1e-6)
-        return found.score >= loop.min_score and found.shape >= loop.min_shape and gain >= loop.min_gain
+        return found.score >= self.config.loop.min_score and found.shape >= MIN_SHAPE and gain >= MIN_GAIN
 
     def _edge(self, there: int, here: int, found: Found) -> Edge:
-        loop = self.config.loop
-        cos_yaw, sin_yaw = math.cos(self._poses[there, 2]), math.sin(self._poses[there, 2])
-        turn = np.array([[cos_yaw, sin_yaw, 0.0], [-sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
-        covariance = turn @ found.covariance @ turn.T
-        covariance += np.diag(np.square([loop.loop_sigma_m, loop.loop_sigma_m, loop.loop_sigma_rad]))
+        covariance = _loop_covariance(found.covariance, float(self._poses[there, 2]))
         return Edge(there, here, relative2(self._poses[there], found.pose), covariance, robust=True)
 
     def _confirm(self, candidate: _Candidate) -> list[Edge]:
         """Return the loops that agree with this one, if there are enough; otherwise none, and the candidate waits."""
-        loop = self.config.loop
         here = candidate.edge.b
         # A keyframe removed in the meantime is not a node of the graph.
         self._pending = [
@@ -263,7 +300,7 @@ class BackEnd:
         self._pending.append(candidate)
         ends = {other.edge.b for other in agreeing} | {here}
         way = candidate.travelled_m - min((other.travelled_m for other in agreeing), default=candidate.travelled_m)
-        if len(ends) < loop.confirmations or way < (loop.confirmations - 1) * loop.spacing_m:
+        if len(ends) < CONFIRMATIONS or way < (CONFIRMATIONS - 1) * SPACING_M:
             return []
         self._pending = [other for other in self._pending if other not in agreeing and other is not candidate]
         return [other.edge for other in agreeing] + [candidate.edge]
@@ -292,16 +329,15 @@ class BackEnd:
 
     def _thin_out(self, k: int) -> None:
         """Remove keyframe ``k`` if enough older ones cover its place, so that a known area has a constant cost."""
-        loop = self.config.loop
-        if loop.same_place == 0 or k < 1 or not self._alive[k]:
+        if k < 1 or not self._alive[k]:
             return
         apart = self._poses[:k] - self._poses[k]
-        near = np.hypot(apart[:, 0], apart[:, 1]) <= loop.same_place_m
-        near &= np.abs(np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))) <= loop.same_place_rad
+        near = np.hypot(apart[:, 0], apart[:, 1]) <= SAME_PLACE_M
+        near &= np.abs(np.arctan2(np.sin(apart[:, 2]), np.cos(apart[:, 2]))) <= SAME_PLACE_RAD
         near &= self._alive[:k]
         # the robot's own recent track is not a return to a known place
         near[max(0, k - 2 * self.config.field.keyframes) :] = False
-        if int(near.sum()) < loop.same_place:
+        if int(near.sum()) < SAME_PLACE:
             return
         own = [edge for edge in self.edges if k in (edge.a, edge.b)]
         step = next((edge for edge in own if edge.b == k and not edge.robust), None)
@@ -345,33 +381,30 @@ class BackEnd:
         self._poses[alive] = solution.poses
         return True
 
-    def _redraw(self, last: bool) -> OccupancyMap | None:
+    def _rebuild_map(self, last: bool) -> OccupancyMap | None:
         """Rebuild the map if the keyframes have moved since it was built, at a limited rate."""
-        count, drawn = len(self), len(self._drawn)
+        count, built = len(self), len(self._built)
         if count == 0:
             return None
-        moved = self.poses[:drawn] - self._drawn
-        far = float(np.hypot(moved[:, 0], moved[:, 1]).max()) if drawn else math.inf
-        turned = float(np.abs(np.arctan2(np.sin(moved[:, 2]), np.cos(moved[:, 2]))).max()) if drawn else math.inf
+        moved = self.poses[:built] - self._built
+        far = float(np.hypot(moved[:, 0], moved[:, 1]).max()) if built else math.inf
+        turned = float(np.abs(np.arctan2(np.sin(moved[:, 2]), np.cos(moved[:, 2]))).max()) if built else math.inf
         if far < 0.5 * self.config.map.resolution_m and turned < 0.005:
             return None
         # A rebuild takes time in proportion to the number of keyframes; at this rate the cost per new keyframe is
         # constant.
-        if not last and far < 0.2 and turned < 0.05 and count - drawn < max(20, count // 10):
+        if not last and far < 0.2 and turned < 0.05 and count - built < max(20, count // 10):
             return None
-        drawing = OccupancyMap(self.config.map)
+        rebuilt = OccupancyMap(self.config.map)
         for k in np.flatnonzero(self._alive[:count]):
-            drawing.insert(self._poses[k], self._keyframes[k].scan)
-        self._drawn = self.poses.copy()
-        return drawing
+            rebuilt.insert(self._poses[k], self._keyframes[k].scan)
+        self._built = self.poses.copy()
+        return rebuilt
 
 
-def _turned(covariance: FloatArray, yaw: float) -> FloatArray:
-    """Rotate a covariance (3, 3) into a frame turned by ``-yaw``."""
-    cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
-    turn = np.array([[cos_yaw, -sin_yaw, 0.0], [sin_yaw, cos_yaw, 0.0], [0.0, 0.0, 1.0]])
-    turned: FloatArray = turn @ covariance @ turn.T
-    return turned
+def _loop_covariance(covariance: FloatArray, yaw: float) -> FloatArray:
+    """Covariance of a loop in the frame of its start, which has the heading ``yaw`` in the map."""
+    return turned(covariance, -yaw) + np.diag(np.square([LOOP_SIGMA_M, LOOP_SIGMA_M, LOOP_SIGMA_RAD]))
 
 
 def _reversed(edge: Edge) -> Edge:
@@ -379,7 +412,7 @@ def _reversed(edge: Edge) -> Edge:
     b_from_a = inverse2(edge.a_from_b)
     carry = np.eye(3)
     carry[0, 2], carry[1, 2] = edge.a_from_b[1], -edge.a_from_b[0]
-    covariance = _turned(carry @ edge.covariance @ carry.T, -float(edge.a_from_b[2]))
+    covariance = turned(carry @ edge.covariance @ carry.T, -float(edge.a_from_b[2]))
     return Edge(edge.b, edge.a, b_from_a, covariance, edge.robust)
 
 
@@ -391,15 +424,15 @@ def _chained(first: Edge, second: Edge) -> Edge:
     return Edge(first.a, second.b, a_from_c, covariance, first.robust or second.robust)
 
 
-def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints], loop: LoopConfig) -> FloatArray:
+def gather(poses: Sequence[FloatArray], scans: Sequence[ScanPoints]) -> FloatArray:
     """Points of scans at poses (3,), in the frame of the last pose, evenly spread, (n, 2)."""
     parts = []
     for pose, scan in zip(poses, scans, strict=True):
         x, y, yaw = relative2(poses[-1], pose)
-        points = scan.points[(scan.points**2).sum(axis=1) <= loop.max_range_m**2]
+        points = scan.points[(scan.points**2).sum(axis=1) <= QUERY_RANGE_M**2]
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
         parts.append(points @ np.array([[cos_yaw, sin_yaw], [-sin_yaw, cos_yaw]]) + (x, y))
-    return spread(np.concatenate(parts), 0.1, loop.max_points)
+    return spread(np.concatenate(parts), 0.1, QUERY_POINTS)
 
 
 def correction(before: FloatArray, after: FloatArray) -> FloatArray:

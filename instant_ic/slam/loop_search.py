@@ -23,6 +23,12 @@ POOL = 4
 
 COARSE_POINTS = 100
 """Number of query points in the wide search; the fine search uses all."""
+ROTATION_STEP_RAD = 0.035
+"""Heading step of the coarse search: at 6 m, the side of a pooled cell."""
+CANDIDATES = 12
+"""Number of coarse peaks to refine."""
+APART_M, APART_RAD = 0.6, 0.3
+"""Poses this far apart, or turned by this much, are different places."""
 
 
 @njit(cache=True)
@@ -136,73 +142,55 @@ class Found:
     runner_up: float
 
 
-@dataclass(frozen=True)
-class LoopSearch:
-    """Wide search in a field.
-
-    Attributes:
-        residual_sigma: as in `Matcher`.
-        rotation_step_rad: of the coarse search.
-        candidates: number of coarse peaks to refine.
-        apart_m: places this far apart, or turned by ``apart_rad``, count as different.
-    """
-
-    residual_sigma: float = 0.6
-    rotation_step_rad: float = 0.035
-    candidates: int = 12
-    apart_m: float = 0.6
-    apart_rad: float = 0.3
-
-    def find(
-        self, field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
-    ) -> Found | None:
-        """Best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,); None if nothing fits."""
-        resolution = field.resolution
-        coarse = POOL * resolution
-        cells = max(1, math.ceil(reach_m / coarse))
-        rotations = max(1, min(math.ceil(reach_rad / self.rotation_step_rad), int(math.pi / self.rotation_step_rad)))
-        few = points[:: max(1, len(points) // COARSE_POINTS)]
-        volume = score_volume(
-            pool(field.values, POOL), field.origin, coarse, few, centre, cells, rotations, self.rotation_step_rad
+def find_place(
+    field: LikelihoodField, points: FloatArray, centre: FloatArray, reach_m: float, reach_rad: float
+) -> Found | None:
+    """Best pose of ``points`` (n, 2) within ``reach_m``, ``reach_rad`` of ``centre`` (3,); None if nothing fits."""
+    resolution = field.resolution
+    coarse = POOL * resolution
+    cells = max(1, math.ceil(reach_m / coarse))
+    rotations = max(1, min(math.ceil(reach_rad / ROTATION_STEP_RAD), int(math.pi / ROTATION_STEP_RAD)))
+    few = points[:: max(1, len(points) // COARSE_POINTS)]
+    volume = score_volume(
+        pool(field.values, POOL), field.origin, coarse, few, centre, cells, rotations, ROTATION_STEP_RAD
+    )
+    tops = peaks(volume, CANDIDATES, 1, 1)
+    none = np.zeros(3)
+    close: list[tuple[float, FloatArray, FloatArray, float]] = []
+    for r, j, i in tops:
+        start = centre + np.array([(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * ROTATION_STEP_RAD])
+        if close and volume[r, j, i] < close[0][0] - 0.1:
+            break  # a pooled score is close to an upper bound: no later candidate can be near the best
+        x, y, yaw, _ = correlate(
+            field.values, field.origin, resolution, points, start, POOL, 4, ROTATION_STEP_RAD / 4, start,
+            none, 1.0, 1.0,
+        )  # fmt: skip
+        start = np.array([x, y, yaw])
+        pose, hessian, score, squares = refine(
+            field.values, field.origin, resolution, points, start, start, none, 1.0, 12, 0.15, 0.04
         )
-        tops = peaks(volume, self.candidates, 1, 1)
-        none = np.zeros(3)
-        close: list[tuple[float, FloatArray, FloatArray, float]] = []
-        for r, j, i in tops:
-            start = centre + np.array(
-                [(i - cells) * coarse, (j - cells) * coarse, (r - rotations) * self.rotation_step_rad]
-            )
-            if close and volume[r, j, i] < close[0][0] - 0.1:
-                break  # a pooled score is close to an upper bound: no later candidate can be near the best
-            x, y, yaw, _ = correlate(
-                field.values, field.origin, resolution, points, start, POOL, 4, self.rotation_step_rad / 4, start,
-                none, 1.0, 1.0,
-            )  # fmt: skip
-            start = np.array([x, y, yaw])
-            pose, hessian, score, squares = refine(
-                field.values, field.origin, resolution, points, start, start, none, 1.0, 12, 0.15, 0.04
-            )
-            close.append((float(score), pose, hessian.copy(), float(squares)))
-            close.sort(key=lambda entry: -entry[0])
-        if not close:
-            return None
-        score, pose, hessian, squares = close[0]
-        others = [entry[0] for entry in close[1:] if self.apart(entry[1], pose)]
-        try:
-            covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
-            # Information on translation with unknown heading: the Schur complement.
-            known = hessian[:2, :2] - np.outer(hessian[:2, 2], hessian[2, :2]) / hessian[2, 2]
-            low, high = np.linalg.eigvalsh(known)
-        except np.linalg.LinAlgError:
-            return None
-        shape = float(max(low, 0.0) / high) if high > 0 else 0.0
-        pose = np.array([pose[0], pose[1], wrap_angle(float(pose[2]))])
-        return Found(pose, 0.5 * (covariance + covariance.T), score, shape, max(others, default=0.0))
+        close.append((float(score), pose, hessian.copy(), float(squares)))
+        close.sort(key=lambda entry: -entry[0])
+    if not close:
+        return None
+    score, pose, hessian, squares = close[0]
+    others = [entry[0] for entry in close[1:] if apart(entry[1], pose)]
+    try:
+        covariance = max(squares / max(len(points) - 3, 1), 1e-3) * np.linalg.inv(hessian)
+        # Information on translation with unknown heading: the Schur complement.
+        known = hessian[:2, :2] - np.outer(hessian[:2, 2], hessian[2, :2]) / hessian[2, 2]
+        low, high = np.linalg.eigvalsh(known)
+    except np.linalg.LinAlgError:
+        return None
+    shape = float(max(low, 0.0) / high) if high > 0 else 0.0
+    pose = np.array([pose[0], pose[1], wrap_angle(float(pose[2]))])
+    return Found(pose, 0.5 * (covariance + covariance.T), score, shape, max(others, default=0.0))
 
-    def apart(self, a: FloatArray, b: FloatArray) -> bool:
-        """Whether two poses (3,) are different places."""
-        turn = abs(wrap_angle(float(a[2] - b[2])))
-        return math.hypot(a[0] - b[0], a[1] - b[1]) >= self.apart_m or turn >= self.apart_rad
+
+def apart(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two poses (3,) are different places."""
+    turn = abs(wrap_angle(float(a[2] - b[2])))
+    return math.hypot(a[0] - b[0], a[1] - b[1]) >= APART_M or turn >= APART_RAD
 
 
 def spread(points: FloatArray, cell_m: float, max_points: int) -> FloatArray:

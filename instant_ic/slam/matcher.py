@@ -17,6 +17,16 @@ from instant_ic.geometry.poses import relative2, wrap_angle
 from instant_ic.slam.likelihood_field import LikelihoodField
 from instant_ic.slam.scan import FloatArray
 
+RESIDUAL_SIGMA = 0.6
+"""Standard deviation (1σ) of ``1 − M`` for a point on its surface: smaller trusts the scan more, and odometry, which
+decides in bare corridors, less."""
+ODOMETRY_CUTOFF = 4.0
+"""Distance from the guess, in σ, beyond which its pull hardly grows: odometry may be entirely wrong."""
+COARSE_STEP_RAD, FINE_STEP_RAD = 0.02, 0.005
+"""Heading steps of the two searches; at 2.5 m the coarse one is a cell of the field."""
+REFINE_ITERATIONS = 20
+"""Maximum number of Gauss-Newton steps; they end earlier once the step is below 0.01 mm."""
+
 
 @njit(cache=True)
 def correlate(  # type: ignore[no-untyped-def]
@@ -236,65 +246,46 @@ class Match:
     at_border: bool
 
 
-@dataclass(frozen=True)
-class Matcher:
-    """Finds the pose of a scan in a likelihood field.
+def match_scan(
+    field: LikelihoodField, points: FloatArray, guess: FloatArray, sigma: FloatArray, window: Window
+) -> Match:
+    """Find the pose of ``points`` (n, 2), n > 0, in a likelihood field near ``guess`` (3,).
 
-    Attributes:
-        residual_sigma: standard deviation (1σ) of ``1 − M`` for a point on its surface; a smaller value trusts the scan
-            more and odometry less.
-        cutoff: distance from the guess, in σ, beyond which the prior's pull stops growing.
-        coarse_rotation_step_rad, fine_rotation_step_rad: steps of the two searches; the translation step is one field
-            cell.
-        refine_iterations: maximum number of Gauss-Newton steps.
+    Args:
+        field: the local map.
+        points: (n, 2) in the base frame.
+        guess: field_from_base (3,).
+        sigma: standard deviations (3,) of the guess: along, across, rotation.
+        window: how far from the guess to search.
     """
-
-    residual_sigma: float
-    cutoff: float
-    coarse_rotation_step_rad: float
-    fine_rotation_step_rad: float
-    refine_iterations: int
-
-    def match(
-        self, field: LikelihoodField, points: FloatArray, guess: FloatArray, sigma: FloatArray, window: Window
-    ) -> Match:
-        """Match ``points`` (n, 2), n > 0, near ``guess`` (3,).
-
-        Args:
-            field: the local map.
-            points: (n, 2) in the base frame.
-            guess: field_from_base (3,).
-            sigma: standard deviations (3,) of the guess: along, across, rotation.
-            window: how far from the guess to search.
-        """
-        information = 1.0 / np.square(sigma)
-        weight = 1.0 / self.residual_sigma**2
-        gain = weight * len(points)
-        resolution = field.resolution
-        cells = math.ceil(window.translation_m / resolution)
-        rotations = math.ceil(window.rotation_rad / self.coarse_rotation_step_rad)
-        x, y, yaw, _ = correlate(
-            field.values, field.origin, resolution, points, guess, cells, rotations,
-            self.coarse_rotation_step_rad, guess, information, self.cutoff, gain,
-        )  # fmt: skip
-        at_border = (
-            max(abs(x - guess[0]), abs(y - guess[1])) > (cells - 0.5) * resolution
-            or abs(yaw - guess[2]) > (rotations - 0.5) * self.coarse_rotation_step_rad
-        )
-        finer = math.ceil(self.coarse_rotation_step_rad / self.fine_rotation_step_rad) - 1
-        x, y, yaw, _ = correlate(
-            field.values, field.origin, resolution, points, np.array([x, y, yaw]), 1, finer,
-            self.fine_rotation_step_rad, guess, information, self.cutoff, gain,
-        )  # fmt: skip
-        # Keep the prior's weight fixed at its value at the best pose of the search.
-        error = relative2(guess, np.array([x, y, yaw]))
-        information = information / (1.0 + float(information @ error**2) / self.cutoff**2)
-        pose, hessian, score, squares = refine(
-            field.values, field.origin, resolution, points, np.array([x, y, yaw]), guess, information, weight,
-            self.refine_iterations, 3 * resolution, 2 * self.coarse_rotation_step_rad,
-        )  # fmt: skip
-        # The residuals measure the quality of the fit: a poor fit gets a wide covariance.
-        variance = max(squares / max(len(points) - 3, 1), 1e-3) * weight
-        covariance = variance * np.linalg.inv(hessian)
-        pose[2] = wrap_angle(float(pose[2]))
-        return Match(pose, 0.5 * (covariance + covariance.T), float(score), bool(at_border))
+    information = 1.0 / np.square(sigma)
+    weight = 1.0 / RESIDUAL_SIGMA**2
+    gain = weight * len(points)
+    resolution = field.resolution
+    cells = math.ceil(window.translation_m / resolution)
+    rotations = math.ceil(window.rotation_rad / COARSE_STEP_RAD)
+    x, y, yaw, _ = correlate(
+        field.values, field.origin, resolution, points, guess, cells, rotations, COARSE_STEP_RAD, guess, information,
+        ODOMETRY_CUTOFF, gain,
+    )  # fmt: skip
+    at_border = (
+        max(abs(x - guess[0]), abs(y - guess[1])) > (cells - 0.5) * resolution
+        or abs(yaw - guess[2]) > (rotations - 0.5) * COARSE_STEP_RAD
+    )
+    finer = math.ceil(COARSE_STEP_RAD / FINE_STEP_RAD) - 1
+    x, y, yaw, _ = correlate(
+        field.values, field.origin, resolution, points, np.array([x, y, yaw]), 1, finer, FINE_STEP_RAD, guess,
+        information, ODOMETRY_CUTOFF, gain,
+    )  # fmt: skip
+    # Keep the prior's weight fixed at its value at the best pose of the search.
+    error = relative2(guess, np.array([x, y, yaw]))
+    information = information / (1.0 + float(information @ error**2) / ODOMETRY_CUTOFF**2)
+    pose, hessian, score, squares = refine(
+        field.values, field.origin, resolution, points, np.array([x, y, yaw]), guess, information, weight,
+        REFINE_ITERATIONS, 3 * resolution, 2 * COARSE_STEP_RAD,
+    )  # fmt: skip
+    # The residuals measure the quality of the fit: a poor fit gets a wide covariance.
+    variance = max(squares / max(len(points) - 3, 1), 1e-3) * weight
+    covariance = variance * np.linalg.inv(hessian)
+    pose[2] = wrap_angle(float(pose[2]))
+    return Match(pose, 0.5 * (covariance + covariance.T), float(score), bool(at_border))

@@ -7,8 +7,20 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-from instant_ic.slam.config import MotionConfig
 from instant_ic.slam.scan import FloatArray
+
+WINDOW_S = 2.0
+"""Time window of the comparison: long enough for a slow robot to move clearly."""
+STILL_M, STILL_RAD = 0.02, 0.03
+"""Tracks below both in the window are standing."""
+MOVED_M, MOVED_RAD = 0.1, 0.15
+"""A robot above either in the window is moving: several times the error of scan matching."""
+CARRIED_JUMP_M = 0.4
+"""Jump between two scans, with standing tracks, above which the robot was carried."""
+SLIP_SHARE, STUCK_SHARE = 0.4, 0.85
+"""Shares of the track distance lost above which the robot is slipping, or stuck."""
+TURN_MEMORY = 0.95
+"""Weight of older turns in the estimate of the effective track width: about the last 20 blocks count."""
 
 
 class MotionState(enum.StrEnum):
@@ -36,7 +48,7 @@ class _Step:
 
 
 class MotionMonitor:
-    """Compares odometry steps with matched steps over the last ``window_s``.
+    """Compares odometry steps with matched steps over the last `WINDOW_S`.
 
     Attributes:
         state: see `MotionState`.
@@ -47,8 +59,7 @@ class MotionMonitor:
         turn_factor_sigma: its standard deviation (1σ); inf before the first turn.
     """
 
-    def __init__(self, config: MotionConfig) -> None:
-        self.config = config
+    def __init__(self) -> None:
         self.state = MotionState.NORMAL
         self.slip = 0.0
         self.turn_factor = 1.0
@@ -73,7 +84,7 @@ class MotionMonitor:
         seen_m = math.copysign(math.hypot(seen[0], seen[1]), seen[0])
         self._steps.append(_Step(elapsed_s, wheels_m, float(wheels[2]), seen_m, float(seen[2]), matched))
         self._span_s += elapsed_s
-        while len(self._steps) > 1 and self._span_s - self._steps[0].seconds >= self.config.window_s:
+        while len(self._steps) > 1 and self._span_s - self._steps[0].seconds >= WINDOW_S:
             self._span_s -= self._steps.popleft().seconds
         if matched:
             self._learn_turn(float(wheels[2]), float(seen[2]))
@@ -81,30 +92,28 @@ class MotionMonitor:
         return self.state
 
     def _judge(self) -> MotionState:
-        config, steps = self.config, self._steps
+        steps = self._steps
         wheels_way = sum(abs(s.wheels_m) for s in steps)
         wheels_turn = sum(abs(s.wheels_rad) for s in steps)
         seen = [s for s in steps if s.seen]
         seen_way = abs(sum(s.seen_m for s in seen))
         seen_turn = abs(sum(s.seen_rad for s in seen))
-        stands = wheels_way < config.still_m and wheels_turn < config.still_rad
+        stands = wheels_way < STILL_M and wheels_turn < STILL_RAD
         if stands:
             self.slip = 0.0
             if len(seen) < 0.5 * len(steps):
                 return MotionState.CARRIED
             jump = max((abs(s.seen_m) for s in seen), default=0.0)
-            if jump > config.carried_jump_m:
+            if jump > CARRIED_JUMP_M:
                 return MotionState.CARRIED
-            return (
-                MotionState.PUSHED if seen_way > config.moved_m or seen_turn > config.moved_rad else MotionState.NORMAL
-            )
+            return MotionState.PUSHED if seen_way > MOVED_M or seen_turn > MOVED_RAD else MotionState.NORMAL
         net = abs(sum(s.wheels_m for s in seen))
-        self.slip = 1.0 - seen_way / net if net > config.moved_m else 0.0
+        self.slip = 1.0 - seen_way / net if net > MOVED_M else 0.0
         turned = abs(sum(s.wheels_rad for s in seen))
-        lost_turn = 1.0 - seen_turn * self.turn_factor / turned if turned > config.moved_rad else 0.0
-        if max(self.slip, lost_turn) > config.stuck_share and max(seen_way, 0.3 * seen_turn) < config.still_m * 2:
+        lost_turn = 1.0 - seen_turn * self.turn_factor / turned if turned > MOVED_RAD else 0.0
+        if max(self.slip, lost_turn) > STUCK_SHARE and max(seen_way, 0.3 * seen_turn) < STILL_M * 2:
             return MotionState.STUCK
-        return MotionState.SLIPPING if max(self.slip, lost_turn) > config.slip_share else MotionState.NORMAL
+        return MotionState.SLIPPING if max(self.slip, lost_turn) > SLIP_SHARE else MotionState.NORMAL
 
     def _learn_turn(self, wheels_rad: float, seen_rad: float) -> None:
         self._block_wheels += wheels_rad
@@ -116,7 +125,7 @@ class MotionMonitor:
         self._block_wheels = self._block_seen = self._block_turned = 0.0
         if abs(seen) < 0.3 or abs(wheels) > 3 * abs(seen):
             return  # turning back and forth, or a stuck robot: no information about the track width
-        keep = self.config.turn_memory
+        keep = TURN_MEMORY
         error = wheels - self.turn_factor * seen
         self._squares = keep * self._squares + seen * seen
         self._products = keep * self._products + seen * wheels

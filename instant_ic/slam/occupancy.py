@@ -18,6 +18,11 @@ from instant_ic.slam.scan import FloatArray, ScanPoints
 
 GROW_CELLS = 64
 
+HIT, MISS = 0.7, 0.4
+"""Occupancy probability of a cell in which a beam ended, and of one that a beam passed through."""
+LOW, HIGH = 0.03, 0.97
+"""Limits of a cell's probability, so that changes of the place become visible after a few scans."""
+
 
 class OccupancyGrid(NamedTuple):
     """A map as in nav_msgs/OccupancyGrid.
@@ -144,10 +149,7 @@ class OccupancyMap:
         self.version = 0
         self.clipped = 0
         self._mark = 0
-        self._hit = _log_odds(config.hit_probability)
-        self._miss = _log_odds(config.miss_probability)
-        self._low = _log_odds(config.min_probability)
-        self._high = _log_odds(config.max_probability)
+        self._log_odds = [_log_odds(probability) for probability in (HIT, MISS, LOW, HIGH)]
         self._first = np.zeros(2, dtype=np.int64)  # cell index of the corner; the corner is first·resolution
         self._cells = np.zeros((0, 0), dtype=np.float32)
         self._seen = np.zeros((0, 0), dtype=np.int32)
@@ -164,7 +166,7 @@ class OccupancyMap:
         self._mark += 1
         cast_scan(
             self._cells, self._seen, self._mark, self.origin, self.config.resolution_m, map_from_base, scan.origin,
-            scan.points, scan.clear_ends, self.config.max_range_m, self._hit, self._miss, self._low, self._high,
+            scan.points, scan.clear_ends, self.config.max_range_m, *self._log_odds,
         )  # fmt: skip
         self.version += 1
 

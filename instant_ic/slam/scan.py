@@ -51,12 +51,16 @@ class ScanPoints:
     clear_ends: FloatArray
 
 
+JOIN_GAP_M = 0.3
+"""Neighbouring hits closer than this are one surface: less than the width of a door."""
+POINT_SPACING_M = 0.04
+"""Minimum spacing of the matched points along a surface, below the cell size of the field."""
 COLLINEAR_M = 0.05
 COLLINEAR_GAP_M = 8.0
 COLLINEAR_GAP_RATIO = 2.0
 
 
-def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArray[np.bool_]:
+def _joined(points: FloatArray, beams: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Which points (n, 2) continue the surface of the previous one.
 
     Points of neighbouring beams are joined if they are close together. On a wall seen at a grazing angle, where hits
@@ -78,14 +82,14 @@ def _joined(points: FloatArray, beams: NDArray[np.intp], gap_m: float) -> NDArra
         straight &= (cross <= COLLINEAR_M * shorter) & (longer <= COLLINEAR_GAP_RATIO * shorter)
         in_line[:-1] |= straight
         in_line[1:] |= straight
-    joined[1:] = neighbours & ((length <= gap_m) | (in_line & (length <= COLLINEAR_GAP_M)))
+    joined[1:] = neighbours & ((length <= JOIN_GAP_M) | (in_line & (length <= COLLINEAR_GAP_M)))
     return joined
 
 
-def scan_points(scan: Scan, base_from_laser: FloatArray, join_gap_m: float, clear_m: float) -> ScanPoints:
+def scan_points(scan: Scan, base_from_laser: FloatArray, clear_m: float) -> ScanPoints:
     """Hits and free rays of ``scan``; a range is a hit if ``range_min <= r <= range_max`` (REP-117).
 
-    Neighbouring beams whose hits lie no more than ``join_gap_m`` apart, or in a line, are one surface. A ray of +inf is
+    Neighbouring beams whose hits lie no more than `JOIN_GAP_M` apart, or in a line, are one surface. A ray of +inf is
     free for ``clear_m`` metres (0: unknown).
     """
     ranges = np.asarray(scan.ranges, dtype=np.float64)
@@ -96,13 +100,13 @@ def scan_points(scan: Scan, base_from_laser: FloatArray, join_gap_m: float, clea
     beams = np.flatnonzero(hit)
     directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     points = origin + ranges[beams, None] * directions[beams]
-    joined = _joined(points, beams, join_gap_m)
+    joined = _joined(points, beams)
     free = np.isposinf(ranges) if clear_m > 0 else np.zeros(ranges.size, dtype=np.bool_)
     return ScanPoints(points, joined, origin, origin + clear_m * directions[free])
 
 
-def thin(points: FloatArray, joined: NDArray[np.bool_], spacing_m: float, max_points: int) -> FloatArray:
-    """Points for matching: at least ``spacing_m`` apart along a surface, at most ``max_points``, evenly chosen.
+def thin(points: FloatArray, joined: NDArray[np.bool_], max_points: int) -> FloatArray:
+    """Points for matching: at least `POINT_SPACING_M` apart along a surface, at most ``max_points``, evenly chosen.
 
     Without thinning, a near wall hit by many beams outweighs the far walls that determine the heading.
     """
@@ -110,9 +114,9 @@ def thin(points: FloatArray, joined: NDArray[np.bool_], spacing_m: float, max_po
         return points
     step = np.zeros(len(points))
     step[1:] = np.where(joined[1:], np.sqrt(((points[1:] - points[:-1]) ** 2).sum(axis=1)), np.inf)
-    # Arc length along each surface; a point is kept where the length enters a new interval of spacing_m.
-    step[~np.isfinite(step)] = spacing_m
-    stretch = np.floor(np.cumsum(step) / spacing_m) if spacing_m > 0 else np.arange(len(points), dtype=np.float64)
+    # Arc length along each surface; a point is kept where the length enters a new interval of POINT_SPACING_M.
+    step[~np.isfinite(step)] = POINT_SPACING_M
+    stretch = np.floor(np.cumsum(step) / POINT_SPACING_M)
     keep = np.ones(len(points), dtype=np.bool_)
     keep[1:] = stretch[1:] != stretch[:-1]
     kept = points[keep]

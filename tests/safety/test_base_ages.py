@@ -70,7 +70,7 @@ def test_silent_scans_are_reported_after_the_clock_was_set(jump_s: int) -> None:
     bus.publish("/wheel/odom", odometry_message(np.eye(4), 0.0, 0.0, "odom", "base_link", clock.now_ns()))
     ranges = np.full(720, 3.0, np.float32)
     bus.publish("/scan", scan_message(ranges, -np.pi, np.pi / 360, 0.1, 30.0, "velodyne", clock.now_ns()))
-    assert node.last_scan_ns is not None
+    assert node.queue.last_ns is not None
     clock.set_by_ns = jump_s * S
     clock.set(clock.steady_ns() + 2 * S)
     node.watch()

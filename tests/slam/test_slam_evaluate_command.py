@@ -91,8 +91,8 @@ def test_figures_trajectory_and_plot(
 def test_the_particle_filter_by_name(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     start = tmp_path / "start.log"  # a filter costs many times what the graph does
     start.write_bytes(b"".join(gzip.decompress(log.read_bytes()).splitlines(keepends=True)[:60]))
-    words = ["evaluate", "slam", str(start), "--backend", "rbpf", "--trajectory", str(tmp_path / "t"), "-p"]
-    assert main([*words, "rbpf.particles:=5"]) == 0
+    words = ["evaluate", "slam", str(start), "--backend", "rbpf", "--trajectory", str(tmp_path / "t")]
+    assert main([*words, "--particles", "5"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["backend"] == "rbpf" and report["updates"] > 3
     assert len(np.loadtxt(tmp_path / "t")) == report["scans"]

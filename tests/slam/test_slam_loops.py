@@ -14,8 +14,8 @@ from instant_ic.geometry.poses import compose2, relative2
 from instant_ic.slam import GridSlam, SlamConfig, SlamResult
 from instant_ic.slam.config import FieldConfig
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.loop_closure import BackEnd, _Candidate, _chained, _reversed
-from instant_ic.slam.loop_search import LoopSearch, peaks, pool, score_volume, spread
+from instant_ic.slam.loop_closure import LoopClosure, _Candidate, _chained, _reversed
+from instant_ic.slam.loop_search import find_place, peaks, pool, score_volume, spread
 from instant_ic.slam.pose_graph import Edge
 
 COARSE = Laser(180, 360.0, 12.0, 0.015)
@@ -42,7 +42,9 @@ def loop_errors(slam: GridSlam, journey: Drive) -> np.ndarray:
     at = {entry.scan.stamp_ns: k for k, entry in enumerate(journey.entries)}
     true = [journey.truth[at[k.stamp_ns]] for k in slam.front_end.trajectory.keyframes]
     rest = [
-        relative2(relative2(true[edge.a], true[edge.b]), edge.a_from_b) for edge in slam.back_end.edges if edge.robust
+        relative2(relative2(true[edge.a], true[edge.b]), edge.a_from_b)
+        for edge in slam.loop_closure.edges
+        if edge.robust
     ]
     return np.array([math.hypot(r[0], r[1]) for r in rest])
 
@@ -64,7 +66,7 @@ def ring() -> tuple[Drive, GridSlam, list[SlamResult]]:
 
 def test_a_loop_is_closed(ring: tuple[Drive, GridSlam, list[SlamResult]]) -> None:
     journey, slam, results = ring
-    assert slam.back_end.closed > 5
+    assert slam.loop_closure.closed > 5
     assert loop_errors(slam, journey).max() < 0.15
     online = np.array([r.map_from_base for r in results])
     metres, degrees = trajectory_errors(online, journey.truth)
@@ -104,7 +106,7 @@ def test_a_bare_corridor_closes_no_false_loop() -> None:
     journey = drive(walls, [(0.0, 0.0), (18.0, 0.0), (0.0, 0.0), (18.0, 0.0)], COARSE, 3, step_m=0.2)
     slam, _ = run(journey)
     assert len(slam.front_end.trajectory) > 100
-    assert slam.back_end.closed == 0
+    assert slam.loop_closure.closed == 0
 
 
 def test_staying_in_one_room_does_not_add_keyframes_for_ever() -> None:
@@ -125,17 +127,20 @@ def test_staying_in_one_room_does_not_add_keyframes_for_ever() -> None:
 
 def test_a_loop_that_waits_does_not_outlive_its_keyframe() -> None:
     # A keyframe may be merged into another while a loop to it waits for others that agree.
-    back_end = BackEnd(SlamConfig())
+    loop_closure = LoopClosure(SlamConfig())
     slam, _ = run(drive(rectangle(-3, -3, 3, 3), [(0.0, 0.0), (2.0, 0.0)], COARSE, 0))
-    back_end.update(slam.front_end.trajectory.keyframes)
-    here = len(back_end) - 1
-    edges = [Edge(a, here - a, relative2(back_end.poses[a], back_end.poses[here - a]), np.eye(3), True) for a in (1, 2)]
+    loop_closure.update(slam.front_end.trajectory.keyframes)
+    here = len(loop_closure) - 1
+    edges = [
+        Edge(a, here - a, relative2(loop_closure.poses[a], loop_closure.poses[here - a]), np.eye(3), True)
+        for a in (1, 2)
+    ]
     for edge in edges:
-        assert back_end._confirm(_Candidate(edge, 0.0)) == []
-    back_end._alive[1] = False
-    last = Edge(0, here, relative2(back_end.poses[0], back_end.poses[here]), np.eye(3), True)
-    assert back_end._confirm(_Candidate(last, 50.0)) == []  # of three, one is gone
-    assert [c.edge for c in back_end._pending] == [edges[1], last]
+        assert loop_closure._confirm(_Candidate(edge, 0.0)) == []
+    loop_closure._alive[1] = False
+    last = Edge(0, here, relative2(loop_closure.poses[0], loop_closure.poses[here]), np.eye(3), True)
+    assert loop_closure._confirm(_Candidate(last, 50.0)) == []  # of three, one is gone
+    assert [c.edge for c in loop_closure._pending] == [edges[1], last]
 
 
 def field_of(walls: PlanarWorld, poses: list[tuple[float, float, float]]) -> LikelihoodField:
@@ -149,7 +154,7 @@ def field_of(walls: PlanarWorld, poses: list[tuple[float, float, float]]) -> Lik
         joined = np.zeros(len(points), dtype=bool)
         joined[1:] = np.hypot(*np.diff(points, axis=0).T) < 2.0  # else the far walls would be dotted lines
         surfaces.append(Surface(np.array(pose), points, joined))
-    field.draw(np.zeros(3), surfaces)
+    field.rebuild(np.zeros(3), surfaces)
     return field
 
 
@@ -162,7 +167,7 @@ def seen_from(walls: PlanarWorld, pose: tuple[float, float, float]) -> np.ndarra
 
 def test_the_search_finds_what_is_metres_away() -> None:
     world = PlanarWorld(rectangle(-2, -1.5, 4, 2.5) + rectangle(1.5, 1.0, 2.0, 1.4))
-    found = LoopSearch().find(
+    found = find_place(
         field_of(world, [(0, 0, 0), (2, 0, 0.5)]), seen_from(world, (1.7, -0.4, 0.6)), np.zeros(3), 3.0, 0.8
     )
     assert found is not None
@@ -173,19 +178,19 @@ def test_the_search_finds_what_is_metres_away() -> None:
 
 def test_a_corridor_has_no_shape_and_a_symmetric_room_two_answers() -> None:
     corridor = PlanarWorld([(-40, -1, 40, -1), (-40, 1, 40, 1)])
-    found = LoopSearch().find(
+    found = find_place(
         field_of(corridor, [(0, 0, 0), (1, 0, 0)]), seen_from(corridor, (2, 0, 0)), np.zeros(3), 2.0, 0.3
     )
     assert found is not None and found.shape < 0.05
     square = PlanarWorld(rectangle(-2, -2, 2, 2))
-    found = LoopSearch().find(field_of(square, [(0, 0, 0)]), seen_from(square, (0.5, 0, 0)), np.zeros(3), 1.0, 1.7)
+    found = find_place(field_of(square, [(0, 0, 0)]), seen_from(square, (0.5, 0, 0)), np.zeros(3), 1.0, 1.7)
     assert found is not None and found.runner_up > 0.95 * found.score  # 90° on, at (0, 0.5), it looks the same
 
 
 def test_nothing_to_find_is_no_answer() -> None:
     empty = LikelihoodField(FieldConfig(max_range_m=5.0), 1.0)
-    empty.draw(np.zeros(3), [])
-    assert LoopSearch().find(empty, np.array([[1.0, 0.0]]), np.zeros(3), 1.0, 0.5) is None
+    empty.rebuild(np.zeros(3), [])
+    assert find_place(empty, np.array([[1.0, 0.0]]), np.zeros(3), 1.0, 0.5) is None
 
 
 def test_pooled_cells_hold_the_best_near_them() -> None:
@@ -230,4 +235,4 @@ def test_loops_can_be_switched_off() -> None:
     config = SlamConfig(loop=replace(SlamConfig().loop, enabled=False))
     journey = drive(rectangle(-3, -3, 3, 3), [(0.0, 0.0), (1.0, 0.0)], LASERS["vlp16"], 0)
     slam, _ = run(journey, GridSlam(config))
-    assert slam.back_end.closed == 0 and len(slam.back_end) == 0
+    assert slam.loop_closure.closed == 0 and len(slam.loop_closure) == 0

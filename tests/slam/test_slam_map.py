@@ -101,7 +101,7 @@ def test_a_room_is_drawn_where_it_is() -> None:
     room = box_room()
     occupancy = OccupancyMap(MapConfig())
     for k, pose in enumerate([[0.0, 0.0, 0.0], [0.5, 0.3, 1.0], [2.8, -0.5, -2.0]]):
-        occupancy.insert(np.array(pose), scan_points(room.scan(np.array(pose), k + 1), np.zeros(3), 0.3, 0.0))
+        occupancy.insert(np.array(pose), scan_points(room.scan(np.array(pose), k + 1), np.zeros(3), 0.0))
     grid = occupancy.grid()
     rows, columns = np.nonzero(grid.values > 60)
     centres = np.stack([columns, rows], axis=1) * grid.resolution + grid.origin + grid.resolution / 2

@@ -10,15 +10,14 @@ from slam_planar_world import PlanarWorld, box_room, corridor
 
 from instant_ic.slam import FieldConfig, MatchConfig
 from instant_ic.slam.likelihood_field import LikelihoodField, Surface
-from instant_ic.slam.matcher import Matcher, Window
+from instant_ic.slam.matcher import Window, match_scan
 from instant_ic.slam.scan import ScanPoints, scan_points, thin
 
-MATCH = MatchConfig()
 WIDE = np.array([0.3, 0.3, 0.3])
 
 
 def points_at(world: PlanarWorld, pose: list[float], noise_m: float = 0.0, stamp: int = 1) -> ScanPoints:
-    return scan_points(world.scan(np.array(pose), stamp, noise_m=noise_m), np.zeros(3), 0.3, 0.0)
+    return scan_points(world.scan(np.array(pose), stamp, noise_m=noise_m), np.zeros(3), 0.0)
 
 
 def field_of(world: PlanarWorld, *poses: list[float], noise_m: float = 0.0) -> LikelihoodField:
@@ -27,22 +26,12 @@ def field_of(world: PlanarWorld, *poses: list[float], noise_m: float = 0.0) -> L
     for index, pose in enumerate(poses):
         points = points_at(world, pose, noise_m, stamp=index + 1)
         surfaces.append(Surface(np.array(pose), points.points, points.joined))
-    field.draw(np.array(poses[-1]), surfaces)
+    field.rebuild(np.array(poses[-1]), surfaces)
     return field
 
 
-def matcher() -> Matcher:
-    return Matcher(
-        MATCH.residual_sigma,
-        MATCH.odometry_cutoff,
-        MATCH.coarse_rotation_step_rad,
-        MATCH.fine_rotation_step_rad,
-        MATCH.refine_iterations,
-    )
-
-
 def match_points(points: ScanPoints) -> np.ndarray:
-    return thin(points.points, points.joined, MATCH.point_spacing_m, MATCH.max_points)
+    return thin(points.points, points.joined, MatchConfig().max_points)
 
 
 def value_at(field: LikelihoodField, x: float, y: float) -> float:
@@ -73,7 +62,7 @@ def test_noisy_hits_are_averaged_to_one_surface() -> None:
 def test_a_scan_moved_and_turned_by_known_amounts_is_found(moved: list[float]) -> None:
     room = box_room()
     field = field_of(room, [0.0, 0.0, 0.0])
-    match = matcher().match(field, match_points(points_at(room, moved)), np.zeros(3), WIDE, Window(0.35, 0.35))
+    match = match_scan(field, match_points(points_at(room, moved)), np.zeros(3), WIDE, Window(0.35, 0.35))
     assert np.hypot(*(match.pose[:2] - moved[:2])) < 0.01
     assert abs(match.pose[2] - moved[2]) < 0.003
     assert match.score > 0.9
@@ -82,7 +71,7 @@ def test_a_scan_moved_and_turned_by_known_amounts_is_found(moved: list[float]) -
 def test_a_heading_near_half_a_turn_is_wrapped() -> None:
     room = box_room()
     field = field_of(room, [0.0, 0.0, math.pi - 0.01])
-    match = matcher().match(
+    match = match_scan(
         field, match_points(points_at(room, [0.0, 0.0, -math.pi + 0.02])), np.array([0.0, 0.0, math.pi - 0.01]), WIDE,
         Window(0.1, 0.1),
     )  # fmt: skip
@@ -95,7 +84,7 @@ def test_two_matches_are_the_same_bit_for_bit() -> None:
     for _ in range(2):
         field = field_of(room, [0.0, 0.0, 0.0], [0.3, 0.0, 0.1], noise_m=0.02)
         points = match_points(points_at(room, [0.2, 0.1, 0.1], 0.02, stamp=9))
-        match = matcher().match(field, points, np.zeros(3), WIDE, Window(0.35, 0.35))
+        match = match_scan(field, points, np.zeros(3), WIDE, Window(0.35, 0.35))
         results.append((match.pose.tobytes(), match.covariance.tobytes(), match.score))
     assert results[0] == results[1]
 
@@ -104,13 +93,13 @@ def test_covariance_is_wide_along_a_corridor_and_narrow_across() -> None:
     world = corridor()
     field = field_of(world, [0.0, 0.0, 0.0], noise_m=0.01)
     sigma = np.array([0.05, 0.05, 0.05])
-    match = matcher().match(
+    match = match_scan(
         field, match_points(points_at(world, [0.02, 0.0, 0.0], 0.01, 7)), np.zeros(3), sigma, Window(0.1, 0.1)
     )
     along, across = np.sqrt(np.diag(match.covariance)[:2])
     assert along > 3 * across
     room = box_room()
-    match = matcher().match(
+    match = match_scan(
         field_of(room, [0.0, 0.0, 0.0]), match_points(points_at(room, [0.02, 0.0, 0.0])), np.zeros(3), sigma,
         Window(0.1, 0.1),
     )  # fmt: skip
@@ -123,7 +112,7 @@ def test_the_prior_decides_along_a_corridor_even_when_the_guess_is_off_across() 
     field = field_of(world, *[[0.25 * k, 0.0, 0.0] for k in range(-8, 1)], noise_m=0.01)
     points = match_points(points_at(world, [0.1, 0.0, 0.0], 0.01, 99))
     guess = np.array([0.1, 0.08, 0.05])
-    match = matcher().match(field, points, guess, np.array([0.02, 0.1, 0.05]), Window(0.3, 0.2))
+    match = match_scan(field, points, guess, np.array([0.02, 0.1, 0.05]), Window(0.3, 0.2))
     assert abs(match.pose[0] - 0.1) < 0.03
     assert abs(match.pose[1]) < 0.01
     assert abs(match.pose[2]) < 0.005

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.slam.config import MotionConfig
 from instant_ic.slam.motion import MotionMonitor, MotionState
 
 
@@ -25,7 +24,7 @@ def steps(
 
 
 def test_a_robot_that_moves_as_its_tracks_do_is_normal() -> None:
-    monitor = MotionMonitor(MotionConfig())
+    monitor = MotionMonitor()
     assert steps(monitor, 30, (0.05, 0.0), (0.047, 0.0)) is MotionState.NORMAL
     assert monitor.slip == pytest.approx(0.06)
     assert steps(monitor, 30) is MotionState.NORMAL
@@ -33,7 +32,7 @@ def test_a_robot_that_moves_as_its_tracks_do_is_normal() -> None:
 
 
 def test_slip_and_stuck() -> None:
-    monitor = MotionMonitor(MotionConfig())
+    monitor = MotionMonitor()
     assert steps(monitor, 30, (0.05, 0.0), (0.025, 0.0)) is MotionState.SLIPPING
     assert monitor.slip == pytest.approx(0.5)
     assert steps(monitor, 30, (0.05, 0.0), (0.001, 0.0)) is MotionState.STUCK
@@ -45,7 +44,7 @@ def test_slip_and_stuck() -> None:
 
 
 def test_pushed_and_carried() -> None:
-    monitor = MotionMonitor(MotionConfig())
+    monitor = MotionMonitor()
     assert steps(monitor, 30, (0.0, 0.0), (0.02, 0.0)) is MotionState.PUSHED
     assert steps(monitor, 30) is MotionState.NORMAL
     assert steps(monitor, 30, seen=(0.0, 0.02)) is MotionState.PUSHED
@@ -54,18 +53,18 @@ def test_pushed_and_carried() -> None:
     assert steps(monitor, 25) is MotionState.NORMAL
     assert steps(monitor, 15, matched=False) is MotionState.CARRIED
     # Lost while driving is not carried.
-    assert steps(MotionMonitor(MotionConfig()), 30, (0.05, 0.0), matched=False) is MotionState.NORMAL
+    assert steps(MotionMonitor(), 30, (0.05, 0.0), matched=False) is MotionState.NORMAL
 
 
 def test_noise_of_a_standing_robot_is_no_push() -> None:
-    monitor = MotionMonitor(MotionConfig())
+    monitor = MotionMonitor()
     rng = np.random.default_rng(0)
     for noise in rng.standard_normal((200, 3)) * [0.005, 0.005, 0.003]:
         assert monitor.update(np.zeros(3), noise, 0.1, True) is MotionState.NORMAL
 
 
 def test_the_turn_factor_is_learnt() -> None:
-    monitor = MotionMonitor(MotionConfig())
+    monitor = MotionMonitor()
     assert monitor.turn_factor == 1.0 and math.isinf(monitor.turn_factor_sigma)
     rng = np.random.default_rng(1)
     for k in range(1500):
@@ -76,10 +75,3 @@ def test_the_turn_factor_is_learnt() -> None:
     assert monitor.turn_factor == pytest.approx(1.3, abs=0.03)
     assert 0 < monitor.turn_factor_sigma < 0.05
     assert monitor.state is MotionState.NORMAL
-
-
-def test_bad_thresholds_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"MotionConfig\.moved_m must be > still_m"):
-        MotionConfig(moved_m=0.01)
-    with pytest.raises(ValueError, match="stuck_share"):
-        MotionConfig(stuck_share=0.3)

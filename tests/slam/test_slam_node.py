@@ -30,7 +30,6 @@ from instant_ic.msg import (
     transform_message,
 )
 from instant_ic.msg import pose_matrix as message_pose
-from instant_ic.slam import ParticleConfig
 from nodes.grid_slam import GridSlamConfig, GridSlamNode
 
 START_NS = 1_700_000_000_000_000_000
@@ -212,7 +211,7 @@ def test_time_that_goes_far_back_begins_a_new_map() -> None:
     size = len(rig.node.slam.front_end.trajectory)
     assert size > 2
     # A recording is played again: the clock of the bus cannot go back, so age is let pass.
-    object.__setattr__(rig.node, "config", replace(rig.node.config, max_scan_age_s=100.0))
+    rig.node.queue.config = replace(rig.node.config, max_scan_age_s=100.0)
     rig.now_ns -= 1_900_000_000
     rig.wheel()
     rig.scan()
@@ -323,7 +322,7 @@ def test_map_updates_bring_the_old_map_to_the_new_one() -> None:
         if stamp_ns(update) > last_whole:
             part = np.asarray(update.data, dtype=np.int8).reshape(update.height, update.width)
             grid[update.y : update.y + update.height, update.x : update.x + update.width] = part
-    assert np.array_equal(grid, rig.node.published.values)
+    assert np.array_equal(grid, rig.node.updates.grid.values)
 
 
 def test_a_stuck_robot_is_told() -> None:
@@ -350,19 +349,8 @@ def test_a_fault_of_the_worker_is_told_and_the_scans_go_on(monkeypatch: pytest.M
     def broken(*args: object) -> None:
         raise RuntimeError("no more")
 
-    monkeypatch.setattr(rig.node.slam.back_end, "update", broken)
+    monkeypatch.setattr(rig.node.slam.loop_closure, "update", broken)
     rig.drive(0.4, 0.3, 20)
     assert len(rig.bus.messages("/pose")) == 21 and max(rig.pose_errors()) < 0.03
     level, text, _ = rig.node.diagnoses()["loops"]
     assert level == ERROR and "no more" in text
-
-
-def test_the_particle_filter_runs_in_the_same_node() -> None:
-    rig = Rig(GridSlamConfig(backend="rbpf", rbpf=ParticleConfig(particles=5, linearUpdate=0.2, angularUpdate=0.2)))
-    rig.wheel()
-    rig.scan()
-    rig.drive(0.4, 0.2, 30)
-    assert len(rig.bus.messages("/pose")) == 31
-    assert max(rig.pose_errors()) < 0.1
-    grid, _, _ = grid_array(rig.bus.last("/map"))
-    assert (grid == 100).sum() > 100

@@ -33,7 +33,10 @@ def add_kind(kinds: Any) -> None:
     parser.add_argument(
         "--tolerance", type=float, default=0.006, metavar="S", help="tolerance of that match (default: %(default)g s)"
     )
-    parser.add_argument("--backend", choices=("graph", "rbpf"), help="SLAM method (default: slam.backend, graph)")
+    parser.add_argument(
+        "--backend", choices=("graph", "rbpf"), default="graph", help="graph: grid SLAM; rbpf: particle filter"
+    )
+    parser.add_argument("--particles", type=int, default=30, metavar="N", help="of rbpf (default: %(default)d)")
     parser.add_argument("--json", type=Path, metavar="OUT", help="also write the figures here")
     parser.add_argument("--plot", type=Path, metavar="OUT.png", help="write an image of map and trajectory here")
     parser.add_argument(
@@ -57,6 +60,7 @@ def evaluate_slam(args: argparse.Namespace) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from instant_ic.bag.replay import make_node
+    from instant_ic.experiments.particle_slam import ParticleConfig
     from instant_ic.experiments.slam import (
         evaluate_log,
         perturb_odometry,
@@ -71,10 +75,11 @@ def evaluate_slam(args: argparse.Namespace) -> int:
         raise UserError("--stamps selects relations: give --relations too", 2)
     if not args.tolerance > 0:
         raise UserError(f"--tolerance must be > 0 (got {args.tolerance:g})", 2)
-    words = [f"grid_slam.{word}" for word in args.param]
-    if args.backend:
-        words.append(f"grid_slam.backend:={args.backend}")
-    config = make_node("grid_slam", args.params_file or [], words).config.slam
+    if args.particles < 1:
+        raise UserError(f"--particles must be at least 1 (got {args.particles})", 2)
+    overrides = [f"grid_slam.{override}" for override in args.param]
+    config = make_node("grid_slam", args.params_file or [], overrides).config
+    particles = ParticleConfig(particles=args.particles) if args.backend == "rbpf" else None
     trajectory_file = args.trajectory or Path(_stem(args.log) + ".trajectory.txt")
     for file in (args.json, args.plot, trajectory_file):
         if file is not None and not file.parent.is_dir():
@@ -100,13 +105,13 @@ def evaluate_slam(args: argparse.Namespace) -> int:
             progress.update(task, description=args.log.name, total=len(entries))
             source = entries if args.perturb_odometry is None else perturb_odometry(entries, args.perturb_odometry)
             report, run = evaluate_log(
-                source, relations, config, use_wheel_odom=not args.no_odometry, tolerance_s=args.tolerance,
-                on_scan=lambda done: progress.update(task, completed=done),
+                source, relations, config, particles=particles, use_wheel_odom=not args.no_odometry,
+                tolerance_s=args.tolerance, on_scan=lambda done: progress.update(task, completed=done),
             )  # fmt: skip
     except (LogError, OSError, ValueError) as error:
         raise UserError(f"evaluate slam: {error}") from None
     write_trajectory(trajectory_file, run.trajectory)
-    report = {"log": args.log.name, "backend": config.backend, **report, "trajectory": str(trajectory_file)}
+    report = {"log": args.log.name, "backend": args.backend, **report, "trajectory": str(trajectory_file)}
     if args.plot:
         _plot(args.plot, run)
         report["plot"] = str(args.plot)

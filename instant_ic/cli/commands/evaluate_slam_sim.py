@@ -44,10 +44,10 @@ def evaluate_slam_sim(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
+    from instant_ic.experiments.particle_slam import ParticleConfig
     from instant_ic.experiments.pictures import save_map
     from instant_ic.experiments.slam_sim import evaluate_round_trip, round_trip
     from instant_ic.sim.worlds import make_world
-    from instant_ic.slam import SlamConfig
 
     if args.seeds < 1 or args.rounds < 1:
         raise UserError("--seeds and --rounds must be at least 1", 2)
@@ -59,8 +59,8 @@ def evaluate_slam_sim(args: argparse.Namespace) -> int:
             world = make_world(args.world)
             for seed in range(args.seeds):
                 trip = round_trip(world, args.slip, seed, args.rounds)
-                config = SlamConfig(backend=args.backend)
-                report, run = evaluate_round_trip(trip, config, use_wheel_odom=not args.no_odometry)
+                particles = ParticleConfig() if args.backend == "rbpf" else None
+                report, run = evaluate_round_trip(trip, particles=particles, use_wheel_odom=not args.no_odometry)
                 reports.append({"seed": seed, **report})
                 progress.advance(task)
         except ValueError as error:

@@ -180,9 +180,9 @@ def climb(table, cells, delta, start, laser, points, kernel, sigma, lsigma, lste
                 trial[1] += sin_yaw * ahead + cos_yaw * left
             else:
                 trial[2] += turn if move == 4 else -turn
-            value, told = score(table, cells, delta, trial, laser, points, kernel, sigma, lsigma)
+            value, trial_likelihood = score(table, cells, delta, trial, laser, points, kernel, sigma, lsigma)
             if value > best:
-                best, likelihood, better = value, told, True
+                best, likelihood, better = value, trial_likelihood, True
                 top[:] = trial
         if better:
             pose[:] = top

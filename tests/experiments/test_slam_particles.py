@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from slam_planar_world import box_room, rectangle
 
+from instant_ic.experiments.particle_slam import ParticleConfig, ParticleSlam
 from instant_ic.experiments.slam import run_log
 from instant_ic.experiments.slam_worlds import Laser, drive, trajectory_errors
-from instant_ic.slam import ParticleConfig, SlamConfig, SlamStatus
-from instant_ic.slam.rbpf import ParticleSlam
-from instant_ic.slam.tile_maps import TILE, TileMaps, climb, score
+from instant_ic.experiments.tile_maps import TILE, TileMaps, climb, score
+from instant_ic.slam import SlamStatus
+from tests.slam.slam_planar_world import box_room, rectangle
 
-FEW = SlamConfig(backend="rbpf", rbpf=ParticleConfig(particles=10, linearUpdate=0.3, angularUpdate=0.2))
+FEW = ParticleConfig(particles=10, linearUpdate=0.3, angularUpdate=0.2)
 LASER = Laser(180, 360.0, 12.0, 0.01)
 WALLS = [*rectangle(-2.0, -1.5, 6.0, 2.5), *rectangle(1.5, 1.0, 2.0, 1.4), *rectangle(4.0, -1.0, 4.4, -0.4)]
 WAY = [(0.0, 0.0), (3.0, 0.5), (5.0, 1.5), (3.0, 0.5), (0.0, 0.0)]
@@ -77,7 +77,7 @@ def test_the_climb_goes_back_to_where_the_scan_was_drawn() -> None:
 
 def test_a_drive_on_bad_odometry() -> None:
     journey = drive(WALLS, WAY, LASER, 2, noise=0.1, scale=0.1, step_m=0.15)
-    result = run_log(journey.entries, FEW)
+    result = run_log(journey.entries, particles=FEW)
     wheels, _ = trajectory_errors(np.array([e.odom_pose for e in journey.entries]), journey.truth)
     online, degrees = trajectory_errors(result.online[:, 1:], journey.truth)
     final, _ = trajectory_errors(result.trajectory[:, 1:], journey.truth)
@@ -94,15 +94,15 @@ def test_a_drive_on_bad_odometry() -> None:
 
 def test_two_runs_are_the_same_and_another_seed_is_not() -> None:
     journey = drive(WALLS, WAY[:2], LASER, 3, step_m=0.15)
-    runs = [run_log(journey.entries, FEW).trajectory.tobytes() for _ in range(2)]
+    runs = [run_log(journey.entries, particles=FEW).trajectory.tobytes() for _ in range(2)]
     assert runs[0] == runs[1]
-    other = replace(FEW, rbpf=replace(FEW.rbpf, seed=1))
-    assert run_log(journey.entries, other).trajectory.tobytes() != runs[0]
+    other = replace(FEW, seed=1)
+    assert run_log(journey.entries, particles=other).trajectory.tobytes() != runs[0]
 
 
 def test_without_odometry_scan_matching_stands_in() -> None:
     journey = drive(WALLS, WAY[:3], LASER, 4)
-    result = run_log(journey.entries, FEW, use_wheel_odom=False)
+    result = run_log(journey.entries, particles=FEW, use_wheel_odom=False)
     online, _ = trajectory_errors(result.online[:, 1:], journey.truth)
     assert online.max() < 0.15
 
@@ -119,5 +119,3 @@ def test_empty_scans_and_time_going_backwards() -> None:
     assert bridged.map_from_base == pytest.approx([0.2, 0.0, 0.0])
     with pytest.raises(ValueError, match="not finite"):
         slam.process(world.scan(np.zeros(3), 9, beams=180), [math.nan, 0.0, 0.0])
-    with pytest.raises(ValueError, match="does not support saved maps"):
-        slam.set_pose([0.0, 0.0, 0.0])

@@ -8,25 +8,74 @@ become too unequal (Grisetti, Stachniss, Burgard, 2007). Between two updates the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Share, check_ranges
+from instant_ic.experiments.tile_maps import TileMaps, climb
 from instant_ic.geometry.poses import compose2, inverse2, relative2, wrap_angle
-from instant_ic.slam.config import ParticleConfig, SlamConfig
+from instant_ic.slam.config import SlamConfig
 from instant_ic.slam.grid_slam import GridSlam, SlamResult, SlamStatus
-from instant_ic.slam.map_files import save_grid
-from instant_ic.slam.motion import MotionMonitor
 from instant_ic.slam.occupancy import OccupancyGrid
 from instant_ic.slam.scan import FloatArray, Scan, ScanPoints, scan_points
-from instant_ic.slam.tile_maps import TileMaps, climb
 
 OCCUPIED = 0.25
 """Minimum share of hits among the beams at a cell for it to be occupied (slam_gmapping's occ_thresh)."""
+
+
+@dataclass(frozen=True)
+class ParticleConfig:
+    """Parameters, with GMapping's names and defaults.
+
+    Attributes:
+        particles: number of paths, each with its own map.
+        linearUpdate: translation after which a scan is used, metres.
+        angularUpdate: rotation after which a scan is used, radians.
+        resampleThreshold: resample when the share of effective particles falls below this.
+        maxUrange: farther hits are ignored, metres.
+        sigma: standard deviation of a hit for matching, metres.
+        kernelSize: number of cells searched around a hit.
+        lstep: first translation step of the hill climbing, metres.
+        astep: first rotation step of the hill climbing, radians.
+        iterations: number of times that the steps are halved.
+        lsigma: standard deviation of a hit for the weight.
+        ogain: smooths the weights.
+        lskip: number of beams skipped after each used beam.
+        minimumScore: a match with a lower score is rejected.
+        srr: odometry error in translation from translation.
+        srt: odometry error in rotation from translation.
+        str: odometry error in translation from rotation.
+        stt: odometry error in rotation from rotation.
+        delta: cell size of the particles' maps, metres.
+        seed: seed of all random numbers.
+    """
+
+    particles: PositiveInt = 30
+    linearUpdate: Positive = 1.0
+    angularUpdate: Positive = 0.5
+    resampleThreshold: Share = 0.5
+    maxUrange: Positive = 20.0
+    sigma: Positive = 0.05
+    kernelSize: NotNegativeInt = 1
+    lstep: Positive = 0.05
+    astep: Positive = 0.05
+    iterations: NotNegativeInt = 5
+    lsigma: Positive = 0.075
+    ogain: Positive = 3.0
+    lskip: NotNegativeInt = 0
+    minimumScore: NotNegative = 0.0
+    srr: NotNegative = 0.1
+    srt: NotNegative = 0.2
+    str: NotNegative = 0.1
+    stt: NotNegative = 0.2
+    delta: Positive = 0.05
+    seed: NotNegativeInt = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -50,18 +99,16 @@ class _PathAnchor:
 
 
 class ParticleSlam:
-    """Particle filter with the interface of `instant_ic.slam.backend.Slam`."""
+    """Particle filter with the interface of `instant_ic.experiments.slam.Slam`."""
 
-    def __init__(self, config: SlamConfig) -> None:
-        self.config = config
-        self.particle_config: ParticleConfig = config.rbpf
+    def __init__(self, particles: ParticleConfig | None = None, config: SlamConfig | None = None) -> None:
+        self.config = config = config or SlamConfig()
+        self.particle_config = particles or ParticleConfig()
         count = self.particle_config.particles
         self.maps = TileMaps(count, self.particle_config.delta, config.map.max_size_m)
-        self.motion = MotionMonitor(config.motion)
         self.map_from_base: FloatArray = np.zeros(3)
         self.map_from_odom: FloatArray = np.zeros(3)
         self.odom_from_base: FloatArray = np.zeros(3)
-        self.map_version = 0
         self.resampled = 0
         self._rng = np.random.default_rng(self.particle_config.seed)
         self._poses: FloatArray = np.zeros((count, 3))
@@ -73,13 +120,8 @@ class ParticleSlam:
         self._stamp_ns: int | None = None
         self._at_update: FloatArray = np.zeros(3)
         self._way = self._turn = 0.0
-        self._lidar = GridSlam(replace(config, backend="graph", loop=replace(config.loop, enabled=False)))
+        self._lidar = GridSlam(replace(config, loop=replace(config.loop, enabled=False)))
         self._wheels: bool | None = None
-
-    @property
-    def map_clipped(self) -> int:
-        """Number of cells outside the largest allowed map."""
-        return int(self.maps.counters[1])
 
     def process(
         self, scan: Scan, odom_pose: ArrayLike | None = None, base_from_laser: ArrayLike = (0.0, 0.0, 0.0)
@@ -97,7 +139,7 @@ class ParticleSlam:
         if odometry is None:
             odometry = self._lidar.process(scan, None, base_from_laser).map_from_base
         mount = np.asarray(base_from_laser, dtype=np.float64)
-        points = scan_points(scan, mount, self.config.field.join_gap_m, 0.0)
+        points = scan_points(scan, mount, 0.0)
         empty = len(points.points) < self.config.match.min_points
         if self._stamp_ns is None:
             if empty:
@@ -143,23 +185,14 @@ class ParticleSlam:
         values[visits == 0] = -1
         return OccupancyGrid(values, self.maps.delta, corner)
 
-    def background_job(self) -> Callable[[], Any] | None:
+    def background_job(self) -> None:
         """Return None: this method has no background jobs."""
-        return None
 
     def take_over(self, outcome: Any) -> None:
         """Do nothing: there are no background jobs."""
 
     def finish(self) -> None:
         """Do nothing: no work is pending."""
-
-    def save(self, stem: Path) -> list[Path]:
-        """Write the map, without a graph."""
-        return save_grid(stem, self.grid())
-
-    def set_pose(self, map_from_base: ArrayLike) -> None:
-        """Raise ValueError: this method does not support saved maps."""
-        raise ValueError("backend rbpf does not support saved maps: use backend graph")
 
     def figures(self) -> dict[str, object]:
         """Counts of updates, effective particles, resamplings and map tiles."""
@@ -198,7 +231,6 @@ class ParticleSlam:
             self._resample()
         for k in range(gmapping.particles):
             maps.register(k, self._poses[k], scan.origin, scan.points, gmapping.maxUrange)
-        self.map_version += 1
         return best
 
     def _draw_motion(self, step: FloatArray) -> None:

@@ -1,0 +1,67 @@
+"""Diagnoses of the grid SLAM after a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.slam.front_end import SlamStatus
+from instant_ic.slam.grid_slam import GridSlam, SlamResult
+from instant_ic.slam.motion import MotionState
+
+_STATUSES = {
+    SlamStatus.FIRST: (Level.OK, "map started"),
+    SlamStatus.TRACKED: (Level.OK, "tracking"),
+    SlamStatus.RECOVERED: (Level.WARN, "odometry was far off; the scan was found again by the wide search"),
+    SlamStatus.LOST: (Level.ERROR, "the scan fits nowhere near; going on by odometry"),
+    SlamStatus.RESTARTED: (Level.ERROR, "lost for long; a new local map begins where odometry says"),
+    SlamStatus.NO_POINTS: (Level.WARN, "the scan has too few points; going on by odometry"),
+    SlamStatus.TIME_BACKWARDS: (Level.WARN, "the scan is not newer than the one before and is ignored"),
+}
+
+_MOTIONS = {
+    MotionState.NORMAL: (Level.OK, "the robot moves as its tracks do"),
+    MotionState.SLIPPING: (Level.WARN, "the tracks slip"),
+    MotionState.STUCK: (Level.ERROR, "the tracks turn and the robot stands: it is stuck"),
+    MotionState.PUSHED: (Level.WARN, "the robot moves and its tracks stand: somebody pushes it"),
+    MotionState.CARRIED: (Level.ERROR, "the tracks stand and the place is another one: the robot is being carried"),
+}
+
+
+def diagnoses(slam: GridSlam, result: SlamResult, with_odometry: bool, use_wheel_odom: bool) -> Iterator[Diagnosis]:
+    """State of the SLAM after a scan.
+
+    Args:
+        slam: after `GridSlam.process`.
+        result: of that scan.
+        with_odometry: whether the scan came with odometry.
+        use_wheel_odom: whether it should have.
+    """
+    sigma_m = float(np.sqrt(max(np.diag(result.covariance)[:2])))
+    figures = {"score": round(result.score, 3), "sigma_xy_m": round(sigma_m, 4), **slam.figures()}
+    yield Diagnosis("slam", *_STATUSES[result.status], figures)
+    if not result.localized:
+        text = "the robot's place in the saved map is not known yet: drive on, or set it (/initialpose)"
+        yield Diagnosis("place", Level.WARN, text)
+    elif slam.saved is not None:
+        yield Diagnosis("place", Level.OK, "found in the saved map")
+    motion = slam.motion
+    level, text = _MOTIONS[motion.state] if with_odometry else (Level.OK, "no wheels to compare with")
+    factor = {
+        "slip": round(motion.slip, 2),
+        "turn_factor": round(motion.turn_factor, 3),
+        "turn_factor_sigma": round(min(motion.turn_factor_sigma, 9.999), 3),
+    }
+    yield Diagnosis("motion", level, text, factor)
+    if with_odometry:
+        correction_m = round(float(np.hypot(*slam.map_from_odom[:2])), 3)
+        yield Diagnosis("odometry", Level.OK, "wheel odometry", {"correction_m": correction_m})
+    elif use_wheel_odom:
+        text = "no wheel odometry on /wheel/odom: LiDAR odometry is used instead"
+        yield Diagnosis("odometry", Level.WARN, text)
+    else:
+        yield Diagnosis("odometry", Level.OK, "LiDAR odometry (use_wheel_odom is false)")
+    if slam.map.clipped:
+        yield Diagnosis("map", Level.WARN, "the map has reached max_size_m", {"points_left_out": slam.map.clipped})
