@@ -67,7 +67,7 @@ def parameter_infos(
 def _infos(config_class: type[Any], config: Any, defaults: Any, prefix: str) -> list[ParameterInfo]:
     """Parameters of one group; ``defaults`` is the group as its parent creates it, None at the top."""
     infos: list[ParameterInfo] = []
-    meanings = attributes(config_class)
+    meanings = {name: text for base in reversed(config_class.__mro__) for name, text in attributes(base).items()}
     hints, bounds = get_type_hints(config_class), ranges(config_class)  # type: ignore[arg-type]
     for field in dataclasses.fields(config_class):
         hint, key = hints[field.name], f"{prefix}{field.name}"
@@ -100,7 +100,7 @@ def plain(value: Any) -> Any:
 
 def attributes(config_class: type[Any]) -> dict[str, str]:
     """Entries of the "Attributes:" section of a docstring; ``a, b: text`` describes both."""
-    doc = inspect.getdoc(config_class) or ""
+    doc = inspect.cleandoc(config_class.__doc__ or "")
     part = doc.partition("Attributes:\n")[2].split("\n\n")[0]
     found: dict[str, str] = {}
     names: list[str] = []

@@ -77,7 +77,7 @@ class MatchConfig:
         free_motion_yaw_rate_radps: without odometry: maximum yaw rate, for the width of the search.
     """
 
-    max_points: int = 240
+    max_points: PositiveInt = 240
     min_points: Annotated[int, Range(low=3)] = 20
     search_translation_m: Positive = 0.3
     search_rotation_rad: Positive = 0.3
