@@ -1,10 +1,11 @@
 """Parameters of the tracked base."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated
 
 from instant_ic.base.protocol import ADDRESSES, BAUD_RATES
-from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 
 
 def _require(ok: bool, key: str, value: object, rule: str) -> None:
@@ -140,3 +141,73 @@ class RoboclawConfig:
             self.reconnect_min_s,
             "> 0 and at most reconnect_max_s",
         )
+
+
+@dataclass(frozen=True)
+class ControllerConfig:
+    """Parameters of the whole tracked base.
+
+    Attributes:
+        roboclaw: serial link.
+        geometry: tracks and encoders.
+        limits: speeds and accelerations.
+        odometry: growth of the odometry's uncertainty.
+        command_timeout_s: largest age of a command; older commands are dropped, and without a newer one the base
+            stops hard.
+        health_period_s: time between reads of battery, status and the controller's watchdog.
+    """
+
+    roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
+    geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
+    odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
+    command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.25
+    health_period_s: Positive = 0.25
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+_LEAST_PERIODS = 3
+"""Commands that may be missing before the controller's watchdog stops the motors."""
+
+
+@dataclass(frozen=True)
+class CrawlerBaseConfig(ControllerConfig):
+    """Parameters of the node ``crawler_base``, in addition to those of the controller.
+
+    Attributes:
+        rate_hz: commands and odometry messages per second.
+        odom_frame: parent of the base's frame.
+        base_frame: the base's own frame.
+        battery_full_v: main battery when full, volts.
+        battery_empty_v: voltage of the main battery when it needs charging, volts; lower voltages warn.
+        recent_s: seconds for which repeats, dropped commands and impossible readings remain a warning.
+        connect_grace_s: seconds after the start for which a missing controller is not an error yet.
+        command_source: name of the only node whose commands are obeyed; empty: any node.
+        accept_unstamped: also obey commands without a stamp, with their arrival time as stamp.
+    """
+
+    rate_hz: Annotated[float, Range(5, 200)] = 30.0
+    odom_frame: str = "odom"
+    base_frame: str = "base_link"
+    battery_full_v: float = 25.2
+    battery_empty_v: float = 21.0
+    recent_s: Positive = 10.0
+    connect_grace_s: NotNegative = 5.0
+    command_source: str = "arbiter"
+    accept_unstamped: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_ranges(self)
+        if not 0.0 < self.battery_empty_v < self.battery_full_v:
+            raise ValueError(
+                "battery_empty_v must be > 0 and below battery_full_v "
+                f"(got {self.battery_empty_v}, {self.battery_full_v})"
+            )
+        if self.roboclaw.watchdog_s < _LEAST_PERIODS / self.rate_hz:
+            raise ValueError(
+                f"roboclaw.watchdog_s must span {_LEAST_PERIODS} periods of rate_hz "
+                f"(got {self.roboclaw.watchdog_s} s at {self.rate_hz} Hz)"
+            )

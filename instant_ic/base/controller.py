@@ -2,46 +2,19 @@
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Annotated
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawConfig, SkidSteerConfig
+from instant_ic.base.config import ControllerConfig, RoboclawConfig
 from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import OdometryEstimate, WheelOdometry, unwrap_counts
 from instant_ic.base.roboclaw import ControllerRestarted, LinkError, Roboclaw, SerialPort, Status, open_serial
-from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.pace import current
 
 _COUNTED_SINCE_M = 0.2
 """Largest count, in metres of track, that a restarted controller can reach before the next reading."""
-
-
-@dataclass(frozen=True)
-class ControllerConfig:
-    """Parameters of the whole tracked base.
-
-    Attributes:
-        roboclaw: serial link.
-        geometry: tracks and encoders.
-        limits: speeds and accelerations.
-        odometry: growth of the odometry's uncertainty.
-        command_timeout_s: largest age of a command; older commands are dropped, and without a newer one the base
-            stops hard.
-        health_period_s: time between reads of battery, status and the controller's watchdog.
-    """
-
-    roboclaw: RoboclawConfig = field(default_factory=RoboclawConfig)
-    geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
-    limits: LimitsConfig = field(default_factory=LimitsConfig)
-    odometry: OdometryNoiseConfig = field(default_factory=OdometryNoiseConfig)
-    command_timeout_s: Annotated[float, Range(above=0, high=2)] = 0.25
-    health_period_s: Positive = 0.25
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any
 from instant_ic.msg.convert import (
     HARD_STOP,
     POINT_DTYPE,
+    battery_message,
     cloud_array,
     cloud_message,
     cloud_xyz,
@@ -53,6 +54,7 @@ __all__ = [
     "HARD_STOP",
     "POINT_DTYPE",
     "MessageError",
+    "battery_message",
     "cloud_array",
     "cloud_message",
     "cloud_xyz",

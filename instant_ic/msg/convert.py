@@ -332,6 +332,29 @@ def twist_values(message: Any) -> tuple[float, float]:
     return float(message.linear.x), float(message.angular.z)
 
 
+def battery_message(voltage_v: float, charge: float, frame_id: str, stamp: int) -> Any:
+    """sensor_msgs/BatteryState of a discharging battery with ``charge`` 0-1; what is not measured is NaN."""
+    state, nan, none = message_type("BatteryState"), float("nan"), np.zeros(0, np.float32)
+    return state(
+        header=header(frame_id, stamp),
+        voltage=voltage_v,
+        temperature=nan,
+        current=nan,
+        charge=nan,
+        capacity=nan,
+        design_capacity=nan,
+        percentage=charge,
+        power_supply_status=state.POWER_SUPPLY_STATUS_DISCHARGING,
+        power_supply_health=state.POWER_SUPPLY_HEALTH_UNKNOWN,
+        power_supply_technology=state.POWER_SUPPLY_TECHNOLOGY_UNKNOWN,
+        present=True,
+        cell_voltage=none,
+        cell_temperature=none,
+        location="base",
+        serial_number="",
+    )
+
+
 def odometry_message(
     parent_from_child: Matrix,
     v: float,

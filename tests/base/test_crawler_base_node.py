@@ -99,7 +99,7 @@ def test_old_and_senseless_commands_are_dropped_and_told(bench: Bench) -> None:
     assert "not finite" in bench.node.diagnoses()["command"][1]
     bench.run(0.2)
     assert bench.emulator.target_speed_pps.tolist() == [0.0, 0.0]
-    assert bench.node.dropped == 3
+    assert bench.node.gate.dropped == 3
 
 
 def test_unstamped_twist_is_refused_or_counts_from_its_arrival() -> None:
@@ -117,7 +117,7 @@ def test_unstamped_twist_is_refused_or_counts_from_its_arrival() -> None:
     refusing.command(twist_stamped(0.2, 0.0, 0))
     refusing.run(0.2)
     assert refusing.emulator.target_speed_pps.max() == 0.0
-    assert "has no stamp" in refusing.node.diagnoses()["command"][1] and refusing.node.dropped == 2
+    assert "has no stamp" in refusing.node.diagnoses()["command"][1] and refusing.node.gate.dropped == 2
 
 
 def test_controllers_watchdog_stops_the_motors_when_the_node_is_dead(bench: Bench) -> None:

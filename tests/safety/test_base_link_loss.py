@@ -6,8 +6,7 @@ from collections.abc import Callable
 import pytest
 from base_line import Base
 
-from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.controller import ControllerConfig
+from instant_ic.base.config import ControllerConfig, RoboclawConfig
 from instant_ic.base.protocol import Command
 
 STOP = bytes.fromhex("80 25 00 00 00 00 00 00 00 00 34 04")

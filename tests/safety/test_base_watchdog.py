@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from base_line import RATE_HZ, Base
 
-from instant_ic.base.config import RoboclawConfig
-from instant_ic.base.controller import ControllerConfig
+from instant_ic.base.config import ControllerConfig, RoboclawConfig
 from instant_ic.base.protocol import Command
 from nodes.crawler_base import CrawlerBaseConfig
 

@@ -1,0 +1,89 @@
+"""Decides which commands the base obeys: one node's, recent and finite."""
+
+from __future__ import annotations
+
+import math
+
+from instant_ic.base.config import CrawlerBaseConfig
+from instant_ic.base.recent import RecentCount
+from instant_ic.diagnosis import Diagnosis, Level
+
+
+class CommandGate:
+    """Checks commands, and counts those that are dropped and the nodes that may not drive.
+
+    Attributes:
+        driver: the obeyed node; with any source allowed, the last publisher.
+        dropped: number of refused commands.
+        publishers: whether another node also publishes commands.
+        command: what became of the newest command; None before the first.
+    """
+
+    def __init__(self, config: CrawlerBaseConfig) -> None:
+        self.config = config
+        self.driver = config.command_source
+        self.dropped = 0
+        self.publishers = Diagnosis("publishers", Level.OK, "no second publisher of /cmd_vel")
+        self.command: Diagnosis | None = None
+        self._drops = RecentCount(config.recent_s)
+        self._strangers_ns: int | None = None
+
+    def admit_publisher(self, publisher: str, steady_ns: int) -> bool:
+        """Whether a node's commands are obeyed; every publisher besides the driving node is a warning."""
+        if not self.config.command_source and publisher != self.driver:
+            if self.driver:
+                self._warn_of(self.driver, steady_ns)
+            self.driver = publisher
+        if publisher == self.driver:
+            return True
+        self._warn_of(publisher, steady_ns)
+        self._refuse(f"{publisher} may not drive, only {self.driver} (command_source)", steady_ns)
+        return False
+
+    def admit(self, v: float, w: float, stamp_ns: int, received_ns: int, steady_ns: int) -> bool:
+        """Whether a command of the driving node is obeyed.
+
+        Args:
+            v: speed along x, m/s.
+            w: turn rate, rad/s.
+            stamp_ns: of the message; 0 without one.
+            received_ns: arrival on the same clock.
+            steady_ns: present steady time.
+        """
+        age_s = (received_ns - stamp_ns) * 1e-9
+        if not (math.isfinite(v) and math.isfinite(w)):
+            reason = f"command is not finite (v={v}, w={w})"
+        elif stamp_ns == 0 and not self.config.accept_unstamped:
+            reason = f"command of {self.driver} has no stamp (accept_unstamped is false)"
+        elif stamp_ns and age_s > self.config.command_timeout_s:
+            reason = f"command is {age_s:.2f} s old"
+        elif age_s < 0:
+            reason = f"command's stamp is {-age_s:.2f} s ahead: set the clocks"
+        else:
+            if not self._drops.count(steady_ns):
+                self._set(Level.OK, "driving by /cmd_vel")
+            return True
+        self._refuse(reason, steady_ns)
+        return False
+
+    def update(self, steady_ns: int) -> None:
+        """End warnings whose cause is older than ``recent_s``."""
+        recent = f"in the last {self.config.recent_s:g} s"
+        if self.dropped and not self._drops.count(steady_ns):
+            self._set(Level.OK, f"none dropped {recent}")
+        if self._strangers_ns is not None and steady_ns - self._strangers_ns > self.config.recent_s * 1e9:
+            self._strangers_ns = None
+            self.publishers = Diagnosis("publishers", Level.OK, f"no second publisher of /cmd_vel {recent}")
+
+    def _warn_of(self, publisher: str, steady_ns: int) -> None:
+        self._strangers_ns = steady_ns
+        text = f"/cmd_vel is also published by {publisher}: stop that node"
+        self.publishers = Diagnosis("publishers", Level.WARN, text)
+
+    def _refuse(self, reason: str, steady_ns: int) -> None:
+        self.dropped += 1
+        self._drops.add(1, steady_ns)
+        self._set(Level.WARN, f"dropped: {reason}")
+
+    def _set(self, level: Level, text: str) -> None:
+        self.command = Diagnosis("command", level, text, {"dropped": self.dropped})

@@ -1,0 +1,72 @@
+"""Diagnoses of the base: serial link, replies, encoders, battery, faults of the controller."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from instant_ic.base.config import CrawlerBaseConfig
+from instant_ic.base.controller import BaseController, Health
+from instant_ic.base.recent import RecentCount
+from instant_ic.diagnosis import Diagnosis, Level
+
+
+class BaseReport:
+    """Turns states and counters of a controller into diagnoses.
+
+    Args:
+        config: parameters; `config` may be replaced at any time.
+        controller: source of the counters.
+        started_ns: steady time of the start.
+    """
+
+    def __init__(self, config: CrawlerBaseConfig, controller: BaseController, started_ns: int) -> None:
+        self.config = config
+        self._controller = controller
+        self._started_ns = started_ns
+        self._linked = False  # connected once since the start
+        self._retries = self._rejected = 0
+        self._repeats, self._jumps = RecentCount(config.recent_s), RecentCount(config.recent_s)
+
+    def link(self, connected: bool, text: str, steady_ns: int) -> Diagnosis:
+        """A change of the serial link; soon after the start, a missing controller is only a warning."""
+        self._linked |= connected
+        starting = not self._linked and steady_ns - self._started_ns < self.config.connect_grace_s * 1e9
+        return Diagnosis("link", Level.OK if connected else Level.WARN if starting else Level.ERROR, text)
+
+    def recent(self, steady_ns: int) -> Iterator[Diagnosis]:
+        """Repeated commands and impossible encoder readings of the last ``recent_s``."""
+        counters, recent = self._controller.roboclaw.counters, f"the last {self.config.recent_s:g} s"
+        self._repeats.add(counters.retries - self._retries, steady_ns)
+        self._retries = counters.retries
+        repeated = self._repeats.count(steady_ns)
+        values = {
+            "repeated": counters.retries,
+            "timeouts": counters.timeouts,
+            "crc_errors": counters.crc_errors,
+            "transactions": counters.transactions,
+            "stops": counters.stops,
+        }
+        text = f"{repeated} commands repeated in {recent}" if repeated else "no command had to be repeated"
+        yield Diagnosis("replies", Level.WARN if repeated else Level.OK, text, values)
+        rejected = self._controller.odometry.rejected
+        self._jumps.add(rejected - self._rejected, steady_ns)
+        self._rejected = rejected
+        jumps = self._jumps.count(steady_ns)
+        text = f"{jumps} readings of {recent} were impossible jumps and left out" if jumps else "plausible"
+        yield Diagnosis("encoders", Level.WARN if jumps else Level.OK, text, {"rejected": rejected})
+
+    def health(self, health: Health) -> Iterator[Diagnosis]:
+        """Battery and faults."""
+        empty_v = self.config.battery_empty_v
+        low = health.battery_v < empty_v
+        text = f"{health.battery_v:.1f} V" + (f", below {empty_v} V: charge it" if low else "")
+        yield Diagnosis("battery", Level.WARN if low else Level.OK, text)
+        faults, warnings = health.status.faults, health.status.warnings
+        level = Level.ERROR if faults else Level.WARN if warnings else Level.OK
+        values = {"status": f"0x{health.status.value:0{2 * health.status.size}x}"}
+        yield Diagnosis("controller", level, ", ".join(faults + warnings) or "no faults", values)
+
+    def charge(self, health: Health) -> float:
+        """Charge of the battery by its voltage, 0-1."""
+        empty_v, full_v = self.config.battery_empty_v, self.config.battery_full_v
+        return min(1.0, max(0.0, (health.battery_v - empty_v) / (full_v - empty_v)))
