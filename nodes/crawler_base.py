@@ -145,7 +145,6 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
         self.show_latch()
 
     def show_latch(self) -> None:
-        """Report the state of the emergency stop."""
         if not self.latch.stopped:
             self.diagnose("emergency stop", OK, "released")
             return
@@ -163,20 +162,13 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
 
     def publish_odometry(self, estimate: OdometryEstimate) -> None:
         """Publish the odometry message and its transform."""
-        odom_from_base = matrix_from_pose2(estimate.pose)
-        message = odometry_message(
-            odom_from_base,
-            float(estimate.twist[0]),
-            float(estimate.twist[2]),
-            self.config.odom_frame,
-            self.config.base_frame,
-            estimate.stamp_ns,
-            pose_covariance=estimate.pose_covariance,
-            twist_covariance=estimate.twist_covariance,
-        )
-        message.twist.twist.linear.y = float(estimate.twist[1])
+        odom_from_base, frames = matrix_from_pose2(estimate.pose), (self.config.odom_frame, self.config.base_frame)
+        v, lateral, w = (float(part) for part in estimate.twist)
+        covariances = (estimate.pose_covariance, estimate.twist_covariance)
+        message = odometry_message(odom_from_base, v, w, *frames, estimate.stamp_ns, *covariances)
+        message.twist.twist.linear.y = lateral
         self.odometry.publish(message)
-        self.tf_broadcast(self.config.odom_frame, self.config.base_frame, odom_from_base, estimate.stamp_ns)
+        self.tf_broadcast(*frames, odom_from_base, estimate.stamp_ns)
 
     def publish_health(self, health: Health) -> None:
         """Publish the battery message, the controller's faults and its emergency stop input."""
@@ -211,7 +203,6 @@ class CrawlerBaseNode(Node[CrawlerBaseConfig]):
             self.stop()
 
     def teardown(self) -> None:
-        """Stop the motors."""
         thread = getattr(self, "thread", None)
         if thread is not None:
             if not thread.end():

@@ -72,7 +72,6 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.limiter.yaw_rate_radps = config.correction_yaw_rate_radps
 
     def restart(self) -> None:
-        """Begin a new map."""
         config = self.config
         try:
             map_file = Path(config.map_file).expanduser() if config.map_file else None
@@ -183,7 +182,6 @@ class GridSlamNode(Node[GridSlamConfig]):
             self.map_out.publish(grid_message(whole.values, whole.resolution, origin, frame, stamp))
 
     def watch(self) -> None:
-        """Report missing scans."""
         self.show(self.queue.watch(self.clock.steady_ns()))
 
     def show(self, state: Diagnosis) -> None:
@@ -191,7 +189,7 @@ class GridSlamNode(Node[GridSlamConfig]):
 
 
 def work(item: tuple[GridSlam, Callable[[], Any]]) -> tuple[GridSlam, Any, str]:
-    """Loop closure, optimisation, search in a saved map: on the worker's thread."""
+    """Run a background job of the SLAM, on the worker's thread."""
     slam, job = item
     try:
         return slam, job(), ""

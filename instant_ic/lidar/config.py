@@ -1,10 +1,11 @@
-"""Parameters of the VLP-16: decoding and the flat scan."""
+"""Parameters of the VLP-16: decoding, the flat scan, the node."""
 
 import math
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
+from instant_ic.lidar.receiver import ReceiverConfig
 
 
 @dataclass(frozen=True)
@@ -53,3 +54,50 @@ class FlatScanConfig:
             raise ValueError(f"min_height must be below max_height (got {self.min_height}, {self.max_height})")
         if not self.range_min < self.range_max:
             raise ValueError(f"range_min must be below range_max (got {self.range_min}, {self.range_max})")
+
+
+@dataclass(frozen=True)
+class Vlp16DriverConfig:
+    """Parameters of the node ``vlp16_driver``.
+
+    Attributes:
+        source: ``udp``, ``pcap``, or ``topic`` (packets of a bag from /lidar/packets).
+        host: local address; 0.0.0.0 also takes broadcasts.
+        port: port of data packets.
+        position_port: port of position packets; -1: not received.
+        sensor: the sensor's IPv4 address; empty: the first sender until the driver restarts.
+        pcap: capture file, for source pcap.
+        rate: playback rate of the capture; 1 is the recorded rate.
+        loop: restart the capture at its end.
+        frame_id: the sensor's frame.
+        mount_xyz: sensor position on base_link, metres.
+        mount_rpy_deg: sensor roll, pitch, yaw on base_link, degrees.
+        silence_s: seconds without a packet that are an error.
+        decoder: conversion of packets to points.
+        scan: conversion of points to the flat scan.
+    """
+
+    source: Literal["udp", "pcap", "topic"] = "udp"
+    host: str = "0.0.0.0"
+    port: int = 2368
+    position_port: int = 8308
+    sensor: str = ""
+    pcap: str = ""
+    rate: Positive = 1.0
+    loop: bool = False
+    frame_id: str = "velodyne"
+    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 0.6)
+    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    silence_s: Positive = 2.0
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    scan: FlatScanConfig = field(default_factory=FlatScanConfig)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if self.source == "pcap" and not self.pcap:
+            raise ValueError("pcap must name a capture file where source is pcap (got '')")
+        self.receiver()
+
+    def receiver(self) -> ReceiverConfig:
+        """The receiver's part of the parameters."""
+        return ReceiverConfig(self.host, self.port, self.position_port, self.sensor)

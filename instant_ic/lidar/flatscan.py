@@ -14,6 +14,9 @@ from instant_ic.lidar.stream import PacketStream, Revolution
 _MOTION_SAMPLES = 65
 """Samples of the motion over a revolution; within 1.6 ms it is straight enough (1 um at 1 rad/s)."""
 
+MAX_TILT_DEG = 5.0
+"""A flat scan lies in the sensor's plane. At this tilt, a point 0.7 m above or below the sensor is 6 cm off."""
+
 
 @dataclass(frozen=True)
 class FlatScan:
@@ -83,6 +86,20 @@ def flat_scan(
         stamp_ns=revolution.end_ns,
         compensated=motion is not None,
     )
+
+
+def check_level(base_from_lidar: NDArray[np.float64]) -> None:
+    """Check that a mount (4, 4) is level enough for a flat scan.
+
+    Raises:
+        ValueError: the sensor's z axis is more than MAX_TILT_DEG off the vertical.
+    """
+    tilt_deg = float(np.degrees(np.arccos(np.clip(base_from_lidar[2, 2], -1.0, 1.0))))
+    if tilt_deg > MAX_TILT_DEG:
+        raise ValueError(
+            f"The LiDAR is mounted {tilt_deg:.1f}° off the vertical, but /scan needs a level sensor (at most "
+            f"{MAX_TILT_DEG:g}°). Mount it level, or correct roll and pitch of its mount."
+        )
 
 
 def coverage(revolution: Revolution) -> float:

@@ -118,7 +118,7 @@ def test_revolutions_that_are_cut_short_give_no_scan(tmp_path: Path, min_coverag
     bus.advance(0.5)
     clouds = len(bus.messages("/lidar/points"))
     assert len(bus.messages("/scan")) == scans
-    assert node.partial == clouds - scans
+    assert node.report.partial == clouds - scans
 
 
 def test_scan_is_motion_compensated_by_odometry(capture: Path) -> None:
@@ -200,7 +200,7 @@ def test_udp_over_real_sockets(run_dir: Path) -> None:
         np.testing.assert_allclose(ranges[np.isfinite(ranges)], 3.0, atol=2e-3)
         assert np.isfinite(ranges).sum() > 300
         assert probe.clouds[-1].point_step == 22
-        driver.last_ns -= SECOND
+        driver.feed.last_ns -= SECOND
         driver.check()
         level, text, values = driver.diagnoses()["packets"]
         assert level == ERROR
@@ -242,20 +242,20 @@ def test_packets_of_a_second_address_ahead_of_the_sensor_withhold_the_scan(run_d
             for index in range(200):
                 sensor.sendto(real[index], to)
                 # One at a time: what is asserted is whose packets are taken, not how fast the machine takes them.
-                spin_until(lambda count=index + 1: driver.stream.counters.packets >= count)  # type: ignore[misc]
+                spin_until(lambda count=index + 1: driver.feed.stream.counters.packets >= count)  # type: ignore[misc]
             spin_until(lambda: len(probe.scans) >= 1)
             spin_until(lambda: driver.waiting == 0)
             before = len(probe.scans)
             for index in range(200, 500):
                 stranger.sendto(forged[index], to)
-                spin_until(lambda count=index - 199: driver.sources.foreign >= count)  # type: ignore[misc]
+                spin_until(lambda count=index - 199: driver.feed.sources.foreign >= count)  # type: ignore[misc]
                 sensor.sendto(real[index], to)
-                spin_until(lambda count=index + 1: driver.stream.counters.packets >= count)  # type: ignore[misc]
-            spin_until(lambda: driver.withheld >= 3)
+                spin_until(lambda count=index + 1: driver.feed.stream.counters.packets >= count)  # type: ignore[misc]
+            spin_until(lambda: driver.report.withheld >= 3)
         assert len(probe.scans) == before
         level, text, _ = driver.diagnoses()["source"]
         assert level == ERROR and "127.0.0.3" in text and "No scan" in text
-        assert driver.stream.counters.late == 0
+        assert driver.feed.stream.counters.late == 0
         for scan in probe.scans:
             ranges = scan.ranges[np.isfinite(scan.ranges)]
             np.testing.assert_allclose(ranges, 1.0, atol=2e-3)
@@ -291,6 +291,12 @@ def test_forged_packets_with_the_sensors_address_withhold_points_and_scan(tmp_pa
         np.testing.assert_allclose(ranges, 1.0, atol=2e-3)
     # The forged clock ran 90 ms ahead; the stamps of what follows are the sensor's again.
     assert stamp_ns(after[-1]) == pytest.approx(bus.records("/scan")[-1].stamp_ns, abs=2e7)
+
+
+@pytest.mark.parametrize("rpy_deg", [(0.0, 6.0, 0.0), (180.0, 0.0, 0.0)])
+def test_a_tilted_mount_is_refused(rpy_deg: tuple[float, float, float]) -> None:
+    with pytest.raises(Exception, match=r"mounted .*° off the vertical"):
+        LockstepBus().add(Vlp16DriverNode, Vlp16DriverConfig(source="topic", mount_rpy_deg=rpy_deg))
 
 
 def test_shipped_parameters_are_the_defaults() -> None:

@@ -1,0 +1,54 @@
+"""Packets in, trusted revolutions out."""
+
+from __future__ import annotations
+
+from instant_ic.lidar.config import DecoderConfig
+from instant_ic.lidar.packets import DATA_PACKET_BYTES
+from instant_ic.lidar.sources import SourceGuard
+from instant_ic.lidar.stream import PacketStream, Revolution
+
+Packets = list[tuple[bytes, int]]
+"""Payloads with their stamps."""
+
+
+class PacketFeed:
+    """Assembles revolutions with the packets they consist of, and restarts after a doubtful sender.
+
+    Attributes:
+        stream: decodes the packets.
+        sources: decides whether the packets can be trusted.
+        last_ns: steady time of the newest packet, or of the start.
+    """
+
+    def __init__(self, config: DecoderConfig, sensor: str, steady_ns: int) -> None:
+        self.stream = PacketStream(config)
+        self.sources = SourceGuard(sensor)
+        self.last_ns = steady_ns
+        self._doubtful = False
+        self._packets: Packets = []
+
+    def take(self, payload: bytes, stamp_ns: int, steady_ns: int) -> tuple[Revolution, Packets] | None:
+        """Add one data packet; return the revolution that it ends, if any."""
+        self.last_ns = steady_ns
+        counters = self.stream.counters
+        taken, late = counters.packets, counters.late + counters.clock_resets
+        revolution = self.stream.feed(payload, stamp_ns)
+        self.sources.count(counters.packets - taken, counters.late + counters.clock_resets - late, steady_ns)
+        doubtful, self._doubtful = self._doubtful, self.sources.doubt(steady_ns) is not None
+        if doubtful and not self._doubtful:
+            # A forged packet may have moved the sensor's clock, and is part of the revolution so far.
+            self.stream.restart()
+            revolution = None
+        if len(payload) == DATA_PACKET_BYTES:
+            self._packets.append((payload, stamp_ns))
+        return self._with_packets(revolution)
+
+    def finish(self) -> tuple[Revolution, Packets] | None:
+        """Return the rest as the last revolution."""
+        return self._with_packets(self.stream.finish())
+
+    def _with_packets(self, revolution: Revolution | None) -> tuple[Revolution, Packets] | None:
+        if revolution is None:
+            return None
+        packets, self._packets = self._packets, []
+        return revolution, packets

@@ -1,0 +1,57 @@
+"""Plays a capture at its recorded rate, or faster or slower."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from instant_ic.lidar.capture import CaptureError, CaptureReader, Datagram
+
+
+class CapturePlayer:
+    """Returns the datagrams of a capture when they are due.
+
+    Args:
+        path: capture file.
+        rate: playback rate; 1 is the recorded rate.
+        now_ns: clock of the stamps at the start.
+        steady_ns: steady time of the start.
+
+    Raises:
+        CaptureError: the file is not a capture, or holds no UDP datagram.
+        OSError: the file cannot be read.
+    """
+
+    def __init__(self, path: str, rate: float, now_ns: int, steady_ns: int) -> None:
+        self._reader = CaptureReader(path)
+        self._datagrams = iter(self._reader)
+        self._next: Datagram | None = next(self._datagrams, None)
+        if self._next is None:
+            raise CaptureError(f"{path}: holds no UDP datagram ({dict(self._reader.counters.skipped)})")
+        self._rate = rate
+        self._first_ns = self._next.stamp_ns
+        self._start_ns, self._start_steady_ns = now_ns, steady_ns
+
+    @property
+    def ended(self) -> bool:
+        """Whether all datagrams were returned."""
+        return self._next is None
+
+    def due(self, steady_ns: int) -> Iterator[Datagram]:
+        """Datagrams that are due at a steady time, stamped as from the start on.
+
+        Stamps keep the sensor's own rate at any playback rate; otherwise its clock would seem to drift.
+        """
+        elapsed_ns = (steady_ns - self._start_steady_ns) * self._rate
+        while self._next is not None and self._next.stamp_ns - self._first_ns <= elapsed_ns:
+            datagram, self._next = self._next, next(self._datagrams, None)
+            yield datagram._replace(stamp_ns=self._start_ns + datagram.stamp_ns - self._first_ns)
+
+    @property
+    def skipped(self) -> str:
+        """Packets of the capture that are not UDP datagrams, by reason; empty if there are none."""
+        return ", ".join(f"{count} x {reason}" for reason, count in self._reader.counters.skipped.items())
+
+    @property
+    def played(self) -> int:
+        """Number of datagrams of the capture read so far."""
+        return self._reader.counters.datagrams

@@ -1,0 +1,90 @@
+"""Diagnoses of the LiDAR: packets, senders, the sensor's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from instant_ic.diagnosis import Diagnosis, Level
+from instant_ic.lidar.feed import PacketFeed
+from instant_ic.lidar.packets import PacketError, decode_position_packet
+
+_SILENT = {
+    "topic": "no /lidar/packets for {silent_s:.1f} s",
+    "pcap": "{where} has ended",
+    "udp": "no packet on UDP {where} for {silent_s:.1f} s: is the sensor on, does its destination address fit, is this "
+    "host in its network (factory: 192.168.1.201), does a firewall block it, is net.ipv4.conf.*.rp_filter 0?",
+}
+"""What to check when no packets arrive, by source."""
+_PPS = ("absent", "synchronising", "locked", "error")
+
+
+class LidarReport:
+    """Reports losses, silence and doubtful senders.
+
+    Attributes:
+        skipped: revolutions that the node had no time for.
+        partial: incomplete revolutions, which gave no scan.
+        withheld: revolutions that could not be trusted.
+    """
+
+    def __init__(self, feed: PacketFeed) -> None:
+        self.skipped = self.partial = self.withheld = 0
+        self._feed = feed
+        self._reported = (0, 0, 0)
+        self._partial_reported = 0
+
+    def position(self, payload: bytes) -> Diagnosis:
+        """State of the sensor's clock from a position packet."""
+        try:
+            position = decode_position_packet(payload)
+        except PacketError as error:
+            return Diagnosis("position", Level.WARN, str(error))
+        pps = _PPS[position.pps] if position.pps < len(_PPS) else str(position.pps)
+        return Diagnosis("position", Level.OK, f"pulse per second {pps}", {"nmea": position.nmea})
+
+    def source(self, steady_ns: int) -> Diagnosis:
+        """Whether the packets come from one sender, in order."""
+        doubt, sources = self._feed.sources.doubt(steady_ns), self._feed.sources
+        values = {"foreign": sources.foreign, "withheld": self.withheld}
+        return Diagnosis("source", Level.ERROR if doubt else Level.OK, doubt or "one sender, in order", values)
+
+    def check(self, steady_ns: int, silence_s: float, source: str, where: str) -> Iterator[Diagnosis]:
+        """State of the sender and of the packets since the last call.
+
+        Args:
+            steady_ns: steady time.
+            silence_s: time without a packet that is an error.
+            source: as in `Vlp16DriverConfig`.
+            where: address or file of the source.
+        """
+        yield self.source(steady_ns)
+        stream, counters = self._feed.stream, self._feed.stream.counters
+        losses = (counters.missing, counters.bad, self.skipped)
+        new = [now - before for now, before in zip(losses, self._reported, strict=True)]
+        self._reported = losses
+        values = {
+            "packets": counters.packets,
+            "revolutions": counters.revolutions,
+            "missing": counters.missing,
+            "late": counters.late,
+            "bad": counters.bad,
+            "clock_resets": counters.clock_resets + stream.clock.resets,
+            "revolutions_skipped": self.skipped,
+            "revolutions_partial": self.partial,
+        }
+        silent_s = (steady_ns - self._feed.last_ns) * 1e-9
+        level, text = Level.OK, "receiving packets"
+        if silent_s > silence_s:
+            level, text = Level.ERROR, _SILENT[source].format(where=where, silent_s=silent_s)
+        elif not counters.packets:
+            level, text = Level.WARN, "no packet yet"
+        elif any(new):
+            level = Level.WARN
+            text = (
+                f"in the last second {new[0]} packets missing, {new[1]} not from a VLP-16, {new[2]} revolutions skipped"
+            )
+        else:
+            partial, self._partial_reported = self.partial - self._partial_reported, self.partial
+            if partial:
+                text += f"; {partial} incomplete revolutions gave no scan"
+        yield Diagnosis("packets", level, text, values)
