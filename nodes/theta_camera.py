@@ -73,7 +73,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         config = self.config
         self.loop: CameraLoop | None = None
         self.out = self.publisher("/camera/image/compressed", CompressedImage, qos=SENSOR)
-        self.tell_mount()
+        self.broadcast_mount()
         self.last_ns = self.started_ns = self.clock.steady_ns()
         self.published = self.published_told = 0
         self.camera = self.make_camera()
@@ -94,14 +94,14 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
             self.timer(config.health_period_s, lambda: self.health.submit(client))
         self.loop.start()
 
-    def tell_mount(self) -> None:
+    def broadcast_mount(self) -> None:
         """Broadcast the camera's mount on the robot."""
         mount = pose_matrix(*self.config.mount_xyz, *np.radians(self.config.mount_rpy_deg))
         self.tf_broadcast_static("base_link", self.config.frame_id, mount)
 
     def reconfigure(self, config: ThetaCameraConfig) -> None:
         super().reconfigure(config)
-        self.tell_mount()
+        self.broadcast_mount()
 
     def make_camera(self) -> Camera:
         """The camera that the parameters select."""
@@ -138,17 +138,17 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
         """Report silence and the frame rate; each second."""
         silent_s = (self.clock.steady_ns() - self.last_ns) * 1e-9
         values = {
-            "pictures": self.published,
+            "images": self.published,
             "rate_hz": self.published - self.published_told,
-            "bad_pictures": self.camera.bad_frames,
+            "bad_images": self.camera.bad_frames,
         }
         self.published_told = self.published
         if silent_s <= self.config.silence_s:
             if self.published:
-                self.diagnose("pictures", OK, "receiving images", **values)
+                self.diagnose("images", OK, "receiving images", **values)
             return
         level = ERROR if silent_s > 4.0 * self.config.silence_s else WARN
-        self.diagnose("pictures", level, f"no image for {silent_s:.1f} s", **values)
+        self.diagnose("images", level, f"no image for {silent_s:.1f} s", **values)
 
     def on_health(self, health: ThetaState | str) -> None:
         """Report battery, temperature and errors of the Theta."""

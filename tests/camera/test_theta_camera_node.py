@@ -107,11 +107,11 @@ def test_theta_over_real_sockets(run_dir: Path, monkeypatch: pytest.MonkeyPatch)
             assert values["battery"] == 0.1
             camera.last_ns = camera.clock.steady_ns()
             camera.check()
-            assert camera.diagnoses()["pictures"][0] == OK
+            assert camera.diagnoses()["images"][0] == OK
             for seconds, expected in ((2.5, WARN), (8.5, ERROR)):
                 camera.last_ns = camera.clock.steady_ns() - round(seconds * 1e9)
                 camera.check()
-                level, text, _ = camera.diagnoses()["pictures"]
+                level, text, _ = camera.diagnoses()["images"]
                 assert level == expected and text.startswith("no image for")
         finally:
             for node in reversed(nodes):
