@@ -29,7 +29,8 @@ def argument_parser(node_class: type[Node[Any]]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog=f"ic run {node_class.name}",
         description=(sys.modules[node_class.__module__].__doc__ or "").strip(),
-        epilog=f"example: ic run {node_class.name} --params-file config/sim.yaml -p use_sim_time:=true",
+        epilog=f"example: ic run {node_class.name} --params-file my_{node_class.name}.yaml -p use_sim_time:=true\n"
+        f"parameters: docs/reference.md, or ic config show {node_class.name}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--name", default=node_class.name, help="name of this node (default: %(default)s)")
@@ -58,12 +59,7 @@ def load_config(
     Raises:
         ParameterError: a file or an override is wrong; the message says where.
     """
-    values: params.Values = {}
-    for path in files:
-        values.update(params.load_file(path, name))
-    values.update(params.parse_override(word) for word in overrides)
-    common: params.Values = {key: values.pop(key) for key in ("use_sim_time", "nice") if key in values}
-    return params.build(node_class.config_class(), values), params.build(params.ProcessParameters, common)
+    return params.configure(node_class.config_class(), params.gather(name, files, overrides))
 
 
 def parse_remaps(words: Sequence[str]) -> dict[str, str]:

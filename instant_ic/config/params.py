@@ -3,7 +3,7 @@
 File form::
 
     /**:
-      ros__parameters: {use_sim_time: false}     # every node
+      ros__parameters: {base_frame: base_link}   # every node that has such a parameter
     grid_slam:
       ros__parameters:
         resolution: 0.05                         # metres
@@ -13,8 +13,11 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
+import math
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType, UnionType
@@ -26,17 +29,52 @@ from instant_ic.config.ranges import Range, check_ranges, range_of
 
 ConfigT = TypeVar("ConfigT")
 
+SHARED = "/**"
+"""Section of a parameter file for all nodes: each takes the values that it has a parameter for."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake in parameters.
+
+    Attributes:
+        text: what is wrong.
+        where: its place (``config/slam.yaml:12`` or ``-p key:=value``); empty if no given value is at fault.
+        key: the parameter at fault; empty if there is none.
+    """
+
+    text: str
+    where: str = ""
+    key: str = ""
+
+    def __str__(self) -> str:
+        """``where: text``."""
+        return f"{self.where}: {self.text}" if self.where else self.text
+
 
 class ParameterError(ValueError):
-    """A parameter is unknown, of the wrong type or out of range; the message says where."""
+    """Parameters are unknown, of the wrong type or out of range; ``problems`` holds each mistake with its place."""
+
+    def __init__(self, *problems: Problem | str) -> None:
+        self.problems = tuple(Problem(p) if isinstance(p, str) else p for p in problems)
+        super().__init__("\n".join(map(str, self.problems)))
 
 
 @dataclass(frozen=True)
 class Value:
-    """A value with its origin (``config/slam.yaml:12`` or ``-p key:=value``)."""
+    """A value with its origin.
+
+    Attributes:
+        value: as YAML gives it.
+        where: ``config/slam.yaml:12`` or ``-p key:=value``.
+        file: the parameter file; None: the command line.
+        shared: whether it comes from a ``/**`` section, which is for every node that has such a parameter.
+    """
 
     value: Any
     where: str
+    file: Path | None = None
+    shared: bool = False
 
 
 Values = dict[str, Value]
@@ -60,11 +98,76 @@ class ProcessParameters:
         check_ranges(self)
 
 
+PROCESS_KEYS = ("use_sim_time", "nice")
+"""Names of :class:`ProcessParameters`."""
+
+
+def gather(node: str, files: Sequence[Path], overrides: Sequence[str], places: Mapping[str, str] | None = None) -> Values:
+    """All values given to a node: the files in their order, then the ``key:=value`` overrides.
+
+    Args:
+        node: name of the node.
+        files: ROS 2 parameter files.
+        overrides: ``key:=value`` texts.
+        places: place of an override, if it has a better one than the command line (a launch file's line).
+
+    Raises:
+        ParameterError: all files and overrides that cannot be read.
+    """
+    values: Values = {}
+    problems: list[Problem] = []
+    for file in files:
+        try:
+            values.update(load_file(file, node))
+        except ParameterError as error:
+            problems += error.problems
+    for text in overrides:
+        where = (places or {}).get(text, f"-p {text}")
+        try:
+            key, value = parse_override(text)
+            values[key] = dataclasses.replace(value, where=where)
+        except ParameterError as error:
+            problems += [dataclasses.replace(problem, where=problem.where and where) for problem in error.problems]
+    if problems:
+        raise ParameterError(*problems)
+    return values
+
+
+def configure(config_class: type[ConfigT], values: Mapping[str, Value]) -> tuple[ConfigT, ProcessParameters]:
+    """Typed configuration of a node, and the parameters of its process.
+
+    Raises:
+        ParameterError: all values that are refused.
+    """
+    own = {key: value for key, value in values.items() if key not in PROCESS_KEYS}
+    common = {key: value for key, value in values.items() if key in PROCESS_KEYS}
+    problems: list[Problem] = []
+    made: list[Any] = []
+    for kind, part in ((config_class, own), (ProcessParameters, common)):
+        try:
+            made.append(build(kind, part))
+        except ParameterError as error:
+            problems += error.problems
+    if problems:
+        raise ParameterError(*problems)
+    return made[0], made[1]
+
+
 def load_file(path: Path, node: str) -> Values:
-    """Read the parameters of one node from a ROS 2 parameter file; ``/**`` sections apply first.
+    """Read the parameters of one node from a ROS 2 parameter file; its own section overrides ``/**``.
 
     Raises:
         ParameterError: the file cannot be read, is not YAML, or has the wrong structure.
+    """
+    sections = load_sections(path)
+    return {**sections.get(SHARED, {}), **sections.get(node, {})}
+
+
+def load_sections(path: Path) -> dict[str, Values]:
+    """Read all sections of a ROS 2 parameter file: node name, or ``/**``, → its values.
+
+    Raises:
+        ParameterError: see :func:`load_file`.
     """
     try:
         text = path.read_text()
@@ -74,25 +177,27 @@ def load_file(path: Path, node: str) -> Values:
         raise ParameterError(f"{path}: cannot be read as UTF-8: {error}") from error
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
-        return {} if root is None else _sections(root, path, node)
+        return {} if root is None else _sections(root, path)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}:{mark.line + 1}" if mark else str(path)
-        raise ParameterError(f"{where}: not YAML: {getattr(error, 'problem', error)}") from error
+        raise ParameterError(Problem(f"not YAML: {getattr(error, 'problem', error)}", where)) from error
     except RecursionError:
         raise ParameterError(f"{path}: nested endlessly: does an anchor contain itself?") from None
 
 
-def _sections(root: yaml.Node, path: Path, node: str) -> Values:
+def _sections(root: yaml.Node, path: Path) -> dict[str, Values]:
     sections: dict[str, Values] = {}
-    for name, section in _items(root, path):
-        values: Values = {}
+    for title, section in _items(root, path):
+        name = title if title == SHARED else title.strip("/")
+        values = sections.setdefault(name, {})
         for key, body in _items(section, path):
             if key != "ros__parameters":
-                raise ParameterError(f"{_where(path, body)}: expected ros__parameters under {name!r}, found {key!r}")
-            _flatten(body, "", path, values)
-        sections[name.strip("/") if name != "/**" else name] = values
-    return {**sections.get("/**", {}), **sections.get(node, {})}
+                raise ParameterError(
+                    Problem(f"expected ros__parameters under {title!r}, found {key!r}", _where(path, body))
+                )
+            _flatten(body, "", path, values, name == SHARED)
+    return sections
 
 
 def _where(path: Path, node: yaml.Node) -> str:
@@ -103,33 +208,34 @@ def _items(node: yaml.Node, path: Path) -> list[tuple[str, yaml.Node]]:
     if isinstance(node, yaml.ScalarNode) and node.value == "":
         return []
     if not isinstance(node, yaml.MappingNode):
-        raise ParameterError(f"{_where(path, node)}: expected a mapping (node name: ros__parameters: key: value)")
+        raise ParameterError(Problem("expected a mapping (node name: ros__parameters: key: value)", _where(path, node)))
     items = [(str(key.value), value) for key, value in node.value]
     keys = [key for key, _ in items]
     for (key, value), at in zip(items, range(len(keys)), strict=True):
         if key in keys[:at]:
-            raise ParameterError(f"{_where(path, value)}: {key!r} is given twice")
+            raise ParameterError(Problem(f"{key!r} is given twice", _where(path, value)))
     return items
 
 
-def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values) -> None:
+def _flatten(node: yaml.Node, prefix: str, path: Path, out: Values, shared: bool) -> None:
     for key, value in _items(node, path):
         if isinstance(value, yaml.MappingNode) and value.value:
-            _flatten(value, f"{prefix}{key}.", path, out)
+            _flatten(value, f"{prefix}{key}.", path, out, shared)
         else:
-            out[prefix + key] = Value(_construct(value, f"{_where(path, value)}: {prefix}{key}"), _where(path, value))
+            where = _where(path, value)
+            out[prefix + key] = Value(_construct(value, prefix + key, where), where, path, shared)
 
 
 _YAML_FAULTS = (yaml.YAMLError, ValueError, AttributeError)
 """What PyYAML raises for an invalid value: 2001-13-45 is a ValueError, ``!!timestamp x`` an AttributeError."""
 
 
-def _construct(node: yaml.Node, what: str) -> Any:
+def _construct(node: yaml.Node, key: str, where: str) -> Any:
     loader = yaml.SafeLoader("")
     try:
         return loader.construct_object(node, deep=True)
     except _YAML_FAULTS as error:
-        raise ParameterError(f"{what}: the value is not YAML: {_one_line(error)}") from error
+        raise ParameterError(Problem(f"{key}: the value is not YAML: {_one_line(error)}", where, key)) from error
     finally:
         loader.dispose()
 
@@ -151,9 +257,9 @@ def yaml_value(text: str, what: str) -> Any:
     try:
         return yaml.safe_load(text)
     except _YAML_FAULTS as error:
-        raise ParameterError(f"{what}: the value is not YAML: {_one_line(error)}") from error
+        raise ParameterError(Problem(f"the value is not YAML: {_one_line(error)}", what)) from error
     except RecursionError:
-        raise ParameterError(f"{what}: the value is nested too deeply") from None
+        raise ParameterError(Problem("the value is nested too deeply", what)) from None
 
 
 def parse_override(word: str) -> tuple[str, Value]:
@@ -164,12 +270,14 @@ def parse_override(word: str) -> tuple[str, Value]:
     """
     key, separator, text = word.partition(":=")
     if not separator or not key:
-        raise ParameterError(f"-p {word}: expected key:=value")
+        raise ParameterError(Problem("expected key:=value", f"-p {word}"))
     return key, Value(yaml_value(text, f"-p {word}"), f"-p {word}")
 
 
 def build(config_class: type[ConfigT], values: Mapping[str, Value], base: ConfigT | None = None) -> ConfigT:
-    """Typed configuration from flat values; errors name the place of an unknown key or a wrong type.
+    """Typed configuration from flat values.
+
+    A shared value that the node does not have is for other nodes, and skipped.
 
     Args:
         config_class: dataclass of the configuration.
@@ -177,42 +285,92 @@ def build(config_class: type[ConfigT], values: Mapping[str, Value], base: Config
         base: source of all other values; None uses the defaults.
 
     Raises:
-        ParameterError: see above, or ``__post_init__`` refused the values.
+        ParameterError: all unknown keys, wrong types and values out of range, and what ``__post_init__`` refused.
     """
-    return _build(config_class, dict(values), "", base)
-
-
-def _build(config_class: type[ConfigT], values: Values, prefix: str, base: ConfigT | None) -> ConfigT:
-    hints = get_type_hints(config_class, include_extras=True)
-    fields = {f.name: f for f in dataclasses.fields(config_class)}  # type: ignore[arg-type]
-    arguments: dict[str, Any] = {}
-    nested: dict[str, Values] = {}
+    problems: list[Problem] = []
+    typed: dict[str, Any] = {}
     for key, value in values.items():
+        try:
+            typed[key] = _coerce(value.value, _type_of(config_class, key), key)
+        except _UnknownError as error:
+            if not value.shared:
+                problems.append(Problem(str(error), value.where, key))
+        except _RefusedError as error:
+            problems.append(Problem(str(error), value.where, key))
+    while True:
+        try:
+            config = _assemble(config_class, typed, base)
+            break
+        except ValueError as error:
+            key = _culprit(config_class, typed, base, error)
+            problems.append(Problem(str(error), values[key].where if key else "", key))
+            if not key:
+                break
+            del typed[key]
+    if problems:
+        raise ParameterError(*problems)
+    return config
+
+
+class _RefusedError(ValueError):
+    """A value is refused; the message says why."""
+
+
+class _UnknownError(_RefusedError):
+    """There is no such parameter."""
+
+
+@functools.cache
+def _hints(config_class: type[Any]) -> dict[str, Any]:
+    hints = get_type_hints(config_class, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(config_class)}
+
+
+def _type_of(config_class: type[Any], key: str) -> Any:
+    """Declared type of a parameter."""
+    group, names = config_class, key.split(".")
+    for index, name in enumerate(names):
+        hints, prefix = _hints(group), "".join(f"{part}." for part in names[:index])
+        if name not in hints:
+            close = difflib.get_close_matches(name, hints, n=1)
+            hint = f"; did you mean {prefix + close[0]!r}?" if close else f"; known: {', '.join(sorted(hints))}"
+            raise _UnknownError(f"unknown parameter {key!r}{hint}")
+        if not dataclasses.is_dataclass(hints[name]):
+            if rest := ".".join(names[index + 1 :]):
+                raise _RefusedError(f"parameter {prefix + name!r} has no part {rest!r}")
+            return hints[name]
+        group = hints[name]
+    raise _RefusedError(f"parameter {key!r} is a group: give {key}.<name>")
+
+
+def _assemble(config_class: type[ConfigT], typed: Mapping[str, Any], base: ConfigT | None) -> ConfigT:
+    """Build a configuration from flat typed values; a ValueError comes from a dataclass's own check."""
+    arguments: dict[str, Any] = {}
+    groups: dict[str, dict[str, Any]] = {}
+    for key, value in typed.items():
         head, _, rest = key.partition(".")
-        full = prefix + key
-        if head not in fields:
-            close = difflib.get_close_matches(head, fields, n=1)
-            hint = f"; did you mean {prefix + close[0]!r}?" if close else f"; known: {', '.join(sorted(fields))}"
-            raise ParameterError(f"{value.where}: unknown parameter {full!r}{hint}")
-        if dataclasses.is_dataclass(hints[head]):
-            if not rest:
-                raise ParameterError(f"{value.where}: parameter {full!r} is a group: give {full}.<name>")
-            nested.setdefault(head, {})[rest] = value
-        elif rest:
-            raise ParameterError(f"{value.where}: parameter {prefix + head!r} has no part {rest!r}")
+        if rest:
+            groups.setdefault(head, {})[rest] = value
         else:
-            arguments[head] = _coerce(value.value, hints[head], full, value.where)
-    for head, inner in nested.items():
+            arguments[head] = value
+    fields = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
+    for head, inner in groups.items():
         # A group's defaults come from its parent: another group of the same class may have different ones.
         group = field_default(fields[head]) if base is None else getattr(base, head)
-        arguments[head] = _build(hints[head], inner, f"{prefix}{head}.", group)
-    try:
-        return config_class(**arguments) if base is None else dataclasses.replace(base, **arguments)  # type: ignore[type-var]
-    except ValueError as error:
-        if isinstance(error, ParameterError):
-            raise
-        where = next((v.where for k, v in values.items() if k.split(".")[0] in str(error)), "parameters")
-        raise ParameterError(f"{where}: {error}") from error
+        arguments[head] = _assemble(_hints(config_class)[head], inner, group)  # type: ignore[arg-type]
+    return config_class(**arguments) if base is None else dataclasses.replace(base, **arguments)  # type: ignore[type-var]
+
+
+def _culprit(config_class: type[Any], typed: Mapping[str, Any], base: Any, error: ValueError) -> str:
+    """The first value without which the error disappears or changes; empty if there is none."""
+    for key in typed:
+        try:
+            _assemble(config_class, {other: value for other, value in typed.items() if other != key}, base)
+        except ValueError as remaining:
+            if str(remaining) == str(error):
+                continue
+        return key
+    return ""
 
 
 def field_default(field: dataclasses.Field[Any]) -> Any:
@@ -222,50 +380,53 @@ def field_default(field: dataclasses.Field[Any]) -> Any:
     return None if field.default is dataclasses.MISSING else field.default
 
 
-def _coerce(value: Any, hint: Any, key: str, where: str) -> Any:
+def _coerce(value: Any, hint: Any, key: str) -> Any:
     """Convert a value to the declared type of its field."""
     origin = get_origin(hint)
     if origin is Annotated:
-        plain = _coerce(value, get_args(hint)[0], key, where)
+        plain = _coerce(value, get_args(hint)[0], key)
         bounds = range_of(hint)
         if bounds is not None and plain is not None and plain not in bounds:
-            raise ParameterError(f"{where}: {key} {bounds.words} (got {value})")
+            raise _RefusedError(f"{key} {bounds.words} (got {value})")
         return plain
     if origin in (typing.Union, UnionType):
         options = get_args(hint)
         if value is None and NoneType in options:
             return None
-        return _coerce(value, next(o for o in options if o is not NoneType), key, where)
+        return _coerce(value, next(o for o in options if o is not NoneType), key)
     if origin is typing.Literal:
         if value in get_args(hint):
             return value
-        raise ParameterError(f"{where}: {key} must be one of {', '.join(map(str, get_args(hint)))} (got {value!r})")
+        raise _RefusedError(f"{key} must be one of {', '.join(map(str, get_args(hint)))} (got {value!r})")
     if hint is bool and isinstance(value, bool):
         return value
     if hint is int and isinstance(value, int) and not isinstance(value, bool):
         return value
     if hint is float and isinstance(value, (int, float)) and not isinstance(value, bool):
-        return float(value)
+        with suppress(OverflowError):  # of a huge int
+            if math.isfinite(number := float(value)):
+                return number
+        raise _RefusedError(f"{key} must be a finite number (got {value})")
     if hint is str and isinstance(value, (str, int, float)) and not isinstance(value, bool):
         return str(value)
     if hint is Path and isinstance(value, str):
         return Path(value)
     if origin in (tuple, list) and isinstance(value, list):
-        return _coerce_sequence(value, origin, get_args(hint), key, where)
+        return _coerce_sequence(value, origin, get_args(hint), key)
     if hint is Any:
         return value
     wanted = getattr(hint, "__name__", str(hint)) if origin is None else str(hint)
-    raise ParameterError(f"{where}: {key} must be {wanted} (got {value!r})")
+    raise _RefusedError(f"{key} must be {wanted} (got {value!r})")
 
 
-def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], key: str, where: str) -> Any:
+def _coerce_sequence(value: list[Any], origin: Any, arguments: tuple[Any, ...], key: str) -> Any:
     if origin is tuple and arguments and arguments[-1] is not Ellipsis:
         if len(value) != len(arguments):
-            raise ParameterError(f"{where}: {key} must have {len(arguments)} values (got {len(value)})")
+            raise _RefusedError(f"{key} must have {len(arguments)} values (got {len(value)})")
         hints = list(arguments)
     else:
         hints = [arguments[0] if arguments else Any] * len(value)
-    return origin(_coerce(v, h, f"{key}[{i}]", where) for i, (v, h) in enumerate(zip(value, hints, strict=True)))
+    return origin(_coerce(v, h, f"{key}[{i}]") for i, (v, h) in enumerate(zip(value, hints, strict=True)))
 
 
 def to_dict(config: Any) -> dict[str, Any]:

@@ -7,6 +7,7 @@ checked in a separate process, which frees the memory when it ends.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import json
@@ -17,10 +18,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from instant_ic import paths
 from instant_ic.launch.description import NodeSpec
+
+if TYPE_CHECKING:
+    from instant_ic.config.params import Values
 
 _CHECK_TIMEOUT_S = 120.0
 _MOST_REMEMBERED = 500
@@ -39,22 +43,60 @@ class _Node:
     words: tuple[str, ...]
     at: str
     places: Mapping[str, str]
-
-    @classmethod
-    def of(cls, spec: NodeSpec) -> _Node:
-        """The part of a specification that the check needs."""
-        start = spec.command.index(str(paths.node_file(spec.exec))) + 1
-        return cls(spec.label, spec.exec, spec.command[start:], f"{spec.file}:{spec.line}", dict(spec.places))
+    shared: Mapping[str, tuple[Any, str, str]]
+    """Value, place and file of each parameter that a ``/**`` section sets for the nodes of this run directory."""
+    own_programs: bool
+    """Whether the stack has nodes that are not checked."""
 
 
 def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
     """The shipped nodes; programs given by path and executables are not checked."""
-    return [_Node.of(spec) for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
+    shipped = [spec for spec in nodes if str(paths.node_file(spec.exec)) in spec.command]
+    shared = _shared(shipped)
+    own_programs = any(spec.heartbeat for spec in nodes if spec not in shipped)
+    return [
+        _Node(
+            label=spec.label,
+            exec=spec.exec,
+            words=_words(spec),
+            at=f"{spec.file}:{spec.line}",
+            places=dict(spec.places),
+            shared=shared[spec.group],
+            own_programs=own_programs,
+        )
+        for spec in shipped
+    ]
+
+
+def _words(spec: NodeSpec) -> tuple[str, ...]:
+    """The node's own arguments."""
+    return spec.command[spec.command.index(str(paths.node_file(spec.exec))) + 1 :]
+
+
+def _files(words: Sequence[str]) -> list[Path]:
+    return [Path(word) for option, word in itertools.pairwise(words) if option == "--params-file"]
+
+
+def _shared(specs: Sequence[NodeSpec]) -> dict[str, dict[str, tuple[Any, str, str]]]:
+    """The ``/**`` values of each run directory; the first node with a value decides, so that others can differ."""
+    from instant_ic.config.params import PROCESS_KEYS, SHARED, ParameterError, load_sections
+
+    sections = functools.cache(load_sections)
+    found: dict[str, dict[str, tuple[Any, str, str]]] = {}
+    for spec in specs:
+        own: dict[str, tuple[Any, str, str]] = {}
+        for file in _files(_words(spec)):
+            with suppress(ParameterError):  # the check of the node reports it
+                for key, value in sections(file).get(SHARED, {}).items():
+                    own[key] = (value.value, value.where, str(file))
+        values = found.setdefault(spec.group, {})
+        values.update({key: value for key, value in own.items() if key not in values and key not in PROCESS_KEYS})
+    return found
 
 
 def check_parameters(nodes: Sequence[NodeSpec]) -> list[str]:
     """Check all nodes for unknown parameters, wrong types and values out of range; returns one text per problem."""
-    return [problem for node in _checkable(nodes) for problem in _problems(node)]
+    return list(dict.fromkeys(problem for node in _checkable(nodes) for problem in _problems(node)))
 
 
 def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = None) -> list[str]:
@@ -79,20 +121,18 @@ def check_parameters_quickly(nodes: Sequence[NodeSpec], cache: Path | None = Non
     bad = {label for label, _ in problems}
     good = [key for node, key in keys.items() if json.loads(node)["label"] not in bad]
     _remember(cache, [*(key for key in known if key not in good), *good])
-    return [text for _, text in problems]
+    return list(dict.fromkeys(text for _, text in problems))
 
 
 def _frozen(node: _Node) -> str:
-    return json.dumps(vars(node), sort_keys=True)
+    return json.dumps(vars(node), sort_keys=True, default=str)
 
 
 def _key(node: str, package: str) -> str:
     digest = hashlib.sha256(f"{package}\n{node}".encode())
-    words = json.loads(node)["words"]
-    for option, word in itertools.pairwise(words):
-        if option == "--params-file":
-            with suppress(OSError):  # missing: the check itself reports it
-                digest.update(Path(word).read_bytes())
+    for file in _files(json.loads(node)["words"]):
+        with suppress(OSError):  # missing: the check itself reports it
+            digest.update(file.read_bytes())
     return digest.hexdigest()
 
 
@@ -144,7 +184,7 @@ def _problems(node: _Node) -> list[str]:
     """All problems of one node's command line."""
     from instant_ic.bus.node_files import NodeFileError, node_class
     from instant_ic.bus.process import argument_parser, parse_remaps
-    from instant_ic.config.params import ParameterError, ProcessParameters
+    from instant_ic.config.params import ParameterError, configure, gather
 
     where = f"{node.at}: node {node.label}"
     try:
@@ -164,51 +204,59 @@ def _problems(node: _Node) -> list[str]:
         parse_remaps(args.remap)
     except ParameterError as error:
         problems.append(f"{where}: {error}")
-    values = _values(node, args, problems, where)
-    common = {key: values.pop(key) for key in ProcessParameters.__dataclass_fields__ if key in values}
-    for config_class, part in ((found.config_class(), values), (ProcessParameters, common)):
-        problems += _refused(config_class, part, node, where)
+    try:
+        values = gather(args.name, args.params_file, args.param, node.places)
+    except ParameterError as error:
+        return problems + [str(problem) if problem.where else f"{where}: {problem}" for problem in error.problems]
+    problems += _undeclared(node, values)
+    try:
+        config, _ = configure(found.config_class(), values)
+    except ParameterError as error:
+        for problem in error.problems:
+            at_line = problem.where and not problem.where.startswith("-p ")
+            problems.append(f"{problem} (node {node.label})" if at_line else f"{where}: {problem}")
+        return problems
+    return problems + _contradictions(node, values, config)
+
+
+def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
+    """Values that differ from the one shared by the nodes, unless stated beside it or on the node's own entry."""
+    from instant_ic.config.params import flatten, to_dict
+    from instant_ic.config.parameter_info import plain
+
+    problems: list[str] = []
+    effective = flatten(to_dict(config))
+    for key, (wanted, place, file) in node.shared.items():
+        value = values.get(key)
+        if key not in effective or (got := plain(effective[key])) == wanted or str(got) == str(wanted):
+            continue
+        if value is None:
+            problems.append(
+                f"{node.at}: node {node.label}: {key} is {got}, its default, but {place} sets {wanted} for the other "
+                f"nodes: give it the same file (from: {file})"
+            )
+        elif value.file is not None and (value.shared or str(value.file) != file):
+            problems.append(
+                f"{value.where}: {key} {got} contradicts {place}, which sets {wanted} for all nodes: change it there, "
+                f"or set it for this node in the launch file (node {node.label})"
+            )
     return problems
 
 
-def _values(node: _Node, args: Any, problems: list[str], where: str) -> dict[str, Any]:
-    from instant_ic.config.params import ParameterError, Values, load_file, parse_override
+def _undeclared(node: _Node, values: Values) -> list[str]:
+    """Shared values that no node has a parameter for: a typing error, or of a program that is not checked."""
+    from instant_ic.bus.node_files import node_class
+    from instant_ic.config.parameter_info import parameter_infos
 
-    values: Values = {}
-    for path in args.params_file:
-        try:
-            values.update(load_file(path, args.name))
-        except ParameterError as error:
-            problems.append(str(error))
-    for word in args.param:
-        try:
-            key, value = parse_override(word)
-            values[key] = value
-        except ParameterError as error:
-            problems.append(f"{where}: {error}")
-    return values
-
-
-def _refused(config_class: type[Any], values: dict[str, Any], node: _Node, where: str) -> list[str]:
-    """All values that a configuration refuses: each refused value is removed, and the rest is checked again."""
-    from instant_ic.config.params import ParameterError, build
-
-    problems: list[str] = []
-    while True:
-        try:
-            build(config_class, values)
-            return problems
-        except ParameterError as error:
-            text = str(error)
-            to_blame = [key for key, value in values.items() if text.startswith(f"{value.where}: ")]
-            at = values[to_blame[0]].where if to_blame else ""
-            words = text.removeprefix(f"{at}: ") if to_blame else text
-            place = node.places.get(at.removeprefix("-p "), "" if at.startswith("-p ") else at)
-            problems.append(f"{place}: {words} (node {node.label})" if place else f"{where}: {text}")
-            if not to_blame:
-                return problems
-            for key in to_blame:
-                del values[key]
+    left = {key: value for key, value in values.items() if value.shared}
+    if not left or node.own_programs:
+        return []
+    for name in dict.fromkeys((node.exec, *paths.node_names())):
+        for info in parameter_infos(node_class(name).config_class()):
+            left.pop(info.name, None)
+        if not left:
+            break
+    return [f"{value.where}: no node has a parameter {key!r}" for key, value in left.items()]
 
 
 def main() -> None:
