@@ -60,7 +60,15 @@ _MOTION_SAMPLES = 9
 
 @dataclass(frozen=True)
 class ArbiterNodeConfig(ArbiterConfig):
-    """Parameters of the node ``arbiter``: the library's, and the node's own."""
+    """Parameters of the node ``arbiter``: the library's, and the node's own.
+
+    Attributes:
+        rate_hz: steps of the state machine and messages on /cmd_vel, per second.
+        wall_min_length_m: m; a straight run of occupied map cells this long is a wall, a shorter one is an obstacle.
+        wall_period_s: s; walls are searched for in a changed /map at most this often, on a separate thread.
+        map_jump_m: m; a correction of map→odom larger than this makes the costmap forget its marks.
+        map_jump_deg: degrees; as map_jump_m, for the yaw.
+    """
 
     rate_hz: Positive = 20.0
     wall_min_length_m: Positive = 1.5

@@ -14,6 +14,7 @@ import numpy as np
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, main
 from instant_ic.bus.control import ControlError, NodeControl, NodeMissingError
 from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.config.robot import CAMERA_MOUNT, Mount, Rectangle
 from instant_ic.console import (
     ConsoleError,
     ConsoleServer,
@@ -70,7 +71,19 @@ MAX_FAULTS = 4
 
 @dataclass(frozen=True)
 class ConsoleConfig:
-    """Parameters. config/console.yaml describes each one."""
+    """Parameters. config/console.yaml describes each one.
+
+    Attributes:
+        lead: rendered views are moved to the v-bot's present position by their depth.
+        state_rate_hz: rate at which mode, poses and commands are sent to the page.
+        map_rate_hz: highest rate at which a changed map or costmap is sent to the page.
+        dissolve_ms: duration of the dissolve between camera and rendered view; 0 = cut.
+        ease_ms: time in which the remaining offset between the two robots' poses is eased out of the image; 0 = at
+            once.
+        colour_release_s: the new image at a switch takes the colours of the old one and returns to its own in this
+            time; 0 = no colour matching.
+        recorder: node behind the page's record, snapshot and bookmark buttons.
+    """
 
     server: ServerConfig = field(default_factory=ServerConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
@@ -80,9 +93,8 @@ class ConsoleConfig:
     dissolve_ms: Annotated[float, Range(0, 5000)] = 250.0
     ease_ms: Annotated[float, Range(0, 5000)] = 400.0
     colour_release_s: Annotated[float, Range(0, 60)] = 6.0
-    footprint_length_m: Positive = 0.6
-    footprint_width_m: Positive = 0.5
-    camera_height_m: float = 1.2
+    footprint: Rectangle = field(default_factory=Rectangle)
+    camera_mount: Mount = CAMERA_MOUNT
     recorder: str = "operator_recorder"
 
     def __post_init__(self) -> None:
@@ -140,8 +152,8 @@ class ConsoleNode(Node[ConsoleConfig]):
             "ease_ms": config.ease_ms,
             "colour_release_s": config.colour_release_s,
             "lead_max_m": config.lead.max_m,
-            "footprint": [config.footprint_length_m, config.footprint_width_m],
-            "camera": [0.0, 0.0, config.camera_height_m],
+            "footprint": [config.footprint.length_m, config.footprint.width_m],
+            "camera": [0.0, 0.0, config.camera_mount.xyz[2]],
         }
         self._map: OccupancyGrid | None = None
         self.recording = RecordingDesk(self.ask_recorder, lambda told: self.server.publish("recording", told))
@@ -569,7 +581,7 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Return base_from_camera with the identity as rotation."""
         place = np.eye(4)
         base_from_camera = self.lookup("base_link", "camera")
-        place[:3, 3] = (0, 0, self.config.camera_height_m) if base_from_camera is None else base_from_camera[:3, 3]
+        place[:3, 3] = self.config.camera_mount.xyz if base_from_camera is None else base_from_camera[:3, 3]
         return place
 
     def points(self, path: Path | None) -> list[list[float]]:

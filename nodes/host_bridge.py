@@ -38,7 +38,18 @@ UNLISTED = "of no list"
 
 @dataclass(frozen=True)
 class HostBridgeConfig:
-    """Parameters; config/bridge.yaml explains each."""
+    """Parameters; config/bridge.yaml explains each.
+
+    Attributes:
+        listen: robot: tcp://0.0.0.0:7450.
+        connect: station: tcp://ADDRESS:7450.
+        peer: station: name of the robot among the allowed hosts; empty: the only one.
+        keys: key folder; empty: $XDG_CONFIG_HOME/instant_ic/keys.
+        driver: robot: host that drives; empty: the first driver connected, until it leaves.
+        max_offset_ms: ms; clock offset between the hosts above which the bridge warns.
+        to_station: topics that the robot sends, one per line (form: docs/bridge.md).
+        to_robot: topics that a station sends; not /cmd_vel, which only the arbiter publishes.
+    """
 
     listen: str = ""
     connect: str = ""

@@ -36,7 +36,15 @@ from instant_ic.msg import (
 
 @dataclass(frozen=True)
 class NavigatorConfig:
-    """Parameters of the node ``navigator``."""
+    """Parameters of the node ``navigator``.
+
+    Attributes:
+        controller_frequency: commands per second.
+        replan_period_s: s between plans.
+        subgoal_timeout_s: s; with an older subgoal the robot stands.
+        costmap_timeout_s: s; with an older costmap the robot stands.
+        state_timeout_s: s; with an older /ic/state nothing is published.
+    """
 
     controller_frequency: Positive = 20.0
     replan_period_s: Positive = 0.2

@@ -6,8 +6,6 @@ import os
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
 from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.camera.config import FilesConfig, ThetaConfig, VideoConfig
 from instant_ic.camera.files import FileCamera
@@ -16,6 +14,7 @@ from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import ThetaCamera, ThetaClient, ThetaState
 from instant_ic.camera.video import VideoCamera
 from instant_ic.config.ranges import Positive, Share, check_ranges
+from instant_ic.config.robot import CAMERA_MOUNT, Mount
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import CompressedImage, compressed_image_message
 
@@ -32,8 +31,7 @@ class ThetaCameraConfig:
         source: ``theta`` (Web API), ``video`` (device, RTSP address or video file), ``files``.
         url: address of the Theta; device, address or path for the other sources.
         frame_id: the camera's frame.
-        mount_xyz: camera position on base_link, metres.
-        mount_rpy_deg: camera roll, pitch, yaw on base_link, degrees.
+        camera_mount: the camera's pose on base_link.
         silence_s: seconds without an image that cause a warning; four times as long is an error.
         health_period_s: seconds between requests for the Theta's battery and temperature.
         battery_low: battery charge below which to warn, 0-1.
@@ -47,8 +45,7 @@ class ThetaCameraConfig:
     source: Literal["theta", "video", "files"] = "theta"
     url: str = "http://192.168.1.1"
     frame_id: str = "camera"
-    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 1.2)
-    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_mount: Mount = CAMERA_MOUNT
     silence_s: Positive = 2.0
     health_period_s: Positive = 10.0
     battery_low: Share = 0.2
@@ -66,7 +63,7 @@ class ThetaCameraConfig:
 
 class ThetaCameraNode(Node[ThetaCameraConfig]):
     name = "theta_camera"
-    live_parameters = ("silence_s", "battery_low", "board_hot_c", "mount_xyz", "mount_rpy_deg")
+    live_parameters = ("silence_s", "battery_low", "board_hot_c", "camera_mount")
 
     def setup(self) -> None:
         """Create the topics, the mount and the loop that reads the camera."""
@@ -96,8 +93,7 @@ class ThetaCameraNode(Node[ThetaCameraConfig]):
 
     def broadcast_mount(self) -> None:
         """Broadcast the camera's mount on the robot."""
-        mount = pose_matrix(*self.config.mount_xyz, *np.radians(self.config.mount_rpy_deg))
-        self.tf_broadcast_static("base_link", self.config.frame_id, mount)
+        self.tf_broadcast_static("base_link", self.config.frame_id, pose_matrix(*self.config.camera_mount.pose))
 
     def reconfigure(self, config: ThetaCameraConfig) -> None:
         super().reconfigure(config)

@@ -30,7 +30,16 @@ from instant_ic.msg import (
 
 @dataclass(frozen=True)
 class VirtualRobotConfig:
-    """Parameters of the node ``virtual_robot``."""
+    """Parameters of the node ``virtual_robot``.
+
+    Attributes:
+        rate_hz: steps and messages on /vbot/odom, per second.
+        command_timeout_s: s; with an older operator's command the v-bot stops.
+        state_timeout_s: s without /ic/state after which the v-bot stands still.
+        wall_min_length_m: m; as for the arbiter.
+        wall_period_s: s; as for the arbiter.
+        walls_block: false: the v-bot passes walls too.
+    """
 
     rate_hz: Positive = 20.0
     command_timeout_s: Positive = 0.3

@@ -51,7 +51,7 @@ class Vlp16DriverNode(Node[Vlp16DriverConfig]):
         self.feed = PacketFeed(config.decoder, config.sensor, self.clock.steady_ns())
         self.report = LidarReport(self.feed)
         self.waiting = 0
-        self.base_from_lidar = pose_matrix(*config.mount_xyz, *np.radians(config.mount_rpy_deg))
+        self.base_from_lidar = pose_matrix(*config.lidar_mount.pose)
         try:
             check_level(self.base_from_lidar)
         except ValueError as error:

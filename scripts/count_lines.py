@@ -39,7 +39,7 @@ def parameters() -> dict[str, int]:
     from instant_ic.config.parameter_info import parameter_infos
     from instant_ic.paths import node_names
 
-    return {name: len(parameter_infos(node_class(name).config_class(), node=name)) for name in node_names()}
+    return {name: len(parameter_infos(node_class(name).config_class())) for name in node_names()}
 
 
 def main() -> int:

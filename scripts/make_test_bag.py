@@ -130,12 +130,10 @@ def make(path: Path, seconds: float, quality: int) -> None:
 
 def mounts(simulation: Simulation) -> TFMessage:
     """Sensor mounts as the drivers publish them."""
-    camera, lidar = simulation.config.camera, simulation.config.lidar
-    places = (("camera", camera.mount_xyz, camera.mount_yaw_deg), ("velodyne", lidar.mount_xyz, lidar.mount_yaw_deg))
+    mounts = (("camera", simulation.config.camera_mount), ("velodyne", simulation.config.lidar_mount))
     return TFMessage(
         transforms=[
-            transform_message(pose_matrix(*xyz, 0.0, 0.0, math.radians(yaw)), "base_link", frame, START_NS)
-            for frame, xyz, yaw in places
+            transform_message(pose_matrix(*mount.pose), "base_link", frame, START_NS) for frame, mount in mounts
         ]
     )
 

@@ -25,6 +25,7 @@ from instant_ic.bus.lockstep import LockstepBus, Record
 from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
 from instant_ic.bus.process import load_config
+from instant_ic.config.params import SHARED
 from instant_ic.msg import deserialize
 
 BROADCASTS: Mapping[str, tuple[str, ...]] = {
@@ -91,7 +92,7 @@ def shipped_parameter_files(name: str) -> list[Path]:
         if file.name in ("sim.yaml", "fleet_sim.yaml"):  # fleet_sim.yaml lowers rates to fit many robots
             continue
         try:
-            named = name in _sections(file, file.stat().st_mtime_ns)
+            named = {name, SHARED} & _sections(file, file.stat().st_mtime_ns)
         except (OSError, yaml.YAMLError):
             continue  # a broken file that this node may not use: an error appears when it is named explicitly
         if named:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 from instant_ic.base.protocol import ADDRESSES, BAUD_RATES
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.robot import MotionLimits
 
 
 def _require(ok: bool, key: str, value: object, rule: str) -> None:
@@ -55,30 +56,22 @@ class SkidSteerConfig:
 
 
 @dataclass(frozen=True)
-class LimitsConfig:
+class LimitsConfig(MotionLimits):
     """Speed and acceleration limits of the base.
 
     Attributes:
-        max_v: largest speed along x, m/s.
-        max_w: largest turn rate, rad/s.
-        max_v_acceleration: largest change of the speed, m/s^2.
-        max_w_acceleration: largest change of the turn rate, rad/s^2.
-        hard_deceleration: deceleration of each track when commands stop or a command asks for a hard stop, m/s^2.
+        hard_decel_m_s2: m/s²; deceleration of each track when commands stop or a command asks for a hard stop.
     """
 
-    max_v: Positive = 0.5
-    max_w: Positive = 1.0
-    max_v_acceleration: Positive = 0.8
-    max_w_acceleration: Positive = 2.0
-    hard_deceleration: Positive = 4.0
+    hard_decel_m_s2: Positive = 4.0
 
     def __post_init__(self) -> None:
-        check_ranges(self)
+        super().__post_init__()
         _require(
-            self.hard_deceleration >= self.max_v_acceleration,
-            "hard_deceleration",
-            self.hard_deceleration,
-            "at least max_v_acceleration",
+            self.hard_decel_m_s2 >= self.max_linear_accel_m_s2,
+            "hard_decel_m_s2",
+            self.hard_decel_m_s2,
+            "at least max_linear_accel_m_s2",
         )
 
 

@@ -179,11 +179,11 @@ class BaseController:
         half_width = 0.5 * geometry.effective_width
         if command is None or command.hard:
             # The controller ramps down by itself, so the ramp ends even if no packet follows. The limiter tracks it.
-            self.roboclaw.drive([0.0, 0.0], geometry.pulses_per_metre * limits.hard_deceleration)
-            return self.limiter.brake(limits.hard_deceleration, limits.hard_deceleration / half_width, dt_s)
+            self.roboclaw.drive([0.0, 0.0], geometry.pulses_per_metre * limits.hard_decel_m_s2)
+            return self.limiter.brake(limits.hard_decel_m_s2, limits.hard_decel_m_s2 / half_width, dt_s)
         v, w = self.limiter.step(command.v, command.w, dt_s)
         # The limiter shapes the twist; the controller's ramp allows both parts at once on one track.
-        ramp = limits.max_v_acceleration + half_width * limits.max_w_acceleration
+        ramp = limits.max_linear_accel_m_s2 + half_width * limits.max_angular_accel_rad_s2
         speeds = kinematics.motors_from_tracks(kinematics.tracks_from_twist(v, w))
         self.roboclaw.drive(speeds.tolist(), geometry.pulses_per_metre * ramp)
         return v, w

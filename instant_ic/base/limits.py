@@ -32,8 +32,8 @@ class TwistLimiter:
         if dt_s < 0.0:
             raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
         v, w = clamp_twist(v, w, self.config)
-        self.v = _towards(self.v, v, self.config.max_v_acceleration * dt_s)
-        self.w = _towards(self.w, w, self.config.max_w_acceleration * dt_s)
+        self.v = _towards(self.v, v, self.config.max_linear_accel_m_s2 * dt_s)
+        self.w = _towards(self.w, w, self.config.max_angular_accel_rad_s2 * dt_s)
         return self.v, self.w
 
     def brake(self, deceleration: float, w_deceleration: float, dt_s: float) -> tuple[float, float]:
@@ -51,10 +51,10 @@ class TwistLimiter:
 def clamp_twist(v: float, w: float, config: LimitsConfig) -> tuple[float, float]:
     """Scale both parts of the twist by one factor to bring it within the speed limits."""
     scale = 1.0
-    if abs(v) > config.max_v:
-        scale = config.max_v / abs(v)
-    if abs(w) * scale > config.max_w:
-        scale = config.max_w / abs(w)
+    if abs(v) > config.max_linear_m_s:
+        scale = config.max_linear_m_s / abs(v)
+    if abs(w) * scale > config.max_angular_rad_s:
+        scale = config.max_angular_rad_s / abs(w)
     return v * scale, w * scale
 
 

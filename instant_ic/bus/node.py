@@ -436,7 +436,7 @@ class Node(Generic[ConfigT]):
 
     def parameters(self) -> list[ParameterInfo]:
         """All parameters with their present values; may be called from any thread."""
-        infos = parameter_infos(type(self.config), self.config, self.live_parameters, type(self).name)
+        infos = parameter_infos(type(self.config), self.config, self.live_parameters)
         own = {info.name for info in infos}
         process = params.ProcessParameters(self.use_sim_time, self.nice)
         common = parameter_infos(params.ProcessParameters, process)

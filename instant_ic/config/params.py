@@ -102,7 +102,9 @@ PROCESS_KEYS = ("use_sim_time", "nice")
 """Names of :class:`ProcessParameters`."""
 
 
-def gather(node: str, files: Sequence[Path], overrides: Sequence[str], places: Mapping[str, str] | None = None) -> Values:
+def gather(
+    node: str, files: Sequence[Path], overrides: Sequence[str], places: Mapping[str, str] | None = None
+) -> Values:
     """All values given to a node: the files in their order, then the ``key:=value`` overrides.
 
     Args:
@@ -330,7 +332,7 @@ def _type_of(config_class: type[Any], key: str) -> Any:
     """Declared type of a parameter."""
     group, names = config_class, key.split(".")
     for index, name in enumerate(names):
-        hints, prefix = _hints(group), "".join(f"{part}." for part in names[:index])
+        hints, prefix = _hints(group), "".join(f"{part}." for part in names[:index])  # type: ignore[arg-type]
         if name not in hints:
             close = difflib.get_close_matches(name, hints, n=1)
             hint = f"; did you mean {prefix + close[0]!r}?" if close else f"; known: {', '.join(sorted(hints))}"

@@ -15,7 +15,21 @@ RATE_COMMANDS = 200  # newest commands kept to measure the rate
 
 @dataclass(frozen=True)
 class DriveConfig:
-    """Speed limits, and the time-outs after which a command expires."""
+    """Speed limits, and the time-outs after which a command expires.
+
+    Attributes:
+        max_linear_mps: m/s at full speed limit; commands are clamped to it.
+        max_angular_rps: rad/s at full speed limit; commands are clamped to it.
+        rate_hz: rate of /operator/cmd_vel while driving.
+        watchdog_s: time without a command from the page, while driving, after which zero is published.
+        max_command_age_s: commands older than this on arrival are dropped.
+        stop_repeat_s: time after a stop in which zeros are published at rate_hz; afterwards at keep_alive_hz.
+        keep_alive_hz: zeros of an idle driver; they show the arbiter that the operator is present (arbiter:
+            timeouts.command).
+        beat_timeout_s: silence of the driver's page (pings at 20 Hz) after which the driver is reported lost to the
+            arbiter.
+        lease_timeout_s: silence of the driver's page after which it loses the lease.
+    """
 
     max_linear_mps: float = 0.4
     max_angular_rps: float = 0.8

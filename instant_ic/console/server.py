@@ -107,7 +107,19 @@ class Backend(Protocol):
 
 @dataclass(frozen=True)
 class ServerConfig:
-    """Address, limits and access of the server."""
+    """Address, limits and access of the server.
+
+    Attributes:
+        host: listen address; any but loopback (e.g. 0.0.0.0) opens the page to the network, with sign-in.
+        port: 0 = any free port; the log states it.
+        allowed_hosts: host names by which browsers may reach the page, besides localhost and IP addresses.
+        max_clients: simultaneous pages; two places are reserved for pages that may drive.
+        max_connections: simultaneous connections; at the limit the address with the most idle ones loses its oldest.
+        max_connections_per_address: the same for one address (IPv6: one /64).
+        max_messages_per_s: limit for the driver's page, with bursts of twice this number; 0.4 of it for others; above,
+            the WebSocket is closed.
+        background_picture_hz: rate of images that are not shown (the camera while in the virtual space).
+    """
 
     host: str = "127.0.0.1"
     port: Annotated[int, Range(0, 65535)] = 8080  # 0 = any free port

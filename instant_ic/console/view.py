@@ -21,7 +21,19 @@ ELSEWHERE_M = 1.0
 
 @dataclass(frozen=True)
 class ViewConfig:
-    """Requests for rendered views."""
+    """Requests for rendered views.
+
+    Attributes:
+        width: width * height is the number of pixels of a rendered view; its shape follows the driver's window.
+        height: see width.
+        fov_margin: requested over shown field of view; larger: more room to re-aim, coarser pixels.
+        virtual_rate_hz: requests a second in the virtual space (one outstanding at a time).
+        still_rate_hz: requests a second in the virtual space while nothing moves, which leaves the renderer free.
+        watcher_rate_hz: requests a second for each page that looks elsewhere than the driver's, if time is left; 0 =
+            none.
+        real_rate_hz: requests a second while the camera is shown, to keep the renderer warm; 0 = none.
+        response_timeout_s: an unanswered request counts as lost after this time.
+    """
 
     width: Annotated[int, Range(16, 4096)] = 320  # times height: pixels of a view; its shape is the window's
     height: Annotated[int, Range(16, 4096)] = 180
@@ -38,7 +50,12 @@ class ViewConfig:
 
 @dataclass(frozen=True)
 class LeadConfig:
-    """Showing rendered views from the v-bot's present position (``geometry.depth_picture``)."""
+    """Showing rendered views from the v-bot's present position (``geometry.depth_picture``).
+
+    Attributes:
+        max_m: largest distance from the rendered position; 0 = views are not moved.
+        seconds: time of the transition after a switch, and back before the return; 0 = at once.
+    """
 
     max_m: NotNegative = 0.3  # largest distance from the rendered position; 0: views are not moved
     seconds: NotNegative = 0.8  # time of the transition after a switch, and back before the return

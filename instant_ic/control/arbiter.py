@@ -105,7 +105,14 @@ class SwitchConfig:
 
 @dataclass(frozen=True)
 class ArbiterConfig:
-    """Configuration of the arbiter's library part."""
+    """Configuration of the arbiter's library part.
+
+    Attributes:
+        collision_monitor: last step before /cmd_vel; the most restrictive polygon wins.
+        planner: answers «is there a way round?»; the navigator has its own.
+        timeouts: s; with an older message the command is zero. Images (camera, view): late_s after their usual arrival,
+            if longer.
+    """
 
     limits: MotionLimits = field(default_factory=MotionLimits)
     footprint: Footprint = field(default_factory=Footprint)

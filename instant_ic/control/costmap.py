@@ -31,7 +31,25 @@ SLACK_M = 1e-6
 
 @dataclass(frozen=True)
 class CostmapConfig:
-    """Parameters of the rolling window, with nav2's names."""
+    """Parameters of the rolling window, with nav2's names.
+
+    Attributes:
+        width: m; side of the window that moves with the robot.
+        resolution: m per cell.
+        update_frequency: per second; upper limit: each update adds a new scan or new points.
+        publish_frequency: messages on /costmap, per second.
+        inflation_radius: m; costs reach this far from an obstacle.
+        cost_scaling_factor: 1/m; higher: costs fall off faster, paths come closer to obstacles.
+        obstacle_max_range: m; farther hits are not marked.
+        raytrace_max_range: m; beams clear no farther than this.
+        inf_is_valid: true: +inf (no return) clears too. Not for a VLP-16: anything nearer than 0.4 m gives no return
+            either.
+        lethal_cost_threshold: 0..100; /map cells from this value on are obstacles.
+        footprint_clearing_enabled: the cells under the robot are free.
+        static_seen_through: consecutive scans that must look through a cell that only the map holds, until it counts as
+            free; 0: never.
+        points: low and hanging things, from /lidar/points.
+    """
 
     width: Positive = 12.0
     resolution: Positive = 0.05

@@ -28,7 +28,33 @@ CARROT_SHARES = (1.0, 0.7, 0.45, 0.25)
 
 @dataclass(frozen=True)
 class FollowerConfig:
-    """Parameters, with the names of nav2's regulated pure pursuit where it has them."""
+    """Parameters, with the names of nav2's regulated pure pursuit where it has them.
+
+    Attributes:
+        desired_linear_vel: m/s; above the operator's usual 0.4, so that the r-bot catches up.
+        lookahead_dist: m; used if use_velocity_scaled_lookahead_dist is false.
+        use_velocity_scaled_lookahead_dist: the carrot is lookahead_time ahead.
+        lookahead_time: s.
+        min_lookahead_dist: m.
+        max_lookahead_dist: m.
+        regulated_linear_scaling_min_radius: m; slower in tighter curves.
+        regulated_linear_scaling_min_speed: m/s; lower limit of that slowing.
+        use_rotate_to_heading: turn on the spot if the carrot is far to the side.
+        rotate_to_heading_min_angle: rad; bearing of the carrot above which the robot turns on the spot.
+        rotate_to_heading_stop_angle: rad; bearing below which it drives on.
+        rotate_to_heading_gain: 1/s.
+        approach_decel_m_s2: m/s²; braking towards the end of the path.
+        use_collision_detection: a nearer carrot is used if the arc to it would touch something.
+        max_allowed_time_to_collision_up_to_carrot: s of that arc that are checked.
+        collision_padding_m: m round the footprint in this check.
+        xy_goal_tolerance: m; well inside switch.position_m.
+        yaw_goal_tolerance: rad; well inside switch.yaw_deg.
+        track_distance_m: m; nearer than this to a moving v-bot, its own speed is followed.
+        track_min_speed_m_s: m/s (rad/s); below this speed the v-bot counts as standing.
+        track_gain_x: 1/s; along the heading.
+        track_gain_y: 1/m²; across.
+        track_gain_yaw: 1/m.
+    """
 
     desired_linear_vel: Positive = 0.5
     lookahead_dist: Positive = 0.5

@@ -8,18 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.robot import Rectangle
 
 
 @dataclass(frozen=True)
-class Footprint:
-    """Rectangle in metres, length along x, width along y."""
-
-    length_m: Positive = 0.60
-    width_m: Positive = 0.50
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
+class Footprint(Rectangle):
+    """The robot's outline, with what the planner needs of it."""
 
     @property
     def inscribed_radius_m(self) -> float:

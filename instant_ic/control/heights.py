@@ -31,7 +31,20 @@ INSTANTS = 65
 
 @dataclass(frozen=True)
 class HeightConfig:
-    """Which points are obstacles, and how long they are kept; nav2's names where nav2 has the parameter."""
+    """Which points are obstacles, and how long they are kept; nav2's names where nav2 has the parameter.
+
+    Attributes:
+        enabled: false: the flat scan alone.
+        min_obstacle_height: m above the ground; lower points can be driven over.
+        max_obstacle_height: m; higher points can be passed under. The camera's mast is 1.20 m high.
+        ground_tilt_deg: degrees; apparent slope of the ground that is tolerated: the robot pitches, or the floor
+            slopes.
+        obstacle_min_range: m from the LiDAR; nearer points are on the robot's own body.
+        obstacle_max_range: m; farther points are not marked.
+        mark_threshold: points in a cell from which on it is an obstacle.
+        vertical_resolution_deg: degrees between the sensor's rings.
+        clear_margin_m: m; a beam must end this far behind a mark to clear it.
+    """
 
     enabled: bool = True
     min_obstacle_height: float = 0.05

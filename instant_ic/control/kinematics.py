@@ -3,26 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.config.ranges import Positive, check_ranges
+from instant_ic.config.robot import MotionLimits
 from instant_ic.geometry.poses import wrap_angle
-
-
-@dataclass(frozen=True)
-class MotionLimits:
-    """Speed and acceleration limits of the base (config/base.yaml holds the base's own copy)."""
-
-    max_linear_m_s: Positive = 0.5
-    max_angular_rad_s: Positive = 1.0
-    max_linear_accel_m_s2: Positive = 0.8
-    max_angular_accel_rad_s2: Positive = 2.0
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
 
 def clip_twist(linear: float, angular: float, limits: MotionLimits) -> tuple[float, float]:

@@ -18,7 +18,16 @@ from instant_ic.geometry.poses import relative2
 
 @dataclass(frozen=True)
 class RecoveryConfig:
-    """When the robot counts as stuck, and how it frees itself."""
+    """When the robot counts as stuck, and how it frees itself.
+
+    Attributes:
+        stuck_after_s: s of commands without motion after which the robot backs off.
+        duration_s: s; duration of backing off.
+        speed_m_s: m/s; backwards, the next time forwards.
+        moved_m: m from which on the robot counts as moving.
+        turned_rad: rad from which on it counts as moving.
+        keep_plan_s: s for which a path to the goal that is still free is kept when no new one is found.
+    """
 
     stuck_after_s: Positive = 1.5
     duration_s: Positive = 1.5

@@ -17,7 +17,15 @@ from instant_ic.control.walls import WallMap
 
 @dataclass(frozen=True)
 class PassageConfig:
-    """How soon free space must follow behind the obstacle, and how long the detour may be."""
+    """How soon free space must follow behind the obstacle, and how long the detour may be.
+
+    Attributes:
+        max_pass_m: m; largest distance behind the obstacle at which free space must begin for a switch to the v-bot.
+        max_detour_m: m; how much longer than straight on the way round may be.
+        max_cost: 0..252; highest cost at which a place counts as free.
+        wall_clearance_m: m; least distance to a wall on the line behind the obstacle: nearer, the v-bot would have to
+            pass the wall.
+    """
 
     max_pass_m: NotNegative = 3.0
     max_detour_m: NotNegative = 4.0

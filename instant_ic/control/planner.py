@@ -35,7 +35,27 @@ HURRY = 1.2
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """What the planner may cross, and at what cost; names of nav2's Smac planner where it has the parameter."""
+    """What the planner may cross, and at what cost; names of nav2's Smac planner where it has the parameter.
+
+    Attributes:
+        cost_penalty: higher: longer paths, farther from obstacles.
+        tight_cost: 0..251; above this cost the robot cannot turn on the spot (0.39 m from obstacles).
+        tight_penalty: extra cost of a metre above tight_cost.
+        allow_unknown: plan through unseen cells; the driven path still ends before them.
+        unknown_penalty: extra cost of a metre through unseen cells.
+        unknown_standoff_m: m; distance kept to unseen cells.
+        angle_quantization_bins: headings per full turn in the search.
+        allow_reverse_expansion: allow driving backwards, out of dead ends for example.
+        reverse_penalty: extra cost of a metre driven backwards.
+        change_penalty: m; cost of a change of direction.
+        non_straight_penalty: cost factor of a metre on a curve.
+        rotation_penalty: m; cost of one radian turned on the spot.
+        retrospective_gain: 0..0.2; discount along the previous path: keeps the chosen side.
+        footprint_padding: m round the footprint.
+        escape_radius_m: m; how far a robot that stands on obstacles may drive to get off them.
+        tolerance: m; a path that ends this near an occupied goal counts as a way.
+        max_iterations: poses after which the search gives up.
+    """
 
     cost_penalty: NotNegative = 3.0
     tight_cost: Annotated[int, Range(0, 251)] = 165

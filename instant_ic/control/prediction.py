@@ -16,7 +16,16 @@ from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, 
 
 @dataclass(frozen=True)
 class PredictionConfig:
-    """How far to look ahead."""
+    """How far to look ahead.
+
+    Attributes:
+        latency_s: s; delay from a command to the base's response.
+        margin_m: m; horizon beyond the stopping distance; higher: earlier switch to the v-bot.
+        yaw_margin_rad: rad; horizon when turning on the spot.
+        max_horizon_s: s; longest prediction, however slow the robot.
+        step_s: s between predicted poses.
+        padding_m: m round the footprint.
+    """
 
     latency_s: NotNegative = 0.2
     margin_m: NotNegative = 0.6

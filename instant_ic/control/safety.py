@@ -86,7 +86,17 @@ def parse_polygon(text: str) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class CollisionMonitorConfig:
-    """Polygons, of which the most restrictive wins, and the largest age of their points."""
+    """Polygons, of which the most restrictive wins, and the largest age of their points.
+
+    Attributes:
+        source_timeout: s; older scans or points stop the robot.
+        blind_radius_m: m; the LiDAR sees nothing nearer than this; the costmap's lethal cells are used instead.
+        memory_range_m: m; marks of 3D points count up to here, whether seen at present or not.
+        stop: something inside, and the command leads deeper: zero.
+        slowdown: something inside: slower.
+        limit: something inside: at most the limits.
+        approach: footprint makes contact within time_before_collision: slowed in proportion.
+    """
 
     source_timeout: Positive = 0.5
     blind_radius_m: NotNegative = 0.45

@@ -17,7 +17,15 @@ from instant_ic.control.walls import WallMap
 
 @dataclass(frozen=True)
 class SubgoalConfig:
-    """What counts as a free place, and how far ahead to look for one."""
+    """What counts as a free place, and how far ahead to look for one.
+
+    Attributes:
+        max_cost: 0..252; highest cost of a subgoal (0.42 m from obstacles).
+        extend_m: m; length searched straight on for a free place behind the obstacle.
+        search_radius_m: m round the v-bot; searched when nothing is free straight on.
+        anticipate: send the r-bot behind an obstacle as soon as the v-bot is about to pass it.
+        wall_clearance_m: m; the search straight on ends where the line comes nearer to a wall than this.
+    """
 
     max_cost: Annotated[int, Range(0, LETHAL - 2)] = 150
     extend_m: NotNegative = 3.0

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.base.kinematics import SkidSteer
 from instant_ic.experiments.particle_slam import ParticleConfig
 from instant_ic.experiments.slam import LogResult, run_log
 from instant_ic.experiments.slam_worlds import trajectory_errors
@@ -63,7 +62,7 @@ def round_trip(
     config = RobotConfig(slip=slip, turn_slip=slip)
     start = (*route[0], math.atan2(route[1][1] - route[0][1], route[1][0] - route[0][0]))
     robot = TrackedRobot(config, world.occupied(config.contact_low, config.contact_high), start, seed)
-    kinematics = SkidSteer(config.steering)
+    kinematics = robot.kinematics
     rng = np.random.default_rng([37, seed])
     angles = np.asarray(-math.pi + 2 * math.pi / BEAMS * np.arange(BEAMS), dtype=np.float64)
     entries: list[LogEntry] = []

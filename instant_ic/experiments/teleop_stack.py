@@ -304,7 +304,7 @@ class SimulatedStack:
             looks = self.nodes["depth_estimator" if config.depth == "fused" else "depth_scaler"]
             self._depth_hz = float(looks.config.max_rate_hz)
         camera = make_node("theta_camera", None, words).config
-        mount = pose_matrix(*camera.mount_xyz, *np.radians(camera.mount_rpy_deg))
+        mount = pose_matrix(*camera.camera_mount.pose)
         self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
         self.nodes["console"].server.stop()
         self.nodes["console"].server = self.page

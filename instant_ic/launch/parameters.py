@@ -221,8 +221,8 @@ def _problems(node: _Node) -> list[str]:
 
 def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
     """Values that differ from the one shared by the nodes, unless stated beside it or on the node's own entry."""
-    from instant_ic.config.params import flatten, to_dict
     from instant_ic.config.parameter_info import plain
+    from instant_ic.config.params import flatten, to_dict
 
     problems: list[str] = []
     effective = flatten(to_dict(config))

@@ -70,8 +70,7 @@ class Vlp16DriverConfig:
         rate: playback rate of the capture; 1 is the recorded rate.
         loop: restart the capture at its end.
         frame_id: the sensor's frame.
-        mount_xyz: sensor position on base_link, metres.
-        mount_rpy_deg: sensor roll, pitch, yaw on base_link, degrees.
+        lidar_mount: the sensor's pose on base_link.
         silence_s: seconds without a packet that are an error.
         decoder: conversion of packets to points.
         scan: conversion of points to the flat scan.
@@ -86,8 +85,7 @@ class Vlp16DriverConfig:
     rate: Positive = 1.0
     loop: bool = False
     frame_id: str = "velodyne"
-    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 0.6)
-    mount_rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lidar_mount: Mount = LIDAR_MOUNT
     silence_s: Positive = 2.0
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
     scan: FlatScanConfig = field(default_factory=FlatScanConfig)

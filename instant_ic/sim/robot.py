@@ -1,13 +1,14 @@
 """Dynamics of the tracked robot: motors, slipping tracks, encoders, contact with the world."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
+from instant_ic.config.robot import Rectangle
 from instant_ic.sim.contact import OccupancyMask
 
 FloatArray = npt.NDArray[np.float64]
@@ -21,7 +22,6 @@ class RobotConfig:
     """Parameters of the simulated robot.
 
     Attributes:
-        length, width: size of the footprint, metres, centred on base_link.
         contact_low, contact_high: objects between these heights stop the robot, metres.
         track_acceleration: largest acceleration of a track by its motor, m/s².
         motor_lag_s: time constant with which a track follows its set point.
@@ -31,11 +31,8 @@ class RobotConfig:
         turn_slip: relative standard deviation of the effective track width; 0 disables it.
         slip_time_s: time constant of the slip.
         encoder_noise_pulses: standard deviation of the encoder counts while a track moves.
-        steering: geometry; must equal the driver's, or its odometry has a bias.
     """
 
-    length: float = 0.60
-    width: float = 0.50
     contact_low: float = 0.03
     contact_high: float = 0.9
     track_acceleration: float = 2.0
@@ -45,10 +42,9 @@ class RobotConfig:
     turn_slip: float = 0.05
     slip_time_s: float = 1.0
     encoder_noise_pulses: float = 2.0
-    steering: SkidSteerConfig = field(default_factory=SkidSteerConfig)
 
     def __post_init__(self) -> None:
-        for key in ("length", "width", "track_acceleration", "motor_lag_s", "rolling_resistance", "slip_time_s"):
+        for key in ("track_acceleration", "motor_lag_s", "rolling_resistance", "slip_time_s"):
             if not getattr(self, key) > 0:
                 raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
         for key in ("slip", "turn_slip"):
@@ -63,6 +59,14 @@ class RobotConfig:
 class TrackedRobot:
     """Robot on the floor plan.
 
+    Args:
+        config: dynamics.
+        mask: where objects stop the robot.
+        pose: x, y, yaw at the start.
+        seed: seed of slip and noise.
+        footprint: outline.
+        geometry: tracks and encoders.
+
     Attributes:
         pose: (3,) x, y, yaw (unwrapped) in the world's frame.
         twist: (3,) true v_x, v_y, yaw rate in the robot's frame.
@@ -72,10 +76,16 @@ class TrackedRobot:
     """
 
     def __init__(
-        self, config: RobotConfig, mask: OccupancyMask, pose: tuple[float, float, float], seed: int = 0
+        self,
+        config: RobotConfig,
+        mask: OccupancyMask,
+        pose: tuple[float, float, float],
+        seed: int = 0,
+        footprint: Rectangle = Rectangle(),  # noqa: B008 - frozen
+        geometry: SkidSteerConfig = SkidSteerConfig(),  # noqa: B008 - frozen
     ) -> None:
         self.config = config
-        self.kinematics = SkidSteer(config.steering)
+        self.kinematics = SkidSteer(geometry)
         self.pose: FloatArray = np.asarray(pose, float)
         self.twist: FloatArray = np.zeros(3)
         self.tracks: FloatArray = np.zeros(2)
@@ -87,7 +97,7 @@ class TrackedRobot:
         self._travelled: FloatArray = np.zeros(2)
         self._jitter: FloatArray = np.zeros(2)
         self._held_at: FloatArray = self.pose
-        self._outline = _outline(config.length, config.width, mask.cell_m)
+        self._outline = _outline(footprint.length_m, footprint.width_m, mask.cell_m)
         if self.touches(self.pose):
             raise ValueError(f"the start pose x={pose[0]:.2f}, y={pose[1]:.2f} collides with the world")
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.base.config import SkidSteerConfig
+from instant_ic.config.robot import CAMERA_MOUNT, LIDAR_MOUNT, Mount, Rectangle
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer, Frame
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -54,6 +56,9 @@ class SimulationConfig:
         start: start pose x, y (metres), yaw (radians) of the robot; empty selects the world's start.
         seed: seed of all noise.
         robot, camera, lidar, base: parameters of the parts.
+        footprint: outline of the robot.
+        geometry: tracks and encoders.
+        camera_mount, lidar_mount: poses on base_link.
     """
 
     world: str = "corridor"
@@ -63,6 +68,10 @@ class SimulationConfig:
     camera: ThetaConfig = field(default_factory=ThetaConfig)
     lidar: Vlp16Config = field(default_factory=Vlp16Config)
     base: BaseConfig = field(default_factory=BaseConfig)
+    footprint: Rectangle = field(default_factory=Rectangle)
+    geometry: SkidSteerConfig = field(default_factory=SkidSteerConfig)
+    camera_mount: Mount = CAMERA_MOUNT
+    lidar_mount: Mount = LIDAR_MOUNT
 
     def __post_init__(self) -> None:
         if len(self.start) not in (0, 3):
@@ -89,7 +98,8 @@ class Simulation:
         self.world = world or make_world(config.world)
         start = config.start or self.world.spawn
         mask = self.world.occupied(config.robot.contact_low, config.robot.contact_high, 0.01)
-        self.robot = TrackedRobot(config.robot, mask, (start[0], start[1], start[2]), config.seed)
+        pose = (start[0], start[1], start[2])
+        self.robot = TrackedRobot(config.robot, mask, pose, config.seed, config.footprint, config.geometry)
         self.controller = RoboclawEmulator(config.base.address, ideal_motors=False)
         self.controller.battery_v = config.base.battery_v
         self.lock = threading.Lock()
@@ -98,7 +108,7 @@ class Simulation:
         size = int(HISTORY_S / STEP_S) + 2
         self._history = np.column_stack([np.full(size, -1e9), np.tile(self.robot.pose, (size, 1))])
         self._remember()
-        self.scanner = Vlp16(config.lidar, self.world, self.poses_at, self.epoch_ns, config.seed)
+        self.scanner = Vlp16(config.lidar, self.world, self.poses_at, self.epoch_ns, config.seed, config.lidar_mount)
 
     def epoch_ns(self, time_s: float) -> int:
         """Epoch time of a simulated time; ``start_ns`` may be shifted after a pause of the simulation."""
@@ -143,8 +153,7 @@ class Simulation:
 
     def panorama(self, width: int, height: int) -> Frame:
         """Render the camera's current view."""
-        mount = self.config.camera
-        base_from_camera = pose_matrix(*mount.mount_xyz, 0.0, 0.0, math.radians(mount.mount_yaw_deg))
+        base_from_camera = pose_matrix(*self.config.camera_mount.pose)
         return self.renderer.render(self.world_from_base() @ base_from_camera, width, height)
 
     def scan_packets(self, count: int | None = None) -> list[bytes]:

@@ -40,8 +40,6 @@ class ThetaConfig:
         quality: JPEG quality, 1-100.
         noise: standard deviation of a pixel value, of 255.
         user, password: credentials of HTTP digest (client mode); an empty user disables it.
-        mount_xyz: position on base_link, metres.
-        mount_yaw_deg: yaw on base_link, degrees.
     """
 
     enabled: bool = True
@@ -55,8 +53,6 @@ class ThetaConfig:
     noise: float = 0.0
     user: str = ""
     password: str = ""
-    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 1.20)
-    mount_yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
         if (self.width, self.height) not in {f[:2] for f in PREVIEW_FORMATS}:

@@ -9,6 +9,8 @@ from datetime import UTC, datetime
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.config.robot import LIDAR_MOUNT, Mount
+from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar import packets as wire
 from instant_ic.sim.world import World
 
@@ -29,8 +31,6 @@ class Vlp16Config:
         range_noise: standard deviation of a range, metres.
         min_range, max_range: limits of a return, metres; anything nearer or farther gives none.
         burst: packets sent together (1.33 ms each); larger bursts need less CPU.
-        mount_xyz: position on base_link, metres.
-        mount_yaw_deg: yaw on base_link, degrees.
     """
 
     enabled: bool = True
@@ -42,8 +42,6 @@ class Vlp16Config:
     min_range: float = 0.2
     max_range: float = 100.0
     burst: int = 8
-    mount_xyz: tuple[float, float, float] = (0.0, 0.0, 0.60)
-    mount_yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
         if not 300 <= self.rpm <= 1200:
@@ -68,12 +66,20 @@ class Vlp16:
         pose_at: pose of base_link at given times.
         epoch_ns: epoch time of a simulated time, which gives the packets' microseconds past the hour.
         seed: seed of the noise.
+        mount: pose on base_link.
     """
 
     def __init__(
-        self, config: Vlp16Config, world: World, pose_at: PoseAt, epoch_ns: Callable[[float], int], seed: int = 0
+        self,
+        config: Vlp16Config,
+        world: World,
+        pose_at: PoseAt,
+        epoch_ns: Callable[[float], int],
+        seed: int = 0,
+        mount: Mount = LIDAR_MOUNT,
     ) -> None:
         self.config = config
+        self._base_from_lidar = pose_matrix(*mount.pose)
         self._world = world
         self._pose_at = pose_at
         self._epoch_ns = epoch_ns
@@ -117,13 +123,14 @@ class Vlp16:
         # Azimuth is clockwise when viewed from above, 0 ahead (the sensor's x in ROS axes).
         alpha = np.radians((times * degrees_per_s) % 360.0)
         pose = self._pose_at(times.ravel()).reshape(*times.shape, 3)
-        heading = pose[..., 2] + math.radians(config.mount_yaw_deg) - alpha
-        directions = np.empty((*times.shape, 3), np.float32)
-        directions[..., 0] = self._cos * np.cos(heading)
-        directions[..., 1] = self._cos * np.sin(heading)
-        directions[..., 2] = self._sin
-        mx, my, mz = config.mount_xyz
+        beams = np.stack([self._cos * np.cos(alpha), -self._cos * np.sin(alpha), self._sin + 0 * alpha], axis=-1)
+        beams = beams @ self._base_from_lidar[:3, :3].T
         c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        directions = np.empty((*times.shape, 3), np.float32)
+        directions[..., 0] = c * beams[..., 0] - s * beams[..., 1]
+        directions[..., 1] = s * beams[..., 0] + c * beams[..., 1]
+        directions[..., 2] = beams[..., 2]
+        mx, my, mz = self._base_from_lidar[:3, 3]
         origins = np.empty_like(directions)
         origins[..., 0] = pose[..., 0] + c * mx - s * my
         origins[..., 1] = pose[..., 1] + s * mx + c * my

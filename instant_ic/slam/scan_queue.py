@@ -124,5 +124,5 @@ class ScanQueue:
 def level_mount(base_from_laser: Matrix) -> FloatArray:
     """Planar mount (3,) of a laser; ValueError if its scan plane is not level."""
     if base_from_laser[2, 2] < 0.9:
-        raise ValueError("the laser's z axis is more than 25° off the vertical: check its mount (mount_rpy_deg)")
+        raise ValueError("the laser's z axis is more than 25° off the vertical: check its mount (lidar_mount)")
     return pose2_from_matrix(base_from_laser)

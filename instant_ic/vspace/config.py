@@ -19,7 +19,16 @@ def _require(condition: bool, key: str, value: object, rule: str) -> None:
 
 @dataclass(frozen=True)
 class FieldConfig:
-    """Multi-resolution hash grid and the small network behind it."""
+    """Multi-resolution hash grid and the small network behind it.
+
+    Attributes:
+        levels: hash-grid levels, coarse to fine.
+        features: features of a table entry, 2 or 4.
+        log2_table: entries of a level, as a power of two; 18 for more detail and more memory.
+        base_resolution: cells of the coarsest level across the scene.
+        hidden: width of the network's hidden layer.
+        geometry: distance: a signed one; density: the paper's way, eight samples a pixel.
+    """
 
     levels: Annotated[int, Range(1, 16)] = 8
     features: int = 4
@@ -44,7 +53,24 @@ class FieldConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """One training run over a keyframe."""
+    """One training run over a keyframe.
+
+    Attributes:
+        ray_columns: rays of a batch in azimuth; even in solid angle.
+        ray_rows: rays of a batch in height; ray_columns x ray_rows in all, both multiples of 8.
+        iterations: length of a training run; idle after it.
+        table_lr: learning rate of the hash table at the start.
+        network_lr: learning rate of the network at the start.
+        final_lr_share: both have fallen to this share at the end.
+        fine_lr_share: rate of the table's finest level against the coarsest's: less is less grain, slower detail.
+        refresh_lr_share: share of both when a keyframe refreshes a trained field.
+        distance_weight: of the geometry's error against the colour's.
+        band_colour_weight: of the colour error beside the surface against that on it.
+        depth_weight: with density: of the error of a ray's depth, by its uncertainty.
+        opacity_weight: with density: of what of the light passes through a surface.
+        distortion_weight: with density: of how far the density is spread along a ray.
+        seed: of the first weights and of the rays.
+    """
 
     ray_columns: Annotated[int, Range(8, 1024)] = 128
     """Strata in azimuth; a batch has ``ray_columns * ray_rows`` rays, one jittered in each."""
@@ -79,7 +105,21 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class GeometryConfig:
-    """How the keyframe's depth shapes the field and the occupancy grid."""
+    """How the keyframe's depth shapes the field and the occupancy grid.
+
+    Attributes:
+        band_min: share of the depth: narrowest half width in which geometry is learnt.
+        band_max: widest.
+        band_sigmas: half width in standard deviations of the keyframe's depth, between the two.
+        torn_ratio: depth jump between neighbouring pixels that is an edge.
+        min_depth_m: m; nearer depths are set to it.
+        max_depth_m: m; farther depths are set to it.
+        min_known_share: keyframes with a smaller share of known depth are refused.
+        body_below_deg: degrees; below, the panorama shows the robot itself, which is left out; -90: nowhere.
+        sky_share: regions of unknown depth above the horizon, as large a share of the sphere, are sky; 1: none.
+        cell_m: m, smallest cell of the occupancy grid.
+        max_cells: cells grow so that the grid has no more than this many (one byte each).
+    """
 
     band_min: Annotated[float, Range(above=0, high=0.5)] = 0.05
     """Half width of the band round the depth in which the signed distance is learnt, share of the depth."""
@@ -110,7 +150,15 @@ class GeometryConfig:
 
 @dataclass(frozen=True)
 class ReadinessConfig:
-    """When the space is fit to show, and how far from the keyframe."""
+    """When the space is fit to show, and how far from the keyframe.
+
+    Attributes:
+        psnr_db: PSNR of the training rays from which the space is fit to show, or takes over from the one before.
+        plateau_iterations: also ready when this many iterations.
+        plateau_db: have gained less than this.
+        max_radius_m: m from the keyframe, at most, that a view is fit to show.
+        parallax_rad: rad: displacement of surfaces by the depth's error that is still fit to show.
+    """
 
     psnr_db: Positive = 24.0
     """PSNR of the training rays that is good enough, also to take over from the keyframe before."""
@@ -130,6 +178,12 @@ class PictureConfig:
     """What a picture shows: the keyframe's panorama, warped by its depth, then the field as it becomes better.
 
     The share of the panorama falls linearly in the PSNR of the training rays.
+
+    Attributes:
+        panorama_until_db: the panorama alone up to this PSNR of the training rays.
+        field_from_db: the field alone from this PSNR on, mixed in between; set to panorama_until_db: field only.
+        refresh_pictures: number of views over which a new keyframe is blended in; 1: at once.
+        least_depth_share: of the keyframe's depth in where surfaces lie, at least; else the panorama's share.
     """
 
     panorama_until_db: float = 40.0
@@ -159,7 +213,20 @@ class PictureConfig:
 
 @dataclass(frozen=True)
 class VirtualSpaceConfig:
-    """Everything about the virtual space but the bus."""
+    """Everything about the virtual space but the bus.
+
+    Attributes:
+        source: field: the panorama warped by its depth until the field is better; warp: that alone, no training; mesh.
+        mesh: file of a place scanned beforehand (GLB, glTF, PLY, OBJ), with source: mesh.
+        mesh_pose: where the mesh lies in the map: x, y, z (m), yaw (degrees, counter-clockwise).
+        mesh_max_triangles: larger meshes are refused.
+        mesh_fit_colours: a factor a colour, so that the mesh looks like the newest keyframe.
+        device: auto: cuda where there is a GPU, else cpu (numba); cuda: triton where it works, else torch-cuda;
+            torch-cpu (slow).
+        panorama_width: px; wider panoramas are area-averaged to this.
+        keyframes: newest keyframes that are kept and shown together, 1..8; the time per view grows with it.
+        picture: the keyframe's panorama, warped by its depth, then the field.
+    """
 
     source: str = "field"
     """What pictures show: ``field`` (the panorama warped by its depth until the field is better), ``warp``: the

@@ -111,7 +111,7 @@ def test_impossible_jump_is_left_out_and_counted() -> None:
 
 
 def test_limiter_ramps_as_worked_out_by_hand() -> None:
-    limiter = TwistLimiter(LimitsConfig(max_v=0.5, max_w=1.0, max_v_acceleration=0.8, max_w_acceleration=2.0))
+    limiter = TwistLimiter(LimitsConfig(0.5, 1.0, 0.8, 2.0))
     assert limiter.step(0.5, 0.0, 0.1) == pytest.approx((0.08, 0.0))
     assert limiter.step(0.5, 1.0, 0.5) == pytest.approx((0.48, 1.0))
     assert limiter.step(0.5, 1.0, 0.5) == pytest.approx((0.5, 1.0))
@@ -135,9 +135,9 @@ def test_limiter_never_exceeds_its_limits(commands: list[tuple[float, float, flo
     before = (0.0, 0.0)
     for v, w, dt_s in commands:
         now = limiter.step(v, w, dt_s)
-        assert abs(now[0]) <= limits.max_v + 1e-12 and abs(now[1]) <= limits.max_w + 1e-12
-        assert abs(now[0] - before[0]) <= limits.max_v_acceleration * dt_s + 1e-12
-        assert abs(now[1] - before[1]) <= limits.max_w_acceleration * dt_s + 1e-12
+        assert abs(now[0]) <= limits.max_linear_m_s + 1e-12 and abs(now[1]) <= limits.max_angular_rad_s + 1e-12
+        assert abs(now[0] - before[0]) <= limits.max_linear_accel_m_s2 * dt_s + 1e-12
+        assert abs(now[1] - before[1]) <= limits.max_angular_accel_rad_s2 * dt_s + 1e-12
         before = now
 
 
@@ -146,7 +146,7 @@ def test_limiter_never_exceeds_its_limits(commands: list[tuple[float, float, flo
     [
         (lambda: SkidSteerConfig(track_width=-0.3), "track_width must be > 0 m \\(got -0.3\\)"),
         (lambda: SkidSteerConfig(left_motor=3), "left_motor"),
-        (lambda: LimitsConfig(max_w=0.0), "max_w"),
+        (lambda: LimitsConfig(max_angular_rad_s=0.0), "max_angular_rad_s"),
         (lambda: RoboclawConfig(baud=12345), "baud"),
         (lambda: RoboclawConfig(address=0x90), "address"),
         (lambda: RoboclawConfig(watchdog_s=0.0), "watchdog_s"),

@@ -248,7 +248,7 @@ def test_shipped_parameters_are_the_defaults() -> None:
 
     from instant_ic.config.params import build, load_file
 
-    path = Path(__file__).resolve().parents[2] / "config" / "base.yaml"
+    path = Path(__file__).resolve().parents[2] / "config" / "robot.yaml"
     assert build(CrawlerBaseConfig, load_file(path, "crawler_base")) == CrawlerBaseConfig()
 
 

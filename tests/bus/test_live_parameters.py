@@ -72,7 +72,7 @@ def test_mount_of_the_camera_is_told_anew(bus, tmp_path):
     cv2.imwrite(str(tmp_path / "a.jpg"), np.zeros((64, 128, 3), np.uint8))
     cls = node_class("theta_camera")
     node = bus.add(cls, cls.config_class()(source="files", url=str(tmp_path)))
-    node.set_parameters({"mount_xyz": [0.1, 0.0, 1.3]})
+    node.set_parameters({"camera_mount.xyz": [0.1, 0.0, 1.3]})
     (transform,) = bus.last("/tf_static").transforms
     assert transform_matrix(transform)[:3, 3].tolist() == pytest.approx([0.1, 0.0, 1.3])
 

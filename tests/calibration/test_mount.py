@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from instant_ic.bag import BagReader, BagWriter
+from instant_ic.bus.node_files import node_class
 from instant_ic.calibration.bag import Selection, read_recording
 from instant_ic.calibration.edges import CUES, FloorPlane, find_floor, lidar_edges, picture_edges
 from instant_ic.calibration.mount import (
@@ -22,7 +23,7 @@ from instant_ic.calibration.mount import (
 )
 from instant_ic.calibration.overlay import before_and_after, overlay
 from instant_ic.cli.main import main
-from instant_ic.config.params import load_file
+from instant_ic.config.params import build, load_file
 from instant_ic.experiments.calibration_sim import BASE_FROM_CAMERA, BASE_FROM_LIDAR, perturbed, record
 from instant_ic.geometry.poses import inverse, pose_matrix
 
@@ -149,8 +150,8 @@ def test_camera_is_found_by_the_command(drive, tmp_path, capsys):
     assert all(summary["constrained"].values())
     assert summary["score_after"] > 1.1 * summary["score_before"] > 1.1
     # The file is what the camera's driver takes, and is the mount that was simulated.
-    values = load_file(out, "theta_camera")
-    mount = pose_matrix(*values["mount_xyz"].value, *np.radians(values["mount_rpy_deg"].value))
+    config = node_class("theta_camera").config_class()
+    mount = pose_matrix(*build(config, load_file(out, "theta_camera")).camera_mount.pose)
     np.testing.assert_allclose(inverse(mount) @ BASE_FROM_LIDAR, np.array(summary["camera_from_lidar"]), atol=2e-4)
     assert plot.stat().st_size > 10_000
     assert "camera on base_link" in capsys.readouterr().out

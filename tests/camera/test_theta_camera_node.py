@@ -120,5 +120,5 @@ def test_theta_over_real_sockets(run_dir: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_shipped_parameters_are_the_defaults() -> None:
-    path = Path(__file__).resolve().parents[2] / "config" / "camera.yaml"
+    path = Path(__file__).resolve().parents[2] / "config" / "robot.yaml"
     assert build(ThetaCameraConfig, load_file(path, "theta_camera")) == ThetaCameraConfig()

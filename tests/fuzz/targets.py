@@ -774,7 +774,7 @@ def _parse_parameters() -> Callable[[bytes], object]:
 
 def _parameter_samples() -> list[bytes]:
     bomb = b"vlp16_driver:\n  ros__parameters:\n" + b"".join(b"    " + line + b"\n" for line in _BOMB.splitlines())
-    return [(ROOT / "config" / "lidar.yaml").read_bytes(), bomb]
+    return [(ROOT / "config" / "robot.yaml").read_bytes(), bomb]
 
 
 def _parameter_errors() -> tuple[type[BaseException], ...]:
@@ -792,7 +792,7 @@ _LAUNCH = b"""launch:
 - node:
     exec: theta_camera
     param:
-    - from: $(config camera.yaml)
+    - from: $(config robot.yaml)
     - {name: theta.width, value: 640, if: $(eval world == 'room' and port > 5)}
     remap: [{from: /a, to: /b}]
     env: [{name: OMP_NUM_THREADS, value: 1}]

@@ -300,5 +300,5 @@ def test_a_tilted_mount_is_refused(rpy_deg: tuple[float, float, float]) -> None:
 
 
 def test_shipped_parameters_are_the_defaults() -> None:
-    path = Path(__file__).resolve().parents[2] / "config" / "lidar.yaml"
+    path = Path(__file__).resolve().parents[2] / "config" / "robot.yaml"
     assert build(Vlp16DriverConfig, load_file(path, "vlp16_driver")) == Vlp16DriverConfig()

@@ -122,10 +122,9 @@ def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: 
     import numpy as np
 
     from instant_ic.calibration.mount import AXES
-    from instant_ic.geometry.poses import inverse, pose_matrix
+    from instant_ic.geometry.poses import inverse
 
-    # Where the bag has no LiDAR mount, use the one of config/lidar.yaml.
-    base_from_lidar = recording.base_from_lidar if recording.base_from_lidar is not None else pose_matrix(z=0.6)
+    base_from_lidar = recording.base_from_lidar if recording.base_from_lidar is not None else _lidar_mount()
     xyz, rpy = _xyz_rpy(base_from_lidar @ inverse(result.camera_from_lidar))
     xyz_before, rpy_before = _xyz_rpy(base_from_lidar @ inverse(given))
     in_units = np.concatenate([result.sigma[:3], np.degrees(result.sigma[3:])])
@@ -145,6 +144,17 @@ def _summary(bag: Path, recording: CalibrationRecording, given: Matrix, result: 
         "yaw_rival": round(result.yaw_rival, 3),
         "camera_from_lidar": result.camera_from_lidar.round(6).tolist(),
     }
+
+
+def _lidar_mount() -> Matrix:
+    """base_from_lidar of config/robot.yaml, for a bag without it."""
+    from instant_ic import paths
+    from instant_ic.bus.node_files import node_class
+    from instant_ic.config import params
+    from instant_ic.geometry.poses import pose_matrix
+
+    values = params.load_file(paths.shipped_file("config", "robot.yaml"), "vlp16_driver")
+    return pose_matrix(*params.configure(node_class("vlp16_driver").config_class(), values)[0].lidar_mount.pose)
 
 
 def _tell(summary: dict[str, Any]) -> None:
@@ -168,8 +178,9 @@ def _yaml(summary: dict[str, Any]) -> str:
     return (
         f"# Camera's mount by ic calibrate camera-lidar {summary['bag']}, {summary['frames']} images.\n"
         f"# Standard deviations (m, degrees): {sigma}.\n{kept}"
-        "theta_camera:\n  ros__parameters:\n"
-        f"    mount_xyz: {summary['mount_xyz']}\n    mount_rpy_deg: {summary['mount_rpy_deg']}\n"
+        "# It goes into the /** section of config/robot.yaml, or on top of it: params:=THIS_FILE.\n"
+        "/**:\n  ros__parameters:\n    camera_mount:\n"
+        f"      xyz: {summary['mount_xyz']}\n      rpy_deg: {summary['mount_rpy_deg']}\n"
     )
 
 

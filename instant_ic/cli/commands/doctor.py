@@ -17,8 +17,8 @@ def add_parser(subparsers: Any) -> None:
         epilog="example: ic doctor --robot --serial-port /dev/ttyACM0",
     )
     parser.add_argument("--robot", action="store_true", help="missing devices are failures, not warnings")
-    parser.add_argument("--serial-port", metavar="PORT", help="port of the RoboClaw (default: from config/base.yaml)")
-    parser.add_argument("--camera-url", metavar="URL", help="URL of the Theta (default: from config/camera.yaml)")
+    parser.add_argument("--serial-port", metavar="PORT", help="port of the RoboClaw (default: from config/robot.yaml)")
+    parser.add_argument("--camera-url", metavar="URL", help="URL of the Theta (default: from config/robot.yaml)")
     parser.add_argument("--lidar-port", type=int, metavar="PORT", help="UDP port of the VLP-16's data")
     parser.add_argument(
         "--listen", type=float, default=1.0, metavar="S", help="time to wait for LiDAR packets (default: %(default)g s)"
@@ -52,9 +52,9 @@ def _expectation(args: argparse.Namespace) -> Any:
     from instant_ic.cli.doctor import Expectation
     from instant_ic.config.params import ParameterError, load_file
 
-    def shipped(file: str, node: str, key: str, default: Any) -> Any:
+    def shipped(node: str, key: str, default: Any) -> Any:
         try:
-            found = load_file(paths.share_dir("config") / file, node).get(key)
+            found = load_file(paths.shipped_file("config", "robot.yaml"), node).get(key)
         except (ParameterError, FileNotFoundError):
             return default  # check_configuration reports the fault in the file
         return default if found is None else found.value
@@ -62,8 +62,8 @@ def _expectation(args: argparse.Namespace) -> Any:
     plain = Expectation()
     return Expectation(
         real_devices=args.robot,
-        serial_port=args.serial_port or shipped("base.yaml", "crawler_base", "roboclaw.port", plain.serial_port),
-        camera_url=args.camera_url or shipped("camera.yaml", "theta_camera", "url", plain.camera_url),
-        lidar_port=args.lidar_port or shipped("lidar.yaml", "vlp16_driver", "port", plain.lidar_port),
+        serial_port=args.serial_port or shipped("crawler_base", "roboclaw.port", plain.serial_port),
+        camera_url=args.camera_url or shipped("theta_camera", "url", plain.camera_url),
+        lidar_port=args.lidar_port or shipped("vlp16_driver", "port", plain.lidar_port),
         listen_seconds=args.listen,
     )

@@ -1,0 +1,78 @@
+"""Parameters that several nodes share: the robot's outline, its limits and its sensor mounts.
+
+Their values stand in the ``/**`` section of `config/robot.yaml`. Every node that uses one declares it by the same name.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+from instant_ic.config.ranges import Positive, Range, check_ranges
+
+Metres = Annotated[float, Range(-100, 100)]
+Degrees = Annotated[float, Range(-360, 360)]
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """The robot's outline, centred on base_link.
+
+    Attributes:
+        length_m: m; along x.
+        width_m: m; along y.
+    """
+
+    length_m: Positive = 0.60
+    width_m: Positive = 0.50
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Speed and acceleration limits of the robot.
+
+    Attributes:
+        max_linear_m_s: m/s; largest speed.
+        max_angular_rad_s: rad/s; largest turn rate.
+        max_linear_accel_m_s2: m/s²; largest change of the speed, for braking too: sets how far ahead the prediction
+            looks.
+        max_angular_accel_rad_s2: rad/s²; largest change of the turn rate.
+    """
+
+    max_linear_m_s: Positive = 0.5
+    max_angular_rad_s: Positive = 1.0
+    max_linear_accel_m_s2: Positive = 0.8
+    max_angular_accel_rad_s2: Positive = 2.0
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Pose of a sensor on base_link, which is on the ground.
+
+    Attributes:
+        xyz: m; position.
+        rpy_deg: degrees; roll, pitch, yaw about fixed axes.
+    """
+
+    xyz: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
+    rpy_deg: tuple[Degrees, Degrees, Degrees] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+    @property
+    def pose(self) -> tuple[float, float, float, float, float, float]:
+        """x, y, z in metres and roll, pitch, yaw in radians: the arguments of ``pose_matrix``."""
+        (x, y, z), (roll, pitch, yaw) = self.xyz, (math.radians(angle) for angle in self.rpy_deg)
+        return x, y, z, roll, pitch, yaw
+
+
+CAMERA_MOUNT = Mount(xyz=(0.0, 0.0, 1.2))
+LIDAR_MOUNT = Mount(xyz=(0.0, 0.0, 0.6))
