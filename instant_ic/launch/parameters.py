@@ -7,6 +7,7 @@ checked in a separate process, which frees the memory when it ends.
 
 from __future__ import annotations
 
+import difflib
 import functools
 import hashlib
 import itertools
@@ -66,6 +67,47 @@ def _checkable(nodes: Sequence[NodeSpec]) -> list[_Node]:
         )
         for spec in shipped
     ]
+
+
+def given_values(spec: NodeSpec) -> tuple[type[Any], Values]:
+    """Configuration class of a shipped node, and the values that its launch file gives it, with their origins.
+
+    Raises:
+        ParameterError: a file or an argument cannot be read.
+    """
+    from instant_ic.bus.node_files import node_class
+    from instant_ic.bus.process import argument_parser
+    from instant_ic.config.params import gather
+
+    found = node_class(spec.exec)
+    args = argument_parser(found).parse_args(_words(spec))
+    return found.config_class(), gather(args.name, args.params_file, args.param, spec.places)
+
+
+def check_parameter_file(file: Path) -> list[str]:
+    """All mistakes in a parameter file: its sections against the shipped nodes, ``/**`` against all of them.
+
+    What depends on other values of the node (a missing one, for example) is left to the check of a launch file.
+    """
+    from instant_ic.bus.node_files import node_class
+    from instant_ic.config.params import SHARED, ParameterError, configure, load_sections
+
+    try:
+        sections = load_sections(file)
+    except ParameterError as error:
+        return [str(problem) for problem in error.problems]
+    problems: list[str] = []
+    names = paths.node_names()
+    shared = sections.pop(SHARED, {})
+    for name, values in sections.items():
+        if name in names:
+            try:
+                configure(node_class(name).config_class(), {**shared, **values})
+            except ParameterError as error:
+                problems += [f"{problem} (node {name})" for problem in error.problems if problem.where]
+        elif close := difflib.get_close_matches(name, names, n=1, cutoff=0.8):
+            problems.append(f"{file}: no shipped node is called {name!r}; did you mean {close[0]!r}?")
+    return problems + _declared_by_none(shared, names)
 
 
 def _words(spec: NodeSpec) -> tuple[str, ...]:
@@ -245,17 +287,21 @@ def _contradictions(node: _Node, values: Values, config: Any) -> list[str]:
 
 def _undeclared(node: _Node, values: Values) -> list[str]:
     """Shared values that no node has a parameter for: a typing error, or of a program that is not checked."""
+    left = {key: value for key, value in values.items() if value.shared}
+    return [] if node.own_programs else _declared_by_none(left, (node.exec, *paths.node_names()))
+
+
+def _declared_by_none(values: Values, nodes: Sequence[str]) -> list[str]:
     from instant_ic.bus.node_files import node_class
     from instant_ic.config.parameter_info import parameter_infos
+    from instant_ic.config.params import PROCESS_KEYS
 
-    left = {key: value for key, value in values.items() if value.shared}
-    if not left or node.own_programs:
-        return []
-    for name in dict.fromkeys((node.exec, *paths.node_names())):
-        for info in parameter_infos(node_class(name).config_class()):
-            left.pop(info.name, None)
+    left = {key: value for key, value in values.items() if key not in PROCESS_KEYS}
+    for name in nodes:
         if not left:
             break
+        for info in parameter_infos(node_class(name).config_class()):
+            left.pop(info.name, None)
     return [f"{value.where}: no node has a parameter {key!r}" for key, value in left.items()]
 
 

@@ -131,3 +131,40 @@ def test_change_keeps_the_rest():
     with pytest.raises(params.ParameterError, match="set: beams, rate takes effect at start"):
         params.change(config, {"rate": 6.0, "beams": 3}, lambda key: key == "frame", "set")
     assert params.change(config, {"rate": 5.0}, lambda key: False, "set") == (config, {})
+
+
+@dataclass(frozen=True)
+class Span:
+    low: float = 0.0
+    high: float = 10.0
+    step: float = 1.0
+
+    def __post_init__(self):
+        if self.low >= self.high:
+            raise ValueError("the span is empty")
+        if self.step > 5:
+            raise ValueError("it is too coarse")
+
+
+def test_all_mistakes_at_once_each_at_the_value_without_which_it_disappears():
+    @dataclass(frozen=True)
+    class Spans:
+        first: Span = field(default_factory=Span)
+        rate: float = 1.0
+
+    given = {"rate": "fast", "first.step": 9.0, "first.low": 20.0, "secnd": 1, "first.high": float("nan")}
+    values = {key: params.Value(value, f"f:{line}") for line, (key, value) in enumerate(given.items(), 1)}
+    with pytest.raises(params.ParameterError) as caught:
+        params.build(Spans, values)
+    assert [(problem.where, problem.key, problem.text) for problem in caught.value.problems] == [
+        ("f:1", "rate", "rate must be float (got 'fast')"),
+        ("f:4", "secnd", "unknown parameter 'secnd'; known: first, rate"),
+        ("f:5", "first.high", "first.high must be a finite number (got nan)"),
+        ("f:3", "first.low", "the span is empty"),
+        ("f:2", "first.step", "it is too coarse"),
+    ]
+
+
+def test_a_huge_number_is_refused():
+    with pytest.raises(params.ParameterError, match="rate must be a finite number"):
+        params.build(Config, {"rate": params.Value(10**400, "here")})

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from instant_ic.cli import completion
+from instant_ic.cli.arguments import launch_values
 from instant_ic.cli.errors import UserError
 
 
@@ -82,12 +83,7 @@ def run(args: argparse.Namespace) -> int:
         pace = Pace.from_now(args.pace)
     except PaceError as error:
         raise UserError(f"--{error}", 2) from None
-    values: dict[str, str] = {}
-    for word in args.arguments:
-        name, separator, value = word.partition(":=")
-        if not separator or not name:
-            raise UserError(f"{word!r}: expected KEY:=VALUE", 2)
-        values[name] = value
+    values = launch_values(args.arguments)
     run_dir = (args.run_dir or paths.run_dir()).absolute()
     description = read_launch_file(file, values, run_dir)
     if args.check or not args.no_check:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,7 @@ def add_parser(subparsers: Any) -> None:
     added = verb("list", "names of the parameters of one node, or of all", list_parameters, "list grid_slam")
     argument(added, "node", nargs="?", metavar="NODE", help="default: every node", completer=completion.nodes)
     added.add_argument("-v", "--values", action="store_true", help="also print their values")
+    added.add_argument("--changed", action="store_true", help="only values that differ from the default, with both")
     added = verb("get", "value of one parameter", get_parameter, "get grid_slam field.resolution_m")
     argument(added, "node", metavar="NODE", completer=completion.nodes)
     argument(added, "key", metavar="KEY", help="a nested key is separated by dots", completer=completion.parameters)
@@ -77,10 +79,22 @@ def list_parameters(args: argparse.Namespace) -> int:
     nodes = [find_node(args.node)] if args.node else registry.list_nodes(paths.run_dir())
     if not nodes:
         raise UserError(nobody_runs())
+    if args.changed:
+        return _list_changed([node.name for node in nodes])
     for node in nodes:
         print(f"{node.name}:")
         for key, value in sorted(params.flatten(node.params).items()):
-            print(f"  {key}: {_show(value)}" if args.values else f"  {key}")
+            print(f"  {key}: {show_value(value)}" if args.values else f"  {key}")
+    return 0
+
+
+def _list_changed(nodes: Sequence[str]) -> int:
+    """Print the values that differ from the default; only the running node knows its defaults."""
+    for name in nodes:
+        print(f"{name}:")
+        for info in _control(name).describe():
+            if info.value != info.default:
+                print(f"  {info.name}: {show_value(info.value)} (default {show_value(info.default)})")
     return 0
 
 
@@ -94,9 +108,9 @@ def get_parameter(args: argparse.Namespace) -> int:
     if args.key not in values and not group:
         raise _no_parameter(args.node, args.key, values)
     if args.key in values:
-        print(_show(values[args.key]))
+        print(show_value(values[args.key]))
     for key, value in group.items():
-        print(f"{key}: {_show(value)}")
+        print(f"{key}: {show_value(value)}")
     return 0
 
 
@@ -120,7 +134,7 @@ def set_parameters(args: argparse.Namespace) -> int:
 def _change(node: str, values: dict[str, Any]) -> int:
     changed = _control(node).set(values)
     for key, value in changed.items():
-        print(f"{key}: {_show(value)}")
+        print(f"{key}: {show_value(value)}")
     if not changed:
         print("nothing to change: the parameters already have these values")
     return 0
@@ -138,9 +152,8 @@ def describe(args: argparse.Namespace) -> int:
     for info in chosen:
         print(f"Parameter name: {info.name}")
         print(f"  Type: {info.type}{f', {info.range}' if info.range else ''}")
-        print(
-            f"  Value: {_show(info.value)}{'' if info.value == info.default else f' (default {_show(info.default)})'}"
-        )
+        default = "" if info.value == info.default else f" (default {show_value(info.default)})"
+        print(f"  Value: {show_value(info.value)}{default}")
         print(f"  Live: {'yes' if info.live else 'no, takes effect at start'}")
         if info.description:
             print(f"  Description: {info.description}")
@@ -185,7 +198,8 @@ def load(args: argparse.Namespace) -> int:
     return _change(name, {key: value.value for key, value in values.items()})
 
 
-def _show(value: Any) -> str:
+def show_value(value: Any) -> str:
+    """A value as one line of YAML."""
     import yaml
 
     return str(yaml.safe_dump(value, default_flow_style=True, width=1 << 20)).removesuffix("...\n").strip()

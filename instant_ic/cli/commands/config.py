@@ -1,0 +1,157 @@
+"""``ic config``: check configuration files, and show where each value of a node comes from."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from instant_ic.cli import completion
+from instant_ic.cli.arguments import launch_values
+from instant_ic.cli.errors import UserError
+
+if TYPE_CHECKING:
+    from instant_ic.launch.description import NodeSpec
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = subparsers.add_parser(
+        "config",
+        help="check configuration files, show the values of a node",
+        description="Check configuration files, and show the values that a node would start with.",
+        epilog="example: ic config show arbiter --changed",
+    )
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    check = verbs.add_parser(
+        "check",
+        help="report all mistakes in launch and parameter files",
+        description="Report all mistakes in launch and parameter files with file and line. Exit status 1: mistakes found.",
+        epilog="example: ic config check my_robot.yaml",
+    )
+    completion.offer(
+        check.add_argument(
+            "files", nargs="*", metavar="LAUNCH_OR_FILE",
+            help="launch file, shipped launch file by name, or parameter file (default: all shipped files)",
+        ),
+        completion.launch_files,
+    )  # fmt: skip
+    check.set_defaults(func=check_files)
+    show = verbs.add_parser(
+        "show",
+        help="effective value of each parameter of a node, and where it comes from",
+        description="Print the effective value of each parameter of a node, and where it comes from: the default, a "
+        "parameter file, the launch file, or an argument of the launch file.",
+        epilog="example: ic config show vlp16_driver --launch robot lidar_port:=3000",
+    )
+    show.add_argument("node", metavar="NODE", help="name of the node in the launch file")
+    completion.offer(
+        show.add_argument(
+            "--launch", nargs="+", default=[], metavar=("FILE", "KEY:=VALUE"),
+            help="launch file and its arguments (default: the first of full, sim and replay with this node)",
+        ),
+        completion.launch_files,
+    )  # fmt: skip
+    show.add_argument("--changed", action="store_true", help="only values that differ from the default")
+    show.set_defaults(func=show_node)
+
+
+def check_files(args: argparse.Namespace) -> int:
+    """Check files, all mistakes at once."""
+    from instant_ic import paths
+    from instant_ic.launch import LaunchFileError, read_arguments, read_launch_file
+    from instant_ic.launch.parameters import check_parameter_file, check_parameters_quickly
+
+    files = [_found(text) for text in args.files]
+    if not files:
+        launch_files = sorted(paths.share_dir("launch").glob("*.yaml"))
+        files = [file for file in launch_files if all(a.default is not None for a in read_arguments(file))]
+        files += [file for file in sorted(paths.share_dir("config").glob("*.yaml")) if file.name != "topics.yaml"]
+    problems: list[str] = []
+    for file in files:
+        if _is_launch_file(file):
+            try:
+                problems += check_parameters_quickly(read_launch_file(file.resolve(), {}).nodes)
+            except LaunchFileError as error:
+                problems += map(str, error.problems)
+        else:
+            problems += check_parameter_file(file)
+    problems = list(dict.fromkeys(problems))
+    for problem in problems:
+        print(f"ic: {problem}", file=sys.stderr)
+    if not problems:
+        print(f"{len(files)} file{'s' if len(files) > 1 else ''}, no errors")
+    return 1 if problems else 0
+
+
+def _found(text: str) -> Path:
+    from instant_ic.launch import find_launch_file
+
+    if Path(text).is_file():
+        return Path(text)
+    try:
+        return find_launch_file(text)
+    except FileNotFoundError as error:
+        raise UserError(str(error), 2) from None
+
+
+def _is_launch_file(file: Path) -> bool:
+    """Whether the top level has the key ``launch``; False also for what is not YAML, which the check then reports."""
+    import yaml
+
+    try:
+        root = yaml.compose(file.read_text(), Loader=yaml.SafeLoader)
+    except (OSError, ValueError, yaml.YAMLError):
+        return False
+    return isinstance(root, yaml.MappingNode) and any(key.value == "launch" for key, _ in root.value)
+
+
+def show_node(args: argparse.Namespace) -> int:
+    """Print value and origin of each parameter."""
+    from instant_ic.cli.commands.param import show_value
+    from instant_ic.config.parameter_info import parameter_infos
+    from instant_ic.config.params import ParameterError, ProcessParameters, configure
+    from instant_ic.launch.parameters import given_values
+
+    spec = _node(args.node, args.launch[:1], launch_values(args.launch[1:]))
+    config_class, values = given_values(spec)
+    try:
+        configurations = configure(config_class, values)
+    except ParameterError as error:
+        raise UserError(str(error)) from error
+    infos = [
+        info
+        for kind, config in zip((config_class, ProcessParameters), configurations, strict=True)
+        for info in parameter_infos(kind, config)
+        if not args.changed or info.value != info.default
+    ]
+    rows = [(i.name, show_value(i.value), values[i.name].where if i.name in values else "default") for i in infos]
+    key_width = max((len(key) for key, _, _ in rows), default=0)
+    value_width = min(max((len(value) for _, value, _ in rows), default=0), 40)
+    print(f"{spec.label} ({spec.file.name}):")
+    for key, value, origin in rows:
+        print(f"  {key:{key_width}}  {value:{value_width}}  {origin}")
+    return 0
+
+
+def _node(name: str, launch_files: list[str], arguments: dict[str, str]) -> NodeSpec:
+    from instant_ic import paths
+    from instant_ic.cli.names import near
+    from instant_ic.launch import find_launch_file, read_launch_file
+
+    known: list[str] = []
+    for file in launch_files or ["full", "sim", "replay"]:
+        needed = {} if launch_files else {"replay": {"bag": "BAG"}}.get(file, {})
+        try:
+            path = find_launch_file(file)
+        except FileNotFoundError as error:
+            raise UserError(str(error), 2) from None
+        for spec in read_launch_file(path, {**needed, **arguments}, paths.run_dir()).nodes:
+            if name in (spec.label, spec.name):
+                if str(paths.node_file(spec.exec)) not in spec.command:
+                    raise UserError(f"{name} is not a node of instant_ic: its parameters are not known")
+                return spec
+            known.append(spec.label)
+    where = " ".join(launch_files) or "full, sim or replay"
+    raise UserError(f"no node {name!r} in {where} ({near(name, known, 'see ic launch FILE --show-args')})")
