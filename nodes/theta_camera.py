@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
 from instant_ic.bus import ERROR, OK, SENSOR, WARN, Node, NodeError, main
 from instant_ic.camera.config import FilesConfig, ThetaConfig, VideoConfig
@@ -13,7 +13,7 @@ from instant_ic.camera.loop import CameraLoop, ReconnectConfig
 from instant_ic.camera.source import Camera, CameraError, Frame
 from instant_ic.camera.theta import ThetaCamera, ThetaClient, ThetaState
 from instant_ic.camera.video import VideoCamera
-from instant_ic.config.ranges import Positive, Share, check_ranges
+from instant_ic.config.ranges import Positive, Range, Share, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, Mount
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import CompressedImage, compressed_image_message
@@ -49,7 +49,7 @@ class ThetaCameraConfig:
     silence_s: Positive = 2.0
     health_period_s: Positive = 10.0
     battery_low: Share = 0.2
-    board_hot_c: float = 70.0
+    board_hot_c: Annotated[float, Range(-40, 150)] = 70.0
     theta: ThetaConfig = field(default_factory=ThetaConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
     files: FilesConfig = field(default_factory=FilesConfig)

@@ -72,7 +72,8 @@ def render() -> str:
         "ROS 2's.",
         "",
     ]
-    missing = []
+    missing: list[str] = []
+    unbounded: list[str] = []
     for path in sorted((ROOT / "nodes").glob("[a-z]*.py")):
         cls = node_class(path.stem)
         source = path.read_text()
@@ -89,11 +90,17 @@ def render() -> str:
         for info in infos:
             if not info.description:
                 missing.append(f"{cls.name}.{info.name}")
+            if not info.range and re.search("int|float", info.type):
+                unbounded.append(f"{cls.name}.{info.name}")
             row = (f"`{info.name}`", info.type, f"`{info.default!r}`", info.range, "yes" * info.live, info.description)
             lines.append(f"| {' | '.join(cell(text) for text in row)} |")
         lines.append("")
     if missing:
         raise SystemExit(f"parameters missing in the Attributes: section of their dataclass: {', '.join(missing)}")
+    if unbounded:
+        raise SystemExit(
+            f"numbers without a range (instant_ic.config.ranges): {', '.join(unbounded)}"
+        )
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -1,17 +1,11 @@
 """Parameters of the tracked base."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from instant_ic.base.protocol import ADDRESSES, BAUD_RATES
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.base.protocol import BAUD_RATES
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, Range, check_ranges, require
 from instant_ic.config.robot import MotionLimits
-
-
-def _require(ok: bool, key: str, value: object, rule: str) -> None:
-    if not ok:
-        raise ValueError(f"{key} must be {rule} (got {value!r})")
 
 
 @dataclass(frozen=True)
@@ -29,25 +23,16 @@ class SkidSteerConfig:
         invert_right: whether the right motor's positive direction drives backwards.
     """
 
-    track_width: float = 0.40
-    track_width_multiplier: float = 1.5
-    x_icr: float = 0.0
-    pulses_per_metre: float = 4000.0
-    left_motor: int = 1
+    track_width: Positive = 0.40
+    track_width_multiplier: Annotated[float, Range(0.5, 5)] = 1.5
+    x_icr: Annotated[float, Range(-10, 10)] = 0.0
+    pulses_per_metre: Positive = 4000.0
+    left_motor: Annotated[int, Range(1, 2)] = 1
     invert_left: bool = False
     invert_right: bool = False
 
     def __post_init__(self) -> None:
-        _require(self.track_width > 0.0, "track_width", self.track_width, "> 0 m")
-        _require(
-            0.5 <= self.track_width_multiplier <= 5.0,
-            "track_width_multiplier",
-            self.track_width_multiplier,
-            "in 0.5..5",
-        )
-        _require(math.isfinite(self.x_icr), "x_icr", self.x_icr, "finite, metres")
-        _require(self.pulses_per_metre > 0.0, "pulses_per_metre", self.pulses_per_metre, "> 0")
-        _require(self.left_motor in (1, 2), "left_motor", self.left_motor, "1 or 2")
+        check_ranges(self)
 
     @property
     def effective_width(self) -> float:
@@ -67,12 +52,8 @@ class LimitsConfig(MotionLimits):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _require(
-            self.hard_decel_m_s2 >= self.max_linear_accel_m_s2,
-            "hard_decel_m_s2",
-            self.hard_decel_m_s2,
-            "at least max_linear_accel_m_s2",
-        )
+        soft = self.max_linear_accel_m_s2
+        require(self, "hard_decel_m_s2", self.hard_decel_m_s2 >= soft, "at least max_linear_accel_m_s2")
 
 
 @dataclass(frozen=True)
@@ -113,27 +94,19 @@ class RoboclawConfig:
     """
 
     port: str = "/dev/ttyACM0"
-    baud: int = 115200
-    address: int = 0x80
-    reply_timeout_s: float = 0.1
-    retries: int = 2
-    watchdog_s: float = 0.3
-    reconnect_min_s: float = 0.2
-    reconnect_max_s: float = 2.0
+    baud: Annotated[int, Range(2400, 460800)] = 115200
+    address: Annotated[int, Range(128, 135)] = 0x80
+    reply_timeout_s: Positive = 0.1
+    retries: NotNegativeInt = 2
+    watchdog_s: Annotated[float, Range(0.1, 1)] = 0.3
+    reconnect_min_s: Positive = 0.2
+    reconnect_max_s: Positive = 2.0
 
     def __post_init__(self) -> None:
-        _require(self.port != "", "port", self.port, "the path of a serial device")
-        _require(self.baud in BAUD_RATES, "baud", self.baud, f"one of {BAUD_RATES}")
-        _require(self.address in ADDRESSES, "address", self.address, "in 128..135")
-        _require(self.reply_timeout_s > 0.0, "reply_timeout_s", self.reply_timeout_s, "> 0 s")
-        _require(self.retries >= 0, "retries", self.retries, ">= 0")
-        _require(0.1 <= self.watchdog_s <= 1.0, "watchdog_s", self.watchdog_s, "in 0.1..1 s")
-        _require(
-            0.0 < self.reconnect_min_s <= self.reconnect_max_s,
-            "reconnect_min_s",
-            self.reconnect_min_s,
-            "> 0 and at most reconnect_max_s",
-        )
+        check_ranges(self)
+        require(self, "port", self.port != "", "the path of a serial device")
+        require(self, "baud", self.baud in BAUD_RATES, f"one of {BAUD_RATES}")
+        require(self, "reconnect_min_s", self.reconnect_min_s <= self.reconnect_max_s, "at most reconnect_max_s")
 
 
 @dataclass(frozen=True)
@@ -184,8 +157,8 @@ class CrawlerBaseConfig(ControllerConfig):
     rate_hz: Annotated[float, Range(5, 200)] = 30.0
     odom_frame: str = "odom"
     base_frame: str = "base_link"
-    battery_full_v: float = 25.2
-    battery_empty_v: float = 21.0
+    battery_full_v: Positive = 25.2
+    battery_empty_v: Positive = 21.0
     recent_s: Positive = 10.0
     connect_grace_s: NotNegative = 5.0
     command_source: str = "arbiter"

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Percent, Positive, check_ranges
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, Percent, Positive, PositiveInt, check_ranges
 
 PREVIEW_FORMATS = ((1920, 960, 8), (1024, 512, 30), (1024, 512, 8), (640, 320, 30), (640, 320, 8))
 """(width, height, frames/s) that the Theta Z1 offers."""
@@ -24,9 +24,9 @@ class ThetaConfig:
         busy_wait_s: first wait before such a repeat; doubled each time.
     """
 
-    width: int = 1024
-    height: int = 512
-    rate_hz: int = 30
+    width: PositiveInt = 1024
+    height: PositiveInt = 512
+    rate_hz: PositiveInt = 30
     latency_s: NotNegative = 0.20
     read_timeout_s: Positive = 2.0
     connect_timeout_s: Positive = 5.0

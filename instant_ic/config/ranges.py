@@ -118,3 +118,9 @@ def check_ranges(config: Any) -> None:
         for value in _numbers(getattr(config, name)):
             if value not in bounds:
                 raise ValueError(f"{name} {bounds.words} (got {value})")
+
+
+def require(config: Any, name: str, condition: bool, rule: str) -> None:
+    """Raise ValueError unless a condition between fields holds; for ``__post_init__`` after :func:`check_ranges`."""
+    if not condition:
+        raise ValueError(f"{name} must be {rule} (got {getattr(config, name)!r})")

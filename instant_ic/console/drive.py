@@ -10,6 +10,8 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
+from instant_ic.config.ranges import NotNegative, Positive, check_ranges
+
 RATE_COMMANDS = 200  # newest commands kept to measure the rate
 
 
@@ -31,23 +33,18 @@ class DriveConfig:
         lease_timeout_s: silence of the driver's page after which it loses the lease.
     """
 
-    max_linear_mps: float = 0.4
-    max_angular_rps: float = 0.8
-    rate_hz: float = 20.0  # commands published while driving
-    watchdog_s: float = 0.25  # time without a command from the driver after which the robot stops
-    max_command_age_s: float = 0.3  # older commands (by the client's stamp) are dropped
-    stop_repeat_s: float = 0.3  # time after a stop in which zeros are published at rate_hz
-    keep_alive_hz: float = 10.0  # zeros of an idle driver whose page is heard: the operator is present
-    beat_timeout_s: float = 0.25  # silence of the driver's page after which he is reported lost to the arbiter
-    lease_timeout_s: float = 2.0  # silence of the driver's page after which he loses the lease
+    max_linear_mps: Positive = 0.4
+    max_angular_rps: Positive = 0.8
+    rate_hz: Positive = 20.0
+    watchdog_s: Positive = 0.25
+    max_command_age_s: Positive = 0.3
+    stop_repeat_s: NotNegative = 0.3
+    keep_alive_hz: Positive = 10.0
+    beat_timeout_s: Positive = 0.25
+    lease_timeout_s: Positive = 2.0
 
     def __post_init__(self) -> None:
-        for key in ("max_linear_mps", "max_angular_rps", "rate_hz", "watchdog_s", "max_command_age_s"):
-            _positive(key, getattr(self, key))
-        for key in ("keep_alive_hz", "beat_timeout_s", "lease_timeout_s"):
-            _positive(key, getattr(self, key))
-        if not self.stop_repeat_s >= 0 or not math.isfinite(self.stop_repeat_s):
-            raise ValueError(f"stop_repeat_s must be >= 0 (got {self.stop_repeat_s})")
+        check_ranges(self)
         if self.watchdog_s * self.rate_hz < 2:
             raise ValueError(f"watchdog_s must span two commands of rate_hz (got {self.watchdog_s} s)")
 
@@ -230,8 +227,3 @@ class DriveGate:
 
 def _clamp(value: float, limit: float) -> float:
     return max(-limit, min(limit, value)) + 0.0  # + 0.0 turns -0.0 into 0.0
-
-
-def _positive(key: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise ValueError(f"{key} must be > 0 (got {value})")

@@ -47,8 +47,8 @@ class HeightConfig:
     """
 
     enabled: bool = True
-    min_obstacle_height: float = 0.05
-    max_obstacle_height: float = 1.30
+    min_obstacle_height: Annotated[float, Range(-10, 10)] = 0.05
+    max_obstacle_height: Annotated[float, Range(-10, 10)] = 1.30
     ground_tilt_deg: NotNegative = 0.8
     obstacle_min_range: NotNegative = 0.45
     obstacle_max_range: Positive = 6.0

@@ -1,10 +1,10 @@
 """Parameters of the VLP-16: decoding, the flat scan, the node."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, Share, check_ranges
+from instant_ic.config.robot import LIDAR_MOUNT, Mount
 from instant_ic.lidar.receiver import ReceiverConfig
 
 
@@ -41,8 +41,8 @@ class FlatScanConfig:
         min_coverage: smallest measured share of the circle for a scan, 0-1.
     """
 
-    min_height: float = 0.10
-    max_height: float = 1.30
+    min_height: Annotated[float, Range(-10, 10)] = 0.10
+    max_height: Annotated[float, Range(-10, 10)] = 1.30
     beams: Annotated[int, Range(4, 7200)] = 720
     range_min: NotNegative = 0.4
     range_max: Positive = 100.0
@@ -50,7 +50,7 @@ class FlatScanConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        if not (math.isfinite(self.min_height) and self.min_height < self.max_height):
+        if not self.min_height < self.max_height:
             raise ValueError(f"min_height must be below max_height (got {self.min_height}, {self.max_height})")
         if not self.range_min < self.range_max:
             raise ValueError(f"range_min must be below range_max (got {self.range_min}, {self.range_max})")
@@ -78,8 +78,8 @@ class Vlp16DriverConfig:
 
     source: Literal["udp", "pcap", "topic"] = "udp"
     host: str = "0.0.0.0"
-    port: int = 2368
-    position_port: int = 8308
+    port: Annotated[int, Range(0, 65535)] = 2368
+    position_port: Annotated[int, Range(-1, 65535)] = 8308
     sensor: str = ""
     pcap: str = ""
     rate: Positive = 1.0

@@ -2,12 +2,14 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
+from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges, require
 from instant_ic.config.robot import Rectangle
 from instant_ic.sim.contact import OccupancyMask
 
@@ -33,27 +35,19 @@ class RobotConfig:
         encoder_noise_pulses: standard deviation of the encoder counts while a track moves.
     """
 
-    contact_low: float = 0.03
-    contact_high: float = 0.9
-    track_acceleration: float = 2.0
-    motor_lag_s: float = 0.06
-    rolling_resistance: float = 0.5
-    slip: float = 0.02
-    turn_slip: float = 0.05
-    slip_time_s: float = 1.0
-    encoder_noise_pulses: float = 2.0
+    contact_low: NotNegative = 0.03
+    contact_high: Positive = 0.9
+    track_acceleration: Positive = 2.0
+    motor_lag_s: Positive = 0.06
+    rolling_resistance: NotNegative = 0.5
+    slip: Annotated[float, Range(0, below=0.5)] = 0.02
+    turn_slip: Annotated[float, Range(0, below=0.5)] = 0.05
+    slip_time_s: Positive = 1.0
+    encoder_noise_pulses: NotNegative = 2.0
 
     def __post_init__(self) -> None:
-        for key in ("track_acceleration", "motor_lag_s", "rolling_resistance", "slip_time_s"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
-        for key in ("slip", "turn_slip"):
-            if not 0 <= getattr(self, key) < 0.5:
-                raise ValueError(f"{key} must be in 0..0.5 (got {getattr(self, key)})")
-        if self.encoder_noise_pulses < 0:
-            raise ValueError(f"encoder_noise_pulses must be >= 0 (got {self.encoder_noise_pulses})")
-        if not 0 <= self.contact_low < self.contact_high:
-            raise ValueError(f"contact_low must be below contact_high (got {self.contact_low}, {self.contact_high})")
+        check_ranges(self)
+        require(self, "contact_low", self.contact_low < self.contact_high, "below contact_high")
 
 
 class TrackedRobot:

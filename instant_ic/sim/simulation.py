@@ -3,11 +3,13 @@
 import math
 import threading
 from dataclasses import dataclass, field
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
 from instant_ic.base.config import SkidSteerConfig
+from instant_ic.config.ranges import NotNegativeInt, Positive, Range, check_ranges
 from instant_ic.config.robot import CAMERA_MOUNT, LIDAR_MOUNT, Mount, Rectangle
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer, Frame
@@ -37,14 +39,13 @@ class BaseConfig:
 
     enabled: bool = True
     link: str = "roboclaw"
-    address: int = 0x80
-    battery_v: float = 25.2
+    address: Annotated[int, Range(128, 135)] = 0x80
+    battery_v: Positive = 25.2
 
     def __post_init__(self) -> None:
         if not self.link or "/" in self.link:
             raise ValueError(f"link must be a plain file name (got {self.link!r})")
-        if self.battery_v <= 0:
-            raise ValueError(f"battery_v must be > 0 (got {self.battery_v})")
+        check_ranges(self)
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ class SimulationConfig:
     """
 
     world: str = "corridor"
-    start: tuple[float, ...] = ()
-    seed: int = 0
+    start: tuple[Annotated[float, Range(-1000, 1000)], ...] = ()
+    seed: NotNegativeInt = 0
     robot: RobotConfig = field(default_factory=RobotConfig)
     camera: ThetaConfig = field(default_factory=ThetaConfig)
     lidar: Vlp16Config = field(default_factory=Vlp16Config)
@@ -74,6 +75,7 @@ class SimulationConfig:
     lidar_mount: Mount = LIDAR_MOUNT
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         if len(self.start) not in (0, 3):
             raise ValueError(f"start must be empty or x, y, yaw (got {list(self.start)})")
 

@@ -10,11 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.config.ranges import NotNegative, Percent, PositiveInt, Range, check_ranges
 from instant_ic.limits import load_image
 from instant_ic.pace import current
 
@@ -44,13 +45,13 @@ class ThetaConfig:
 
     enabled: bool = True
     host: str = "127.0.0.1"
-    port: int = 8089
-    width: int = 1024
-    height: int = 512
-    rate: float = 5.0
-    latency_s: float = 0.20
-    quality: int = 92
-    noise: float = 0.0
+    port: Annotated[int, Range(0, 65535)] = 8089
+    width: PositiveInt = 1024
+    height: PositiveInt = 512
+    rate: Annotated[float, Range(above=0, high=30)] = 5.0
+    latency_s: Annotated[float, Range(0, below=2)] = 0.20
+    quality: Percent = 92
+    noise: NotNegative = 0.0
     user: str = ""
     password: str = ""
 
@@ -58,16 +59,7 @@ class ThetaConfig:
         if (self.width, self.height) not in {f[:2] for f in PREVIEW_FORMATS}:
             formats = ", ".join(sorted({f"{w}x{h}" for w, h, _ in PREVIEW_FORMATS}))
             raise ValueError(f"width and height must be one of {formats} (got {self.width}x{self.height})")
-        if not 0 < self.rate <= 30:
-            raise ValueError(f"rate must be in 0..30 (got {self.rate})")
-        if not 0 <= self.latency_s < 2:
-            raise ValueError(f"latency_s must be in 0..2 (got {self.latency_s})")
-        if not 1 <= self.quality <= 100:
-            raise ValueError(f"quality must be in 1..100 (got {self.quality})")
-        if self.noise < 0:
-            raise ValueError(f"noise must be >= 0 (got {self.noise})")
-        if not 0 <= self.port < 65536:
-            raise ValueError(f"port must be in 0..65535 (got {self.port})")
+        check_ranges(self)
 
 
 #: Returns the camera's current view for a width and height: panorama (H, W, 3), sRGB.

@@ -5,10 +5,12 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.config.ranges import NotNegative, PositiveInt, Range, check_ranges, require
 from instant_ic.config.robot import LIDAR_MOUNT, Mount
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.lidar import packets as wire
@@ -35,26 +37,17 @@ class Vlp16Config:
 
     enabled: bool = True
     host: str = "127.0.0.1"
-    data_port: int = 2368
-    position_port: int = 8308
-    rpm: float = 600.0
-    range_noise: float = 0.01
-    min_range: float = 0.2
-    max_range: float = 100.0
-    burst: int = 8
+    data_port: Annotated[int, Range(1, 65535)] = 2368
+    position_port: Annotated[int, Range(1, 65535)] = 8308
+    rpm: Annotated[float, Range(300, 1200)] = 600.0
+    range_noise: NotNegative = 0.01
+    min_range: NotNegative = 0.2
+    max_range: Annotated[float, Range(above=0, high=131)] = 100.0
+    burst: PositiveInt = 8
 
     def __post_init__(self) -> None:
-        if not 300 <= self.rpm <= 1200:
-            raise ValueError(f"rpm must be in 300..1200 (got {self.rpm})")
-        if self.range_noise < 0:
-            raise ValueError(f"range_noise must be >= 0 (got {self.range_noise})")
-        if not 0 <= self.min_range < self.max_range <= 131.0:
-            raise ValueError(f"min_range must be below max_range <= 131 (got {self.min_range}, {self.max_range})")
-        if self.burst < 1:
-            raise ValueError(f"burst must be at least 1 (got {self.burst})")
-        for key in ("data_port", "position_port"):
-            if not 0 < getattr(self, key) < 65536:
-                raise ValueError(f"{key} must be in 1..65535 (got {getattr(self, key)})")
+        check_ranges(self)
+        require(self, "min_range", self.min_range < self.max_range, "below max_range")
 
 
 class Vlp16:

@@ -7,14 +7,12 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, TypeAlias
 
-from instant_ic.config.ranges import Positive, PositiveInt, Range, Share, check_ranges
+from instant_ic.config.ranges import Positive, PositiveInt, Range, Share, check_ranges, require
 
 _UpToOne: TypeAlias = Annotated[float, Range(above=0, high=1)]
 
 
-def _require(condition: bool, key: str, value: object, rule: str) -> None:
-    if not condition:
-        raise ValueError(f"{key} must be {rule} (got {value!r})")
+Coordinate: TypeAlias = Annotated[float, Range(-100_000, 100_000)]
 
 
 @dataclass(frozen=True)
@@ -31,24 +29,20 @@ class FieldConfig:
     """
 
     levels: Annotated[int, Range(1, 16)] = 8
-    features: int = 4
-    """Features of a table entry; the CPU kernels know 2 and 4."""
+    features: Annotated[int, Range(2, 4)] = 4
     log2_table: Annotated[int, Range(10, 22)] = 17
     base_resolution: Annotated[int, Range(2, 256)] = 16
-    """Cells of the coarsest level across the scene."""
     hidden: Annotated[int, Range(4, 64)] = 32
-    """Width of the hidden layer; a multiple of 4."""
     geometry: str = "distance"
-    """What the field says of surfaces: ``distance``, a signed one (one colour query a pixel), or ``density``, the
-    paper's way (colours composited over samples round the depth)."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        _require(self.geometry in ("distance", "density"), "geometry", self.geometry, "distance or density")
-        _require(self.features in (2, 4), "features", self.features, "2 or 4")
-        _require(self.hidden % 4 == 0, "hidden", self.hidden, "a multiple of 4")
+        require(self, "geometry", self.geometry in ("distance", "density"), "distance or density")
+        require(self, "features", self.features in (2, 4), "2 or 4")
+        require(self, "hidden", self.hidden % 4 == 0, "a multiple of 4")
         inputs = self.levels * self.features
-        _require(inputs % 4 == 0 and inputs <= 64, "levels * features", inputs, "a multiple of 4 up to 64")
+        if inputs % 4 or inputs > 64:
+            raise ValueError(f"levels * features must be a multiple of 4 up to 64 (got {inputs})")
 
 
 @dataclass(frozen=True)
@@ -73,34 +67,24 @@ class TrainConfig:
     """
 
     ray_columns: Annotated[int, Range(8, 1024)] = 128
-    """Strata in azimuth; a batch has ``ray_columns * ray_rows`` rays, one jittered in each."""
     ray_rows: Annotated[int, Range(8, 1024)] = 64
     iterations: PositiveInt = 2000
-    """Length of the learning-rate schedule; training idles after it. A short one is worse at every moment: rates that
-    fall early leave the finest levels unlearnt."""
     table_lr: _UpToOne = 0.04
     network_lr: _UpToOne = 0.02
     final_lr_share: _UpToOne = 0.03
     fine_lr_share: _UpToOne = 0.1
-    """Learning rate of the finest level against the coarsest's, between them by equal ratios: it keeps grain down."""
     refresh_lr_share: _UpToOne = 0.5
-    """Share of the learning rates when a keyframe refreshes a trained field."""
     distance_weight: Positive = 0.1
-    """Weight of the signed-distance error against the colour error."""
     band_colour_weight: Share = 0.3
-    """Weight of the colour error of samples beside the surface against those on it."""
     depth_weight: Share = 0.1
-    """With ``density``: weight of the squared error of a ray's depth, in bands and by its uncertainty."""
     opacity_weight: Share = 0.1
-    """With ``density``: weight of what of the light passes through a surface, squared."""
     distortion_weight: Share = 0.01
-    """With ``density``: weight of how far a ray's density is spread (distortion loss of mip-NeRF 360)."""
-    seed: int = 1
+    seed: Annotated[int, Range(low=0)] = 1
 
     def __post_init__(self) -> None:
         check_ranges(self)
         for key in ("ray_columns", "ray_rows"):
-            _require(getattr(self, key) % 8 == 0, key, getattr(self, key), "a multiple of 8")
+            require(self, key, getattr(self, key) % 8 == 0, "a multiple of 8")
 
 
 @dataclass(frozen=True)
@@ -122,30 +106,21 @@ class GeometryConfig:
     """
 
     band_min: Annotated[float, Range(above=0, high=0.5)] = 0.05
-    """Half width of the band round the depth in which the signed distance is learnt, share of the depth."""
     band_max: Annotated[float, Range(above=0, high=0.5)] = 0.06
     band_sigmas: Positive = 2.0
-    """Half width of the band in standard deviations of the depth, between the two limits."""
     torn_ratio: Annotated[float, Range(above=0, below=1)] = 0.10
-    """Neighbouring depths that differ by more than this share are an edge, unless they lie on one plane."""
     min_depth_m: Positive = 0.2
     max_depth_m: Positive = 30.0
-    """Depths beyond are set to it."""
     min_known_share: _UpToOne = 0.5
-    """A keyframe whose depth is known in less of the picture is refused."""
     body_below_deg: Annotated[float, Range(-90, 0)] = -90.0
-    """Below this elevation the panorama shows the robot itself, which is left out; -90: nowhere."""
     sky_share: Share = 0.05
-    """Regions of unknown depth above the horizon that are as large a share of the sphere are sky: endlessly far. 1: no
-    sky, they are filled from around."""
     cell_m: _UpToOne = 0.04
-    """Smallest cell of the occupancy grid, metres; larger where max_cells would be passed."""
     max_cells: Annotated[int, Range(10_000, 2**27)] = 6_000_000
 
     def __post_init__(self) -> None:
         check_ranges(self)
-        _require(self.band_min <= self.band_max, "band_max", self.band_max, "at least band_min")
-        _require(self.min_depth_m < self.max_depth_m, "min_depth_m", self.min_depth_m, "below max_depth_m")
+        require(self, "band_max", self.band_min <= self.band_max, "at least band_min")
+        require(self, "min_depth_m", self.min_depth_m < self.max_depth_m, "below max_depth_m")
 
 
 @dataclass(frozen=True)
@@ -161,13 +136,10 @@ class ReadinessConfig:
     """
 
     psnr_db: Positive = 24.0
-    """PSNR of the training rays that is good enough, also to take over from the keyframe before."""
     plateau_iterations: PositiveInt = 100
     plateau_db: Positive = 0.3
-    """Less gain than this over ``plateau_iterations`` also counts as ready."""
     max_radius_m: Positive = 3.0
     parallax_rad: Positive = 0.035
-    """Shift of a surface in the picture, from the depth's error, that is still fit to show."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -186,15 +158,11 @@ class PictureConfig:
         least_depth_share: of the keyframe's depth in where surfaces lie, at least; else the panorama's share.
     """
 
-    panorama_until_db: float = 40.0
-    """The panorama alone up to this PSNR. Views of a field are below their warp until about here (docs/nerf.md)."""
-    field_from_db: float = 44.0
-    """The field alone from this PSNR on; at or under ``panorama_until_db`` the panorama is never used."""
+    panorama_until_db: Annotated[float, Range(-100, 200)] = 40.0
+    field_from_db: Annotated[float, Range(-100, 200)] = 44.0
 
     refresh_pictures: Annotated[int, Range(1, 60)] = 6
-    """Over so many pictures what is shown passes to a new keyframe; 1: at once."""
     least_depth_share: Share = 0.5
-    """Of the keyframe's depth in where surfaces lie, at least; otherwise the panorama's share counts here too."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -229,23 +197,13 @@ class VirtualSpaceConfig:
     """
 
     source: str = "field"
-    """What pictures show: ``field`` (the panorama warped by its depth until the field is better), ``warp``: the
-    warped panorama alone, or ``mesh``: a place scanned beforehand (``make_space``); with both nothing is trained."""
     mesh: str = ""
-    """File of the scanned place (GLB, glTF, PLY or OBJ), with ``source: mesh``."""
-    mesh_pose: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    """Where the mesh lies in the map (map_from_mesh): x, y, z in metres, yaw in degrees, counter-clockwise."""
+    mesh_pose: tuple[Coordinate, Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0, 0.0)
     mesh_max_triangles: PositiveInt = 5_000_000
-    """Meshes with more triangles are refused; one takes 104 bytes, beside the ray caster's tree."""
     mesh_fit_colours: bool = True
-    """Whether the mesh's colours are multiplied, a factor a colour, to look like the newest keyframe's."""
     device: str = "auto"
-    """``auto`` (``cuda`` where torch finds a GPU, else ``cpu``), ``cpu`` (numba), ``cuda`` (Triton where it works, else
-    plain torch), ``triton``, ``torch-cuda``, or ``torch-cpu`` (slow)."""
-    panorama_width: int = 2048
-    """Wider panoramas are area-averaged to this width."""
+    panorama_width: Annotated[int, Range(64, 8192)] = 2048
     keyframes: Annotated[int, Range(1, 8)] = 1
-    """The newest so many are kept and shown together; a picture takes that many times as long. 1: the paper's way."""
     field: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     geometry: GeometryConfig = dataclasses.field(default_factory=GeometryConfig)
@@ -255,11 +213,9 @@ class VirtualSpaceConfig:
     def __post_init__(self) -> None:
         check_ranges(self)
         devices = ("auto", "cpu", "cuda", "triton", "torch-cuda", "torch-cpu")
-        _require(self.device in devices, "device", self.device, "one of " + ", ".join(devices))
-        _require(self.source in ("field", "warp", "mesh"), "source", self.source, "field, warp or mesh")
-        _require(self.source != "mesh" or bool(self.mesh), "mesh", self.mesh, "a file with source: mesh")
-        pose = len(self.mesh_pose) == 4 and all(math.isfinite(value) for value in self.mesh_pose)
-        _require(pose, "mesh_pose", self.mesh_pose, "x, y, z in metres and yaw in degrees")
+        require(self, "device", self.device in devices, "one of " + ", ".join(devices))
+        require(self, "source", self.source in ("field", "warp", "mesh"), "field, warp or mesh")
+        require(self, "mesh", self.source != "mesh" or bool(self.mesh), "a file with source: mesh")
+        require(self, "mesh_pose", len(self.mesh_pose) == 4, "x, y, z in metres and yaw in degrees")
         for key in ("ray_columns", "ray_rows") if self.field.geometry == "density" else ():
-            _require(getattr(self.train, key) % 16 == 0, key, getattr(self.train, key), "a multiple of 16 with density")
-        _require(64 <= self.panorama_width <= 8192, "panorama_width", self.panorama_width, "from 64 to 8192")
+            require(self.train, key, getattr(self.train, key) % 16 == 0, "a multiple of 16 with density")

@@ -18,6 +18,7 @@ from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
+from instant_ic.config.robot import Mount
 from instant_ic.config.params import build, load_file
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.lidar.config import FlatScanConfig
@@ -296,7 +297,7 @@ def test_forged_packets_with_the_sensors_address_withhold_points_and_scan(tmp_pa
 @pytest.mark.parametrize("rpy_deg", [(0.0, 6.0, 0.0), (180.0, 0.0, 0.0)])
 def test_a_tilted_mount_is_refused(rpy_deg: tuple[float, float, float]) -> None:
     with pytest.raises(Exception, match=r"mounted .*° off the vertical"):
-        LockstepBus().add(Vlp16DriverNode, Vlp16DriverConfig(source="topic", mount_rpy_deg=rpy_deg))
+        LockstepBus().add(Vlp16DriverNode, Vlp16DriverConfig(source="topic", lidar_mount=Mount(rpy_deg=rpy_deg)))
 
 
 def test_shipped_parameters_are_the_defaults() -> None:

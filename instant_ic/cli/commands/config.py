@@ -27,7 +27,7 @@ def add_parser(subparsers: Any) -> None:
     check = verbs.add_parser(
         "check",
         help="report all mistakes in launch and parameter files",
-        description="Report all mistakes in launch and parameter files with file and line. Exit status 1: mistakes found.",
+        description="Report all mistakes in launch and parameter files, with file and line; status 1 if there are any.",
         epilog="example: ic config check my_robot.yaml",
     )
     completion.offer(
