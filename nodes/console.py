@@ -71,7 +71,7 @@ MAX_FAULTS = 4
 
 @dataclass(frozen=True)
 class ConsoleConfig:
-    """Parameters. config/console.yaml describes each one.
+    """Parameters.
 
     Attributes:
         lead: rendered views are moved to the v-bot's present position by their depth.

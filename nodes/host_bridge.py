@@ -38,7 +38,7 @@ UNLISTED = "of no list"
 
 @dataclass(frozen=True)
 class HostBridgeConfig:
-    """Parameters; config/bridge.yaml explains each.
+    """Parameters.
 
     Attributes:
         listen: robot: tcp://0.0.0.0:7450.

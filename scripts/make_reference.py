@@ -98,9 +98,7 @@ def render() -> str:
     if missing:
         raise SystemExit(f"parameters missing in the Attributes: section of their dataclass: {', '.join(missing)}")
     if unbounded:
-        raise SystemExit(
-            f"numbers without a range (instant_ic.config.ranges): {', '.join(unbounded)}"
-        )
+        raise SystemExit(f"numbers without a range (instant_ic.config.ranges): {', '.join(unbounded)}")
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -25,7 +25,7 @@ AZIMUTHS = 1800
 BEAMS = 720
 RANGE_MIN_M, RANGE_MAX_M = 0.40, 30.0
 SCAN_BAND_M = (0.10, 1.30)
-"""Heights of the flat scan (config/lidar.yaml)."""
+"""Heights of the flat scan (config/robot.yaml)."""
 IN_THE_WAY_M = (0.05, 1.25)
 """Height range in which an object blocks the robot: the crawler with its mast."""
 LENGTH_M, WIDTH_M = 0.60, 0.50

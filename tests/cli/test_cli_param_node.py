@@ -32,6 +32,11 @@ def test_list_and_get(ic):
     assert status == 1 and "node 'talkr' is not running" in error and "did you mean 'talker'?" in error
 
 
+def test_list_changed_shows_both_values(ic):
+    status, out, _ = ic("param", "list", "talker", "--changed")
+    assert status == 0 and "  inner.depth: 7 (default 3)\n" in out and "inner.share" not in out
+
+
 def test_describe(ic):
     status, out, _ = ic("param", "describe", "talker", "inner.share", "rate_hz")
     assert status == 0
