@@ -1,6 +1,6 @@
 """Parameters that several nodes share: the robot's outline, its limits and its sensor mounts.
 
-Their values stand in the ``/**`` section of `config/robot.yaml`. Every node that uses one declares it by the same name.
+The ``/**`` section of `config/robot.yaml` has their values. Every node that uses one declares it by the same name.
 """
 
 from __future__ import annotations

@@ -16,10 +16,9 @@ class KeyframeConfig:
     """When keyframes are taken.
 
     Attributes:
-        distance_m: motion of the camera since the last keyframe that makes a new one due.
-        angle_deg: likewise for its rotation.
-        unfit_after_s: a keyframe that is due but whose depth cannot be scaled is put off for so long, in the hope of
-            a better one; then it goes out marked as not fit. A fit one replaces it as soon as there is one.
+        distance_m: metres of motion to a new keyframe; smaller renews the virtual space more often.
+        angle_deg: degrees of rotation to a new keyframe.
+        unfit_after_s: seconds that a due keyframe waits for depth that can be scaled.
     """
 
     distance_m: Positive = 0.6

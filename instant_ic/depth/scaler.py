@@ -34,27 +34,21 @@ class ScalerConfig:
     """How depth is scaled.
 
     Attributes:
-        method: ``median_ratio`` (median of range over depth at the points), ``ransac`` (the scale that most points
-            agree on), ``sector`` (that, and a smooth factor over azimuth) or ``max_ratio`` (the paper's rule).
-            ``relative`` and ``disparity`` depth gets scale and shift by RANSAC under any of them. ``as_estimated``
-            takes the metres of a ``metric`` model unseen, for pictures and LiDAR from different places; never for
-            driving.
-        maxima: where ``max_ratio`` takes the depth's maximum: ``lidar``, over the directions that the LiDAR sees, or
-            ``image``, over the whole picture by solid angle.
-        confidence: quantile that stands for the maximum (paper: 99.5 %).
-        output_kind: of the depth model, as in its manifest.
-        min_range_m: nearer points are left out (the robot itself).
-        max_range_m: farther points are left out, and scaled depth is cut there.
-        min_points: fewer points in the picture give no scale.
-        min_azimuth_deg: points in fewer degrees of azimuth give no scale.
-        sector_deg: width of the sectors of ``sector``; 360 is a multiple of it.
-        sector_points: a sector with so many points gets half of its own correction, with more the more.
-        agreement: a point agrees when scaled depth and range differ by no more than this share of the range.
-        min_quality: a smaller share of agreeing points makes the fit not ok.
-        max_rival: the fit is not ok when a quite different scale has more than this share of the points that the
-            scale has: half of a room behind glass, or a mirror.
+        method: sector, ransac, median_ratio, max_ratio (the paper's), as_estimated (not for driving).
+        maxima: max_ratio's largest depth: over the LiDAR's directions (lidar) or the whole image (image).
+        confidence: quantile that stands for the maximum; lower is more robust, higher nearer the maximum.
+        output_kind: of the model, as in its manifest: metric, scale_invariant, relative, disparity.
+        min_range_m: metres from the camera; nearer points (the robot itself) are left out.
+        max_range_m: metres; farther points are left out, farther depth is cut.
+        min_points: points on known depth; fewer give no scale.
+        min_azimuth_deg: degrees of azimuth with points; fewer give no scale.
+        sector_deg: degrees; width of a sector: narrower follows the depth's errors closer, wider is smoother.
+        sector_points: points that give a sector half of its own correction; fewer keep the scale of the whole.
+        agreement: a point agrees within this share of its range; sets what quality counts.
+        min_quality: share of agreeing points; less and the fit is not trusted.
+        max_rival: another scale with more than this share of the scale's points: two fit, none is trusted.
         min_scale, max_scale: a scale outside makes the fit not ok (``metric`` and ``scale_invariant``).
-        assumed_sigma: relative standard deviation that is told of depth taken ``as_estimated``, which nobody measured.
+        assumed_sigma: relative standard deviation published for depth that is used as estimated.
     """
 
     method: str = "sector"

@@ -18,8 +18,8 @@ from instant_ic.bus import ERROR, OK, RELIABLE, WARN, Node, NodeError
 from instant_ic.bus.clock import SystemClock
 from instant_ic.bus.local_transport import LocalTransport
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.config.robot import Mount
 from instant_ic.config.params import build, load_file
+from instant_ic.config.robot import Mount
 from instant_ic.geometry.poses import matrix_from_pose2
 from instant_ic.lidar.config import FlatScanConfig
 from instant_ic.lidar.packets import PACKET_PERIOD_US, encode_position_packet
