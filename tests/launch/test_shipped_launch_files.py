@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from instant_ic import paths
+from instant_ic.bus.node_files import node_class
 from instant_ic.launch import find_launch_file, read_arguments, read_launch_file
 from instant_ic.launch.parameters import check_parameters
 
@@ -79,8 +80,7 @@ def test_simulated_devices_and_drivers_meet() -> None:
     assert "host:=127.0.0.1" in found["vlp16_driver"]
     assert "roboclaw.port:=/run/here/dev/roboclaw" in found["crawler_base"]
     assert "server.port:=9004" in found["console"]
-    link = yaml.safe_load(paths.shipped_file("config", "sim.yaml").read_text())["simulator"]["ros__parameters"]["base"]
-    assert link["link"] == "roboclaw"
+    assert node_class("simulator").config_class()().base.link == "roboclaw"
 
 
 def test_depth_is_taken_unchecked_only_where_it_is_asked_for() -> None:
