@@ -249,7 +249,7 @@ def test_a_mesh_too_large_is_refused(tmp_path, monkeypatch):
 def test_the_configuration_says_what_is_missing():
     with pytest.raises(ValueError, match="mesh must be a file with source: mesh"):
         VirtualSpaceConfig(source="mesh")
-    with pytest.raises(ValueError, match="mesh_pose must be"):
+    with pytest.raises(ValueError, match="mesh_pose must lie in"):
         VirtualSpaceConfig(mesh_pose=(0.0, math.inf, 0.0, 0.0))
     config = VirtualSpaceConfig(source="mesh", mesh="house.glb")
     with pytest.raises(ValueError, match="make_space"):
