@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,6 +26,17 @@ AGREEMENT = 0.1
 
 class DeviceError(RuntimeError):
     """The device that was asked for is not there, or does not work."""
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether torch raised this because the GPU has too little memory; does not import torch."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(error, torch.OutOfMemoryError)
+
+
+def is_device_fault(error: Exception) -> bool:
+    """Whether an error has its cause in the device and not in this software."""
+    return isinstance(error, DeviceError) or is_out_of_memory(error)
 
 
 def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
@@ -86,7 +98,7 @@ def _make_gpu_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
     except ImportError as error:
         words = f"Triton is not installed ({error}); pip install 'instant-ic[triton]'"
     except Exception as error:  # a compiler, a driver: whatever they raise, plain torch still works
-        if type(error).__name__ == "OutOfMemoryError":
+        if is_out_of_memory(error):
             raise
         words = f"the Triton kernels do not work here ({type(error).__name__}: {error})"
     if config.device == "triton":

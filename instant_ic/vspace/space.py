@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from instant_ic.vspace.canvas import Drawing, Painted, Picture
 from instant_ic.vspace.compose import exposure_gains, moved
 from instant_ic.vspace.config import VirtualSpaceConfig
-from instant_ic.vspace.devices import make_device
+from instant_ic.vspace.devices import is_out_of_memory, make_device
 from instant_ic.vspace.nerf.field import Device, FieldParameters, Floats, Lattice, Rays, Scene, Schedule
 from instant_ic.vspace.nerf.occupancy import build_occupancy
 from instant_ic.vspace.prior import KeyframeError, PanoramaPrior, prepare
@@ -422,7 +422,7 @@ class VirtualSpace(Drawn):
         try:
             return call(self._device)
         except RuntimeError as error:
-            if type(error).__name__ != "OutOfMemoryError" or self.config.device != "auto":
+            if not is_out_of_memory(error) or self.config.device != "auto":
                 raise
             self._warning = f"{self._device.name} is out of memory; on the CPU from now on ({error})"
         parameters = self._device.parameters()

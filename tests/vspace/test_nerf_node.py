@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 
-from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.experiments import box_room
 from instant_ic.geometry.depth_picture import decode_depth, encode_depth
@@ -21,7 +20,8 @@ from instant_ic.msg import (
     pose_message,
 )
 from instant_ic.vspace import FieldConfig, TrainConfig, VirtualSpaceConfig
-from nodes.nerf import Job, NerfConfig, NerfNode, read_mask
+from instant_ic.vspace.jobs import Incoming, Job, JobKind, load_robot_mask
+from nodes.nerf import NerfConfig, NerfNode, decode_keyframe
 
 EMPTY, TRAINING, READY = 0, 1, 2
 S = 1_000_000_000
@@ -185,7 +185,7 @@ def test_a_gpu_without_memory_is_told_and_the_next_keyframe_recovers(bus):
     bus.publish("/keyframe", keyframe_message(1), latched=True)
     bus.advance(0.3)
     node = next(n for n in bus.nodes if isinstance(n, NerfNode))
-    device = node.space._device
+    device = node.work.space._device
     whole = device.step
 
     def no_memory(*args):
@@ -222,11 +222,11 @@ def test_a_new_keyframe_is_shown_at_once_and_learnt_behind(bus):
 
 def test_the_newest_of_those_that_wait_is_taken(bus):
     node = bus.node
-    node.preparing = True  # as while a thread prepares one
+    node.schedule.preparing = True  # as while a thread prepares one
     for number in (1, 2, 3):
         bus.publish("/keyframe", keyframe_message(number), latched=True)
-    node.preparing = False
-    node.next_job()
+    node.schedule.preparing = False
+    node.schedule.next()
     bus.publish("/keyframe", keyframe_message(4, fit=False), latched=True)
     assert next(s.keyframe_id for s in bus.messages("/vspace/status") if s.keyframe_id) == 3
     assert bus.last("/vspace/status").keyframe_id == 3
@@ -275,13 +275,13 @@ def test_the_robots_mask(tmp_path):
     with LockstepBus(start_ns=10 * S) as bus:
         node = bus.add(NerfNode, NerfConfig(space=SPACE, robot_mask=str(tmp_path / "mask.png")))
         bus.publish("/keyframe", keyframe_message(1), latched=True)
-        assert node.space.keyframe.usable.mean() == pytest.approx(1 - 12 * 10 / (32 * 64))
+        assert node.work.space.keyframe.usable.mean() == pytest.approx(1 - 12 * 10 / (32 * 64))
     for content, words in ((None, "no such file"), (np.zeros((32, 32), np.uint8), "twice as wide")):
         path = tmp_path / "bad.png"
         if content is not None:
             cv2.imwrite(str(path), content)
-        with pytest.raises(NodeError, match=words):
-            read_mask(str(path))
+        with pytest.raises(ValueError, match=words):
+            load_robot_mask(str(path))
 
 
 def test_pictures_go_on_while_a_keyframe_is_prepared():
@@ -290,14 +290,16 @@ def test_pictures_go_on_while_a_keyframe_is_prepared():
         node = bus.add(NerfNode, NerfConfig(space=SPACE))
         bus.publish("/keyframe", keyframe_message(1), latched=True)
         go_on, results = threading.Event(), []
-        whole = node.space.prepare
+        whole = node.work.space.prepare
 
         def slow(*arguments):
             assert go_on.wait(30)
             return whole(*arguments)
 
-        node.space.prepare = slow
-        thread = threading.Thread(target=lambda: results.append(node.work(Job("keyframe", (keyframe_message(2), 0)))))
+        node.work.space.prepare = slow
+        second = keyframe_message(2)
+        job = Job(JobKind.PREPARE, Incoming(2, second, 0, lambda: decode_keyframe(second)))
+        thread = threading.Thread(target=lambda: results.append(node.work.run(job)))
         thread.start()
         for number in (1, 2, 3):
             bus.publish("/view/request", request_message(number))
@@ -307,7 +309,7 @@ def test_pictures_go_on_while_a_keyframe_is_prepared():
         go_on.set()
         thread.join(30)
         assert results[0].error is None
-        node.space.show(results[0].made)
+        node.work.space.show(results[0].made)
         bus.publish("/view/request", request_message(4))
         assert bus.last("/vspace/view").request_id == 4
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from instant_ic.vspace.turns import LEAST_SHARE, Turns
+from instant_ic.vspace.schedule import LEAST_SHARE, Turns
 
 
 def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, trains=True, iteration_ms=5.0):
@@ -17,11 +17,11 @@ def run(render_ms, asks_fps, render_fps=10.0, train_ms=50.0, seconds=20.0, train
         if now >= next_ask:
             asked_at = asked_at if asked_at is not None else now
             next_ask += 1e3 / asks_fps
-        if turns.draws_next(asked_at is not None, trains):
+        if turns.renders_next(asked_at is not None, trains):
             waited, asked_at = max(waited, now - asked_at), None
             now += render_ms
             drawn += 1
-            turns.drew(render_ms)
+            turns.rendered(render_ms)
         elif trains:
             budget, start = turns.budget_ms(), now
             while now - start < budget:  # whole iterations, one at least

@@ -1,0 +1,219 @@
+"""The work on a virtual space as jobs: what one thread renders and trains, and what another one prepares meanwhile."""
+
+from __future__ import annotations
+
+import enum
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.geometry.depth_picture import encode_depth
+from instant_ic.limits import decode_image, load_image
+from instant_ic.vspace.config import VirtualSpaceConfig
+from instant_ic.vspace.devices import is_device_fault
+from instant_ic.vspace.mesh_file import MeshError
+from instant_ic.vspace.mesh_space import Space, make_space
+from instant_ic.vspace.prior import KeyframeError
+from instant_ic.vspace.space import Status, VirtualSpace
+from instant_ic.vspace.view import View
+from instant_ic.vspace.warm_up import warm_up
+
+KeyframeArrays = tuple[NDArray[np.uint8], NDArray[np.floating], NDArray[np.floating], float | NDArray[np.floating]]
+"""Panorama, depth, map_from_camera and relative sigma, as ``VirtualSpace.prepare`` takes them."""
+
+
+class JobKind(enum.Enum):
+    """What a job does. ``PREPARE`` and ``SCENE`` belong to the preparing thread, the others to the rendering thread."""
+
+    WARM_UP = "warm_up"
+    PREPARE = "keyframe"
+    SHOW = "show"
+    SCENE = "scene"
+    LEARN = "learn"
+    RENDER = "view"
+    TRAIN = "train"
+
+
+_INPUT_JOBS = (JobKind.PREPARE, JobKind.SHOW, JobKind.RENDER)
+"""A ValueError in one of these is the sender's fault: the keyframe or the request is refused."""
+
+
+@dataclass(frozen=True)
+class Incoming:
+    """A keyframe and its arrival time; ``decode`` runs on the preparing thread and may raise ``KeyframeError``."""
+
+    id: int
+    message: Any
+    arrival_ns: int
+    decode: Callable[[], KeyframeArrays]
+
+
+@dataclass(frozen=True)
+class ViewOrder:
+    """A requested view; ``pose`` returns map_from_camera or raises ValueError."""
+
+    id: int
+    message: Any
+    pose: Callable[[], NDArray[np.floating]]
+    width: int
+    height: int
+    fov_rad: float
+    jpeg_quality: int
+
+
+@dataclass(frozen=True)
+class Job:
+    """One piece of work.
+
+    Attributes:
+        keyframe: of all kinds but ``RENDER`` and ``TRAIN``.
+        view: of ``RENDER``.
+        made: result of the keyframe's previous job.
+        iterations, budget_ms: limits of ``TRAIN``.
+    """
+
+    kind: JobKind
+    keyframe: Incoming | None = None
+    view: ViewOrder | None = None
+    made: Any = None
+    iterations: int | None = None
+    budget_ms: float = float("inf")
+
+
+@dataclass(frozen=True)
+class EncodedView:
+    """A rendered view as it is sent."""
+
+    view: View
+    jpeg: bytes
+    mask_png: bytes
+    depth_png: bytes
+    depth_near_m: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a job.
+
+    Attributes:
+        status: of the space after the job; None while there is no space.
+        refused: why the job's input was refused; empty otherwise.
+        error: a fault that is not the input's.
+        is_bug: whether the error is neither a missing device, nor too little memory, nor an unusable mesh.
+    """
+
+    job: Job
+    made: Any = None
+    encoded: EncodedView | None = None
+    status: Status | None = None
+    elapsed_ms: float = 0.0
+    refused: str = ""
+    error: Exception | None = None
+    is_bug: bool = False
+
+
+class SpaceWorker:
+    """Runs jobs on one space. ``run`` is called by two threads, each with its own kinds of jobs.
+
+    Args:
+        config: the space's parameters.
+        robot: the robot's mask, as ``VirtualSpace`` takes it.
+        nice: nice value of the calling threads, 0 to 19.
+        warm: whether ``WARM_UP`` compiles the kernels.
+    """
+
+    def __init__(self, config: VirtualSpaceConfig, robot: NDArray[np.bool_] | None, nice: int, warm: bool) -> None:
+        self.config = config
+        self.space: Space | None = None
+        self._robot, self._nice, self._warm = robot, nice, warm
+
+    def run(self, job: Job) -> Outcome:
+        """Do a job; errors are part of the outcome."""
+        start = time.perf_counter()
+        try:
+            outcome = self._do(job)
+        except Exception as error:  # noqa: BLE001 - reported on the node's thread, which must know that this one is free
+            if job.kind in _INPUT_JOBS and isinstance(error, ValueError):
+                outcome = Outcome(job, refused=str(error))
+            else:
+                expected = is_device_fault(error) or isinstance(error, MeshError)
+                outcome = Outcome(job, error=error, is_bug=not expected)
+        status = None if self.space is None else self.space.status
+        return replace(outcome, status=status, elapsed_ms=(time.perf_counter() - start) * 1e3)
+
+    def _do(self, job: Job) -> Outcome:
+        if job.kind is JobKind.WARM_UP:
+            if self._warm:
+                self._yield_to_others()
+                warm_up(self.config)
+            self.space = make_space(self.config, self._robot)
+            return Outcome(job)
+        space = self.space
+        assert space is not None
+        if job.kind is JobKind.PREPARE:
+            assert job.keyframe is not None
+            if self._warm:
+                self._yield_to_others()
+            arrays = job.keyframe.decode()
+            return Outcome(job, space.prepare(*arrays) if isinstance(space, VirtualSpace) else arrays)
+        if job.kind is JobKind.SCENE and isinstance(space, VirtualSpace):
+            return Outcome(job, space.scene_of(job.made))
+        if job.kind is JobKind.SHOW and isinstance(space, VirtualSpace):
+            space.show(job.made, dissolve=True)
+        elif job.kind is JobKind.SHOW:
+            space.set_keyframe(*job.made)
+        elif job.kind is JobKind.LEARN and isinstance(space, VirtualSpace):
+            space.learn(job.made)
+        elif job.kind is JobKind.TRAIN:
+            space.train(job.budget_ms, job.iterations)
+        elif job.kind is JobKind.RENDER:
+            assert job.view is not None
+            return Outcome(job, encoded=_render(space, job.view))
+        return Outcome(job)
+
+    def _yield_to_others(self) -> None:
+        """Lower this thread's priority (Linux has one per thread)."""
+        if self._nice and sys.platform == "linux":
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._nice)
+
+
+def _render(space: Space, order: ViewOrder) -> EncodedView:
+    view = space.render(order.pose(), order.width, order.height, order.fov_rad)
+    _, jpeg = cv2.imencode(".jpg", view.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, order.jpeg_quality])
+    return EncodedView(view, jpeg.tobytes(), view.mask_png(), *encode_depth(view.depth_m, order.fov_rad))
+
+
+def decode_panorama(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """RGB image (H, W, 3) of a keyframe's JPEG or PNG.
+
+    Raises:
+        KeyframeError: it cannot be decoded.
+    """
+    image = decode_image(data, cv2.IMREAD_COLOR)
+    if image is None:
+        raise KeyframeError(f"the panorama ({data.size} bytes) cannot be decoded")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def load_robot_mask(path: str | Path) -> NDArray[np.bool_]:
+    """Load the mask of the robot in its panoramas, (H, 2 H), true where the image file is bright.
+
+    Raises:
+        ValueError: not an image, or not twice as wide as high.
+    """
+    image = load_image(path, cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise ValueError(f"robot_mask {path}: no such file, or it cannot be decoded as an image")
+    if image.shape[1] != 2 * image.shape[0]:
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise ValueError(f"robot_mask {path}: must be twice as wide as high, as the panorama is (got {size})")
+    return np.asarray(image > 127)

@@ -1,0 +1,303 @@
+"""What the two threads of a virtual space do next: rendering and training in turns, preparing a new keyframe."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from instant_ic.vspace.config import VirtualSpaceConfig
+from instant_ic.vspace.jobs import Incoming, Job, JobKind, Outcome, ViewOrder
+from instant_ic.vspace.space import State, Status
+
+LEAST_SHARE = 0.25
+"""Least training time as a share of a view's rendering time, also where views alone take longer than their period."""
+_LASTING = (JobKind.WARM_UP, JobKind.LEARN, JobKind.TRAIN)
+"""Jobs that would fail again at once: after an error nothing is trained until the next keyframe."""
+_NOTHING_SEEN = 0.98
+"""A view with a larger share of unseen pixels shows nothing that is known."""
+OK, WARN, ERROR = range(3)
+"""Levels of a finding, as in DiagnosticStatus."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A diagnosis: name, level, text for people, and the id of the keyframe or request (None: of neither)."""
+
+    name: str
+    level: int
+    text: str
+    id: int | None = None
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Fields of VspaceStatus.msg; 0 or empty where unknown."""
+
+    state: State
+    keyframe_id: int
+    ready_radius_m: float
+    psnr_db: float
+    expected_psnr_db: float
+    unseen_share: float
+    train_seconds: float
+    ready_seconds: float
+    iterations: int
+    ms_per_iteration: float
+    render_ms: float
+    render_fps: float
+    device: str
+    message: str
+
+
+class Turns:
+    """Shares one device between rendering and training so that a frame rate is held.
+
+    Args:
+        render_fps: target frame rate of requested views; training gets the remaining time.
+        train_ms_per_frame: longest uninterrupted training in ms, and so the longest wait of a requested view.
+    """
+
+    def __init__(self, render_fps: float, train_ms_per_frame: float) -> None:
+        self.render_fps = render_fps
+        self.train_ms_per_frame = train_ms_per_frame
+        self._rendered_last = False
+        self._render_ms = 0.0
+
+    def renders_next(self, requested: bool, trains: bool) -> bool:
+        """Whether a requested view is next; while the space ``trains``, training has a turn after each view."""
+        return requested and not (trains and self._rendered_last)
+
+    def rendered(self, render_ms: float) -> None:
+        """Note the rendering time of a view."""
+        self._rendered_last, self._render_ms = True, render_ms
+
+    def budget_ms(self) -> float:
+        """Length of training's next turn, which starts now: the rest of the view's period, within the limits."""
+        left = 1e3 / self.render_fps - self._render_ms if self._rendered_last else self.train_ms_per_frame
+        self._rendered_last = False
+        return min(self.train_ms_per_frame, max(left, LEAST_SHARE * self._render_ms))
+
+
+class FrameRate:
+    """Frame rate over the last 20 views."""
+
+    def __init__(self) -> None:
+        self._rendered_ns: deque[int] = deque(maxlen=20)
+
+    def note(self, now_ns: int) -> None:
+        """Count a view."""
+        self._rendered_ns.append(now_ns)
+
+    def per_second(self, now_ns: int) -> float:
+        """Views per second; 0 when none was rendered for 2 s."""
+        if len(self._rendered_ns) < 2 or now_ns - self._rendered_ns[-1] > 2_000_000_000:
+            return 0.0
+        span = self._rendered_ns[-1] - self._rendered_ns[0]
+        return (len(self._rendered_ns) - 1) * 1e9 / span if span > 0 else 0.0
+
+
+class JobSchedule:
+    """Decides which job is next; knows neither threads nor messages. All calls come from one thread.
+
+    Args:
+        config: the space's parameters.
+        turns: shares of rendering and training.
+        render: starts a job on the thread that renders and trains; ``take`` gets its outcome.
+        prepare: starts a job on the thread that prepares keyframes; ``take_prepared`` gets its outcome.
+        lockstep: no measured time counts, and training runs in ``train`` only; otherwise it fills idle time.
+    """
+
+    def __init__(
+        self,
+        config: VirtualSpaceConfig,
+        turns: Turns,
+        render: Callable[[Job], None],
+        prepare: Callable[[Job], None],
+        lockstep: bool,
+    ) -> None:
+        self.config, self.turns = config, turns
+        self.keyframe: Incoming | None = None  # newest one that views show
+        self.status: Status | None = None
+        self.failure = ""
+        self.preparing = False
+        self._render, self._prepare, self._lockstep = render, prepare, lockstep
+        self._waiting_keyframe: Incoming | None = None
+        self._waiting_view: ViewOrder | None = None
+        self._busy = False  # the rendering thread
+        self._todo: deque[Job] = deque()  # the rendering thread's jobs for the keyframe in preparation
+        self._learns = False  # the field has something to learn
+        self._is_ready, self._ready_seconds = False, 0.0
+        self._warned = False  # about the device
+        self._frame_rate = FrameRate()
+        # Of the last rendered view; 0 = unknown.
+        self._render_ms = self._expected_psnr_db = self._unseen_share = 0.0
+
+    def start(self) -> None:
+        """Start with the warm-up."""
+        self._start(Job(JobKind.WARM_UP))
+
+    def offer_keyframe(self, keyframe: Incoming) -> None:
+        """Prepare and show a keyframe; it replaces one that still waits."""
+        self._waiting_keyframe = keyframe
+        self.next()
+
+    def request_view(self, order: ViewOrder) -> None:
+        """Render a view; it replaces one that still waits."""
+        self._waiting_view = order
+        self.next()
+
+    def next(self) -> None:
+        """Give idle threads their next jobs; they stay idle when there is nothing to prepare, render or train."""
+        if self.status is not None and self._waiting_keyframe is not None and not self.preparing:
+            waiting, self._waiting_keyframe = self._waiting_keyframe, None
+            self.preparing = True
+            self._prepare(Job(JobKind.PREPARE, waiting))
+        if self._busy or self.status is None:
+            return
+        trains = self._trains and not self._lockstep
+        if self._todo:
+            self._start(self._todo.popleft())
+        elif self._waiting_view is not None and self.turns.renders_next(True, trains):
+            order, self._waiting_view = self._waiting_view, None
+            self._start(Job(JobKind.RENDER, view=order))
+        elif trains:
+            self._start(Job(JobKind.TRAIN, budget_ms=self.turns.budget_ms()))
+
+    def train(self, iterations: int) -> None:
+        """Train now, unless a job runs or nothing is left to train."""
+        if not self._busy and self._trains:
+            self._start(Job(JobKind.TRAIN, iterations=iterations))
+
+    def _start(self, job: Job) -> None:
+        self._busy = True
+        self._render(job)
+
+    @property
+    def _trains(self) -> bool:
+        """Whether anything is left to train."""
+        return self._learns and not self.failure and self.status is not None and not self.status.converged
+
+    def take_prepared(self, outcome: Outcome) -> None:
+        """Pass the preparing thread's result to the rendering thread."""
+        job = outcome.job
+        if outcome.error is not None or outcome.refused:
+            self.preparing = False
+        else:
+            kind = JobKind.SHOW if job.kind is JobKind.PREPARE else JobKind.LEARN
+            self._todo.append(Job(kind, job.keyframe, made=outcome.made))
+
+    def take(self, outcome: Outcome, now_ns: int) -> bool:
+        """Take the rendering thread's result; returns whether the state, the text or the keyframe has changed."""
+        self._busy = False
+        job, self.status = outcome.job, outcome.status
+        failed = outcome.error is not None
+        changed = False
+        if job.kind is JobKind.LEARN:
+            self.preparing = False
+            self._learns = self._learns or not failed
+        elif job.kind is JobKind.SHOW and (failed or outcome.refused):
+            self.preparing = False
+        elif job.kind is JobKind.SHOW:
+            self.keyframe, self.failure, self._is_ready = job.keyframe, "", False
+            changed = True
+            if self.config.source == "field":
+                self._prepare(Job(JobKind.SCENE, job.keyframe, made=job.made))
+            else:
+                self.preparing = False
+        elif outcome.encoded is not None:
+            view = outcome.encoded.view
+            self._render_ms = 0.0 if self._lockstep else outcome.elapsed_ms
+            self._expected_psnr_db = 0.0 if math.isnan(view.expected_psnr_db) else view.expected_psnr_db
+            self._unseen_share = view.unseen_share
+            self.turns.rendered(self._render_ms)
+            self._frame_rate.note(now_ns)
+        if failed and job.kind in _LASTING:
+            self.failure = f"{job.kind.value}: {type(outcome.error).__name__}: {outcome.error}"
+            changed = True
+        if self.keyframe is not None and not self._is_ready and self.state == State.READY:
+            self._is_ready = changed = True
+            self._ready_seconds = (now_ns - self.keyframe.arrival_ns) / 1e9
+        return changed
+
+    @property
+    def state(self) -> State:
+        """What the space can show."""
+        if self.failure:
+            return State.FAILED
+        if self.status is None or (self.keyframe is None and self.config.source != "mesh"):
+            return State.EMPTY
+        return self.status.state
+
+    def text(self) -> str:
+        """The state in a sentence for people."""
+        space, status = self.config, self.status
+        if self.failure:
+            return self.failure
+        if status is None:
+            return "warming up: kernels are being compiled"
+        if space.source == "mesh":
+            return f"the scanned place {Path(space.mesh).name}; nothing is trained (source: mesh)"
+        if self.keyframe is None:
+            return "waiting for the first keyframe"
+        if space.source == "warp":
+            return "the panorama warped by its depth; nothing is trained (source: warp)"
+        if status.converged:
+            text = f"trained, {status.psnr_db:.1f} dB; idle"
+        else:
+            text = f"training, {status.psnr_db:.1f} dB" if status.iterations else "training"
+        if status.refreshing:
+            text += f"; learning keyframe {self.keyframe.id}"
+        share = space.picture.panorama_share(status.psnr_db)
+        return f"{text}; shown: {share:.0%} warped panorama" if share > 0 else text
+
+    def findings(self, outcome: Outcome) -> list[Finding]:
+        """Diagnoses that follow from a job's outcome, after it was taken."""
+        kind, status, keyframe, view = outcome.job.kind, outcome.status, outcome.job.keyframe, outcome.job.view
+        found = []
+        if status is not None and (status.warning or self._warned):
+            self._warned = bool(status.warning)
+            found.append(Finding("device", WARN if self._warned else OK, status.warning or status.device))
+        if outcome.error is not None:
+            name = "vspace" if kind in _LASTING else "keyframe" if view is None else "view"
+            text = f"{kind.value}: {type(outcome.error).__name__}: {outcome.error}"
+            found.append(Finding(name, ERROR, text))
+        elif keyframe is not None and outcome.refused:
+            text = f"keyframe {keyframe.id} refused: {outcome.refused}"
+            found.append(Finding("keyframe", ERROR, text, keyframe.id))
+        elif keyframe is not None and kind is JobKind.SHOW:
+            found.append(Finding("keyframe", OK, f"keyframe {keyframe.id} in use", keyframe.id))
+        elif view is not None and outcome.refused:
+            found.append(Finding("view", WARN, f"request {view.id} refused: {outcome.refused}", view.id))
+        elif view is not None:
+            text = f"{view.width} x {view.height} in {self._render_ms:.0f} ms"
+            if self._unseen_share > _NOTHING_SEEN:
+                text += ": no keyframe shows anything from that pose; is it far away?"
+            found.append(Finding("view", WARN if self._unseen_share > _NOTHING_SEEN else OK, text, view.id))
+        elif kind is JobKind.TRAIN:
+            found.append(Finding("vspace", OK, self.text()))
+        return found
+
+    def figures(self, now_ns: int) -> Figures:
+        """The present status."""
+        status, keyframe, state = self.status, self.keyframe, self.state
+        shown = status if keyframe is not None or self.config.source == "mesh" else None
+        of_keyframe = status if keyframe is not None else None
+        return Figures(
+            state=state,
+            keyframe_id=0 if status is None or keyframe is None else keyframe.id,
+            ready_radius_m=0.0 if shown is None else shown.ready_radius_m,
+            psnr_db=of_keyframe.psnr_db if of_keyframe is not None and of_keyframe.iterations else 0.0,
+            expected_psnr_db=self._expected_psnr_db,
+            unseen_share=self._unseen_share,
+            train_seconds=0.0 if keyframe is None else (now_ns - keyframe.arrival_ns) / 1e9,
+            ready_seconds=self._ready_seconds if keyframe is not None and state == State.READY else 0.0,
+            iterations=0 if of_keyframe is None else of_keyframe.iterations,
+            ms_per_iteration=0.0 if of_keyframe is None or self._lockstep else of_keyframe.ms_per_iteration,
+            render_ms=self._render_ms,
+            render_fps=self._frame_rate.per_second(now_ns),
+            device="" if status is None else status.device,
+            message=self.text(),
+        )
