@@ -64,7 +64,7 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         self.failures = 0
         self.depth = self.publisher("/depth/raw", Image, qos=SENSOR)
         self.info = self.publisher("/depth/model", DepthModelInfo, qos=LATCHED)
-        self.tell_model()
+        self.publish_model()
         self.worker = self.background(self.estimate, self.on_result)
         self.subscribe("/camera/image/compressed", CompressedImage, self.on_image, qos=SENSOR)
         self.timer(_WATCH_S, self.watch)
@@ -86,10 +86,10 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
         if provider not in ("auto", self.model.provider):
             self.log.warning("provider %s was requested, the model runs on %s%s", provider, self.model.provider, why)
 
-    def tell_model(self) -> None:
+    def publish_model(self) -> None:
         """Publish which kind of values ``/depth/raw`` carries, for the node that scales them."""
         manifest = self.model.manifest
-        self.told = self.model.provider
+        self.published_provider = self.model.provider
         info = DepthModelInfo(
             header=header("", self.clock.now_ns()), name=manifest.name, licence=manifest.licence,
             output_kind=manifest.output_kind, provider=self.model.provider,
@@ -141,8 +141,8 @@ class DepthEstimatorNode(Node[DepthEstimatorConfig]):
 
     def on_result(self, result: tuple[Any, NDArray[np.float32] | None, str]) -> None:
         header, depth, reason = result
-        if self.model.provider != self.told:
-            self.tell_model()
+        if self.model.provider != self.published_provider:
+            self.publish_model()
         if depth is None:
             self.failures += 1
             self.diagnose("depth", ERROR, reason, provider=self.model.provider, failures=self.failures)

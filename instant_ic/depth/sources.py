@@ -69,6 +69,16 @@ class DepthResult:
     message: str
     source: str
 
+    def figures(self) -> dict[str, float | str]:
+        """Rounded values for a diagnosis."""
+        return {
+            "scale": round(self.scale, 4),
+            "quality": round(self.quality, 3),
+            "points": self.points,
+            "source": self.source,
+            "sigma": round(self.relative_sigma, 4),
+        }
+
 
 class DepthSource:
     """Makes depth of a picture's network estimate and the LiDAR points of the same moment."""

@@ -84,7 +84,7 @@ def test_what_is_no_panorama_is_told(config: DepthEstimatorConfig) -> None:
 def test_failing_gpu_is_left_for_the_cpu(config: DepthEstimatorConfig) -> None:
     with LockstepBus(START) as bus:
         node = bus.add(DepthEstimatorNode, config)
-        node.model, node.told = Failing(node.model.manifest), "cuda"
+        node.model, node.published_provider = Failing(node.model.manifest), "cuda"
         bus.publish(TOPIC, compressed_image_message(picture(), "camera", START), stamp_ns=START)
         level, message, values = node.diagnoses()["depth"]
         assert (level, values["failures"]) == (2, 1)

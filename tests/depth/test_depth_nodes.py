@@ -268,7 +268,7 @@ def test_motion_is_compensated() -> None:
         node = bus.add(DepthScalerNode)
         drive(bus, 1.0)
         stamp = START + S // 5
-        points = node.points_in_camera("camera", stamp)
+        points = node.metric.points_in_camera("camera", stamp)
     assert points is not None
     in_map = transform_points(base_at(stamp) @ BASE_FROM_CAMERA, points)
     # Every point lies on a wall, floor or ceiling of the room again.

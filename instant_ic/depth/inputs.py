@@ -1,0 +1,135 @@
+"""Images and LiDAR revolutions of the last seconds: which of them belong together."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+KEEP_NS = 4_000_000_000
+"""Images and revolutions that differ more from the newest depth are discarded."""
+_MAX_IMAGES = 150
+_MAX_REVOLUTIONS = 40
+_SILENT_NS = 10_000_000_000
+
+
+@dataclass(frozen=True)
+class Revolution:
+    """A LiDAR revolution.
+
+    Attributes:
+        frame: of the points.
+        stamp_ns: of the cloud.
+        time_s: (N,) seconds after the stamp.
+        xyz: returns the points, (N, 3) in metres.
+    """
+
+    frame: str
+    stamp_ns: int
+    time_s: NDArray[np.floating]
+    xyz: Callable[[], NDArray[np.floating]]
+
+    @property
+    def middle_ns(self) -> int:
+        """Time of the middle of the revolution; of an empty one, its stamp."""
+        return self.stamp_ns + (round(0.5e9 * float(self.time_s[0] + self.time_s[-1])) if len(self.time_s) else 0)
+
+
+class RecentInputs:
+    """Images by their stamp, and revolutions."""
+
+    def __init__(self) -> None:
+        self.images: dict[int, Any] = {}
+        self.revolutions: deque[Revolution] = deque(maxlen=_MAX_REVOLUTIONS)
+
+    def add_image(self, stamp_ns: int, image: Any) -> None:
+        """Keep an image; the oldest one goes when there are too many."""
+        self.images[stamp_ns] = image
+        if len(self.images) > _MAX_IMAGES:
+            del self.images[next(iter(self.images))]
+
+    def nearest_revolution(self, stamp_ns: int, max_age_s: float) -> Revolution | None:
+        """The revolution whose middle is nearest in time; None when none is within ``max_age_s``."""
+
+        def gap_ns(revolution: Revolution) -> int:
+            return abs(revolution.middle_ns - stamp_ns)
+
+        found = min((one for one in self.revolutions if len(one.time_s)), key=gap_ns, default=None)
+        return found if found is not None and gap_ns(found) / 1e9 <= max_age_s else None
+
+    def discard(self, stamp_ns: int) -> None:
+        """Discard what lies more than ``KEEP_NS`` from a time, also ahead of it: the clock may have gone back."""
+        for old in [other for other in self.images if abs(other - stamp_ns) > KEEP_NS]:
+            del self.images[old]
+        while self.revolutions and abs(self.revolutions[0].stamp_ns - stamp_ns) > KEEP_NS:
+            self.revolutions.popleft()
+
+
+@dataclass(frozen=True)
+class HeldImage:
+    """An image of the camera frame ``frame``, taken at ``stamp_ns``."""
+
+    frame: str
+    stamp_ns: int
+
+
+class RevolutionTrigger:
+    """Chooses images at a limited rate and holds each one until the revolution around it is complete."""
+
+    def __init__(self) -> None:
+        self._held: HeldImage | None = None
+
+    def image(self, image: HeldImage, last_ns: int | None, max_rate_hz: float, max_age_s: float) -> HeldImage | None:
+        """Take a new image; returns a held one for which no revolution arrived.
+
+        Args:
+            image: the new one.
+            last_ns: stamp of the newest depth; None before the first.
+            max_rate_hz: rate by the images' stamps, with 1 % tolerance.
+            max_age_s: how long a held image waits, by the images' stamps.
+        """
+        late = None
+        if self._held is not None and abs(image.stamp_ns - self._held.stamp_ns) > max_age_s * 1e9:
+            late, self._held = self._held, None
+            last_ns = late.stamp_ns
+        if self._held is None and (last_ns is None or not 0 <= image.stamp_ns - last_ns < 0.99e9 / max_rate_hz):
+            self._held = image
+        return late
+
+    def revolution(self, middle_ns: int) -> HeldImage | None:
+        """The held image if a revolution with this middle completes it.
+
+        A later revolution would be nearer only if the image was taken in the second half of its period.
+        """
+        if self._held is None or middle_ns < self._held.stamp_ns:
+            return None
+        image, self._held = self._held, None
+        return image
+
+    def clear(self) -> None:
+        """Drop the held image."""
+        self._held = None
+
+
+class SilenceWatch:
+    """Notices that images arrive but no depth of the network."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+
+    def silent_s(self, image_ns: int, depth_ns: int | None) -> float:
+        """Seconds without depth, by the images' stamps; 0 up to a limit of 10 s.
+
+        Args:
+            image_ns: stamp of the newest image.
+            depth_ns: stamp of the newest depth; None before the first.
+        """
+        if self._since_ns is None or image_ns < self._since_ns:
+            self._since_ns = image_ns
+            return 0.0
+        silence = image_ns - max(depth_ns or 0, self._since_ns)
+        return silence / 1e9 if silence > _SILENT_NS else 0.0

@@ -1,0 +1,114 @@
+"""Metric depth of an image: the network's estimate or none, the LiDAR around it, and the poses of both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.depth.deskew import points_at
+from instant_ic.depth.inputs import RecentInputs
+from instant_ic.depth.sources import DepthResult, DepthSource, without_body
+from instant_ic.geometry.poses import Matrix
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Names of the frames: of the keyframes' poses, of motion compensation, and of the robot on the ground."""
+
+    map: str = "map"
+    odom: str = "odom"
+    base: str = "base_link"
+
+
+@dataclass(frozen=True)
+class MetricDepthConfig:
+    """Parameters.
+
+    Attributes:
+        frames: names of the frames.
+        rows: height of the result without a network's depth, which otherwise sets it.
+        body_elevation_deg: below this elevation the image shows the robot itself; -90: nowhere.
+        max_age_s: largest difference between the middle of a revolution and the image, in seconds.
+    """
+
+    frames: Frames
+    rows: int
+    body_elevation_deg: float
+    max_age_s: float
+
+
+class MetricDepth:
+    """Joins a ``DepthSource`` with the poses of camera and LiDAR.
+
+    Args:
+        source: computes depth of points and the network's estimate.
+        transforms: poses over time.
+        inputs: recent revolutions.
+        config: parameters.
+    """
+
+    def __init__(
+        self, source: DepthSource, transforms: TransformBuffer, inputs: RecentInputs, config: MetricDepthConfig
+    ) -> None:
+        self.source, self.transforms, self.inputs, self.config = source, transforms, inputs, config
+
+    def estimate(self, raw: NDArray[np.float32] | None, camera: str, stamp_ns: int) -> DepthResult:
+        """Depth of an image; if something is missing the result is not ok, and its message says what.
+
+        Args:
+            raw: (H, W) the network's depth; None for source ``lidar``.
+            camera: the camera's frame.
+            stamp_ns: the image's time.
+        """
+        config, size = self.config, (self.config.rows, 2 * self.config.rows)
+        try:
+            up, height_m = self.camera_stance(camera, stamp_ns)
+            if raw is not None and self.source.config.scaler.method == "as_estimated":
+                # Not masked: a camera at another place has another height.
+                return self.source.estimate(raw, np.empty((0, 3)), up, height_m, size=size)
+            points = self.points_in_camera(camera, stamp_ns)
+        except TransformError as error:
+            return self.source.refuse(raw, str(error), size)
+        if points is None:
+            return self.source.refuse(raw, f"no LiDAR revolution within {config.max_age_s} s", size)
+        result = self.source.estimate(raw, points, up, height_m, size=size)
+        return without_body(result, up, height_m, config.body_elevation_deg)
+
+    def camera_stance(self, camera: str, stamp_ns: int) -> tuple[NDArray[np.float64], float]:
+        """Up direction in the camera's frame (odometry is level), and the camera's height above the ground.
+
+        Raises:
+            TransformError: the poses are not known.
+        """
+        base_from_camera = self.transforms.lookup(self.config.frames.base, camera, stamp_ns)
+        odom_from_camera = self.transforms.lookup(self.config.frames.odom, camera, stamp_ns)
+        return np.array(odom_from_camera[2, :3]), float(base_from_camera[2, 3])
+
+    def points_in_camera(self, camera: str, stamp_ns: int) -> NDArray[np.float64] | None:
+        """(N, 3) motion-compensated points in the camera's frame at ``stamp_ns``; None without a revolution near it.
+
+        Raises:
+            TransformError: the poses are not known.
+        """
+        revolution = self.inputs.nearest_revolution(stamp_ns, self.config.max_age_s)
+        if revolution is None:
+            return None
+        odom, lidar = self.config.frames.odom, revolution.frame
+        camera_from_odom = self.transforms.lookup(camera, odom, stamp_ns)
+
+        def camera_from_lidar(at_ns: int) -> Matrix:
+            return camera_from_odom @ self.transforms.lookup(odom, lidar, at_ns)
+
+        return points_at(revolution.xyz(), revolution.time_s, revolution.stamp_ns, camera_from_lidar)
+
+    def map_from_camera(self, camera: str, stamp_ns: int) -> Matrix:
+        """Odometry at the image's time with the newest correction: the map as known at present.
+
+        Raises:
+            TransformError: the poses are not known.
+        """
+        map_from_odom = self.transforms.lookup(self.config.frames.map, self.config.frames.odom)
+        return map_from_odom @ self.transforms.lookup(self.config.frames.odom, camera, stamp_ns)

@@ -1,0 +1,151 @@
+"""The simulation in real time with its devices on their real protocols."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from instant_ic.pace import current
+from instant_ic.sim.capture_replay import CaptureReplay
+from instant_ic.sim.roboclaw import RoboClawServer
+from instant_ic.sim.simulation import Simulation, SimulationConfig
+from instant_ic.sim.theta import ThetaServer, panorama_file
+from instant_ic.sim.vlp16 import Vlp16Server
+
+_STEP_S = 0.01
+_MAX_WAIT_S = 0.3
+"""Longest wait for a running step at shutdown."""
+_MAX_LAG_S = 0.25
+"""Most simulated time to catch up on at once after a stall."""
+
+
+@dataclass(frozen=True)
+class DevicesConfig(SimulationConfig):
+    """Parameters of the simulation and its devices.
+
+    Attributes:
+        panorama: image file that the camera shows instead of the world; empty: the world.
+        pcap: VLP-16 recording to send instead of simulated packets; empty: the world.
+        pcap_loop: whether to restart the recording at its end.
+    """
+
+    panorama: str = ""
+    pcap: str = ""
+    pcap_loop: bool = True
+
+
+class SimulatedDevices:
+    """The enabled devices of a simulation, open until ``close``.
+
+    Args:
+        config: parameters.
+        simulation: robot and world.
+        serial_folder: folder of the link to the motor controller's pseudo-terminal.
+        log: receives the devices' addresses.
+
+    Raises:
+        ValueError, OSError, CaptureError: a device cannot be opened.
+    """
+
+    def __init__(self, config: DevicesConfig, simulation: Simulation, serial_folder: Path, log: logging.Logger) -> None:
+        self.scanner: Vlp16Server | CaptureReplay | None = None
+        self.camera: ThetaServer | None = None
+        self._base: RoboClawServer | None = None
+        self._simulation = simulation
+        try:
+            self._open(config, serial_folder, log)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, config: DevicesConfig, serial_folder: Path, log: logging.Logger) -> None:
+        simulation, lidar = self._simulation, config.lidar
+        if lidar.enabled and config.pcap:
+            path = Path(config.pcap).expanduser()
+            self.scanner = CaptureReplay(path, lidar.host, lidar.data_port, lidar.position_port, config.pcap_loop)
+        elif lidar.enabled:
+            self.scanner = Vlp16Server(simulation.scanner)
+        if config.camera.enabled:
+            if not config.panorama:
+                self._see(config.camera.width, config.camera.height)  # compiles before the clock starts
+            source = panorama_file(Path(config.panorama).expanduser()) if config.panorama else self._see
+            self.camera = ThetaServer(config.camera, source, config.seed)
+            log.info("Theta Web API on http://%s:%d", config.camera.host, self.camera.port)
+        if config.base.enabled:
+            link = serial_folder / config.base.link
+            self._base = RoboClawServer(simulation.controller, simulation.lock, link)
+            log.info("RoboClaw on %s (%s)", link, self._base.device)
+
+    def close(self) -> None:
+        """Close the devices."""
+        for device in (self._base, self.camera, self.scanner):
+            if device is not None:
+                device.close()
+
+    def _see(self, width: int, height: int) -> npt.NDArray[np.uint8]:
+        return self._simulation.panorama(width, height).rgb
+
+
+class RealTimeLoop:
+    """Keeps simulated time at the stack's time, in a thread of its own.
+
+    Args:
+        simulation: it is stepped.
+        scanner: sends what it has scanned after each step.
+        on_fault: called on the thread when a step fails; the loop has ended then.
+
+    Attributes:
+        fault: the error that ended the loop; None while it runs.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        scanner: Vlp16Server | CaptureReplay | None,
+        on_fault: Callable[[Exception], None],
+    ) -> None:
+        self.fault: Exception | None = None
+        self._simulation, self._scanner, self._on_fault = simulation, scanner, on_fault
+        self._paused_s = 0.0
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="simulation", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the loop; waits at most 0.3 s for a running step."""
+        self._stopped.set()
+        self._thread.join(_MAX_WAIT_S)
+
+    def take_paused_s(self) -> float:
+        """Seconds for which the simulation has paused since the last call, because the machine stalled."""
+        paused, self._paused_s = self._paused_s, 0.0
+        return paused
+
+    def _run(self) -> None:
+        simulation, pace = self._simulation, current()
+        offset = pace.steady_s() - simulation.time_s
+        simulation.start_ns = pace.now_ns() - round(simulation.time_s * 1e9)
+        try:
+            while not self._stopped.is_set():
+                lag = pace.steady_s() - offset - simulation.time_s
+                if lag < _STEP_S:
+                    pace.sleep(_STEP_S - lag)
+                    continue
+                if lag > _MAX_LAG_S:
+                    # The machine stalled: the robot stands too, and the devices pause instead of catching up.
+                    self._paused_s += lag - _MAX_LAG_S
+                    offset += lag - _MAX_LAG_S
+                    simulation.start_ns += round((lag - _MAX_LAG_S) * 1e9)
+                    lag = _MAX_LAG_S
+                simulation.step(lag)
+                if self._scanner is not None:
+                    self._scanner.pump(simulation.time_s)
+        except Exception as error:  # noqa: BLE001 - a thread's fault must reach the diagnostics
+            self.fault = error
+            self._on_fault(error)
