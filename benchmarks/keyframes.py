@@ -20,8 +20,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from skimage.metrics import structural_similarity
 
+from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.config import PictureConfig
@@ -35,14 +35,9 @@ STEP_M, KEYFRAME_M, AHEAD_M, WAY_M = 0.05, 0.75, 0.6, 3.0
 """The drive: distance between views, between keyframes, of the view ahead of the robot, and in total."""
 
 
-def psnr(picture: Any, truth: Any) -> float:
-    """PSNR in dB."""
-    return 10 * math.log10(255**2 / max(float(np.mean((picture.astype(float) - truth) ** 2)), 1e-3))
-
-
-def score(picture: Any, truth: Any) -> tuple[float, float]:
-    """PSNR and SSIM (7 × 7 uniform window)."""
-    return round(psnr(picture, truth), 2), round(float(structural_similarity(picture, truth, channel_axis=2)), 3)
+def score(view: Any, truth: Any) -> tuple[float, float]:
+    """PSNR in dB and SSIM."""
+    return round(psnr_db(view, truth), 2), round(ssim(view, truth), 3)
 
 
 class World:
@@ -138,9 +133,9 @@ def refresh(world: World, _: argparse.Namespace) -> dict[str, Any]:
                 space.show(space.prepare(*taken[-1]), dissolve=True)
             pose = pose_matrix(x + AHEAD_M, 0.15 * math.sin(2 * x), yaw=0.2 * math.sin(1.5 * x))
             real, shown = world.truth(pose), world.view(space, pose)
-            quality.append(psnr(shown.rgb, real))
+            quality.append(psnr_db(shown.rgb, real))
             if len(taken) > 1:
-                drops.append(psnr(world.view(before, pose).rgb, real) - quality[-1])
+                drops.append(psnr_db(world.view(before, pose).rgb, real) - quality[-1])
             both = shown.confidence == 0 if last is None else (shown.confidence == 0) & (last.confidence == 0)
             if last is not None and both.any():
                 flicker.append(float(np.abs(shown.rgb[both].astype(float) - last.rgb[both]).mean()))

@@ -28,11 +28,11 @@ import cv2
 import numpy as np
 from numba import njit
 from peer_hash import peer_encoding
-from skimage.metrics import structural_similarity
 
 from instant_ic import paths
 from instant_ic.depth.model import DEFAULT_MODEL, DepthModel
 from instant_ic.experiments import box_room
+from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace import FieldConfig, PictureConfig, VirtualSpace, VirtualSpaceConfig
@@ -168,10 +168,6 @@ def scene(world: str) -> tuple[Any, Any, list[Any], list[Any]]:
     return renderer.render(keyframe, 1024, 512), keyframe, poses, truth
 
 
-def psnr_db(a: Any, b: Any) -> float:
-    return 10 * math.log10(255**2 / float(np.mean((a.astype(np.float64) - b) ** 2)))
-
-
 def point_warp(picture: Any, depth_m: Any, pose: Any, view_pose: Any, width: int, height: int) -> Any:
     """Render the panorama's pixels as points, nearest on top; holes are filled from their surroundings."""
     directions = equirect_directions(*picture.shape[1::-1])
@@ -210,10 +206,7 @@ def against_warp(picture: Any, pose: Any, poses: list[Any], truth: list[Any], it
             space.train(iterations=iterations)
             views[label] = [space.render(p, *SIZES[0], FOV).rgb for p in poses]
         for label, drawn in views.items():
-            result[f"{name}_{label}"] = [
-                (round(psnr_db(a, b), 2), round(float(structural_similarity(a, b, channel_axis=2)), 3))
-                for a, b in zip(drawn, truth, strict=True)
-            ]
+            result[f"{name}_{label}"] = scores(drawn, truth)
     return result
 
 
@@ -266,10 +259,7 @@ def time_to_quality(world: str, seconds: float, source: str) -> dict[str, Any]:
 
 def scores(drawn: list[Any], truth: list[Any]) -> list[tuple[float, float]]:
     """PSNR in dB and SSIM of each view."""
-    return [
-        (round(psnr_db(a, b), 2), round(float(structural_similarity(a, b, channel_axis=2)), 3))
-        for a, b in zip(drawn, truth, strict=True)
-    ]
+    return [(round(psnr_db(a, b), 2), round(ssim(a, b), 3)) for a, b in zip(drawn, truth, strict=True)]
 
 
 def geometries(world: str, seconds: float) -> dict[str, Any]:

@@ -18,9 +18,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from nerf import FOV, psnr_db, scene
+from nerf import FOV, scene
 
 from instant_ic import paths
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.vspace import PictureConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace.view import perspective_rays
 

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from instant_ic.experiments.depth_worlds import Scene, scenes
+from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import VirtualSpace, VirtualSpaceConfig, readiness
 from instant_ic.vspace.view import perspective_rays
@@ -62,7 +63,7 @@ def samples(kind: str, scene: Scene) -> list[dict[str, Any]]:
             mse = float(np.mean((picture.rgb.astype(float) - real) ** 2)) / 255**2
             rows.append({
                 "world": kind, "sigma": sigma, "distance_m": distance, "terms": terms,
-                "psnr_db": -10 * math.log10(max(mse, 1e-6)), "expected_db": space.expected_psnr_db(view),
+                "psnr_db": psnr_of_mse(mse), "expected_db": space.expected_psnr_db(view),
             })  # fmt: skip
     return rows
 

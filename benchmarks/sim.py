@@ -16,6 +16,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.robot import RobotConfig
@@ -28,11 +29,6 @@ def cpu_ms(call: Callable[[], object]) -> float:
     began = time.thread_time()
     call()
     return 1e3 * (time.thread_time() - began)
-
-
-def psnr(picture: np.ndarray, truth: np.ndarray) -> float:
-    """Peak signal-to-noise ratio of two 8-bit images, dB."""
-    return float(10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2)))
 
 
 def measure(world_name: str, poses: int, seed: int) -> dict[str, object]:
@@ -50,7 +46,7 @@ def measure(world_name: str, poses: int, seed: int) -> dict[str, object]:
         picture = renderer.render(pose, 1024, 512).rgb
         jpeg_ms.append(cpu_ms(lambda p=picture: cv2.imencode(".jpg", p, [cv2.IMWRITE_JPEG_QUALITY, 92])))  # type: ignore[misc]
         if number < 5:
-            quality_db.append(psnr(picture, renderer.render(pose, 1024, 512, supersample=4).rgb))
+            quality_db.append(psnr_db(picture, renderer.render(pose, 1024, 512, supersample=4).rgb))
 
     def seconds(duration_s: float) -> None:
         for _ in range(round(duration_s * 100)):

@@ -22,6 +22,7 @@ import numpy as np
 
 from instant_ic.experiments.vspace import evaluate, path_poses, scores, start_pose
 from instant_ic.experiments.vspace_sources import CAMERA_HEIGHT_M, VspaceSettings
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.worlds import make_world
@@ -76,8 +77,7 @@ def resolution(renderer: EquirectRenderer, pose: Any, depth_m: Any, full: Any, s
     for name, rgb in panoramas.items():
         drawn = PanoramaWarp(rgb, depth_m, pose).render(view, *size, FOV)
         psnr, ssim = scores(drawn.rgb, truth)
-        error = (drawn.rgb.astype(np.float64) - truth)[drawn.confidence > 0]
-        seen = 10 * math.log10(255**2 / float(np.mean(error**2)))
+        seen = psnr_db(drawn.rgb[drawn.confidence > 0], truth[drawn.confidence > 0])
         result[name] = {"psnr_db": round(psnr, 2), "ssim": round(ssim, 4), "psnr_db_of_what_is_seen": round(seen, 2)}
     return result
 

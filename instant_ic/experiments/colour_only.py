@@ -12,6 +12,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace import View, VirtualSpaceConfig
 from instant_ic.vspace.nerf import kernels
 from instant_ic.vspace.nerf.field import (
@@ -74,7 +75,7 @@ class ColourOnlyField:
             self._schedule.iteration += 1
             if time.process_time() - start >= cpu_seconds:
                 break
-        return -10 * math.log10(max(error, 1e-10)) if not math.isnan(error) else math.nan
+        return psnr_of_mse(error)
 
     def _step(self) -> float:
         height, width = self._rgb.shape[:2]

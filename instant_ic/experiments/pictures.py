@@ -27,12 +27,6 @@ def perspective_crop(
     return np.clip(np.rint(sample_equirect(panorama, directions)), 0, 255).astype(np.uint8)
 
 
-def psnr_db(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
-    """Peak signal-to-noise ratio of two 8-bit images, dB; inf if they are equal."""
-    error = float(np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2))
-    return float("inf") if error == 0 else 10 * float(np.log10(255.0**2 / error))
-
-
 def correlation(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
     """Pearson correlation of two images' values, −1..1; 0 if one of them is uniform."""
     x, y = (picture.astype(np.float64).ravel() - float(picture.mean()) for picture in (a, b))

@@ -22,12 +22,12 @@ from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.experiments.pictures import (
     correlation,
     perspective_crop,
-    psnr_db,
     save_depth,
     save_map,
     save_view_strip,
 )
 from instant_ic.experiments.stack import Stack, StackError, free_ports
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import inverse, pose_matrix, yaw_of
 from instant_ic.msg import grid_array, image_array, message_type, pose_message, stamp_ns, to_time
 from instant_ic.msg import pose_matrix as matrix_of_pose

@@ -33,6 +33,7 @@ from instant_ic.experiments.teleop_stack import (
     StackConfig,
 )
 from instant_ic.experiments.teleop_worlds import Course, floor_plan
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 
 FloatArray: TypeAlias = NDArray[np.float64]
@@ -129,8 +130,6 @@ class _Episode:
         return replace(switch, psnr_db=self._psnr_db(*found))
 
     def _psnr_db(self, before: Shown, after: Shown) -> float:
-        from instant_ic.experiments.pictures import psnr_db
-
         view, photo = (before, after) if before.virtual else (after, before)
         rgb = decode(view.jpeg)
         return psnr_db(rgb, photograph(self.stack, photo, rgb.shape[1], rgb.shape[0], view.fov_rad))

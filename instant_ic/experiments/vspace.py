@@ -23,6 +23,7 @@ from instant_ic.experiments.vspace_sources import (
     take_shot,
     train,
 )
+from instant_ic.geometry.image_quality import psnr_db, ssim
 from instant_ic.geometry.poses import pose_matrix
 
 if TYPE_CHECKING:
@@ -187,14 +188,7 @@ def start_pose(world: World, start: tuple[float, float, float] | None) -> tuple[
 
 def scores(picture: Picture, truth: Picture) -> tuple[float, float]:
     """PSNR (dB, at most 99) and SSIM of two images (H, W, 3) uint8."""
-    from skimage.metrics import structural_similarity
-
-    from instant_ic.experiments.pictures import psnr_db
-
-    ssim = structural_similarity(
-        picture, truth, channel_axis=2, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
-    )
-    return min(psnr_db(picture, truth), 99.0), float(ssim)
+    return min(psnr_db(picture, truth), 99.0), ssim(picture, truth)
 
 
 def evaluate(

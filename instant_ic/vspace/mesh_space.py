@@ -1,7 +1,7 @@
-"""Conventional illusory control: a place that was scanned beforehand, drawn as it is (paper, section II).
+"""Conventional illusory control: a place that was scanned beforehand, rendered as it is (paper, section II).
 
 The same calls as ``VirtualSpace``, but nothing is learnt: READY at once, and a keyframe only tells how alike the mesh
-and the camera's picture are, and what the colours have to be multiplied by.
+and the camera's image are, and what the colours have to be multiplied by.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.raycast import RayCaster
 from instant_ic.vspace.config import VirtualSpaceConfig
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from instant_ic.vspace.prior import PanoramaPrior
 
 EDGE_RATIO = 0.03
-"""Neighbouring depths that differ by more than this share are an edge: such pixels are drawn by four rays."""
+"""Neighbouring depths that differ by more than this share are an edge: such pixels are rendered by four rays."""
 _SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 _PROBE_WIDTH = 256
 """Pixels of the panoramas by which mesh and camera are compared."""
@@ -74,7 +75,7 @@ def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_
 
 
 class MeshSpace(Drawn):
-    """A mesh in the map, drawn by ray casting. One thread at a time.
+    """A mesh in the map, rendered by ray casting. One thread at a time.
 
     Raises:
         MeshError: the file cannot be used; the message says why.
@@ -85,7 +86,7 @@ class MeshSpace(Drawn):
     """
 
     keyframe = None
-    """None of the pictures comes from one."""
+    """None of the images comes from one."""
 
     def __init__(self, config: VirtualSpaceConfig) -> None:
         self.config = config
@@ -102,7 +103,7 @@ class MeshSpace(Drawn):
         self._mse = math.nan
         self._variance = 0.0
         self._warning = ""
-        self.render(np.eye(4), 32, 16, 1.0)  # kernels are compiled now, not at the operator's first picture
+        self.render(np.eye(4), 32, 16, 1.0)  # kernels are compiled now, not at the operator's first image
 
     def set_keyframe(
         self,
@@ -176,7 +177,7 @@ class MeshSpace(Drawn):
 
     @property
     def _psnr_db(self) -> float:
-        return -10 * math.log10(max(self._mse, 1e-10)) if self._mse == self._mse else math.nan
+        return psnr_of_mse(self._mse)
 
     @property
     def status(self) -> Status:
@@ -211,7 +212,7 @@ class MeshSpace(Drawn):
         rgb = np.rint(np.clip(image, 0, 1) * np.float32(255)).astype(np.uint8)
         unseen = float(np.mean(confidence == 0))
         mse = (1 - unseen) * self._mse + UNSEEN_GAIN * unseen * self._variance
-        return View(rgb, depth, confidence, projection, -10 * math.log10(max(mse, 1e-10)) if mse == mse else math.nan)
+        return View(rgb, depth, confidence, projection, psnr_of_mse(mse))
 
     def _draw(self, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Colours (P, 3) in 0..1, range (P,) with 0 where nothing is met, and confidence (P,)."""

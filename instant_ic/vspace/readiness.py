@@ -1,6 +1,6 @@
-"""How good a picture from a pose will be, without its truth: expected PSNR.
+"""How good an image from a pose will be, without its truth: expected PSNR.
 
-Two things make a picture differ from the truth: the depth's error moves surfaces aside, and some have not been seen at
+Two things make an image differ from the truth: the depth's error moves surfaces aside, and some have not been seen at
 all. What a shift of some radians costs is read off the panorama itself: the mean squared difference between it and
 itself turned by that angle. (The detail that a near surface lacks was tried as a third: the fit gave it no weight.)
 """
@@ -14,13 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import PanoramaPrior, area_average
 
 _ROWS = 128
 _TURNS = np.array([1, 2, 3, 5, 8, 13, 21, 34])
 BASE_MSE = 8.8e-5
-"""Of a picture from the keyframe's own place: sampling alone."""
+"""Of an image from the keyframe's own place: sampling alone."""
 SHIFT_GAIN, UNSEEN_GAIN = 0.76, 1.98
 """These three are fitted on simulated rooms: ``benchmarks/readiness.py --fit``."""
 
@@ -53,9 +54,9 @@ def error_terms(
     """Squared errors (0..1 units) of a view by shift and by what is unseen, before they are weighted.
 
     Args:
-        priors: keyframes that the view is drawn from; a surface counts for the one that sees it most alike.
+        priors: keyframes that the view is rendered from; a surface counts for the one that sees it most alike.
         texture: of the newest.
-        rays, depth, confidence: the view, (P,) each, as drawn.
+        rays, depth, confidence: the view, (P,) each, as rendered.
     """
     seen = confidence > 0
     unseen = float(1 - seen.mean())
@@ -74,8 +75,8 @@ def error_terms(
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:
-    """PSNR from ``error_terms``; what of the picture the field draws has at least its own error in training."""
+    """PSNR from ``error_terms``; what of the image the field renders has at least its own error in training."""
     shift, unseen = terms
     training = 0.0 if panorama_share == 1 else (1 - panorama_share) * 10 ** (-training_psnr_db / 10)
     mse = BASE_MSE + SHIFT_GAIN * shift + UNSEEN_GAIN * unseen + training
-    return -10 * math.log10(mse)
+    return psnr_of_mse(mse)

@@ -1,4 +1,4 @@
-"""The virtual space: one keyframe's panorama and depth, trained and drawn by turns (paper, IV.A-B)."""
+"""The virtual space: one keyframe's panorama and depth, trained and rendered by turns (paper, IV.A-B)."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.image_quality import psnr_of_mse
 from instant_ic.vspace.canvas import Drawing, Painted, Picture
 from instant_ic.vspace.compose import exposure_gains, moved
 from instant_ic.vspace.config import VirtualSpaceConfig
@@ -31,7 +32,7 @@ from instant_ic.vspace.store import Keyframe, KeyframeSet, KeyframeStore, ready
 from instant_ic.vspace.view import Drawn, View, checked_pose, perspective_rays
 
 T = TypeVar("T")
-_PROBE = (64, 36)  # pixels of the picture that readiness is judged by
+_PROBE = (64, 36)  # pixels of the image that readiness is judged by
 
 
 class State(enum.IntEnum):
@@ -82,7 +83,7 @@ class Status:
 
 
 class NotReadyError(RuntimeError):
-    """Asked for training or a picture before the first keyframe."""
+    """Asked for training or an image before the first keyframe."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,7 @@ class VirtualSpace(Drawn):
 
         Args:
             config: parameters.
-            robot: picture (H, 2 H): true where panoramas show the robot itself or its stand, besides what
+            robot: image (H, 2 H): true where panoramas show the robot itself or its stand, besides what
                 ``config.geometry.body_below_deg`` says.
 
         Raises:
@@ -120,15 +121,15 @@ class VirtualSpace(Drawn):
         """
         self.config = config or VirtualSpaceConfig()
         if self.config.source == "mesh":
-            raise ValueError("source is mesh: nothing is learnt there; use make_space, which draws the mesh")
+            raise ValueError("source is mesh: nothing is learnt there; use make_space, which renders the mesh")
         self._robot = robot
         self._device, self._warning = make_device(self.config)
         self._can_warp = importlib.util.find_spec("numba") is not None
         # Shown, one that is being dissolved into them, and one that is made ready meanwhile.
         self._store = KeyframeStore(self.config.keyframes + 2)
         self._shown: KeyframeSet | None = None
-        self._before: KeyframeSet | None = None  # what pictures showed before, until these have taken over
-        self._pictures = 0  # drawn since then
+        self._before: KeyframeSet | None = None  # what images showed before, until these have taken over
+        self._pictures = 0  # rendered since then
         self._scene: Scene | None = None  # what the field learns
         self._held: tuple[Keyframe, ...] = ()  # whose arrays the scene looks at
         self._texture: tuple[PanoramaPrior, Texture] | None = None
@@ -147,17 +148,17 @@ class VirtualSpace(Drawn):
 
     @property
     def keyframe(self) -> PanoramaPrior | None:
-        """The newest keyframe that pictures show."""
+        """The newest keyframe that images show."""
         return None if self._shown is None else self._shown.keyframes[0].prior
 
     @property
     def keyframes(self) -> tuple[PanoramaPrior, ...]:
-        """All keyframes that pictures show, newest first."""
+        """All keyframes that images show, newest first."""
         return () if self._shown is None else self._shown.priors
 
     @property
     def _psnr_db(self) -> float:
-        return -10 * math.log10(max(self._colour_error, 1e-10))  # NaN stays NaN
+        return psnr_of_mse(self._colour_error)
 
     @property
     def _done(self) -> bool:
@@ -192,7 +193,7 @@ class VirtualSpace(Drawn):
         """Makes a new keyframe ready to be shown, with those before it that are kept; changes nothing that is shown.
 
         Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), in the new one's exposure and
-        without what has moved; none where its pictures have another size. May run in a thread of its own beside all
+        without what has moved; none where its images have another size. May run in a thread of its own beside all
         other calls; one keyframe at a time, and each must be shown before the next.
 
         Args: as ``prior.prepare``.
@@ -221,9 +222,9 @@ class VirtualSpace(Drawn):
         return KeyframeSet(keyframes, exposure_gains([keyframe.prior for keyframe in keyframes]))
 
     def show(self, prepared: KeyframeSet, dissolve: bool = False) -> None:
-        """Pictures show these keyframes from now on.
+        """Images show these keyframes from now on.
 
-        ``dissolve``: what was shown before passes into them over the next ``picture.refresh_pictures`` pictures.
+        ``dissolve``: what was shown before passes into them over the next ``picture.refresh_pictures`` images.
         """
         self._before, self._pictures = self._shown if dissolve else None, 0
         self._shown = prepared
@@ -249,7 +250,7 @@ class VirtualSpace(Drawn):
     def learn(self, prepared: Prepared) -> None:
         """The field learns these keyframes from now on, from what it has learnt before.
 
-        Where the scale has changed by more than a factor of 2 it starts anew. A failing device leaves the old space.
+        Where the scale has changed by more than a factor of 2 it starts again. A failing device leaves the old space.
         """
         scene, old = prepared.scene, self._scene
         refresh = old is not None and scene.lattice is old.lattice
@@ -361,7 +362,7 @@ class VirtualSpace(Drawn):
         return self._judge(rays, depth, confidence)
 
     def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
-        """Expected PSNR of a view as it was drawn, (P,) each; a few thousand pixels tell it."""
+        """Expected PSNR of a view as it was rendered, (P,) each; a few thousand pixels tell it."""
         step = max(1, rays.shape[1] // _PROBE[0])
         height, width = rays.shape
         chosen = np.arange(step // 2, height, step)[:, None] * width + np.arange(step // 2, width, step)
@@ -385,7 +386,7 @@ class VirtualSpace(Drawn):
         return View(rgb, depth.reshape(rays.shape), confidence.reshape(rays.shape), projection, expected)
 
     def _learn_what_is_drawn(self, around: bool) -> None:
-        """Gives the field the keyframes that are shown where it is drawn too, and has none yet."""
+        """Gives the field the keyframes that are shown where it is rendered too, and has none yet."""
         if self._scene is None and (self._panorama_share < 1 or around or not self._can_warp):
             assert self._shown is not None
             self.learn(self.scene_of(self._shown))
@@ -394,7 +395,7 @@ class VirtualSpace(Drawn):
         """A view of what is shown, passing over from what was shown before; ``around``: a panorama, not warped."""
         assert self._shown is not None
         canvas, warps = device.canvas, self._can_warp and not around
-        layers: dict[int, Drawing] = {}  # a keyframe of both sets is drawn once
+        layers: dict[int, Drawing] = {}  # a keyframe of both sets is rendered once
         picture = self._drawn(device, rays, self._shown, warps, layers)
         image = canvas.continued(picture, rays.shape, around)
         if self._before is not None:
@@ -445,9 +446,9 @@ class VirtualSpace(Drawn):
         )
 
     def save(self, path: str | Path) -> Path:
-        """Saves the space that pictures show as one ``.npz`` file; ``path`` is that or a folder. Returns the file.
+        """Saves the space that images show as one ``.npz`` file; ``path`` is that or a folder. Returns the file.
 
-        The optimiser's moments are not in it: training that goes on from a file starts them anew.
+        The optimiser's moments are not in it: training that goes on from a file starts them again.
 
         Raises:
             NotReadyError: no keyframe yet.
@@ -468,7 +469,7 @@ class VirtualSpace(Drawn):
 
     @classmethod
     def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
-        """The space of a file (or of the folder it lies in). Its pictures have the same bits as before, on the CPU.
+        """The space of a file (or of the folder it lies in). Its images have the same bits as before, on the CPU.
 
         Args:
             path: what ``save`` was given.
@@ -489,7 +490,7 @@ class VirtualSpace(Drawn):
         space._colour_error = 10 ** (-progress.psnr_db / 10)
         space._train_seconds, space._ready_iterations = progress.train_seconds, progress.ready_iterations
         space._ready = progress.ready
-        # Rays that were not drawn before, the same at each loading.
+        # Rays that were not sampled before, the same at each loading.
         space._rng = np.random.default_rng((saved.config.train.seed, progress.iteration))
         return space
 

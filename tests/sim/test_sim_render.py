@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from sim_oracles import box_range
 
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions, perspective_directions
 from instant_ic.sim.building import Building, Finish, Zone
@@ -15,10 +16,6 @@ from instant_ic.sim.render import EquirectRenderer
 from instant_ic.sim.textures import linear_to_srgb, make_texture, pyramid, srgb_to_linear
 from instant_ic.sim.world import Material, World, WorldBuilder
 from instant_ic.sim.worlds import load_world, make_world
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return 10 * math.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
 
 
 def test_panorama_depth_is_the_distance_to_the_walls(box_room: World) -> None:
@@ -122,7 +119,7 @@ def test_edges_and_textures_come_close_to_a_supersampled_picture(corridor: World
     renderer, pose = EquirectRenderer(corridor), pose_matrix(z=1.2)
     plain = renderer.render(pose, 512, 256).rgb
     fine = renderer.render(pose, 512, 256, supersample=4).rgb
-    assert psnr(plain, fine) > 36
+    assert psnr_db(plain, fine) > 36
 
 
 def test_light_is_darker_under_things_and_lamps_are_white() -> None:

@@ -138,7 +138,7 @@ def test_the_check_compares_pictures_too():
             return 1 - colour, depth, confidence
 
     check_device(Broken, plain, CONFIG.field)
-    with pytest.raises(DeviceError, match="of a picture's pixels"):
+    with pytest.raises(DeviceError, match="of an image's pixels"):
         check_device(WrongColours, plain, CONFIG.field)
 
 
@@ -154,5 +154,5 @@ def test_the_check_compares_warped_pictures_too():
     for fault in ("colour", "depth", "confidence"):
         wrong = WrongCanvas("cpu")
         wrong.fault = fault
-        with pytest.raises(DeviceError, match="of a warped picture's pixels"):
+        with pytest.raises(DeviceError, match="of a warped image's pixels"):
             check_canvas(wrong, CpuCanvas(), (48, 27))

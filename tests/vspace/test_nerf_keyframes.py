@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from instant_ic.experiments import box_room
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, ReadinessConfig, State, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace import compose as composing
@@ -25,10 +26,6 @@ CONFIG = VirtualSpaceConfig(
 )
 FIRST, SECOND = pose_matrix(x=-1.5, y=0.5), pose_matrix(x=2.8, y=0.9, yaw=0.5)
 VIEW = pose_matrix(x=1.0, y=-1.0, yaw=0.9)  # towards the box, whose far side only the second has seen
-
-
-def psnr_db(a, b):
-    return 10 * math.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
 
 
 def prior_of(pose, gain=1.0, depth=None, height=64):

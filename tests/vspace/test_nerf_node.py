@@ -10,6 +10,7 @@ import pytest
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.experiments import box_room
 from instant_ic.geometry.depth_picture import decode_depth, encode_depth
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.msg import (
     Keyframe,
@@ -105,8 +106,7 @@ def test_trains_draws_and_comes_to_rest(bus):
     assert views[0].confidence > 0.9
     picture = cv2.imdecode(views[0].image.data, cv2.IMREAD_COLOR)[..., ::-1]
     truth = box_room.perspective(CAMERA, 160, 90, 1.57).rgb
-    psnr = 10 * np.log10(255**2 / np.mean((picture.astype(float) - truth) ** 2))
-    assert psnr > 20  # a flat grey of the right mean scores about 15
+    assert psnr_db(picture, truth) > 20  # a flat grey of the right mean scores about 15
     assert len(bus.messages("/vspace/image/compressed")) == 2
 
 
@@ -116,7 +116,7 @@ def test_the_first_view_comes_before_any_training(bus):
     (view,) = bus.messages("/vspace/view")
     picture = cv2.imdecode(view.image.data, cv2.IMREAD_COLOR)[..., ::-1]
     true = box_room.perspective(CAMERA, 160, 90, 1.57)
-    assert 10 * np.log10(255**2 / np.mean((picture.astype(float) - true.rgb) ** 2)) > 20
+    assert psnr_db(picture, true.rgb) > 20
     # The page gets its depth along, small; by a hundredth of the range, and but for a few edges.
     inverse = decode_depth(view.depth_png.tobytes(), view.depth_near_m)
     assert inverse.shape == (54, 96)

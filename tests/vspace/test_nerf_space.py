@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from instant_ic.experiments import box_room
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import (
     FieldConfig,
@@ -32,10 +33,6 @@ CONFIG = VirtualSpaceConfig(
 )
 FIELD_ONLY = dataclasses.replace(CONFIG, picture=PictureConfig(field_from_db=30))
 CAMERA = pose_matrix(x=0.4, y=0.1, z=0.05, yaw=-0.5)
-
-
-def psnr_db(a, b):
-    return 10 * math.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9))
 
 
 def trained(iterations, config=CONFIG, sigma=0.02):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from instant_ic.experiments import box_room
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import CUBE_FACES, equirect_to_cube
 from instant_ic.vspace import FieldConfig, NotReadyError, TrainConfig, View, VirtualSpace, VirtualSpaceConfig
@@ -16,10 +17,6 @@ CONFIG = VirtualSpaceConfig(
 )
 CAMERA = pose_matrix(x=0.4, y=0.1, z=0.05, yaw=-0.5)
 ASIDE = pose_matrix(x=0.9, y=-0.4, yaw=0.8, pitch=0.1)
-
-
-def psnr_db(a, b):
-    return 10 * math.log10(255**2 / np.mean((a.astype(float) - b) ** 2))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from instant_ic.experiments import box_room
-from instant_ic.experiments.pictures import psnr_db
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import FieldConfig, PictureConfig, TrainConfig, VirtualSpace, VirtualSpaceConfig
 from instant_ic.vspace import torch_warp as kernels
