@@ -1,4 +1,4 @@
-"""Depth as a picture for people."""
+"""Colour images of depth."""
 
 from __future__ import annotations
 

@@ -17,13 +17,13 @@ def points_at(
     camera_from_lidar: Callable[[int], NDArray[np.float64]],
     slices: int = 12,
 ) -> NDArray[np.float64]:
-    """Moves every point from where the LiDAR was when it measured it.
+    """Motion-compensate points, each by the LiDAR's pose at its own time.
 
     Args:
         points: (N, 3) in the LiDAR's frame, each at its own time; points that are not finite are left out.
         time_s: (N,) seconds after ``start_ns``.
         start_ns: stamp of the cloud.
-        camera_from_lidar: pose of the LiDAR at a time (ns) in the camera's frame at the picture's time.
+        camera_from_lidar: pose of the LiDAR at a time (ns) in the camera's frame at the image's time.
         slices: stretches between poses of a revolution; a point between two poses is blended from where both put it.
             At 10 Hz and 2 rad/s twelve leave 0.04 mm at 1 m.
 

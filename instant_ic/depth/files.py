@@ -1,4 +1,4 @@
-"""Pictures and depth from files: what the commands read.
+"""Images and depth from files.
 
 Depth as PNG of 16 bits (millimetres), ``.npy``, ``.npz`` (key ``depth``) and OpenEXR (all three metres).
 """
@@ -22,21 +22,21 @@ _EXR_CHANNELS = ("depth", "Depth", "Z", "depth.Z", "ViewLayer.Depth.Z", "V", "de
 
 
 class DepthFileError(ValueError):
-    """A file that holds no depth or no picture; the message names it and says why."""
+    """A file holds no depth or no image; the message names the file and the reason."""
 
 
 def load_picture(path: str | Path) -> NDArray[np.uint8]:
-    """A picture as (H, W, 3) uint8 RGB.
+    """An image as (H, W, 3) uint8 RGB.
 
     Raises:
-        DepthFileError: missing, or no picture.
+        DepthFileError: missing, or no image.
     """
     import cv2
 
     _check_readable(path)
     picture = load_image(path, cv2.IMREAD_COLOR)
     if picture is None:
-        raise DepthFileError(f"{path}: not a readable picture ({', '.join(s[1:] for s in PICTURE_SUFFIXES)})")
+        raise DepthFileError(f"{path}: not a readable image ({', '.join(s[1:] for s in PICTURE_SUFFIXES)})")
     return np.ascontiguousarray(picture[..., ::-1], np.uint8)
 
 
@@ -87,7 +87,7 @@ def _png(path: Path) -> NDArray[Any]:
         channels = 1 if values.ndim == 2 else values.shape[2]
         raise DepthFileError(
             f"{path}: depth as PNG has one channel of 16 bits, millimetres "
-            f"(got {channels} of {8 * values.dtype.itemsize} bits: a picture of depth?)"
+            f"(got {channels} of {8 * values.dtype.itemsize} bits: an image of depth?)"
         )
     return values * np.float32(1e-3)
 
@@ -135,5 +135,5 @@ def _exr(path: Path) -> NDArray[Any]:
     if name is None:
         raise DepthFileError(f"{path}: which channel is depth? Has {', '.join(channels)}; name it Z")
     if name == "R" and not all(np.array_equal(channels["R"], channels.get(c, channels["R"])) for c in "GB"):
-        raise DepthFileError(f"{path}: its channels R, G, B differ: this is a picture, not depth")
+        raise DepthFileError(f"{path}: its channels R, G, B differ: this is an image, not depth")
     return channels[name]

@@ -1,4 +1,4 @@
-"""The network's depth corrected by what the LiDAR sees: the best of both, with an uncertainty for every pixel."""
+"""Fusion of the network's depth with the LiDAR's, with an uncertainty for every pixel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class FusionConfig:
-    """How network and LiDAR structure are brought together.
+    """Parameters of the fusion of network and LiDAR structure.
 
     Attributes:
         across_deg, along_deg: how far around a point, in azimuth and elevation, the network is corrected by it; a
@@ -31,7 +31,7 @@ class FusionConfig:
 
 
 def ceiling_height(depth_m: Floats, rise: Floats, least_m: float = 0.3) -> float | None:
-    """Height over the camera, metres, at which most of the upper part of a depth picture lies.
+    """Height over the camera, metres, at which most of the upper part of a depth image lies.
 
     Args:
         depth_m: (H, W) radial metres, 0 = unknown.
@@ -156,7 +156,7 @@ _SIGMA = np.array(
 
 
 def likely_ceiling(seen_m: float, network: Corrected, usual_m: float) -> float:
-    """Height of a ceiling over the camera, by what a network shows and what is usual, metres.
+    """Height of a ceiling over the camera in metres, from the network's depth and the usual height.
 
     Ceilings vary by a fifth around the usual one; a network's is off by about as much as it is at the points, and by
     a third of the share that is plainly wrong there (measured on the worlds of benchmarks/depth_sigma.py).

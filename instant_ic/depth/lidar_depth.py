@@ -1,8 +1,8 @@
 """Depth of the whole panorama from LiDAR points alone, by a structure of walls, floor and ceiling. numpy only.
 
-A VLP-16 sees a band of 30 degrees; the panorama has 180. What lies outside the band is taken as a building is made:
-what a column of the picture sees last stands upright, on a level floor, under a level ceiling. Every pixel is told how
-it came about and how uncertain it is.
+A VLP-16 covers 30 degrees of elevation, the panorama 180. Outside the LiDAR's range of elevations, a building's usual
+structure is assumed: the last surface in a column of the image is an upright wall on a level floor, under a level
+ceiling. Each pixel carries its origin and its uncertainty.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Indices = NDArray[np.signedinteger]
 
 
 class Origin(IntEnum):
-    """How the depth of a pixel came about."""
+    """Origin of a pixel's depth."""
 
     UNKNOWN = 0
     BEAM = 1  # a point fell into it
@@ -39,7 +39,7 @@ class Origin(IntEnum):
 
 @dataclass(frozen=True)
 class LidarDepthConfig:
-    """How depth is made from points alone.
+    """Parameters of depth from points alone.
 
     Attributes:
         min_range_m: points nearer than this to the camera are left out (the robot itself).
@@ -120,13 +120,13 @@ def level_from_camera(up: Floats) -> NDArray[np.float64]:
 def plane_height(z: Floats, across_m: Floats, columns: NDArray[np.intp], bin_m: float = 0.04) -> float | None:
     """Height of the level plane that most points lie on; None where no plane stands out.
 
-    Points that follow each other upwards in a column of the picture are of one height on a plane, and of one
+    Points that follow each other upwards in a column of the image are of one height on a plane, and of one
     horizontal range on a wall.
 
     Args:
         z: (N,) heights, metres.
         across_m: (N,) horizontal ranges.
-        columns: (N,) columns of the picture.
+        columns: (N,) columns of the image.
         bin_m: width of the histogram's bins.
     """
     order = np.lexsort((across_m, columns))
@@ -152,7 +152,7 @@ _AROUND = [(row, column) for row in (-2, -1, 0, 1, 2) for column in (-2, -1, 1, 
 def lonely(
     measured: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp], alike: float = 0.12
 ) -> NDArray[np.bool_]:
-    """Which points (N,) nothing around them confirms: dust, mixed pixels, mirrors.
+    """Mask (N,) of points without neighbours that confirm them: dust, mixed pixels, mirrors.
 
     Args:
         measured: (H, W) ranges, 0 where no point is.
@@ -167,7 +167,7 @@ def lonely(
         other = measured[np.clip(rows + row, 0, height - 1), (columns + column) % width]
         there += other > 0
         same += np.abs(other - own) < alike * own
-    # A point that is wrong along its beam shows elsewhere in the camera's picture, often with nothing around it.
+    # A point that is wrong along its beam shows elsewhere in the camera's image, often with nothing around it.
     return np.asarray((same < 2) & (float(np.median(there)) >= 4))
 
 
@@ -195,7 +195,7 @@ def rays(height: int, width: int) -> NDArray[np.float32]:
 
 
 class LidarStructure:
-    """Makes depth pictures from points."""
+    """Estimates depth images from points."""
 
     def __init__(self, config: LidarDepthConfig | None = None) -> None:
         self.config = config or LidarDepthConfig()
@@ -214,7 +214,7 @@ class LidarStructure:
             points: (N, 3) in the camera's frame, metres; points that are not finite are left out.
             up: (3,) gravity's up in the camera's frame.
             camera_height_m: of the camera over the floor; None: the floor is looked for in the points.
-            size: height and width of the picture.
+            size: height and width of the image.
             ceiling_m: height of a ceiling over the camera that is taken where no point shows one (instead of the
                 assumed height).
 
@@ -252,7 +252,7 @@ class LidarStructure:
         )
 
     def ranges(self, points: Floats, size: tuple[int, int]) -> NDArray[np.float32]:
-        """Range (H, W) in each pixel of the camera's picture that a confirmed point (N, 3) falls into, else 0."""
+        """Range (H, W) in each pixel of the camera's image that a confirmed point (N, 3) falls into, else 0."""
         picture = np.zeros(size, np.float32)
         _, rows, columns, range_m = _confirmed(self._usable(points), size)
         picture[rows, columns] = range_m
@@ -265,7 +265,7 @@ class LidarStructure:
         return np.asarray(points[inside], np.float64)
 
     def _problem(self, z: Floats, range_m: Floats, columns: NDArray[np.intp], width: int, floor: float | None) -> str:
-        """Why the structure is not to be trusted; empty where it is."""
+        """Reason for not trusting the structure; empty if it is trusted."""
         covered, needed = len(np.unique(columns * 120 // width)) * 3.0, self.config.min_azimuth_deg
         if covered < needed:
             return f"LiDAR points cover {covered:.0f} deg of azimuth, {needed:.0f} are needed"
@@ -279,7 +279,7 @@ class LidarStructure:
 
 
 class _Building:
-    """The structure in a level picture, column by column.
+    """The structure in a level image, column by column.
 
     Attributes:
         hit: (H, W) horizontal range of the point in each pixel, 0 without one.
@@ -359,7 +359,7 @@ class _Building:
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Horizontal range (0: none) of the upright surface that each pixel shows, and its origin.
 
-        ``above`` and ``below`` are the rows of the next points, ``up`` and ``down`` the same within the picture.
+        ``above`` and ``below`` are the rows of the next points, ``up`` and ``down`` the same within the image.
         """
         index = np.arange(self.size[0], dtype=np.int32)[:, None]
         wall_above = (above >= 0) & ~self.flat[up, column]
@@ -387,10 +387,10 @@ class _Building:
         return wall, origin
 
     def _crown(self) -> NDArray[np.float32]:
-        """Horizontal range (W,) at which each column goes on above its uppermost point, 0 where nobody knows.
+        """Horizontal range (W,) at which each column continues above its uppermost point, 0 where unknown.
 
-        A column is known up to its top where the LiDAR's uppermost ring came back. Where it did not, that ring went
-        over what lies below it, and the nearest column with a top tells what is behind.
+        A column is known up to its top where the LiDAR's uppermost ring has a return. Elsewhere that ring passed over
+        the surface below it, and the nearest column with a top gives the range behind.
         """
         upright = np.where(self.flat, 0, self.hit)
         row = (upright > 0).argmax(axis=0)

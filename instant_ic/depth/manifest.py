@@ -1,4 +1,4 @@
-"""What a depth model file expects and gives: the YAML manifest that stands beside the ONNX file."""
+"""Interface of a depth model file: the YAML manifest beside the ONNX file."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class ModelManifest:
         input_width: columns the network takes; the whole 360° lie on them.
         input_layout: ``nchw`` (1, 3, height, width) or ``nhwc`` (1, height, width, 3).
         channels: ``rgb`` or ``bgr``: order of the channels that the network takes.
-        brightness: mean byte of the pictures that the model was trained on; a picture is brought to it by one
+        brightness: mean byte of the images that the model was trained on; an image is brought to it by one
             factor, within 1/2.5 .. 2.5 (a real camera's exposure is not that of the training). 0 leaves it as it is.
         input_scale: the bytes are multiplied by it first.
         mean: then this is subtracted, a value a channel in the network's order.
@@ -54,7 +54,7 @@ class ModelManifest:
         max_range_m: metric depth above it is cut to it.
         geometry: ``radial`` (distance from the camera) or ``planar`` (along the axis of the cube face that the
             pixel lies on); planar output is turned into radial.
-        mask_output: name of an output that tells where depth is valid; empty for none.
+        mask_output: name of an output that marks where depth is valid; empty for none.
         mask_means: ``valid``, or ``invalid`` (sky) of the pixels where the mask is above the threshold.
         mask_threshold: of the mask's numbers; 0.5 for probabilities, 0 for logits.
         sha256: of the model file; empty to leave it unchecked.
@@ -137,7 +137,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _shown(value: Any) -> str:
-    """The value as it is told; with a word about YAML's text ``1e-3``, which is no number to it."""
+    """The value for an error message; notes that YAML reads ``1e-3`` as text, not as a number."""
     if isinstance(value, str) and re.fullmatch(r"[+-]?\d+e[+-]?\d+", value, re.IGNORECASE):
         return f"the text {value!r}: YAML wants a point in it, as in 1.0e-3"
     return repr(value)

@@ -53,7 +53,7 @@ def depth_metrics(
         predicted, truth: of one shape, usually (H, W).
         valid: same shape; False leaves a pixel out.
         weights: how much each pixel counts, of a shape that broadcasts to theirs; by default all the same. For an
-            equirect picture by solid angle: ``solid_angle_weights(height)[:, None]``.
+            equirect image by solid angle: ``solid_angle_weights(height)[:, None]``.
 
     Raises:
         ValueError: the shapes differ or no pixel is valid.
@@ -109,7 +109,7 @@ def mean_metrics(each: Sequence[DepthMetrics]) -> DepthMetrics:
 
 
 def solid_angle_weights(height: int) -> NDArray[np.float32]:
-    """Weight of each row of an equirect picture, (height,), mean 1.
+    """Weight of each row of an equirect image, (height,), mean 1.
 
     The solid angle of a pixel is proportional to the sine difference of its edges' elevations. Without it the poles,
     which fill many pixels and little space, rule a mean over pixels.

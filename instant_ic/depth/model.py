@@ -16,12 +16,12 @@ from instant_ic.geometry.projections import equirect_directions
 
 DEFAULT_MODEL = "slicenet_small.onnx"
 MAX_GAIN = 2.5
-"""A picture's brightness is changed by this factor at most, up or down."""
+"""An image's brightness is changed by this factor at most, up or down."""
 INPUT_TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
 
 
 class InferenceError(RuntimeError):
-    """The network did not come to its end; the text says why."""
+    """The inference did not finish; the text says why."""
 
 
 class DepthModel:
@@ -55,8 +55,8 @@ class DepthModel:
         Args:
             path: the model or the manifest beside it.
             threads: CPU threads of one inference. The result does not depend on the time of day or on load.
-            provider: ``auto`` (the fastest that works), ``tensorrt``, ``cuda`` or ``cpu``. What does not work falls
-                back to the next; :attr:`provider` and :attr:`notes` tell.
+            provider: ``auto`` (the fastest that works), ``tensorrt``, ``cuda`` or ``cpu``. One that does not
+                work falls back to the next; see :attr:`provider` and :attr:`notes`.
 
         Raises:
             ManifestError: manifest or model is missing or they do not fit each other.
@@ -119,7 +119,7 @@ class DepthModel:
         return self._finish(*outputs)
 
     def cancel(self) -> None:
-        """Ends the inference that runs in another thread at its next layer; nothing where none runs."""
+        """Cancel an inference that runs in another thread, at its next layer."""
         if (options := self._run_options) is not None:
             options.terminate = True
 
@@ -203,7 +203,7 @@ class DepthModel:
         manifest, inputs = self.manifest, self.inputs
         if len(inputs) != 1:
             names = ", ".join(a[0] for a in inputs)
-            raise ManifestError(f"{self._where}: takes {len(inputs)} inputs ({names}); only the picture can be given")
+            raise ManifestError(f"{self._where}: takes {len(inputs)} inputs ({names}); only the image can be given")
         name, kind, shape = inputs[0]
         if kind not in INPUT_TYPES:
             raise ManifestError(f"{self._where}: input {name!r} is {kind}; one of {', '.join(INPUT_TYPES)} is needed")

@@ -1,4 +1,4 @@
-"""What onnxruntime runs a model on: TensorRT, CUDA or the CPU, by what is there."""
+"""Choice of onnxruntime's execution provider: TensorRT, CUDA or the CPU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CHOICES = ("auto", *PROVIDERS)
 
 @dataclass(frozen=True)
 class OpenSession:
-    """A session and how it came about.
+    """A session, its provider, and why a faster one is not used.
 
     Attributes:
         session: ``onnxruntime.InferenceSession``.
@@ -33,7 +33,7 @@ class OpenSession:
 
 
 def open_session(model_file: Path, threads: int, provider: str = "auto") -> OpenSession:
-    """Opens a model on the first provider that works; the CPU comes last always.
+    """Open a model on the first provider that works; the CPU is always last.
 
     Args:
         model_file: ONNX file; weights in a file beside it (``external data``) are found.
@@ -58,7 +58,7 @@ def open_session(model_file: Path, threads: int, provider: str = "auto") -> Open
         if full not in available:
             notes.append(f"{name}: not in this onnxruntime (pip install onnxruntime-gpu instead of onnxruntime)")
             continue
-        # onnxruntime falls back by itself and says so on stdout; here each one is tried alone and told by the caller.
+        # onnxruntime falls back by itself and prints to stdout; here each one is tried alone and the caller reports it.
         wanted: list[Any] = [(full, _options(name))] if name != "cpu" else []
         if name == "tensorrt" and PROVIDERS["cuda"] in available:
             wanted.append(PROVIDERS["cuda"])  # for layers that TensorRT does not know

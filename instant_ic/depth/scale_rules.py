@@ -188,7 +188,7 @@ def sector_factors(
 
 
 def solid_angle_quantile(depth: Floats, confidence: float) -> float:
-    """Quantile of the known depth of an equirect picture (H, W), each pixel counted by its solid angle.
+    """Quantile of the known depth of an equirect image (H, W), each pixel counted by its solid angle.
 
     Raises:
         ScaleError: fewer than ``MIN_VALUES`` known pixels.

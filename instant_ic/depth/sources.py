@@ -1,4 +1,4 @@
-"""Where depth comes from: the network scaled by the LiDAR, the LiDAR alone, or both fused. Arrays in, arrays out."""
+"""Sources of depth: the network scaled by the LiDAR, the LiDAR alone, or both fused. Arrays in, arrays out."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FLOOR_SIGMA = 0.02
 
 @dataclass(frozen=True)
 class SourceConfig:
-    """Where depth comes from, and how.
+    """Source of depth and its parameters.
 
     Attributes:
         source: ``network``: the network's depth, scaled; ``lidar``: LiDAR and structure, no network; ``fused``: both.
@@ -43,7 +43,7 @@ class SourceConfig:
 
 @dataclass(frozen=True)
 class DepthResult:
-    """Depth of one picture.
+    """Depth of one image.
 
     Attributes:
         depth_m: (H, W) float32 radial metres, 0 = unknown.
@@ -51,8 +51,8 @@ class DepthResult:
         ok: false: do not trust ``depth_m``; ``message`` says why.
         scale, shift: of the network's depth, see ``scaler.ScaleFit``; 1 and 0 for ``lidar``.
         quality: share of points, 0..1, whose range agrees with the scaled network, before it is fused: how well
-            picture and LiDAR fit together; for ``lidar``, with ``depth_m``, which has no lonely points in it.
-        relative_sigma: one robust number for the picture: median of ``sigma`` over its known pixels.
+            image and LiDAR fit together; for ``lidar``, with ``depth_m``, which has no lonely points in it.
+        relative_sigma: one robust number for the image: median of ``sigma`` over its known pixels.
         points: number of points compared.
         message: for people.
         source: what ``depth_m`` was made from.
@@ -81,14 +81,14 @@ class DepthResult:
 
 
 class DepthSource:
-    """Makes depth of a picture's network estimate and the LiDAR points of the same moment."""
+    """Computes depth from an image's network estimate and simultaneous LiDAR points."""
 
     def __init__(self, config: SourceConfig | None = None) -> None:
         self.config = config or SourceConfig()
 
     @property
     def config(self) -> SourceConfig:
-        """May be set anew at any time."""
+        """May be replaced at any time."""
         return self._config
 
     @config.setter
@@ -106,14 +106,14 @@ class DepthSource:
         rgb: NDArray[np.uint8] | None = None,
         size: tuple[int, int] = (256, 512),
     ) -> DepthResult:
-        """Depth of one picture.
+        """Depth of one image.
 
         Args:
             raw: (H, W) the network's depth in its own unit, 0 = unknown; None is allowed for ``lidar`` alone.
-            points: (N, 3) LiDAR points in the camera's frame at the picture's time, metres.
+            points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
             up: (3,) gravity's up in the camera's frame.
             camera_height_m: of the camera over the floor; None where it is not known.
-            rgb: (H, W, 3) uint8 the picture, for sources that look at it; none of these does.
+            rgb: (H, W, 3) uint8 the image, for sources that look at it; none of these does.
             size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
 
         Raises:
@@ -130,7 +130,7 @@ class DepthSource:
         network, built = self.parts(fit, points, up, camera_height_m)
         result = _of_fit(fit)
         if not fit.ok or built.message:
-            # What the LiDAR alone tells is the better guess, but somebody is wrong: not fit.
+            # The LiDAR alone is the better estimate, but one of the two is wrong: not fit.
             known = built.depth_m > 0
             return replace(
                 result,
@@ -148,7 +148,7 @@ class DepthSource:
         )
 
     def refuse(self, raw: Floats | None, message: str, size: tuple[int, int] = (256, 512)) -> DepthResult:
-        """The result that is not ok, of a picture without points: ``raw`` where that is metres, else all unknown."""
+        """Unfit result for an image without points: ``raw`` if that is in metres, else all unknown."""
         if raw is not None:
             return replace(_of_fit(self.scaler.refuse(raw, message)), source=self.config.source)
         unknown = np.full(size, np.inf, np.float32)
@@ -159,7 +159,7 @@ class DepthSource:
     def parts(
         self, fit: ScaleFit, points: Floats, up: Floats, camera_height_m: float | None
     ) -> tuple[Corrected, LidarDepth]:
-        """What is fused: the scaled network corrected by the points, and the LiDAR's structure. As ``estimate``."""
+        """Inputs of the fusion: the network, scaled and corrected by the points, and the LiDAR's structure."""
         size = fit.depth_m.shape
         network = correct(fit.depth_m, self.structure.ranges(points, size), self.config.fusion)
         rise = rays(*size) @ np.asarray(up, np.float32)
@@ -189,13 +189,13 @@ class DepthSource:
 
 
 def without_body(result: DepthResult, up: Floats, camera_height_m: float | None, elevation_deg: float) -> DepthResult:
-    """The result with floor in place of the robot itself, which fills the picture below an elevation.
+    """Replace the robot itself, which fills the image below an elevation, by floor.
 
     Args:
         result: depth (H, W).
         up: (3,) gravity's up in the camera's frame.
         camera_height_m: of the camera over the floor; None: what is masked is unknown.
-        elevation_deg: below it the picture shows the robot; -90 masks nothing.
+        elevation_deg: below it the image shows the robot; -90 masks nothing.
     """
     rise = rays(*result.depth_m.shape) @ np.asarray(up, np.float32)
     body = rise < np.sin(np.radians(elevation_deg))

@@ -1,6 +1,6 @@
-"""One photo's estimated depth made plausible where no LiDAR is at hand: level floor and ceiling, upright walls.
+"""Regularisation of one photo's depth without a LiDAR: level floor and ceiling, upright walls.
 
-A network's depth bends a little everywhere, and a picture from beside the camera shows it: uneven floors, walls with
+A network's depth bends a little everywhere, and an image from beside the camera shows it: uneven floors, walls with
 kinks. Rooms have a flat floor under the camera, mostly a flat ceiling, and walls that go straight down to the one and
 up to the other.
 """
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Positive, Range, Share, check_ranges
 
 Floats = NDArray[np.float32]
-_PAD = 64  # columns that the picture is continued by on both sides, so that its edge is none
+_PAD = 64  # columns that the image is continued by on both sides, so that its edge is none
 _LEAST_SHARE = 0.15  # of the pixels that look at it have to lie on a floor or ceiling, or there is none
 
 
 @dataclass(frozen=True)
 class TidyConfig:
-    """How far the usual shape of rooms counts.
+    """Parameters of the regularisation.
 
     Attributes:
         height: rows of the result: floor and walls meet as sharply as that.
@@ -31,7 +31,7 @@ class TidyConfig:
         wall_below: what is nearer than this share of the way to floor or ceiling is surely a wall or a thing; beyond
             goes the wall straight on to the plane.
         beyond: what is farther than so many times the way to a plane is not under it: another ceiling, a stair.
-        body_below_deg: below this elevation the picture shows the robot or its stand, and floor is put there.
+        body_below_deg: below this elevation the image shows the robot or its stand, and floor is put there.
     """
 
     height: Annotated[int, Range(64, 2048)] = 512
@@ -98,7 +98,7 @@ def tidy(
             raise ValueError("no floor is to be seen in the depth: leave the camera's height out")
         scale = camera_height_m / floor
         depth, floor, ceiling = depth * np.float32(scale), camera_height_m, None if ceiling is None else ceiling * scale
-    # Guided by the depth itself: a picture's edges are mostly texture, and posters came out of their walls.
+    # Guided by the depth itself: an image's edges are mostly texture, and posters came out of their walls.
     logarithm = np.log(np.clip(np.where(unknown, 1, depth), 0.2, 20) / 0.2) * (255 / np.log(100))
     guide = np.ascontiguousarray(_padded(np.rint(logarithm).astype(np.uint8)))
 
@@ -166,7 +166,7 @@ def continued(values: Floats, sure: NDArray[np.bool_], upwards: bool) -> Floats:
 
 
 def _padded(values: NDArray) -> NDArray:
-    """A panorama continued round both sides."""
+    """Pad a panorama on both sides by its own columns."""
     return np.concatenate([values[:, -_PAD:], values, values[:, :_PAD]], axis=1)
 
 

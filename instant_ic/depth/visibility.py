@@ -1,4 +1,4 @@
-"""Which LiDAR points the camera sees, and in which pixel: the two hang in different places. numpy only."""
+"""Visibility of LiDAR points from the camera, which is mounted elsewhere, and their pixels. numpy only."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CELL_DEG = 1.0
 
 
 def project_points(points: Floats, width: int, height: int) -> tuple[Floats, Floats, Floats]:
-    """Projects points (N, 3) in the camera's frame onto an equirect picture.
+    """Projects points (N, 3) in the camera's frame onto an equirect image.
 
     Returns:
         ``u, v`` index coordinates (see ``geometry.projections.equirect_pixels``) and the range in metres, each (N,).

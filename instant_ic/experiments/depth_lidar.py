@@ -91,14 +91,14 @@ def measure(
     azimuth = math.pi - (np.arange(AZIMUTHS) + 0.5) * (2 * math.pi / AZIMUTHS)
     profile = _profiles(inverse, azimuth)
     elevation = math.pi / 2 - (np.arange(height) + 0.5) * (math.pi / height)
-    torn = _torn(profile, math.pi / height)[:-1] | ((profile[1:] > 0) ^ (profile[:-1] > 0))
-    profile, torn = _bridge_unknown(profile, torn)
+    depth_edge = _torn(profile, math.pi / height)[:-1] | ((profile[1:] > 0) ^ (profile[:-1] > 0))
+    profile, depth_edge = _bridge_unknown(profile, depth_edge)
     radius = np.where(profile > 0, 1.0 / np.where(profile > 0, profile, 1.0), np.nan)
     across, up = radius * np.cos(elevation)[:, None], radius * np.sin(elevation)[:, None] - below_m
 
     points = []
     for omega in np.radians(np.linspace(-15, 15, rings) if rings > 1 else np.zeros(1)):
-        range_m = _first_crossing(across, up, torn, omega)
+        range_m = _first_crossing(across, up, depth_edge, omega)
         hit = (range_m >= MIN_RANGE_M) & (range_m <= MAX_RANGE_M)
         points.append(_on_rays(omega, azimuth[hit], range_m[hit]))
     true = np.concatenate(points)
@@ -156,14 +156,14 @@ def _profiles(inverse: Floats, azimuth: Floats) -> NDArray[np.float64]:
     u = (math.pi - azimuth) * (width / (2 * math.pi)) - 0.5
     left = np.floor(u).astype(np.intp)
     share = u - left
-    torn = _torn(np.ascontiguousarray(inverse.T), 2 * math.pi / width).T
+    depth_edge = _torn(np.ascontiguousarray(inverse.T), 2 * math.pi / width).T
     a, b = inverse[:, left % width], inverse[:, (left + 1) % width]
-    apart = torn[:, left % width] | (a == 0) | (b == 0)
+    apart = depth_edge[:, left % width] | (a == 0) | (b == 0)
     return np.where(apart, np.where(share < 0.5, a, b), (1 - share) * a + share * b)
 
 
 def _bridge_unknown(
-    profile: NDArray[np.float64], torn: NDArray[np.bool_]
+    profile: NDArray[np.float64], depth_edge: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Fill unknown pixels from above (the first from below) and mark them: beams that pass through them have no end."""
     known = profile > 0
@@ -172,10 +172,10 @@ def _bridge_unknown(
     first = np.where(known.any(axis=0), known.argmax(axis=0), -1)
     above = np.where(above < 0, first, above)
     filled = np.where(above < 0, 0.0, np.take_along_axis(profile, np.maximum(above, 0), axis=0))
-    return filled, torn | ~known[:-1] | ~known[1:]
+    return filled, depth_edge | ~known[:-1] | ~known[1:]
 
 
-def _first_crossing(across: Floats, up: Floats, torn: NDArray[np.bool_], omega: float) -> NDArray[np.float64]:
+def _first_crossing(across: Floats, up: Floats, depth_edge: NDArray[np.bool_], omega: float) -> NDArray[np.float64]:
     """Ranges (N,) where beams of elevation ``omega`` first meet profiles (H, N); inf for none or at a discontinuity."""
     side = across * math.sin(omega) - up * math.cos(omega)
     along = across * math.cos(omega) + up * math.sin(omega)
@@ -186,4 +186,4 @@ def _first_crossing(across: Floats, up: Floats, torn: NDArray[np.bool_], omega: 
     range_m = np.where(crosses & (range_m > 0), range_m, np.inf)
     nearest = np.argmin(range_m, axis=0)[None]
     end = np.take_along_axis(range_m, nearest, axis=0)[0]
-    return np.where(np.take_along_axis(torn, nearest, axis=0)[0], np.inf, end)
+    return np.where(np.take_along_axis(depth_edge, nearest, axis=0)[0], np.inf, end)

@@ -1,9 +1,9 @@
-"""What lies behind a keyframe's surfaces, as far as it can be guessed: shown where nobody has seen anything.
+"""A guess of the surfaces behind a keyframe's surfaces, shown where no keyframe has seen anything.
 
 Behind each depth edge the farther surface is continued, in depth and in colour, once for each keyframe: floor and
 ceiling as the level planes they are, all else upright, each in the colours of its own kind. It lies fixed
-in the map, so that pictures of a moving camera agree with each other. The place under the robot is a continuation of
-the ground round it. The sky is drawn here too, endlessly far.
+in the map, so that images of a moving camera agree with each other. The place under the robot is a continuation of
+the ground round it. The sky is rendered here too, endlessly far.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.projections import equirect_directions
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.prior import ROBOT, ROOM, SKY, PanoramaPrior, area_average, fill_holes, torn_quads
+from instant_ic.vspace.prior import ROBOT, ROOM, SKY, PanoramaPrior, area_average, edge_quads, fill_holes
 from instant_ic.vspace.warp import pinhole
 
 REACH_RAD = 0.3
-"""So far behind an edge the background is continued, as seen from the keyframe."""
+"""How far behind an edge the background is continued, as seen from the keyframe."""
 GUESS_SHARE, GUESS_REACH = 0.6, 0.04
-"""Of the guess in the picture, reached so far (share of its width) inside of what is unseen: near what is seen the
-picture's own continuation is the better guess. Measured: benchmarks/keyframes.py."""
+"""Of the guess in the image, reached so far (share of its width) inside of what is unseen: near what is seen the
+image's own continuation is the better guess. Measured: benchmarks/keyframes.py."""
 _NEARER = 0.12  # a surface is in front of another where its inverse depth is greater by this share
 _ON_LEVEL = 0.1  # inverse depths within this share of the floor's or the ceiling's are on it
 _BEHIND = 1.05  # a guess lies farther than what hides it by this factor
 _STEEP, _ALIKE, _LEVEL_SHARE = 0.6, 0.04, 0.6  # beyond this sine of the elevation so many heights agree so far
 _SKY_M = 1e4
-_ROWS = 256  # of the pictures that the background is made in: it is smooth
+_ROWS = 256  # of the images that the background is made in: it is smooth
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Background:
         reach = max(1, round(REACH_RAD / (2 * math.pi / width)))
         steps = np.zeros(inverse.shape, np.int32)
         # Beyond the reach as much again of the near surface is no source of what is behind it.
-        in_front(inverse, torn_quads(inverse, _NEARER), kind, 2 * reach, steps)
+        in_front(inverse, edge_quads(inverse, _NEARER), kind, 2 * reach, steps)
         removed = (content != ROOM) & ~sky
         hole = ((steps > 0) & (steps <= reach)) | removed
         # Nor is the far side's first pixel, which has a part of the near surface's colour.
@@ -96,7 +96,7 @@ class Background:
                 painted[here] = np.rint(colours[here])
         behind = hole & ((filled < inverse / _BEHIND) | removed)
         inverse = np.where(hole, filled, inverse).astype(np.float32)
-        whole = torn_quads(inverse, _NEARER)[:-1] == 0
+        whole = edge_quads(inverse, _NEARER)[:-1] == 0
         guessed = _any_corner(behind) & whole
         return cls(
             np.maximum(inverse, 1 / _SKY_M), painted, _places(guessed), _places(_any_corner(sky) & ~guessed & whole),
@@ -106,15 +106,15 @@ class Background:
     def draw(
         self, rays: Rays, gain: Floats, wanted: NDArray[np.bool_], picture: tuple[Floats, Floats, Floats]
     ) -> NDArray[np.bool_]:
-        """Draws what lies behind into a perspective picture.
+        """Render the background into a perspective image.
 
         Args:
             rays: of the view; gain: (3,) factors of the colours.
             wanted: (P,) where nothing has been seen.
-            picture: in and out: colour (P, 3), depth (P,), confidence (P,), which is 1 on the sky, else left 0.
+            image: in and out: colour (P, 3), depth (P,), confidence (P,), which is 1 on the sky, else left 0.
 
         Returns:
-            Where something was drawn, (P,).
+            Where something was rendered, (P,).
         """
         from instant_ic.vspace.background_kernels import draw_quads, paint
 
@@ -135,7 +135,7 @@ class Background:
 
 
 def mixed_in(image: Floats, guess: Floats, guessed: NDArray[np.bool_]) -> Floats:
-    """A picture continued from what is seen, (H, W, 3), and the guesses (H, W, 3) where there are some (H, W)."""
+    """Mix guesses (H, W, 3), where there are some (H, W), into an image (H, W, 3) continued from its seen parts."""
     from instant_ic.vspace.background_kernels import mix_guess
 
     mixed = image.copy()
@@ -161,7 +161,7 @@ def level_planes(inverse: Floats, rise: Floats, room: NDArray[np.bool_]) -> list
 
 
 def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """By a pixel to all sides; columns wrap."""
+    """Dilate by one pixel; columns wrap."""
     mask = mask | np.roll(mask, 1, 1) | np.roll(mask, -1, 1)
     padded = np.pad(mask, ((1, 1), (0, 0)))
     return padded[:-2] | mask | padded[2:]

@@ -12,18 +12,18 @@ from instant_ic.vspace.nerf.march import along, panorama_pixels
 from instant_ic.vspace.warp_kernels import NEAR_M, beyond, draw_triangle
 
 SAME_THING = np.float32(2)
-"""What is nearer than an edge of a thing by more than this factor is not the thing, but what it stands on."""
+"""A surface nearer than an object's edge by more than this factor is not the object but what it stands on."""
 
 
 @njit(**_OPTIONS)
-def in_front(inverse, torn, level, reach, steps):  # type: ignore[no-untyped-def]
-    """How far pixels of nearer surfaces lie from a depth edge.
+def in_front(inverse, depth_edge, level, reach, steps):  # type: ignore[no-untyped-def]
+    """Distance of pixels of nearer surfaces from a depth edge.
 
     From the near side of each edge the near surface is followed, as long as it stays nearer than half way between the
     two sides of that edge.
 
     Args:
-        inverse, torn: of the ``PanoramaPrior``, (h, w).
+        inverse, depth_edge: of the ``PanoramaPrior``, (h, w).
         level: (h, w) over 0 on the floor and the ceiling, which hide nothing.
         reach: pixels at most.
         steps: out, (h, w) int32: pixels from the edge, from 1; 0 where no edge is near, or on the far side.
@@ -35,7 +35,7 @@ def in_front(inverse, torn, level, reach, steps):  # type: ignore[no-untyped-def
     size = 0
     for v in range(height - 1):
         for u in range(width):
-            if not torn[v, u]:
+            if not depth_edge[v, u]:
                 continue
             right = (u + 1) % width
             a, b, c, d = inverse[v, u], inverse[v, right], inverse[v + 1, u], inverse[v + 1, right]
@@ -67,7 +67,7 @@ def in_front(inverse, torn, level, reach, steps):  # type: ignore[no-untyped-def
 def draw_quads(  # type: ignore[no-untyped-def]
     quads, mark, inverse, directions, view_from_camera, half, nearness, marks
 ):
-    """Some quads of a panorama's mesh into a z-buffer.
+    """Render some quads of a panorama's mesh into a z-buffer.
 
     Args:
         quads: upper left pixels (row, column), (N, 2); mark: what ``marks`` gets.
@@ -109,7 +109,7 @@ def paint(rgb, camera_from_map, gain, origin, directions, wanted, depth, colour)
 
 @njit(**_OPTIONS)
 def mix_guess(guess, guessed, reach, share, image):  # type: ignore[no-untyped-def]
-    """Mixes guessed colours (H, W, 3) into a picture where ``guessed`` (H, W): the more, the farther off what is seen.
+    """Mix guessed colours (H, W, 3) into an image where ``guessed`` (H, W), more with distance from the seen parts.
 
     ``share`` is reached ``reach`` pixels (city blocks) inside.
     """

@@ -1,4 +1,4 @@
-"""What a picture is drawn on: the keyframes' warped panoramas, the field and the background, put together.
+"""Composition of a view: the keyframes' warped panoramas, the field and the background.
 
 One interface, chosen by device: here with numpy and numba on the CPU, in ``torch_canvas`` on a GPU.
 """
@@ -21,12 +21,12 @@ from instant_ic.vspace.warp import dissolve
 Drawing = tuple[Any, Any, Any]
 """Colours (P, 3) in 0..1, depth along the ray (P,) and confidence (P,), in arrays of the canvas' kind."""
 Painted = tuple[NDArray[np.uint8], Floats, Floats]
-"""A finished picture: (H, W, 3) uint8, depth (P,) and confidence (P,)."""
+"""A finished image: (H, W, 3) uint8, depth (P,) and confidence (P,)."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A view (P, …) as it was drawn, in arrays of its canvas; ``guessed``: what nobody has seen, of the background."""
+    """A rendered view (P, …) in arrays of its canvas; ``guessed``: unseen parts of the background."""
 
     colour: Any
     depth: Any
@@ -35,7 +35,7 @@ class Picture:
 
 
 class Canvas(Protocol):
-    """One device's way to put a picture together."""
+    """A backend's composition of views."""
 
     def draw(
         self,
@@ -45,21 +45,21 @@ class Canvas(Protocol):
         field: Drawing | None,
         layers: dict[int, Drawing],
     ) -> Picture:
-        """A view by keyframes: their panoramas warped, dissolved into the field; what lies behind, where nobody looked.
+        """Compose a view: warped panoramas blended with the field, and the background in unseen places.
 
         Args:
             rays: of a perspective view; of any where ``shown`` is None.
             shown: the keyframes; None: the field alone, nothing is warped.
             panorama_share: of the warped panoramas, 0..1.
             field: the view as the field has it, as ``field.Device.drawn`` gives it; None: the panoramas alone.
-            layers: in and out, the warps of keyframes that have been drawn for this view.
+            layers: in and out, the warps of keyframes that have been rendered for this view.
         """
 
     def continued(self, picture: Picture, shape: tuple[int, int], wraps: bool) -> Any:
-        """The picture (H, W, 3) with what nobody knows continued from around it, and the guesses mixed in."""
+        """The image (H, W, 3) with unknown parts filled from their surroundings and the guesses blended in."""
 
     def painted(self, picture: Picture, image: Any) -> Painted:
-        """``continued``'s picture, or a mixture of several, in 8 bit; depth and confidence of ``picture``."""
+        """The image of ``continued``, or a blend of several, in 8 bit; depth and confidence of ``picture``."""
 
 
 class CpuCanvas:
@@ -74,7 +74,7 @@ class CpuCanvas:
         layers: dict[int, Drawing],
     ) -> Picture:
         if field is None:
-            assert shown is not None, "neither keyframes nor a field to draw"
+            assert shown is not None, "neither keyframes nor a field to render"
             picture = self._warped(rays, shown, layers)
         elif shown is not None and panorama_share > 0:
             picture = dissolve(self._warped(rays, shown, layers), field, panorama_share)
@@ -91,7 +91,7 @@ class CpuCanvas:
 
     @staticmethod
     def _warped(rays: Rays, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
-        """The keyframes' panoramas warped by their depth, put together."""
+        """Compose the keyframes' panoramas, warped by their depth."""
         drawn = []
         for keyframe, gain in zip(shown.keyframes, shown.gains, strict=True):
             assert keyframe.warp is not None

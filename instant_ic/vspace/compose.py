@@ -1,4 +1,4 @@
-"""One picture of several keyframes: what each draws of a view, put together; what has moved; one exposure.
+"""Compose one view from several keyframes; find what has moved; bring them to one exposure.
 
 Colours of surfaces that several keyframes have seen are blended as in unstructured lumigraph rendering (Buehler et al.,
 2001): by the angle between the view's ray and the keyframe's, and by the keyframe's distance.
@@ -18,21 +18,21 @@ from instant_ic.vspace.nerf.field import Floats, Rays
 from instant_ic.vspace.prior import ROOM, PanoramaPrior
 
 SAME_SURFACE = 0.06
-"""Depths within this share of each other are one surface."""
+"""Depths within this share of each other belong to one surface."""
 SAME_PLACE = 0.15
-"""Surfaces within this share of the nearest are one that the keyframes' depths disagree about: the best seen counts."""
+"""Surfaces within this share of the nearest are one surface with disagreeing depths: the one seen best counts."""
 SHARPNESS = 6.0
 LEAST_PENALTY = 0.05
 ASIDE_RAD = 0.02
-"""Less is the keyframe's own view, whose edges are right."""
+"""Closer views are the keyframe's own, whose edges are correct."""
 EDGE = 0.25
-"""Less confidence at an edge."""
+"""Reduction of the confidence at an edge."""
 NEARER = 0.9
-"""An older keyframe that is at less than this share of the newest's distance from a surface shows it better,"""
+"""An older keyframe at less than this share of the newest's distance from a surface shows it better,"""
 OTHER_SIDE_RAD = 0.8
-"""and one that looks at it from so far beside the newest another side of it."""
+"""and one at more than this angle beside the newest shows another side of it."""
 SAME_COLOUR = 30.0
-"""Grey levels in which two keyframes' pictures of a place that stands still may differ."""
+"""Grey levels in which two keyframes' images of a place that stands still may differ."""
 _VOTE_ROWS = 256  # of the pixels that are asked whether they have moved
 _STEP_ROWS = 128  # of the pixels that an exposure is fitted on
 _MIN_SAMPLES = 200
@@ -42,7 +42,7 @@ _MAX_SPREAD = 0.35  # of the logarithms of the ratios: more is no common factor
 
 @dataclass(frozen=True)
 class Layer:
-    """A view as one keyframe has it: ``colour`` (P, 3) in 0..1, ``depth`` (P,), ``confidence`` (P,), as a device draws;
+    """One keyframe's view: ``colour`` (P, 3) in 0..1, ``depth`` (P,), ``confidence`` (P,), as a backend renders it;
     ``gain`` (3,) brings its colours to the newest keyframe's exposure.
     """
 
@@ -60,7 +60,7 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     most alike (``SAME_PLACE``); one at an edge of its keyframe's depth, where colours of two surfaces mix, only where
     no keyframe has a plain one. An older keyframe shows nothing that a newer one has looked through: it has moved, or
     is an error of its depth. Nor does it show what is beside its own edges, where its depth may be of either side, or
-    what a newer one has seen itself and draws elsewhere: that would stand there twice. These two do not hold for what
+    what a newer one has seen itself and renders elsewhere: that would stand there twice. These two do not hold for what
     it sees from nearer than the newest (``NEARER``) or from another side (``OTHER_SIDE_RAD``): its edges count there as
     the newest's do. What nobody has seen is as the newest has it. Needs numba.
     """
@@ -72,9 +72,9 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
     depth, confidence = np.empty_like(layers[0].depth), np.empty_like(layers[0].confidence)
     blend(
         *(np.stack([getattr(layer, key) for layer in layers]) for key in ("colour", "depth", "confidence", "gain")),
-        *(np.stack([getattr(layer.prior, key) for layer in layers]) for key in ("torn", "inverse_depth")),
+        *(np.stack([getattr(layer.prior, key) for layer in layers]) for key in ("depth_edge", "inverse_depth")),
         # Of the newest it is never asked.
-        np.stack([layer.prior.beside_edge if older else layer.prior.torn for older, layer in enumerate(layers)]),
+        np.stack([layer.prior.beside_edge if older else layer.prior.depth_edge for older, layer in enumerate(layers)]),
         np.stack([layer.prior.known == 1 for layer in layers]), room, np.linalg.inv(poses).astype(np.float32),
         np.ascontiguousarray(poses[:, :3, 3], np.float32), rays.origin, rays.directions,
         *(np.float32(value) for value in (EDGE, ASIDE_RAD, NEARER, OTHER_SIDE_RAD)),
@@ -85,11 +85,11 @@ def compose(layers: Sequence[Layer], rays: Rays) -> tuple[Floats, Floats, Floats
 
 
 def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
-    """What of each keyframe (newest first, all of one size) is not there any more or never stood still, (h, w) each.
+    """Pixels of each keyframe (newest first, all of one size) that show moved or moving objects, (h, w) each.
 
     Each keyframe that knows says whether there is a surface at a pixel's place or whether it has looked through it; the
     majority counts, and where there is none the newest: of two keyframes the newer wins. What of the newest another's
-    picture shows in the same colour at that place still stands there, and only the depths disagree: it is left in, and
+    image shows in the same colour at that place still stands there, and only the depths disagree: it is left in, and
     so are single pixels. Needs numba.
     """
     from instant_ic.vspace.compose_kernels import outvoted
@@ -113,7 +113,7 @@ def moved(priors: Sequence[PanoramaPrior]) -> list[NDArray[np.bool_]]:
 def _looks_different(
     mask: NDArray[np.bool_], prior: PanoramaPrior, others: Sequence[PanoramaPrior]
 ) -> NDArray[np.bool_]:
-    """Of pixels (h, w) of a keyframe those whose places no other keyframe's picture shows in the same colour."""
+    """Those of a keyframe's pixels (h, w) whose places no other keyframe shows in the same colour."""
     left = mask.copy()
     directions = equirect_directions(mask.shape[1], mask.shape[0])[mask]
     own, pose = _colours(prior, directions), prior.map_from_camera.astype(np.float32)
@@ -126,7 +126,7 @@ def _looks_different(
 
 
 def _opened(mask: NDArray[np.bool_], step: int) -> NDArray[np.bool_]:
-    """Less of what is thinner than three cells of ``step`` pixels; what stays gets a rim of two, as edges are soft."""
+    """Remove regions thinner than three cells of ``step`` pixels; dilate the others by two, as edges are soft."""
     if not mask.any():
         return mask
     for grow, times in ((False, step), (True, 3 * step)):
@@ -179,7 +179,9 @@ def exposure_gain(newest: PanoramaPrior, older: PanoramaPrior) -> Floats | None:
     local = np.einsum("ij,jk->ik", local, newest.map_from_camera[:3, :3].astype(np.float32))
     row, column = _upper_left(newest, local)
     same = np.abs(newest.inverse_depth[row, column] * np.linalg.norm(local, axis=1) - 1) < SAME_SURFACE
-    same &= (newest.known[row, column] == 1) & (newest.torn[row, column] == 0) & (newest.content[row, column] == ROOM)
+    same &= (
+        (newest.known[row, column] == 1) & (newest.depth_edge[row, column] == 0) & (newest.content[row, column] == ROOM)
+    )
     theirs, ours = _colours(older, directions[same]), _colours(newest, local[same])
     usable = np.all((theirs > 12) & (theirs < 243) & (ours > 12) & (ours < 243), axis=1)
     if np.count_nonzero(usable) < _MIN_SAMPLES:

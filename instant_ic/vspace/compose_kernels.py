@@ -1,4 +1,4 @@
-"""CPU kernels of several keyframes: one picture of what each draws, and who has seen what of another (numba)."""
+"""CPU kernels of several keyframes: composition of a view, and which surfaces each has seen (numba)."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ def panorama_pixel(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def blend(  # type: ignore[no-untyped-def]
-    colours, depths, confidences, gains, torn, inverse, beside, known, room, camera_from_map, places, origin,
+    colours, depths, confidences, gains, depth_edge, inverse, beside, known, room, camera_from_map, places, origin,
     directions, edge, aside_rad, nearer, other_side_rad, same_place, same_surface, least_penalty, sharpness,
     colour, depth, confidence,
 ):  # fmt: skip
-    """The layers of a view into one, by the rules of ``compose``.
+    """Compose the layers of a view by the rules of ``compose``.
 
     Args:
         colours: (K, P, 3); depths, confidences: (K, P); newest keyframe first.
-        gains: (K, 3); torn, inverse, known: of the keyframes' depth, (K, h, w); beside: near an edge of it, (K, h, w);
-            room: as ``opinion`` takes it, (K, K).
+        gains: (K, 3); depth_edge, inverse, known: of the keyframes' depth, (K, h, w); beside: near an edge of it,
+            (K, h, w); room: as ``opinion`` takes it, (K, K).
         camera_from_map: (K, 4, 4); places: of the cameras, (K, 3).
         origin: (3,); directions: (P, 3).
         edge … sharpness: the constants of ``compose``.
         colour: out, (P, 3); depth, confidence: out, (P,).
     """
     count = depths.shape[0]
-    height, width = torn.shape[1:]
+    height, width = depth_edge.shape[1:]
     one = np.float32(1)
     rank = np.zeros(count, np.float32)
     penalty = np.zeros(count, np.float32)
@@ -58,7 +58,7 @@ def blend(  # type: ignore[no-untyped-def]
             anew = k > 0 and _anew(places[k], places[0], origin, directions[n], t, nearer, other_side_rad)
             if _angle(places[k], origin, directions[n], t, away) > aside_rad:
                 row, column, _ = panorama_pixel(px, py, pz, height, width)
-                if (k == 0 or anew) and torn[k, row, column]:
+                if (k == 0 or anew) and depth_edge[k, row, column]:
                     rank[k] -= edge
                 elif k > 0 and not anew and beside[k, row, column]:
                     rank[k] = 0
@@ -132,7 +132,7 @@ def _anew(place, newest, origin, direction, t, nearer, other_side_rad):  # type:
 
 @njit(**_OPTIONS)
 def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
-    """What a keyframe says of a point of its camera's frame: ``FOR`` (it has seen a surface there), ``AGAINST`` (it has
+    """A keyframe's opinion on a point of its camera's frame: ``FOR`` (it has seen a surface there), ``AGAINST`` (it has
     looked through it) or ``NO_OPINION`` (it is hidden, or the depth is not known there).
 
     ``room``: share of the distance by which depths may differ.
@@ -154,7 +154,7 @@ def opinion(x, y, z, inverse, sure, room):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def outvoted(directions, inverse, sure, map_from_camera, camera_from_map, room, own, step, out):  # type: ignore[no-untyped-def]
-    """Which pixels of keyframe ``own`` most of the keyframes with an opinion have looked through.
+    """Pixels of keyframe ``own`` through which most of the keyframes with an opinion have looked.
 
     Args:
         directions: of the panorama's pixels, (h, w, 3), camera frame.

@@ -1,4 +1,4 @@
-"""Which device trains and draws: numba on the CPU, the Triton kernels on an NVIDIA GPU, or plain torch on either."""
+"""Choice of the backend: numba on the CPU, the Triton kernels on an NVIDIA GPU, or plain torch on either."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from instant_ic.vspace.warp import Pyramid
 
 MakeDevice = Callable[[FieldConfig, TrainConfig], Device]
 AGREEMENT = 0.1
-"""Triton's errors of a training step may differ from plain torch's by this share: half tables, other roundings."""
+"""Allowed difference between Triton's and plain torch's training errors, as a share: half tables, other rounding."""
 
 
 class DeviceError(RuntimeError):
-    """The device that was asked for is not there, or does not work."""
+    """The requested device is absent or does not work."""
 
 
 def is_out_of_memory(error: Exception) -> bool:
@@ -40,7 +40,7 @@ def is_device_fault(error: Exception) -> bool:
 
 
 def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
-    """The device that ``config.device`` asks for, and what is not as it should be ("" when all is well).
+    """The backend for ``config.device``, and a warning (empty when there is none).
 
     Raises:
         DeviceError: a device was asked for that is not there, or does not work.
@@ -73,12 +73,12 @@ def make_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
 
 
 def _may_have_cuda() -> bool:
-    """Whether the machine has an NVIDIA device at all: importing torch only to learn that it has not costs seconds."""
+    """Whether the machine has an NVIDIA device. Importing torch to find out would take seconds."""
     return any(Path(place).exists() for place in ("/dev/nvidiactl", "/dev/nvmap", "/dev/dxg"))
 
 
 def _make_gpu_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
-    """``make_device`` where there is CUDA.
+    """``make_device`` on a machine with CUDA.
 
     The Triton kernels are compiled here (seconds at the first start of an installation, then kept on disk), and their
     results compared with plain torch's. Where that fails plain torch runs, with a warning.
@@ -107,7 +107,7 @@ def _make_gpu_device(config: VirtualSpaceConfig) -> tuple[Device, str]:
 
 
 def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfig) -> None:
-    """Two training steps and a picture of a scratch scene, against another device's: all kernels run and are right.
+    """Compare two training steps and a view of a scratch scene with another backend's, so that all kernels are run.
 
     Raises:
         DeviceError: the results are not alike.
@@ -126,16 +126,16 @@ def check_device(make: MakeDevice, make_reference: MakeDevice, field: FieldConfi
     colours, depths, _ = zip(*(device.draw(rays, 0.5, 0.9) for device in (ours, theirs)), strict=True)
     alike = np.isclose(depths[0], depths[1], rtol=0.02) & np.all(np.abs(colours[0] - colours[1]) < 0.05, axis=1)
     if alike.mean() < 0.9:
-        raise DeviceError(f"only {alike.mean():.0%} of a picture's pixels are as plain torch draws them")
+        raise DeviceError(f"only {alike.mean():.0%} of an image's pixels are as plain torch renders them")
     if importlib.util.find_spec("numba") is not None:  # without it nothing is warped
         check_canvas(ours.canvas, theirs.canvas)
 
 
 def check_canvas(ours: Canvas, theirs: Canvas, size: tuple[int, int] = (160, 90)) -> None:
-    """Pictures of a scratch keyframe's warp from two places, against another canvas'.
+    """Compare views of a scratch keyframe's warp from two poses with another canvas'.
 
     Raises:
-        DeviceError: the pictures are not alike.
+        DeviceError: the images are not alike.
     """
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[:, ::8] = (250, 120, 30)
@@ -143,7 +143,7 @@ def check_canvas(ours: Canvas, theirs: Canvas, size: tuple[int, int] = (160, 90)
     depth[10:20, 28:40] = 1.0  # something with edges, and with a background that nobody has seen
     prior = prepare(rgb, depth, np.eye(4), 0.05, GeometryConfig(), 64)
     shown = KeyframeSet((ready(0, prior, Pyramid.of(prior.rgb)),), np.ones((1, 3), np.float32))
-    for x, y in ((0.3, 0.4), (1.9, 0.0)):  # from near a wall few quads cover the whole picture
+    for x, y in ((0.3, 0.4), (1.9, 0.0)):  # from near a wall few quads cover the whole image
         pose = np.eye(4)
         pose[:2, 3] = x, y
         rays = perspective_rays(pose, *size, 1.5)
@@ -155,7 +155,7 @@ def check_canvas(ours: Canvas, theirs: Canvas, size: tuple[int, int] = (160, 90)
         alike = np.abs(colours[0].astype(int) - colours[1]).max(axis=2).reshape(-1) < 12
         alike &= np.isclose(depths[0], depths[1], rtol=0.02) & (confidences[0] == confidences[1])
         if alike.mean() < 0.97:
-            raise DeviceError(f"only {alike.mean():.0%} of a warped picture's pixels are as plain torch draws them")
+            raise DeviceError(f"only {alike.mean():.0%} of a warped image's pixels are as plain torch renders them")
 
 
 def _scratch(field: FieldConfig) -> tuple[Scene, Rays]:

@@ -1,4 +1,4 @@
-"""What a space is outside of this program: coloured points, a mesh, a flight through it."""
+"""Export of a space: coloured points, a mesh, a camera flight."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.geometry.projections import equirect_directions
-from instant_ic.vspace.prior import torn_quads
+from instant_ic.vspace.prior import edge_quads
 from instant_ic.vspace.space import NotReadyError, VirtualSpace
 
 
@@ -32,7 +32,7 @@ class Surface:
 
 
 def surface(space: VirtualSpace, width: int = 1024, torn_ratio: float = 0.10) -> Surface:
-    """The surfaces that the keyframe has seen, through the trained field, as a mesh torn at depth edges.
+    """The surfaces that the keyframe has seen, through the trained field, as a mesh cut at depth edges.
 
     Args:
         space: with a keyframe.
@@ -52,7 +52,7 @@ def surface(space: VirtualSpace, width: int = 1024, torn_ratio: float = 0.10) ->
     number = np.cumsum(known.reshape(-1), dtype=np.int32).reshape(known.shape) - 1
     with np.errstate(divide="ignore"):
         inverse = np.where(known, 1 / view.depth_m, 0).astype(np.float32)
-    whole = torn_quads(inverse, torn_ratio)[:-1] == 0
+    whole = edge_quads(inverse, torn_ratio)[:-1] == 0
     for corner in _corners(known):
         whole &= corner
     a, b, c, d = (corner[whole] for corner in _corners(number))
@@ -87,7 +87,7 @@ def write_ply(path: str | Path, surface: Surface, mesh: bool) -> None:
 
 
 def default_flight(radius_m: float) -> list[NDArray[np.float64]]:
-    """Ways (x, y, z, yaw) relative to the camera: ahead, back, and a full turn; within ``radius_m``."""
+    """Waypoints (x, y, z, yaw) relative to the camera: ahead, back, and a full turn; within ``radius_m``."""
     reach = min(radius_m, 1.0)
     turns = [(0.0, 0.0, 0.0, 0.5 * math.pi * quarter) for quarter in range(1, 5)]
     aside = (0.5 * reach, 0.3 * reach, 0.0, -0.3)
@@ -108,7 +108,7 @@ def flight(waypoints: Sequence[Sequence[float] | NDArray[np.floating]], count: i
     if points.ndim != 2 or points.shape[1] != 4 or len(points) < 2 or not np.isfinite(points).all():
         raise ValueError("a flight needs two waypoints or more, each x, y, z, yaw and finite")
     if count < 2:
-        raise ValueError(f"a flight needs two pictures or more (got {count})")
+        raise ValueError(f"a flight needs two images or more (got {count})")
     step = np.diff(points, axis=0)
     # A turn of a radian takes as long as half a metre; a waypoint given twice is a short stop.
     length = np.linalg.norm(step[:, :3], axis=1) + 0.5 * np.abs(step[:, 3])

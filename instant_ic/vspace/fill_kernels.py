@@ -1,4 +1,4 @@
-"""CPU kernel of ``prior.fill_holes`` (numba): each pixel is read once, and only holes are worked out."""
+"""CPU kernel of ``prior.fill_holes`` (numba): reads each pixel once and computes holes only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colours of a mesh under the rays of a picture (numba)."""
+"""Colours of a mesh under the rays of an image (numba)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from instant_ic.vspace.nerf.kernels import _OPTIONS
 
 @njit(**_OPTIONS)
 def _add_bilinear(texels, start, height, width, u, v, weight, rgb):  # type: ignore[no-untyped-def]
-    """Adds ``weight`` × the bilinear colour at (u, v) in repeats of the picture."""
+    """Adds ``weight`` × the bilinear colour at (u, v) in repeats of the image."""
     x, y = (u - math.floor(u)) * width - 0.5, (v - math.floor(v)) * height - 0.5
     x0, y0 = math.floor(x), math.floor(y)
     fx, fy = x - x0, y - y0

@@ -1,7 +1,7 @@
-"""Conventional illusory control: a place that was scanned beforehand, rendered as it is (paper, section II).
+"""Conventional illusory control: renders a place that was scanned beforehand (paper, section II).
 
-The same calls as ``VirtualSpace``, but nothing is learnt: READY at once, and a keyframe only tells how alike the mesh
-and the camera's image are, and what the colours have to be multiplied by.
+The same calls as ``VirtualSpace``, but nothing is trained: READY at once. A keyframe only measures how similar mesh and
+camera image are, and sets the factors of the mesh's colours.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from instant_ic.vspace.prior import PanoramaPrior
 
 EDGE_RATIO = 0.03
-"""Neighbouring depths that differ by more than this share are an edge: such pixels are rendered by four rays."""
+"""Neighbouring depths that differ by more than this share are an edge; its pixels are rendered by four rays."""
 _SUBPIXELS = ((-0.375, -0.125), (-0.125, 0.375), (0.125, -0.375), (0.375, 0.125))
 _PROBE_WIDTH = 256
-"""Pixels of the panoramas by which mesh and camera are compared."""
+"""Width of the panoramas in which mesh and camera are compared."""
 _MIN_SAMPLES = 200
 _MAX_GAIN = 3.0
 _NEAR, _LEAST_NEAR = 0.25, 0.7
@@ -41,7 +41,7 @@ _ASIDE = math.sin(math.radians(22.5))
 
 
 class Space(Protocol):
-    """What a source of views has to be able to do; see ``VirtualSpace`` for each."""
+    """Interface of a source of views; see ``VirtualSpace``."""
 
     config: VirtualSpaceConfig
 
@@ -64,7 +64,7 @@ class Space(Protocol):
 
 
 def make_space(config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> Space:
-    """The space that ``config.source`` asks for; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
+    """Create the space for ``config.source``; ``robot``: the robot's mask, as ``VirtualSpace`` takes it.
 
     Raises:
         MeshError: ``source`` is ``mesh``, and its file cannot be used.
@@ -86,7 +86,7 @@ class MeshSpace(Drawn):
     """
 
     keyframe = None
-    """None of the images comes from one."""
+    """Views do not come from keyframes."""
 
     def __init__(self, config: VirtualSpaceConfig) -> None:
         self.config = config
@@ -112,7 +112,7 @@ class MeshSpace(Drawn):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> None:
-        """Compares the mesh with a panorama: how alike they are, and, with ``mesh_fit_colours``, a factor a colour.
+        """Compare the mesh with a panorama; with ``mesh_fit_colours``, fit one colour factor a channel.
 
         Args: as ``prior.prepare``; ``relative_sigma`` counts for nothing here.
 
@@ -198,7 +198,7 @@ class MeshSpace(Drawn):
         )
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
-        """PSNR that a view will have: the mesh's at the newest keyframe, and what of the view it does not hold.
+        """Expected PSNR of a view: the mesh's at the newest keyframe, reduced by the parts of the view beyond the mesh.
 
         NaN before the first keyframe: nothing is known of how alike mesh and place are.
         """
@@ -256,7 +256,7 @@ class MeshSpace(Drawn):
         return colour, np.where(face >= 0, range_m, 0).astype(np.float32), face
 
     def _fine(self, range_m: Floats, face: NDArray[np.int32], pixel_rad: float) -> NDArray[np.bool_]:
-        """Pixels that one ray does not do: at depth edges, and where triangles are finer than a pixel, (P,)."""
+        """Pixels (P,) that need several rays: at depth edges, and where triangles are finer than a pixel."""
         edge = np.zeros(range_m.shape, bool)
         for axis in (0, 1):
             a, b = (range_m[1:], range_m[:-1]) if axis == 0 else (range_m[:, 1:], range_m[:, :-1])

@@ -1,4 +1,4 @@
-"""A keyframe made ready for training: panorama, depth prior with its tears, pose, uncertainty (paper, IV.A-B)."""
+"""A keyframe prepared for training: panorama, depth prior with its edges, pose, uncertainty (paper, IV.A-B)."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from numpy.typing import NDArray
 from instant_ic.vspace.config import GeometryConfig
 
 MOST_SIGMA = 0.5
-"""Depth that is more uncertain than this, relative to it, is as good as filled in: views of it are less confident."""
+"""Relative standard deviation above which depth counts as filled in; views of it are less confident."""
 
 
 EDGE_RAD = 0.05
-"""So far to each side of an edge its depth may be of the one or the other."""
+"""Distance to each side of an edge within which depth may belong to either surface."""
 
 ROOM, ROBOT, SKY, MOVED = 0, 1, 2, 3
-"""What a pixel shows: a part of the place; the robot itself; the sky, endlessly far; what has moved away."""
+"""Content of a pixel: a part of the place; the robot itself; the sky; something that has moved away."""
 _SKY_RISE = 0.17  # sine of the elevation that unknown regions must lie above, on the mean, to be the sky
 
 
 class KeyframeError(ValueError):
-    """The keyframe cannot be trained from; the message says what is wrong with it."""
+    """The keyframe cannot be used; the message says why."""
 
 
 @dataclass(frozen=True)
 class PanoramaPrior:
-    """What training and rendering need of a keyframe.
+    """A keyframe as training and rendering use it.
 
     Attributes:
         rgb: panorama, (H, W, 3) uint8.
         inverse_depth: 1/m along the ray, (h, w) float32, h = w/2, holes filled.
         known: 1 where the depth was measured or estimated and is less uncertain than ``MOST_SIGMA``, (h, w) uint8.
-        torn: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
+        depth_edge: 1 where the quad between pixel (v, u) and (v + 1, u + 1) crosses a depth edge, (h, w) uint8.
         map_from_camera: pose, (4, 4).
-        relative_sigma: standard deviation of the depth, relative to it: median over the picture.
+        relative_sigma: standard deviation of the depth, relative to it: median over the image.
         band: half width, relative to the depth, of the band in which the signed distance is learnt.
         sigma: as ``relative_sigma``, of each pixel, (h, w) float32; ``MOST_SIGMA`` where the depth was filled in.
-        usable: 1 where training may draw rays, (h, w) uint8: where ``content`` is ``ROOM``.
+        usable: 1 where training may sample rays, (h, w) uint8: where ``content`` is ``ROOM``.
         content: ``ROOM``, ``ROBOT``, ``SKY`` or ``MOVED``, (h, w) uint8; only ``ROOM`` has surfaces.
     """
 
     rgb: NDArray[np.uint8]
     inverse_depth: NDArray[np.float32]
     known: NDArray[np.uint8]
-    torn: NDArray[np.uint8]
+    depth_edge: NDArray[np.uint8]
     map_from_camera: NDArray[np.float64]
     relative_sigma: float
     band: float
@@ -65,9 +65,9 @@ class PanoramaPrior:
 
     @functools.cached_property
     def beside_edge(self) -> NDArray[np.uint8]:
-        """1 within ``EDGE_RAD`` of a torn quad, (h, w) uint8."""
-        pixels = max(1, round(EDGE_RAD / np.pi * self.torn.shape[0]))
-        near = np.pad(self.torn, ((pixels, pixels), (0, 0)))
+        """1 within ``EDGE_RAD`` of a quad with a depth edge, (h, w) uint8."""
+        pixels = max(1, round(EDGE_RAD / np.pi * self.depth_edge.shape[0]))
+        near = np.pad(self.depth_edge, ((pixels, pixels), (0, 0)))
         for axis in (0, 1):  # columns wrap
             near = np.maximum.reduce([np.roll(near, k, axis) for k in range(-pixels, pixels + 1)])
         return np.ascontiguousarray(near[pixels:-pixels])
@@ -98,7 +98,7 @@ def prepare(
             the depth, not finite where it is unknown.
         config: geometry parameters.
         panorama_width: a wider panorama is area-averaged to this width.
-        robot: picture (H, 2 H) of any size: true where the panorama shows the robot itself or its stand, besides what
+        robot: image (H, 2 H) of any size: true where the panorama shows the robot itself or its stand, besides what
             lies below ``config.body_below_deg``.
 
     Raises:
@@ -119,10 +119,10 @@ def prepare(
     known |= sky
     band = float(np.clip(config.band_sigmas * sigma, config.band_min, config.band_max))
     return PanoramaPrior(
-        rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile anew
+        rgb=np.array(rgb, order="C"),  # a copy: the caller may reuse its own, and read-only arrays compile again
         inverse_depth=np.ascontiguousarray(inverse),
         known=(known & ((each <= MOST_SIGMA) | sky) & (content != ROBOT)).astype(np.uint8),
-        torn=torn_quads(inverse, config.torn_ratio),
+        depth_edge=edge_quads(inverse, config.torn_ratio),
         map_from_camera=np.array(map_from_camera, np.float64),
         relative_sigma=sigma,
         band=band,
@@ -139,7 +139,7 @@ def _check_panorama(rgb: NDArray[np.uint8]) -> None:
     if width != 2 * height or width < 32:
         raise KeyframeError(f"panorama must be twice as wide as high, 32 pixels or more (got {width} x {height})")
     if int(rgb.max()) - int(rgb.min()) < 2:
-        raise KeyframeError("panorama has one colour only: covered lens or black picture")
+        raise KeyframeError("panorama has one colour only: covered lens or black image")
 
 
 def _check_pose(map_from_camera: NDArray[np.floating]) -> None:
@@ -172,7 +172,7 @@ def _checked_depth(
     content[robot_region(depth.shape[0], config.body_below_deg, robot)] = ROBOT
     share = float(np.count_nonzero(depth)) / max(1, int(np.count_nonzero(content != SKY)))
     if share < config.min_known_share:
-        raise KeyframeError(f"depth is known in {share:.0%} of the picture, {config.min_known_share:.0%} are needed")
+        raise KeyframeError(f"depth is known in {share:.0%} of the image, {config.min_known_share:.0%} are needed")
     return depth, content
 
 
@@ -224,7 +224,7 @@ def sky_region(unknown: NDArray[np.bool_], least_share: float) -> NDArray[np.boo
 
 
 def _shrunk(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """``area_average``; OpenCV's where it is installed: a tenth of the time where the ratio is no whole number."""
+    """``area_average`` by OpenCV where it is installed: ten times as fast for ratios that are not integers."""
     try:
         import cv2
     except ImportError:
@@ -235,7 +235,7 @@ def _shrunk(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8
 def _checked_sigma(
     relative_sigma: float | NDArray[np.floating], depth_m: NDArray[np.floating], depth: NDArray[np.float32]
 ) -> tuple[float, NDArray[np.float32]]:
-    """One number for the picture, and of each pixel of the depth (after ``_checked_depth``), (h, w), inf = unknown."""
+    """One number for the image, and of each pixel of the depth (after ``_checked_depth``), (h, w), inf = unknown."""
     sigma = np.asarray(relative_sigma, np.float32)
     if sigma.ndim == 0:
         if not np.isfinite(sigma) or sigma < 0:
@@ -340,7 +340,7 @@ _ABRUPT = 0.75  # of the change over five pixels: a step that makes up less of i
 _LARGE = 0.3  # a difference larger than this share is an edge also where others are near
 
 
-def torn_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
+def edge_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.uint8]:
     """1 for each quad (v, u)-(v + 1, u + 1) that crosses a depth edge; columns wrap, the last row has no quad below.
 
     Two neighbours are an edge when their depths differ by more than ``ratio`` and neither side's slope of the inverse
@@ -353,8 +353,8 @@ def torn_quads(inverse_depth: NDArray[np.float32], ratio: float) -> NDArray[np.u
     rows = np.pad(inverse, ((2, 3), (0, 0)), "edge")
     across = _torn_pairs([columns[:, k : k + width] for k in range(6)], ratio)
     down = _torn_pairs([rows[k : k + len(inverse)] for k in range(6)], ratio)
-    torn = across | np.concatenate([across[1:], across[-1:]]) | down | np.roll(down, -1, 1)
-    return torn.astype(np.uint8)
+    depth_edge = across | np.concatenate([across[1:], across[-1:]]) | down | np.roll(down, -1, 1)
+    return depth_edge.astype(np.uint8)
 
 
 def _torn_pairs(line: list[NDArray[np.float32]], ratio: float) -> NDArray[np.bool_]:

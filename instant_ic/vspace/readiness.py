@@ -1,4 +1,4 @@
-"""How good an image from a pose will be, without its truth: expected PSNR.
+"""Expected PSNR of a view, without its ground truth.
 
 Two things make an image differ from the truth: the depth's error moves surfaces aside, and some have not been seen at
 all. What a shift of some radians costs is read off the panorama itself: the mean squared difference between it and
@@ -21,7 +21,7 @@ from instant_ic.vspace.prior import PanoramaPrior, area_average
 _ROWS = 128
 _TURNS = np.array([1, 2, 3, 5, 8, 13, 21, 34])
 BASE_MSE = 8.8e-5
-"""Of an image from the keyframe's own place: sampling alone."""
+"""Error of a view at the keyframe's own pose, from sampling alone."""
 SHIFT_GAIN, UNSEEN_GAIN = 0.76, 1.98
 """These three are fitted on simulated rooms: ``benchmarks/readiness.py --fit``."""
 
@@ -51,7 +51,7 @@ class Texture:
 def error_terms(
     priors: Sequence[PanoramaPrior], texture: Texture, rays: Rays, depth: Floats, confidence: Floats
 ) -> tuple[float, float]:
-    """Squared errors (0..1 units) of a view by shift and by what is unseen, before they are weighted.
+    """Squared errors (0..1 units) of a view from shifts and from unseen parts, before weighting.
 
     Args:
         priors: keyframes that the view is rendered from; a surface counts for the one that sees it most alike.
@@ -75,7 +75,7 @@ def error_terms(
 
 
 def expected_psnr_db(terms: tuple[float, float], training_psnr_db: float, panorama_share: float) -> float:
-    """PSNR from ``error_terms``; what of the image the field renders has at least its own error in training."""
+    """PSNR from ``error_terms``; parts rendered by the field have at least its training error."""
     shift, unseen = terms
     training = 0.0 if panorama_share == 1 else (1 - panorama_share) * 10 ** (-training_psnr_db / 10)
     mse = BASE_MSE + SHIFT_GAIN * shift + UNSEEN_GAIN * unseen + training

@@ -20,17 +20,19 @@ from instant_ic.vspace.nerf.field import FieldParameters, Floats, Lattice
 from instant_ic.vspace.prior import PanoramaPrior
 
 FORMAT, VERSION = "instant_ic virtual space", 2
+_IN_FILE = {"depth_edge": "torn"}
+"""Names of fields in files of this version, where they differ."""
 FILE_NAME = "space.npz"
-"""Of the file where a folder is named."""
+"""Name of the file in a folder."""
 
 
 class SpaceFileError(ValueError):
-    """A file that holds no space that can be used; the message names it and says why."""
+    """A file holds no usable space; the message names the file and the reason."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far training had come."""
+    """Progress of training."""
 
     psnr_db: float
     iteration: int
@@ -42,7 +44,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class SavedSpace:
-    """What a file holds: the keyframes (newest first), their gains (K, 3), and the field that has learnt them."""
+    """Content of a file: the keyframes (newest first), their gains (K, 3), and the trained field."""
 
     config: VirtualSpaceConfig
     priors: tuple[PanoramaPrior, ...]
@@ -59,7 +61,7 @@ def space_file(path: str | Path) -> Path:
 
 
 def write(path: str | Path, saved: SavedSpace) -> Path:
-    """Writes the file whole or not at all; folders are made. Returns its path.
+    """Write the file atomically, creating folders; returns its path.
 
     Raises:
         OSError: it cannot be written.
@@ -76,7 +78,7 @@ def write(path: str | Path, saved: SavedSpace) -> Path:
     groups: dict[str, Any] = {f"prior.{number}": prior for number, prior in enumerate(saved.priors)}
     for group, part in (groups | {"lattice": saved.lattice, "parameters": saved.parameters}).items():
         for field in dataclasses.fields(part):
-            arrays[f"{group}.{field.name}"] = np.asarray(getattr(part, field.name))
+            arrays[f"{group}.{_IN_FILE.get(field.name, field.name)}"] = np.asarray(getattr(part, field.name))
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
@@ -156,7 +158,8 @@ def _checksum(arrays: dict[str, NDArray[Any]]) -> bytes:
 
 def _group(kind: type[Any], group: str, arrays: dict[str, NDArray[Any]]) -> Any:
     """A dataclass of arrays and numbers."""
-    values = {field.name: arrays[f"{group}.{field.name}"] for field in dataclasses.fields(kind)}
+    names = [field.name for field in dataclasses.fields(kind)]
+    values = {name: arrays[f"{group}.{_IN_FILE.get(name, name)}"] for name in names}
     return kind(**{name: value.item() if value.ndim == 0 else value for name, value in values.items()})
 
 

@@ -1,4 +1,4 @@
-"""The virtual space: one keyframe's panorama and depth, trained and rendered by turns (paper, IV.A-B)."""
+"""The virtual space: keyframes' panoramas and depth, shown by warping and learnt by a field (paper, IV.A-B)."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ class State(enum.IntEnum):
 
 @dataclass(frozen=True)
 class TrainStats:
-    """What one ``train`` call did: iterations of this call and its CPU-independent wall time; PSNR is a running mean
-    over training rays since the newest keyframe, dB, NaN before the first iteration.
+    """Result of one ``train`` call: its iterations and wall time; PSNR is a running mean over training rays since the
+    newest keyframe, dB, NaN before the first iteration.
     """
 
     iterations: int
     psnr_db: float
     distance_error: float
-    """Root mean square of the signed distance's error, share of the band."""
+    """Root mean square error of the signed distance, as a share of the truncation distance."""
     elapsed_ms: float
     converged: bool
 
 
 @dataclass(frozen=True)
 class Status:
-    """What the space can show now; fields as in VspaceStatus.msg.
+    """State of the space; fields as in VspaceStatus.msg.
 
     Training figures are since the newest keyframe. ``refreshing``: the field has not learnt that one yet.
     """
@@ -70,32 +70,32 @@ class Status:
     psnr_db: float
     iterations: int
     train_seconds: float
-    """Spent in training since the newest keyframe."""
+    """Training time since the newest keyframe."""
     ready_iterations: int
     """Iterations from the keyframe until READY, 0 while not ready."""
     ms_per_iteration: float
     ready_radius_m: float
-    """How far from the keyframe a view is fit to show."""
+    """Distance from the keyframe up to which views may be shown."""
     converged: bool
     device: str
     warning: str = ""
-    """What is not as it should be with the device; empty when all is well."""
+    """Problem of the device; empty when there is none."""
 
 
 class NotReadyError(RuntimeError):
-    """Asked for training or an image before the first keyframe."""
+    """Training or a view was requested before the first keyframe."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What the field is to learn, and the keyframes that it is of."""
+    """A scene to train on, and its keyframes."""
 
     scene: Scene
     keyframes: KeyframeSet
 
 
 class VirtualSpace(Drawn):
-    """The newest keyframes: shown at once by warping, and one hash-grid field that learns from all of them.
+    """The newest keyframes, shown at once by warping, and one hash-grid field trained on all of them.
 
     A new keyframe is shown from the moment it is taken; the field goes on from what it has learnt. One thread at a
     time, but for ``prepare`` and ``scene_of``, which another may call meanwhile. The same calls with the same seed give
@@ -109,7 +109,7 @@ class VirtualSpace(Drawn):
     """
 
     def __init__(self, config: VirtualSpaceConfig | None = None, robot: NDArray[np.bool_] | None = None) -> None:
-        """Makes an empty space.
+        """Create an empty space.
 
         Args:
             config: parameters.
@@ -148,12 +148,12 @@ class VirtualSpace(Drawn):
 
     @property
     def keyframe(self) -> PanoramaPrior | None:
-        """The newest keyframe that images show."""
+        """The newest keyframe that views show."""
         return None if self._shown is None else self._shown.keyframes[0].prior
 
     @property
     def keyframes(self) -> tuple[PanoramaPrior, ...]:
-        """All keyframes that images show, newest first."""
+        """All keyframes that views show, newest first."""
         return () if self._shown is None else self._shown.priors
 
     @property
@@ -162,7 +162,7 @@ class VirtualSpace(Drawn):
 
     @property
     def _done(self) -> bool:
-        """Nothing is left to train."""
+        """Whether nothing is left to train."""
         return self._schedule.finished or self.config.source == "warp"
 
     def set_keyframe(
@@ -172,7 +172,7 @@ class VirtualSpace(Drawn):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> None:
-        """Takes a new keyframe in: ``prepare``, ``scene_of``, ``learn`` and ``show``, one after another.
+        """Use a new keyframe: ``prepare``, ``scene_of``, ``learn`` and ``show`` in sequence.
 
         Args: as ``prior.prepare``.
 
@@ -190,7 +190,7 @@ class VirtualSpace(Drawn):
         map_from_camera: NDArray[np.floating],
         relative_sigma: float | NDArray[np.floating],
     ) -> KeyframeSet:
-        """Makes a new keyframe ready to be shown, with those before it that are kept; changes nothing that is shown.
+        """Prepare a new keyframe, with the earlier ones that are kept; changes nothing that is shown.
 
         Of the keyframes before it ``config.keyframes`` − 1 are kept (0, the paper's way), in the new one's exposure and
         without what has moved; none where its images have another size. May run in a thread of its own beside all
@@ -212,7 +212,7 @@ class VirtualSpace(Drawn):
         return self._together((newest, *older))
 
     def _together(self, keyframes: tuple[Keyframe, ...]) -> KeyframeSet:
-        """Keyframes in one exposure, without what has moved."""
+        """Keyframes in one exposure, without moved objects."""
         if len(keyframes) == 1:
             alone = keyframes[0].prior.without(np.zeros_like(keyframes[0].prior.content, bool))
             return KeyframeSet((_renewed(keyframes[0], alone),), np.ones((1, 3), np.float32))
@@ -222,7 +222,7 @@ class VirtualSpace(Drawn):
         return KeyframeSet(keyframes, exposure_gains([keyframe.prior for keyframe in keyframes]))
 
     def show(self, prepared: KeyframeSet, dissolve: bool = False) -> None:
-        """Images show these keyframes from now on.
+        """Show these keyframes from now on.
 
         ``dissolve``: what was shown before passes into them over the next ``picture.refresh_pictures`` images.
         """
@@ -233,14 +233,14 @@ class VirtualSpace(Drawn):
         self._let_go()
 
     def _let_go(self) -> None:
-        """Frees what is neither shown nor learnt any more."""
+        """Free keyframes that are neither shown nor trained on."""
         if self._pictures >= self.config.picture.refresh_pictures - 1:
             self._before = None
         shown = [one.keyframes for one in (self._shown, self._before) if one is not None]
         self._store.keep(itertools.chain(*shown, self._held))
 
     def scene_of(self, prepared: KeyframeSet) -> Prepared:
-        """What the field needs to learn keyframes; in any thread, as ``prepare``, and before the next keyframe's."""
+        """Scene to train on; may run in another thread, as ``prepare``, and before the next keyframe's ``prepare``."""
         priors, config = prepared.priors, self.config
         lattice, scene = Lattice.for_prior(priors[0], config.field), self._scene
         if scene is not None and scene.lattice.suits(lattice):
@@ -248,7 +248,7 @@ class VirtualSpace(Drawn):
         return Prepared(Scene(priors, lattice, build_occupancy(priors, config.geometry), prepared.gains), prepared)
 
     def learn(self, prepared: Prepared) -> None:
-        """The field learns these keyframes from now on, from what it has learnt before.
+        """Train on these keyframes from now on, starting from the present parameters.
 
         Where the scale has changed by more than a factor of 2 it starts again. A failing device leaves the old space.
         """
@@ -277,7 +277,7 @@ class VirtualSpace(Drawn):
             raise
 
     def train(self, budget_ms: float = math.inf, iterations: int | None = None) -> TrainStats:
-        """Trains until the time is spent, the iterations are done or the schedule has ended, at least one iteration.
+        """Train for a time, a number of iterations or to the end of the schedule; at least one iteration.
 
         Raises:
             NotReadyError: no keyframe yet.
@@ -316,7 +316,7 @@ class VirtualSpace(Drawn):
 
     @property
     def status(self) -> Status:
-        """What the space can show now."""
+        """The present state."""
         iterations = self._schedule.iteration
         if self._shown is None:
             state = State.EMPTY
@@ -344,7 +344,7 @@ class VirtualSpace(Drawn):
         return min(rule.max_radius_m, rule.parallax_rad * prior.median_depth_m / sigma)
 
     def expected_psnr_db(self, map_from_camera: NDArray[np.floating], fov_rad: float = math.pi / 2) -> float:
-        """PSNR that a view from a pose will have, judged without its truth (``readiness``); −inf without a keyframe.
+        """Expected PSNR of a view, estimated without ground truth (``readiness``); −inf without a keyframe.
 
         From the depth's error, the distance to the keyframes, what they have not seen, and the error in training.
         """
@@ -362,7 +362,7 @@ class VirtualSpace(Drawn):
         return self._judge(rays, depth, confidence)
 
     def _judge(self, rays: Rays, depth: Floats, confidence: Floats) -> float:
-        """Expected PSNR of a view as it was rendered, (P,) each; a few thousand pixels tell it."""
+        """Expected PSNR of a view as it was rendered, (P,) each, from a few thousand of its pixels."""
         step = max(1, rays.shape[1] // _PROBE[0])
         height, width = rays.shape
         chosen = np.arange(step // 2, height, step)[:, None] * width + np.arange(step // 2, width, step)
@@ -386,13 +386,13 @@ class VirtualSpace(Drawn):
         return View(rgb, depth.reshape(rays.shape), confidence.reshape(rays.shape), projection, expected)
 
     def _learn_what_is_drawn(self, around: bool) -> None:
-        """Gives the field the keyframes that are shown where it is rendered too, and has none yet."""
+        """Train on the shown keyframes if the field is rendered too and has no scene yet."""
         if self._scene is None and (self._panorama_share < 1 or around or not self._can_warp):
             assert self._shown is not None
             self.learn(self.scene_of(self._shown))
 
     def _painted(self, device: Device, rays: Rays, around: bool) -> Painted:
-        """A view of what is shown, passing over from what was shown before; ``around``: a panorama, not warped."""
+        """Render the shown keyframes, blended with those shown before; ``around``: a panorama, not warped."""
         assert self._shown is not None
         canvas, warps = device.canvas, self._can_warp and not around
         layers: dict[int, Drawing] = {}  # a keyframe of both sets is rendered once
@@ -407,7 +407,7 @@ class VirtualSpace(Drawn):
     def _drawn(
         self, device: Device, rays: Rays, shown: KeyframeSet, warps: bool, layers: dict[int, Drawing]
     ) -> Picture:
-        """A view by keyframes: their panoramas warped (``warps``), then the field as it becomes better."""
+        """Render keyframes: their panoramas warped (``warps``), blended with the field as it improves."""
         share, depth_share = self._panorama_share, self.config.picture.depth_share(self._psnr_db)
         field = None
         if share < 1 or not warps:
@@ -419,7 +419,7 @@ class VirtualSpace(Drawn):
         return 1.0 if self.config.source == "warp" else self.config.picture.panorama_share(self._psnr_db)
 
     def _on_device(self, call: Callable[[Device], T]) -> T:
-        """Calls; a GPU without memory is left for the CPU where ``device`` is ``auto``, with what is learnt."""
+        """Call with the backend; with ``device: auto``, a GPU that runs out of memory is replaced by the CPU."""
         try:
             return call(self._device)
         except RuntimeError as error:
@@ -469,7 +469,7 @@ class VirtualSpace(Drawn):
 
     @classmethod
     def load(cls, path: str | Path, device: str | None = None) -> VirtualSpace:
-        """The space of a file (or of the folder it lies in). Its images have the same bits as before, on the CPU.
+        """Load the space of a file or folder; on the CPU its views are bit-identical to those before saving.
 
         Args:
             path: what ``save`` was given.

@@ -1,4 +1,4 @@
-"""The newest keyframes, in places that are made once and used again and again."""
+"""Storage of the newest keyframes in preallocated slots."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from instant_ic.vspace.warp import PanoramaWarp, Pyramid
 
 @dataclass(frozen=True)
 class Keyframe:
-    """A keyframe as pictures need it; ``warp`` and ``background`` are None without numba. ``place``: in the store."""
+    """A keyframe prepared for rendering; ``warp`` and ``background`` are None without numba. ``place``: its slot."""
 
     place: int
     prior: PanoramaPrior
@@ -28,7 +28,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class KeyframeSet:
-    """Keyframes that pictures show together, newest first; ``gains`` (K, 3) bring their colours to the newest's."""
+    """Keyframes that views show together, newest first; ``gains`` (K, 3) bring their colours to the newest's."""
 
     keyframes: tuple[Keyframe, ...]
     gains: Floats
@@ -52,7 +52,7 @@ class KeyframeStore:
         self._held: set[int] = set()
 
     def put(self, prior: PanoramaPrior, draws: bool) -> Keyframe:
-        """Copies a keyframe into a free place and makes it ready to be drawn (``draws``: by the warp, with numba)."""
+        """Copy a keyframe into a free slot and prepare it for rendering (``draws``: by the warp, with numba)."""
         names = [field.name for field in fields(prior) if isinstance(getattr(prior, field.name), np.ndarray)]
         arrays = self._free({name: getattr(prior, name) for name in names})
         for name in names:
@@ -67,7 +67,7 @@ class KeyframeStore:
         """The arrays of a free place; another one is made where all are held."""
         with self._lock:
             if self._arrays and any(self._arrays[0][name].shape != array.shape for name, array in like.items()):
-                self._arrays, self._held = [], set()  # another size; whoever holds an old keyframe keeps its arrays
+                self._arrays, self._held = [], set()  # another size; keyframes in use keep their arrays
             free = next((n for n in range(len(self._arrays)) if n not in self._held), len(self._arrays))
             while len(self._arrays) < max(self._places, free + 1):
                 self._arrays.append(_arrays_for(like, len(self._arrays)))
@@ -81,7 +81,7 @@ class KeyframeStore:
 
 
 def ready(place: int, prior: PanoramaPrior, pyramid: Pyramid | None) -> Keyframe:
-    """A keyframe made ready to be drawn by the warp, or not where it has no pyramid."""
+    """Prepare a keyframe for rendering: by the warp if it has a pyramid."""
     if pyramid is None:
         return Keyframe(place, prior, None, None)
     return Keyframe(place, prior, PanoramaWarp.of_prior(prior, pyramid), Background.of(prior))

@@ -1,7 +1,7 @@
-"""Pictures put together by torch, on a GPU: what ``canvas.CpuCanvas`` does, without leaving the device.
+"""Composition of views by torch on a GPU: as ``canvas.CpuCanvas``, without leaving the device.
 
 Two kernels do most of it, in plain torch (``torch_warp``) or in Triton (``triton_warp``). Nothing here waits for the
-device before the finished picture is fetched, but plain torch's kernels.
+device before the finished image is fetched, but plain torch's kernels.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from instant_ic.vspace.warp import PanoramaWarp, pinhole
 
 @dataclass(frozen=True)
 class _Keyframe:
-    """A keyframe on the device; ``torn``, ``beside``, ``sure`` as in ``TorchLayer``; ``behind``: its background's mesh,
-    guesses marked 1 and sky 2, with its colours.
+    """A keyframe on the device; ``depth_edge``, ``beside``, ``sure`` as in ``TorchLayer``; ``behind``: its
+    background's mesh with its colours, where guesses are marked 1 and sky 2.
     """
 
     quads: Patches
     quarters: Patches
     pyramid: TorchPyramid
-    torn: Tensor
+    depth_edge: Tensor
     beside: Tensor
     sure: Tensor
     behind: Patches | None
@@ -65,7 +65,7 @@ class _Eye:
 class TorchCanvas:
     """See ``canvas.Canvas``; its arrays are tensors. One thread at a time.
 
-    A keyframe is uploaded when it is first drawn, and let go with its ``PanoramaWarp``.
+    A keyframe is uploaded when it is first rendered, and let go with its ``PanoramaWarp``.
 
     Args:
         device: torch's name of it.
@@ -88,7 +88,7 @@ class TorchCanvas:
         layers: dict[int, Drawing],
     ) -> Picture:
         if shown is None:
-            assert field is not None, "neither keyframes nor a field to draw"
+            assert field is not None, "neither keyframes nor a field to render"
             colour, depth, confidence = (self._tensor(array) for array in field)
             return Picture(colour, depth, confidence, torch.zeros_like(depth, dtype=torch.bool))
         eye = self._eye(rays)
@@ -119,7 +119,7 @@ class TorchCanvas:
         return rgb.cpu().numpy(), picture.depth.cpu().numpy(), picture.confidence.cpu().numpy()
 
     def _warped(self, eye: _Eye, shown: KeyframeSet, layers: dict[int, Drawing]) -> Drawing:
-        """The keyframes' panoramas warped by their depth, put together."""
+        """Compose the keyframes' panoramas, warped by their depth."""
         for keyframe in shown.keyframes:
             if id(keyframe.warp) not in layers:
                 layers[id(keyframe.warp)] = self._warp(keyframe, eye)
@@ -137,7 +137,7 @@ class TorchCanvas:
                 *layers[id(keyframe.warp)],
                 self._tensor(gain),
                 own.quads.mesh.inverse[1:-1],
-                own.torn,
+                own.depth_edge,
                 own.beside,
                 own.sure,
             ),
@@ -162,7 +162,7 @@ class TorchCanvas:
     def _behind(
         self, keyframe: Keyframe, gain: Floats, eye: _Eye, guessed: Tensor, picture: Drawing
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The picture with a keyframe's background where nothing has been seen; as ``Background.draw``."""
+        """The image with a keyframe's background where nothing has been seen; as ``Background.draw``."""
         colour, depth, confidence = picture
         own, pose = self._uploaded(keyframe), keyframe.prior.map_from_camera
         if own.behind is None or own.behind_rgb is None:
@@ -203,7 +203,9 @@ class TorchCanvas:
         warp = keyframe.warp
         assert warp is not None, "warping needs numba"
         if warp not in self._keyframes:
-            quads, quarters = _mesh_patches(self._tensor(warp.torn), self._tensor(warp.known), self._mesh(warp.inverse))
+            quads, quarters = _mesh_patches(
+                self._tensor(warp.depth_edge), self._tensor(warp.known), self._mesh(warp.inverse)
+            )
             pyramid = warp.pyramid
             behind = (None, None) if keyframe.background is None else self._background(keyframe.background)
             texels, start, sizes = (self._tensor(array) for array in (pyramid.texels, pyramid.start, pyramid.sizes))
@@ -211,7 +213,7 @@ class TorchCanvas:
                 quads,
                 quarters,
                 TorchPyramid(texels, start, sizes, (int(pyramid.sizes[0, 0]), int(pyramid.sizes[0, 1]))),
-                self._tensor(keyframe.prior.torn != 0),
+                self._tensor(keyframe.prior.depth_edge != 0),
                 self._tensor(keyframe.prior.beside_edge != 0),
                 self._tensor(keyframe.prior.known == 1),
                 *behind,
@@ -243,17 +245,17 @@ class TorchCanvas:
         return torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
 
 
-def _mesh_patches(torn: Tensor, known: Tensor, mesh: Mesh) -> tuple[Patches, Patches]:
-    """A mesh's whole quads, and the quarters of the torn ones.
+def _mesh_patches(depth_edge: Tensor, known: Tensor, mesh: Mesh) -> tuple[Patches, Patches]:
+    """A mesh's whole quads, and the quarters of those with a depth edge.
 
     Args:
-        torn, known: with a row more above and below, (h + 2, w), as ``warp_kernels.draw_mesh`` takes them.
+        depth_edge, known: with a row more above and below, (h + 2, w), as ``warp_kernels.draw_mesh`` takes them.
     """
     right = known.roll(-1, 1)
     corners = torch.stack([known[:-1], right[:-1], known[1:], right[1:]], dim=-1).reshape(-1, 4)
-    whole = torn[:-1].reshape(-1) == 0
+    whole = depth_edge[:-1].reshape(-1) == 0
     quads, quarters = torch.nonzero(whole)[:, 0], torch.nonzero(~whole)[:, 0]
-    items = (4 * quarters[:, None] + torch.arange(4, device=torn.device)).reshape(-1)
+    items = (4 * quarters[:, None] + torch.arange(4, device=depth_edge.device)).reshape(-1)
     own = corners[quarters].reshape(-1)
     there = own < 2
     return (
@@ -267,7 +269,7 @@ def _marks(seen: Tensor) -> Tensor:
 
 
 def _read(buffer: Tensor, eye: _Eye) -> tuple[Tensor, Tensor]:
-    """Depth along the rays (P,), 0 where nothing is, and marks (P,) of a buffer that was drawn into."""
+    """Depth along the rays (P,), 0 where nothing is, and marks (P,) of a buffer that was rendered into."""
     marks = buffer.reshape(-1) & torch_warp.MARKS
     nearness = (buffer.reshape(-1) & ~torch_warp.MARKS).view(torch.float32)
     return torch.where(nearness > 0, 1 / (eye.axial * nearness), 0.0), marks
@@ -283,7 +285,7 @@ def _dissolve(warped: Drawing, field: Drawing, share: float) -> Drawing:
 
 
 def _continue_unseen(image: Tensor, depth: Tensor, confidence: Tensor) -> Tensor:
-    """As ``view.continue_unseen`` of a flat picture (H, W, 3): means down a pyramid, and up into the holes."""
+    """As ``view.continue_unseen`` of a flat image (H, W, 3): means down a pyramid, and up into the holes."""
     seen = confidence > 0
     weight = torch.where(seen, depth * depth, 0.0)
     level = torch.cat([image * weight[..., None], weight[..., None]], dim=2).permute(2, 0, 1)[None]

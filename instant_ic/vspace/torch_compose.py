@@ -1,4 +1,4 @@
-"""One picture of several keyframes in plain torch, on a GPU: the same as ``compose.compose``."""
+"""One image of several keyframes in plain torch, on a GPU: the same as ``compose.compose``."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class TorchLayer:
 
     Attributes:
         colour, depth, confidence: of the view, (P, 3), (P,), (P,); gain: (3,).
-        inverse, torn, beside, sure: of the ``PanoramaPrior``, (h, w); ``beside``: near an edge of its depth; ``sure``:
-            where the depth is known.
+        inverse, depth_edge, beside, sure: of the ``PanoramaPrior``, (h, w); ``beside``: near an edge of its depth;
+            ``sure``: where the depth is known.
         camera_from_view: (4, 4).
         camera: the keyframe's place in the view's frame, (3,).
     """
@@ -40,7 +40,7 @@ class TorchLayer:
     confidence: Tensor
     gain: Tensor
     inverse: Tensor
-    torn: Tensor
+    depth_edge: Tensor
     beside: Tensor
     sure: Tensor
     camera_from_view: Tensor
@@ -108,14 +108,14 @@ def panorama_places(local: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tenso
 
 def _rank(k: int, layers: Sequence[TorchLayer], room: Sequence[Sequence[float]], directions: Tensor) -> Tensor:
     """Confidence of layer ``k``, less at an edge of its depth; of an older one 0 where a newer one has looked through
-    it and, unless it sees the place anew, beside its own edges and where a newer one has seen it and draws it
+    it and, unless it sees the place again, beside its own edges and where a newer one has seen it and renders it
     elsewhere.
     """
     own = layers[k]
     local = points(own.camera_from_view, directions, own.depth)
     row, column = _upper_left(local, own.inverse)
     aside = _angle(own, directions, own.depth, local.norm(dim=1)) > ASIDE_RAD
-    rank = own.confidence - torch.where(aside & own.torn[row, column] & (own.confidence > 0), EDGE, 0.0)
+    rank = own.confidence - torch.where(aside & own.depth_edge[row, column] & (own.confidence > 0), EDGE, 0.0)
     if k == 0:
         return rank
     anew = _anew(own, layers[0], directions)
@@ -135,7 +135,7 @@ def _angle(layer: TorchLayer, directions: Tensor, t: Tensor, away: Tensor) -> Te
 
 
 def _anew(layer: TorchLayer, newest: TorchLayer, directions: Tensor) -> Tensor:
-    """Whether a keyframe sees what it draws from nearer than the newest does, or from another side, (P,)."""
+    """Whether a keyframe sees what it renders from nearer than the newest does, or from another side, (P,)."""
     ends = layer.depth[:, None] * directions
     own, other = ends - layer.camera, ends - newest.camera
     near, far = own.norm(dim=1), other.norm(dim=1)

@@ -69,14 +69,14 @@ class TorchPyramid:
 
 @dataclass(frozen=True)
 class WarpKernels:
-    """What ``torch_canvas`` draws by; what each does is said at this module's own."""
+    """The functions that ``torch_canvas`` renders with; see this module's own."""
 
     draw_patches: Callable[[Patches, Tensor, float, Tensor], None]
     look_up: Callable[[TorchPyramid, Tensor, Tensor], Tensor]
 
 
 def draw_patches(patches: Patches, view_from_camera: Tensor, half: float, buffer: Tensor) -> None:
-    """Draws patches into a depth buffer.
+    """Renders patches into a depth buffer.
 
     Args:
         patches: in the camera's frame.
@@ -108,7 +108,7 @@ def draw_patches(patches: Patches, view_from_camera: Tensor, half: float, buffer
     last = torch.tensor([width - 1, height - 1], device=buffer.device)[:, None]
     first = (box.amin(dim=2) - 1e-3).ceil().clamp(min=0)
     end = torch.minimum((box.amax(dim=2) + 1e-3).floor(), last)
-    clipped = (corners[:, :, 0] < NEAR_M).any(dim=1)  # has no place in the picture to bound by: anywhere
+    clipped = (corners[:, :, 0] < NEAR_M).any(dim=1)  # has no place in the image to bound by: anywhere
     first = torch.where(clipped, 0, first).long()
     columns, rows = (torch.where(clipped, last, end).long() - first + 1).clamp(min=0)
     counts = torch.where(volume != 0, columns * rows, 0)

@@ -1,7 +1,7 @@
 """The warp's two kernels for NVIDIA GPUs (Triton), with ``torch_warp``'s signatures; ``TRITON_INTERPRET=1`` for tests.
 
-A lane of a program has a patch; what covers many pixels is drawn by all lanes together. Only ``triton_device`` imports
-this module.
+A lane of a program has one patch; patches of many pixels are rendered by all lanes together. Only ``triton_device``
+imports this module.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -135,7 +135,7 @@ def _draw_patches(
     seen &= (az >= -tall * ax) | (bz >= -tall * bx) | (cz >= -tall * cx) | (dz >= -tall * dx)
     if tl.max(seen.to(tl.int32), axis=0) > 0:
         left, top = half - 0.5 * pixel, (0.5 * height - 0.5) * pixel
-        # A patch with a corner behind the view has no place in the picture to bound by: anywhere.
+        # A patch with a corner behind the view has no place in the image to bound by: anywhere.
         clipped = (ax < _NEAR_M) | (bx < _NEAR_M) | (cx < _NEAR_M) | (dx < _NEAR_M)
         sa, sb = tl.maximum(ax, _NEAR_M), tl.maximum(bx, _NEAR_M)
         sc, sd = tl.maximum(cx, _NEAR_M), tl.maximum(dx, _NEAR_M)

@@ -1,4 +1,4 @@
-"""Pictures of the space: what they hold, and the rays of each projection."""
+"""Views of the space and the rays of each projection."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from instant_ic.vspace.prior import fill_holes
 MIN_VIEW, MAX_VIEW = 16, 4096
 """Pixels a side."""
 _STRIDE_RAD = 0.025
-"""In an equirect picture the inverse depth of a plane is linear between pixels no further apart than about this."""
+"""In an equirect image the inverse depth of a plane is linear between pixels no further apart than about this."""
 
 
 @dataclass(frozen=True)
 class View:
-    """A picture of the space; of a cube map all arrays have a leading axis of six, in the order of ``CUBE_FACES``.
+    """An image of the space; of a cube map all arrays have a leading axis of six, in the order of ``CUBE_FACES``.
 
     Attributes:
         rgb: (H, W, 3) uint8; what is not known is continued from around it.
@@ -30,7 +30,7 @@ class View:
         confidence: (H, W): 1 where a keyframe has seen the place, 0.5 where it has but its depth was filled from
             around, 0 where none has: unknown.
         projection: ``perspective``, ``equirect`` or ``cube``.
-        expected_psnr_db: that the picture has, judged without its truth (``readiness``); NaN of a cube map.
+        expected_psnr_db: that the image has, judged without its truth (``readiness``); NaN of a cube map.
     """
 
     rgb: NDArray[np.uint8]
@@ -41,7 +41,7 @@ class View:
 
     @property
     def unseen_share(self) -> float:
-        """Of the picture's pixels, 0..1: what no keyframe has seen."""
+        """Share of the pixels that no keyframe has seen, 0..1."""
         return float(np.count_nonzero(self.confidence == 0)) / self.confidence.size
 
     @property
@@ -51,7 +51,7 @@ class View:
 
     @property
     def mean_confidence(self) -> float:
-        """Mean over the picture; of an equirect picture by solid angle."""
+        """Mean over the image; of an equirect image by solid angle."""
         if self.projection != "equirect":
             return float(self.confidence.mean())
         height = self.confidence.shape[0]
@@ -59,7 +59,7 @@ class View:
         return float(self.confidence.mean(axis=1) @ weight / weight.sum())
 
     def mask_png(self, width: int = 64) -> bytes:
-        """Confidence of a flat picture as a small grey PNG, 0 unseen to 255 seen; empty where all of it was seen."""
+        """Confidence of a flat image as a small grey PNG, 0 unseen to 255 seen; empty where all of it was seen."""
         import cv2
 
         if (self.confidence >= 1).all():
@@ -75,7 +75,7 @@ class View:
 
 
 def check_size(width: int, height: int) -> None:
-    """Raises ValueError for a picture that is too small or too large to draw."""
+    """Raises ValueError for an image that is too small or too large to render."""
     if not (MIN_VIEW <= width <= MAX_VIEW and MIN_VIEW <= height <= MAX_VIEW):
         raise ValueError(f"view must have {MIN_VIEW} to {MAX_VIEW} pixels a side (got {width} x {height})")
 
@@ -104,7 +104,7 @@ class LensRays(Rays):
     """Rays of a lens, turned into the map only where that is asked for: a GPU turns them itself.
 
     Attributes:
-        lens: unit vectors of the camera's frame, (P, 3); the same array for all pictures of one size and projection.
+        lens: unit vectors of the camera's frame, (P, 3); the same array for all images of one size and projection.
         turn: map_from_camera rotation, (3, 3) float32.
     """
 
@@ -130,7 +130,7 @@ def _turned(directions: Floats, turn: Floats) -> Floats:
 
 
 def perspective_rays(pose: NDArray[np.float64], width: int, height: int, fov_rad: float) -> Rays:
-    """Rays of a pinhole picture along the camera's x axis."""
+    """Rays of a pinhole image along the camera's x axis."""
     return LensRays(pose, *_perspective(width, height, round(fov_rad, 6)), (height, width), 4)
 
 
@@ -142,8 +142,8 @@ def equirect_rays(pose: NDArray[np.float64], width: int) -> Rays:
 
 
 def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: bool = False) -> Floats:
-    """Continues what is not known from around it, more from the far side than from the near: it opens up behind the
-    nearer surface.
+    """Fill unknown pixels from their surroundings, more from the far side than from the near one: gaps open behind
+    nearer surfaces.
 
     Args:
         image: (H, W, 3); depth_m, confidence: (H, W).
@@ -161,18 +161,18 @@ def continue_unseen(image: Floats, depth_m: Floats, confidence: Floats, wraps: b
 
 
 class Drawn(abc.ABC):
-    """A space that is drawn ray by ray: its pictures in each projection."""
+    """A space that is rendered ray by ray: its images in each projection."""
 
     @abc.abstractmethod
     def _view(self, rays: Rays, projection: str) -> View:
-        """What the rays see, (H, W); what is not known is continued from around it."""
+        """Render the rays, (H, W); unknown parts are filled from their surroundings."""
 
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+        """A perspective image along the camera's x axis with the horizontal field of view ``fov_rad``.
 
         Raises:
             NotReadyError: no keyframe yet, where one is needed.
-            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+            ValueError: a size or field of view that cannot be rendered, a pose that is not finite.
         """
         check_size(width, height)
         return self._view(perspective_rays(checked_pose(map_from_camera), width, height, fov_rad), "perspective")

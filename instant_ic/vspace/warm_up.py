@@ -12,17 +12,17 @@ from instant_ic.vspace.space import VirtualSpace
 
 
 def warm_up(config: VirtualSpaceConfig) -> None:
-    """Trains and draws a scratch space of the same kind once: numba's kernels are then compiled, and cached on disk.
+    """Train and render a scratch space of the same kind once, so that numba's kernels are compiled and cached on disk.
 
     About 8 s of CPU on the first run of an installation, below 1 s after it.
     """
-    if config.source == "mesh":  # draws its first picture as it is made
+    if config.source == "mesh":  # renders its first image as it is made
         return
     small = dataclasses.replace(
         config,
         field=dataclasses.replace(config.field, log2_table=10),
         train=dataclasses.replace(config.train, ray_columns=16, ray_rows=16),
-        # Pictures of both the warp and the field.
+        # Images of both the warp and the field.
         picture=dataclasses.replace(config.picture, panorama_until_db=-1e3, field_from_db=1e3),
     )
     space = VirtualSpace(small)

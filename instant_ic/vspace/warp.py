@@ -1,7 +1,7 @@
-"""The newest panorama, warped by its depth: a view without any training, and what the field has to beat.
+"""Views by warping the newest panorama by its depth: no training, and the baseline of the field.
 
-The panorama's depth picture is a mesh, torn at depth edges, drawn into a z-buffer; colours come from the panorama at
-its full resolution, averaged over each pixel's footprint; what opens is continued from the farther side.
+The panorama's depth image is a mesh, cut at depth discontinuities and rendered into a z-buffer. Colours come from the
+panorama at its full resolution, averaged over each pixel's footprint. Gaps are continued from their farther side.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.field import Floats, Rays
-from instant_ic.vspace.prior import ROOM, PanoramaPrior, prepare, torn_quads
+from instant_ic.vspace.prior import ROOM, PanoramaPrior, edge_quads, prepare
 from instant_ic.vspace.view import View, check_size, checked_pose, continue_unseen, perspective_rays
 
-TORN_RATIO = 0.05
+EDGE_RATIO = 0.05
 """Neighbouring depths that differ by more than this share, off one plane, are an edge."""
 BLUR = 0.65
 """Share of a pixel that a colour is averaged over; trilinear look-up blurs by itself (as in ``sim.render``)."""
@@ -55,7 +55,7 @@ class Pyramid:
     def look_up(
         self, camera_from_map: Floats, rays: Rays, depth: Floats, wanted: Floats, share: float, colour: Floats
     ) -> None:
-        """Mixes the panorama's colour into that of a view's surfaces, averaged over each pixel's footprint.
+        """Blend the panorama's colour, averaged over each pixel's footprint, into that of a view's surfaces.
 
         Args:
             camera_from_map: of the panorama, (4, 4) float32.
@@ -85,7 +85,7 @@ class PanoramaWarp:
     """A panorama with depth that can be seen from elsewhere.
 
     Attributes:
-        inverse, torn, known: of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
+        inverse, depth_edge, known: of its mesh, as ``warp_kernels.draw_mesh`` takes them, (h + 2, w).
 
     Example:
         >>> warp = PanoramaWarp(rgb, depth_m, map_from_camera)               # doctest: +SKIP
@@ -125,30 +125,30 @@ class PanoramaWarp:
             np.ascontiguousarray(np.concatenate([a[:1], a, a[-1:]])) for a in (prior.inverse_depth, prior.known)
         )
         none = np.zeros((1, width), np.uint8)
-        # The last row's own quads reach down to the pole, where nothing is torn.
-        torn = torn_quads(prior.inverse_depth, TORN_RATIO)
+        # The last row's own quads reach down to the pole, where there is no depth edge.
+        depth_edge = edge_quads(prior.inverse_depth, EDGE_RATIO)
         gone = prior.content != ROOM
-        if gone.any():  # quads at its rim are drawn by their corners, of which it has none
+        if gone.any():  # quads at its rim are rendered by their corners, of which it has none
             right = np.roll(gone, -1, 1)
-            torn[:-1] |= (gone | right)[:-1] | (gone | right)[1:]
-            torn[-1] = 0
+            depth_edge[:-1] |= (gone | right)[:-1] | (gone | right)[1:]
+            depth_edge[-1] = 0
             self.known[1:-1][gone] = 2
             self.known[[0, -1]] = self.known[[1, -2]]
             none = (self.known[[0]] == 2).astype(np.uint8)
         below = (self.known[[-1]] == 2).astype(np.uint8)
-        self.torn = np.concatenate([none, torn[:-1], below, below])
+        self.depth_edge = np.concatenate([none, depth_edge[:-1], below, below])
         self._halves = _half_step_directions(width, height)
         self._directions = np.ascontiguousarray(self._halves[::2, ::2])
         self._vertices = np.empty((height + 2, width, 3), np.float32)
         self._outside = np.empty((height + 2, width), np.uint8)
 
     def render(self, map_from_camera: NDArray[np.floating], width: int, height: int, fov_rad: float) -> View:
-        """A perspective picture along the camera's x axis with the horizontal field of view ``fov_rad``.
+        """A perspective image along the camera's x axis with the horizontal field of view ``fov_rad``.
 
         Confidence is 1 where the panorama has seen the place, 0.5 where its depth was filled from around, 0 elsewhere.
 
         Raises:
-            ValueError: a size or field of view that cannot be drawn, a pose that is not finite.
+            ValueError: a size or field of view that cannot be rendered, a pose that is not finite.
         """
         check_size(width, height)
         rays = perspective_rays(checked_pose(map_from_camera), width, height, fov_rad)
@@ -173,7 +173,7 @@ class PanoramaWarp:
             self.inverse, self._directions, view_from_camera, half, aspect, self._vertices, self._outside
         )
         warp_kernels.draw_mesh(
-            self._vertices, self._outside, self.inverse, self.torn, self.known, self._halves,
+            self._vertices, self._outside, self.inverse, self.depth_edge, self.known, self._halves,
             view_from_camera, half, nearness, marks,
         )  # fmt: skip
         depth = np.zeros(len(rays.axial), np.float32)
@@ -189,7 +189,7 @@ class PanoramaWarp:
 def dissolve(
     warped: tuple[Floats, Floats, Floats], field: tuple[Floats, Floats, Floats], share: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Two pictures of one view, each as ``draw`` gives it: ``share`` of the first; where one has nothing, the other.
+    """Blend two renderings of one view: ``share`` of the first; where one has nothing, the other.
 
     Depth and confidence are those of the larger share.
     """
@@ -210,7 +210,7 @@ def pinhole(rays: Rays) -> tuple[NDArray[np.float64], np.float32]:
     pose = np.eye(4)
     pose[:3, :3] = np.stack([axis / np.linalg.norm(axis) for axis in (ahead, left, up)], axis=1)
     pose[:3, 3] = rays.origin
-    # The outermost pixels' centres lie half a pixel inside the picture's edge.
+    # The outermost pixels' centres lie half a pixel inside the image's edge.
     return pose, np.float32(0.5 * np.linalg.norm(left) * width / (width - 1))
 
 

@@ -1,4 +1,4 @@
-"""CPU kernels of the depth warp: a torn panorama mesh into a z-buffer, and anti-aliased panorama look-up (numba)."""
+"""CPU kernels of the depth warp: panorama mesh into a z-buffer, and anti-aliased panorama look-up (numba)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def draw_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignor
     """One triangle into the z-buffer; corners are (x, y, z) in the view's frame, x forward.
 
     Edge functions are taken in homogeneous coordinates (Olano and Greer, 1997), so that nothing need be clipped:
-    ``clipped`` only says that a corner lies behind the view, where it has no place in the picture to bound by.
+    ``clipped`` only says that a corner lies behind the view, where it has no place in the image to bound by.
     """
     height, width = nearness.shape
     pixel = np.float32(2) * half / np.float32(width)
@@ -93,16 +93,16 @@ def draw_triangle(a, b, c, clipped, mark, half, nearness, marks):  # type: ignor
 
 @njit(**_OPTIONS)
 def draw_mesh(  # type: ignore[no-untyped-def]
-    vertices, outside, inverse, torn, known, corners, view_from_camera, half, nearness, marks
+    vertices, outside, inverse, depth_edge, known, corners, view_from_camera, half, nearness, marks
 ):
-    """The panorama's mesh into a z-buffer.
+    """Render the panorama's mesh into a z-buffer.
 
-    A quad that crosses a depth edge is drawn as four quarters, each at the depth of its own corner: from the panorama's
-    own place nothing is missing, and from aside the edge opens.
+    A quad that crosses a depth edge is rendered as four quarters, each at the depth of its own corner: nothing is
+    missing from the panorama's own position, and the edge opens from the side.
 
     Args:
-        vertices, outside: of ``place_vertices``; inverse, torn, known: of the ``PanoramaPrior``, with a row more above
-            and below for the poles; known 2: nothing is drawn there.
+        vertices, outside: of ``place_vertices``; inverse, depth_edge, known: of the ``PanoramaPrior``, with a row more
+            above and below for the poles; known 2: nothing is rendered there.
         corners: unit vectors half a pixel up and left of each pixel, (h + 1, w, 3).
         nearness: in and out, (H, W): inverse of the depth along the view's axis, 0 where nothing is.
         marks: in and out, (H, W) uint8: ``EMPTY``, ``FILLED``, ``KNOWN`` or ``BEHIND``.
@@ -115,7 +115,7 @@ def draw_mesh(  # type: ignore[no-untyped-def]
     for v in range(height - 1):
         for u in range(width):
             right = (u + 1) % width
-            if not torn[v, u]:
+            if not depth_edge[v, u]:
                 codes = outside[v, u] | outside[v, right] | outside[v + 1, u] | outside[v + 1, right]
                 if outside[v, u] & outside[v, right] & outside[v + 1, u] & outside[v + 1, right]:
                     continue

@@ -120,6 +120,6 @@ def test_pictures_come_as_rgb_or_with_the_fault(tmp_path):
     cv2.imwrite(str(tmp_path / "red.png"), picture[..., ::-1])
     assert np.array_equal(load_picture(tmp_path / "red.png"), picture)
     (tmp_path / "junk.jpg").write_bytes(b"\xff\xd8 no")
-    for name, words in (("junk.jpg", "not a readable picture"), ("none.jpg", "No such file")):
+    for name, words in (("junk.jpg", "not a readable image"), ("none.jpg", "No such file")):
         with pytest.raises(DepthFileError, match=words):
             load_picture(tmp_path / name)

@@ -356,7 +356,7 @@ def test_command_goes_on_after_a_bad_file_and_ends_with_an_error(folder, capsys)
     figures = json.loads(printed.out)
     assert [row["name"] for row in figures["images"]] == ["a.jpg", "b.jpg"]
     assert [row["name"] for row in figures["errors"]] == ["c.jpg", "d.jpg"]
-    assert "c.jpg: not a readable picture" in printed.err
+    assert "c.jpg: not a readable image" in printed.err
     assert "d.jpg: no depth file has this stem" in printed.err
     assert "b.npz: median" in printed.err
 

@@ -41,19 +41,19 @@ def space_of(prior, **geometry):
 def test_the_near_side_of_an_edge_by_hand():
     inverse = np.full((8, 16), 0.25, np.float32)
     inverse[2:6, 4:9] = 0.5
-    torn = np.zeros((8, 16), np.uint8)
-    torn[2:6, 3] = torn[2:6, 8] = 1
-    torn[1, 3:9] = torn[5, 3:9] = 1
+    depth_edge = np.zeros((8, 16), np.uint8)
+    depth_edge[2:6, 3] = depth_edge[2:6, 8] = 1
+    depth_edge[1, 3:9] = depth_edge[5, 3:9] = 1
     steps = np.zeros((8, 16), np.int32)
     level = np.zeros((8, 16), np.uint8)
-    in_front(inverse, torn, level, 9, steps)
+    in_front(inverse, depth_edge, level, 9, steps)
     assert steps[2:6, 4:9].tolist() == [[1, 1, 1, 1, 1], [1, 2, 2, 2, 1], [1, 2, 2, 2, 1], [1, 1, 1, 1, 1]]
     assert np.count_nonzero(steps) == 20  # nothing on the far side
     steps[...] = 0
-    in_front(inverse, torn, level, 1, steps)
+    in_front(inverse, depth_edge, level, 1, steps)
     assert steps.max() == 1
     steps[...], level[5] = 0, 1  # its last row is floor
-    in_front(inverse, torn, level, 9, steps)
+    in_front(inverse, depth_edge, level, 9, steps)
     assert np.count_nonzero(steps) == 15
 
 

@@ -155,7 +155,7 @@ def sampled(scene, uniform, columns, rows, sources):
     stack, count = StackedPriors.of(scene), 2 * columns * rows
     points, target, weight = np.zeros((count, 3), F), np.zeros((count, 4), F), np.zeros((count, 2), F)
     march.sample_rays(
-        uniform, columns, rows, sources, stack.rgb, stack.inverse_depth, stack.torn, stack.usable, stack.trust,
+        uniform, columns, rows, sources, stack.rgb, stack.inverse_depth, stack.depth_edge, stack.usable, stack.trust,
         stack.map_from_camera, stack.gains, stack.band, points, target, weight,
     )  # fmt: skip
     return points, target, weight
@@ -230,7 +230,7 @@ def test_a_point_belongs_to_the_keyframe_that_sees_it(two_keyframes):
             points = camera + F(share) * (cloud[rng.choice(len(cloud), 300)] - camera)
             values = [
                 march.nearest_prior(
-                    *p, stack.inverse_depth, stack.torn, stack.known, stack.camera_from_map, stack.band, True
+                    *p, stack.inverse_depth, stack.depth_edge, stack.known, stack.camera_from_map, stack.band, True
                 )
                 for p in points
             ]
@@ -266,13 +266,13 @@ def test_a_rays_direction_and_colour_by_hand():
     # turn 1/16, so azimuth 180° − 22.5° = 157.5°; height z = 1 − 2/16 = 0.875.
     rgb = np.zeros((32, 64, 3), np.uint8)
     rgb[...] = (255, 51, 0)
-    inverse, torn = np.full((32, 64), 0.5, F), np.zeros((32, 64), np.uint8)
+    inverse, depth_edge = np.full((32, 64), 0.5, F), np.zeros((32, 64), np.uint8)
     uniform = np.full((64, 3), 0.5, F)
     uniform[:, 2] = 0.75  # half way to the band's far end
     points, target, weight = np.zeros((128, 3), F), np.zeros((128, 4), F), np.zeros((128, 2), F)
     one = np.ones((1, 32, 64), F)
     march.sample_rays(
-        uniform, 8, 8, np.zeros(1, np.int32), rgb[None], inverse[None], torn[None], one.astype(np.uint8), one / 4,
+        uniform, 8, 8, np.zeros(1, np.int32), rgb[None], inverse[None], depth_edge[None], one.astype(np.uint8), one / 4,
         np.eye(4, dtype=F)[None], np.ones((1, 3), F), np.array([0.1], F), points, target, weight,
     )  # fmt: skip
     assert weight == pytest.approx(np.tile([1, 0.25], (128, 1)))

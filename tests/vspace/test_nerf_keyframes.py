@@ -235,7 +235,9 @@ def test_an_older_keyframe_shows_its_edges_only_where_it_sees_more_than_the_newe
 
     def confidence(x, y):
         newest = prior_of(np.eye(4))
-        older = dataclasses.replace(newest, map_from_camera=pose_matrix(x=x, y=y), torn=np.ones_like(newest.torn))
+        older = dataclasses.replace(
+            newest, map_from_camera=pose_matrix(x=x, y=y), depth_edge=np.ones_like(newest.depth_edge)
+        )
         layers = [layer(newest, [5], [0], [0.2]), layer(older, [5], [1], [0.9])]
         return float(compose(layers, rays)[2][0])
 
@@ -303,7 +305,7 @@ def composed_plainly(layers, rays):
         at = np.flatnonzero(confidence[number])
         points = rays.origin + depth[number, at, None] * rays.directions[at]
         local = (points - one.prior.map_from_camera[:3, 3]) @ one.prior.map_from_camera[:3, :3]
-        height, width = one.prior.torn.shape
+        height, width = one.prior.depth_edge.shape
         u, v = composing.equirect_pixels(local, width, height)
         row, column = np.clip(np.floor(v), 0, height - 1).astype(int), np.floor(u).astype(int) % width
         own, first = (points - prior.map_from_camera[:3, 3] for prior in (one.prior, layers[0].prior))
@@ -311,7 +313,7 @@ def composed_plainly(layers, rays):
         between = np.arccos(np.clip(np.einsum("ij,ij->i", own, first) / (near * far), -1, 1))
         anew = (near < composing.NEARER * far) | (between > composing.OTHER_SIDE_RAD)
         lax = anew | (number == 0)
-        edge = np.where(lax, one.prior.torn[row, column], one.prior.beside_edge[row, column]) > 0
+        edge = np.where(lax, one.prior.depth_edge[row, column], one.prior.beside_edge[row, column]) > 0
         edge &= angle(one.prior, points, rays.directions[at]) > 0.02
         rank[number, at] -= np.where(edge, np.where(lax, composing.EDGE, rank[number, at]), 0)
         for newer, other in enumerate(layers[:number]):

@@ -6,7 +6,7 @@ import pytest
 from instant_ic.experiments import box_room
 from instant_ic.vspace import KeyframeError
 from instant_ic.vspace.config import GeometryConfig
-from instant_ic.vspace.prior import prepare, torn_quads
+from instant_ic.vspace.prior import edge_quads, prepare
 
 CAMERA = np.eye(4)
 PICTURE = box_room.panorama(CAMERA, 64)
@@ -53,10 +53,10 @@ def test_a_slope_with_noise_is_no_edge_and_a_step_is():
     slope = np.ones((4, 32), np.float32)
     slope[:, 8:24] = 1.04 ** -np.repeat(np.arange(0, 16, 2), 2)
     slope[:, 24:] = slope[:, 23:24]
-    assert not torn_quads(slope, 0.05)[:, 9:22].any()
+    assert not edge_quads(slope, 0.05)[:, 9:22].any()
     step = np.ones((4, 32), np.float32)
     step[:, 16:] = 1 / 1.08
-    assert np.array_equal(np.flatnonzero(torn_quads(step, 0.05)[1]), [15, 31])
+    assert np.array_equal(np.flatnonzero(edge_quads(step, 0.05)[1]), [15, 31])
     # A large difference is an edge however much leans away around it.
     slope[:, 16:24] /= 1.4
-    assert torn_quads(slope, 0.05)[1, 15]
+    assert edge_quads(slope, 0.05)[1, 15]

@@ -22,7 +22,7 @@ from instant_ic.vspace import (
 )
 from instant_ic.vspace.config import GeometryConfig
 from instant_ic.vspace.nerf.occupancy import build_occupancy, surface_points
-from instant_ic.vspace.prior import area_average, fill_holes, prepare, torn_quads
+from instant_ic.vspace.prior import area_average, edge_quads, fill_holes, prepare
 from instant_ic.vspace.view import perspective_rays
 from instant_ic.vspace.warm_up import warm_up
 
@@ -395,14 +395,14 @@ def test_depth_edges_are_torn_and_leaning_planes_are_not():
     elevation = np.pi / 2 - (np.arange(height) + 0.5) * np.pi / height
     inverse = np.where(elevation < 0, np.sin(-elevation) / 1.2, 1 / 30.0)
     inverse = np.repeat(np.maximum(inverse, 1 / 30.0)[:, None], width, 1).astype(np.float32)
-    plain = torn_quads(inverse, 0.1)
+    plain = edge_quads(inverse, 0.1)
     assert plain[36:63].sum() == 0
     inverse[30:40, 20:30] = 0.5
-    torn = torn_quads(inverse, 0.1)
-    assert torn[31:38, 19].all()
-    assert torn[31:38, 29].all()
-    assert not torn[31:38, 21:28].any()
-    assert not torn[41:, :].any()
+    depth_edge = edge_quads(inverse, 0.1)
+    assert depth_edge[31:38, 19].all()
+    assert depth_edge[31:38, 29].all()
+    assert not depth_edge[31:38, 21:28].any()
+    assert not depth_edge[41:, :].any()
 
 
 def test_occupancy_holds_every_surface_and_knows_distances():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from instant_ic.experiments import box_room
-from instant_ic.experiments.pictures import psnr_db
+from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import pose_matrix
 from instant_ic.vspace import (
     FieldConfig,

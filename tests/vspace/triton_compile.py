@@ -24,7 +24,7 @@ KERNELS = [
 NUMBERS = {
     "i32": "columns rows width height w h keyframes count size nx ny nz levels panorama_width",
     "fp32": "cell panorama_share depth_share beta1 beta2 epsilon half pixel",
-    "*u8": "rgb torn usable known grid marks texels",
+    "*u8": "rgb depth_edge usable known grid marks texels",
     "*i32": "sources items buffer",
     "*i64": "starts sizes",
     "*fp16": "half_table",

@@ -1,4 +1,4 @@
-"""The field's parameters and lattice, and what every device has to be able to do with them."""
+"""The field's parameters and lattice, and the interface of its backends."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Floats = NDArray[np.float32]
 BETA1, BETA2, EPSILON = 0.9, 0.99, 3e-7
 """Adam's constants, as in instant-ngp."""
 VOLUME_SAMPLES = 8
-"""Of a ray where geometry is a density, evenly through the band."""
+"""Number of samples of a ray if geometry is a density, evenly through the truncation distance."""
 RAW_LIMITS = -10.0, 6.0
-"""Of the logarithm of the density: outside it has no gradient."""
+"""Limits of the logarithm of the density; outside them it has no gradient."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class FieldParameters:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a device trains on and renders from: keyframes, lattice and occupancy.
+    """Input of training and rendering: keyframes, lattice and occupancy.
 
     Attributes:
         priors: the keyframes, newest first; all of one size.
@@ -126,7 +126,7 @@ class Scene:
 
 
 def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
-    """Which keyframe each tile of a batch looks from, (tiles,): half of them from the newest, the rest from the others.
+    """Keyframe of each tile of a batch, (tiles,): half of them the newest, the rest the others.
 
     Over the steps each keyframe looks everywhere: by a lattice of two irrational steps, so that no tile is left out
     for long.
@@ -144,20 +144,20 @@ def ray_sources(keyframes: int, tiles: int, step: int) -> NDArray[np.int32]:
 
 
 LEAST_TRUST = 0.1
-"""Weight of depth that is guessed, against depth of the picture's median uncertainty."""
+"""Weight of depth that is guessed, against depth of the image's median uncertainty."""
 
 
 @dataclass(frozen=True)
 class StackedPriors:
     """A scene's keyframes as the kernels take them, newest first: ``PanoramaPrior``'s arrays with a leading axis (K,).
 
-    ``trust``: weight of each pixel's depth in the loss by its uncertainty, (K, h, w), 1 at the picture's median.
+    ``trust``: weight of each pixel's depth in the loss by its uncertainty, (K, h, w), 1 at the image's median.
     """
 
     rgb: NDArray[np.uint8]
     inverse_depth: Floats
     known: NDArray[np.uint8]
-    torn: NDArray[np.uint8]
+    depth_edge: NDArray[np.uint8]
     usable: NDArray[np.uint8]
     trust: Floats
     map_from_camera: Floats
@@ -177,7 +177,7 @@ class StackedPriors:
             rgb=stacked("rgb"),
             inverse_depth=stacked("inverse_depth"),
             known=stacked("known"),
-            torn=stacked("torn"),
+            depth_edge=stacked("depth_edge"),
             usable=stacked("usable"),
             trust=np.stack([depth_trust(prior) for prior in scene.priors]),
             map_from_camera=np.array(poses, np.float32),
@@ -188,7 +188,7 @@ class StackedPriors:
 
 
 def depth_trust(prior: PanoramaPrior) -> Floats:
-    """Weight of each pixel's depth, (h, w) float32: by the square of its uncertainty against the picture's median."""
+    """Weight of each pixel's depth, (h, w) float32: by the square of its uncertainty against the image's median."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(prior.sigma > prior.relative_sigma, prior.relative_sigma / prior.sigma, 1.0)
     return np.clip(ratio * ratio, LEAST_TRUST, 1.0).astype(np.float32)
@@ -197,7 +197,7 @@ def depth_trust(prior: PanoramaPrior) -> Floats:
 @dataclass(frozen=True)
 class Rays:
     """A view's rays: ``origin`` (3,) float32 map frame; ``directions`` (P, 3) float32 unit vectors, map frame;
-    ``axial`` (P,): the depth times it has an inverse that is linear over a plane in the picture (depth along the view's
+    ``axial`` (P,): the depth times it has an inverse that is linear over a plane in the image (depth along the view's
     axis per metre along the ray); ``shape`` (height, width); ``stride``: between so many pixels it may be interpolated.
     """
 
@@ -213,23 +213,23 @@ class Rays:
 
 
 class Device(Protocol):
-    """One device's way to train and render; ``numba_device`` and ``torch_device`` have it.
+    """A backend that trains and renders: ``numba_device``, ``torch_device`` or ``triton_device``.
 
     Attributes:
-        canvas: what puts its pictures together, a ``canvas.Canvas``.
+        canvas: what puts its images together, a ``canvas.Canvas``.
     """
 
     name: str
     canvas: Any
 
     def load(self, parameters: FieldParameters) -> None:
-        """Takes parameters over and forgets the optimiser's moments."""
+        """Load parameters and reset the optimiser's moments."""
 
     def set_scene(self, scene: Scene) -> None:
-        """Trains and renders this scene from now on, with the present parameters; forgets the moments."""
+        """Train and render this scene from now on, with the present parameters; resets the moments."""
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        """One iteration on the rays drawn by ``uniform`` (N, 3) from the keyframes by turns (``ray_sources``).
+        """One iteration on the rays sampled by ``uniform`` (N, 3) from the keyframes in turn (``ray_sources``).
 
         Returns:
             Mean squared colour error (0..1 units) and mean squared distance error (units of the band).

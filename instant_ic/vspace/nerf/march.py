@@ -17,11 +17,11 @@ FIRST_STEP = 0.7
 NOT_SEEN = np.float32(1e9)
 """Stands for "no distance known before"."""
 LOOKED_THROUGH = 3.0
-"""A keyframe whose surface lies so many bands behind a point has looked through it: nothing is there."""
+"""A keyframe whose surface lies this many truncation distances behind a point has looked through it: it is free."""
 
 
 @njit(**_OPTIONS)
-def prior_inverse_depth(inverse, torn, u, v):  # type: ignore[no-untyped-def]
+def prior_inverse_depth(inverse, depth_edge, u, v):  # type: ignore[no-untyped-def]
     """Inverse depth at index coordinates: bilinear on a surface, nearest at an edge."""
     height, width = inverse.shape
     v = min(max(v, np.float32(0)), np.float32(height - 1))
@@ -29,7 +29,7 @@ def prior_inverse_depth(inverse, torn, u, v):  # type: ignore[no-untyped-def]
     fu, fv = u - np.float32(u0), v - np.float32(v0)
     v1 = min(v0 + 1, height - 1)
     left, right = u0 % width, (u0 + 1) % width
-    if torn[v0, left]:
+    if depth_edge[v0, left]:
         return inverse[v1 if fv >= 0.5 else v0, right if fu >= 0.5 else left]
     top = inverse[v0, left] * (np.float32(1) - fu) + inverse[v0, right] * fu
     bottom = inverse[v1, left] * (np.float32(1) - fu) + inverse[v1, right] * fu
@@ -38,7 +38,7 @@ def prior_inverse_depth(inverse, torn, u, v):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def sample_rays(  # type: ignore[no-untyped-def]
-    uniform, columns, rows, sources, rgb, inverse, torn, usable, trust, map_from_camera, gains, band,
+    uniform, columns, rows, sources, rgb, inverse, depth_edge, usable, trust, map_from_camera, gains, band,
     points, target, weight
 ):  # fmt: skip
     """One ray in each of ``columns × rows`` strata of equal solid angle; two samples a ray.
@@ -46,13 +46,13 @@ def sample_rays(  # type: ignore[no-untyped-def]
     Args:
         uniform: (N, 3) in [0, 1): place in the stratum (azimuth, height) and in the band; N = columns · rows.
         sources: (N / 64,): the keyframe that each tile of 8 × 8 strata looks from.
-        rgb, inverse, torn, usable, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        rgb, inverse, depth_edge, usable, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         trust: (K, h, w): weight of the depth by its uncertainty, 0..1.
         map_from_camera: (K, 4, 4) float32; gains: (K, 3).
         points: out, (2 N, 3). Rays go by tiles: 64 points on the surface, then 64 in the band.
         target: out, (2 N, 4): colour minus 0.5, the ray's for both; signed distance in units of the newest's band (in
             front positive).
-        weight: out, (2 N, 2): of the colour and of the distance, 0 where no ray may be drawn.
+        weight: out, (2 N, 2): of the colour and of the distance, 0 where no ray may be sampled.
     """
     height, width = rgb.shape[1:3]
     h, w = inverse.shape[1:]
@@ -81,7 +81,9 @@ def sample_rays(  # type: ignore[no-untyped-def]
             value = (top * (one - fv) + bottom * fv) * gains[k, c]
             target[surface, c] = min(value * np.float32(1 / 255), one) - half
             target[near, c] = target[surface, c]
-        depth = one / prior_inverse_depth(inverse[k], torn[k], turn * np.float32(w) - half, fall * np.float32(h) - half)
+        depth = one / prior_inverse_depth(
+            inverse[k], depth_edge[k], turn * np.float32(w) - half, fall * np.float32(h) - half
+        )
         offset = np.float32(2) * uniform[n, 2] - one
         length = depth * (one + band[k] * offset)
         flat = np.float32(math.sqrt(max(np.float32(0), one - z * z)))
@@ -102,7 +104,7 @@ def sample_rays(  # type: ignore[no-untyped-def]
 
 
 @njit(**_OPTIONS)
-def prior_agrees(x, y, z, inverse, torn, known, tolerance):  # type: ignore[no-untyped-def]
+def prior_agrees(x, y, z, inverse, depth_edge, known, tolerance):  # type: ignore[no-untyped-def]
     """Whether a point of the camera frame lies on a surface of the prior: 0 no, 1 on filled depth, 2 on known depth.
 
     Returns the code as an int. ``tolerance`` is relative to the distance.
@@ -120,7 +122,7 @@ def prior_agrees(x, y, z, inverse, torn, known, tolerance):  # type: ignore[no-u
     a, b = inverse[v0, left] * distance, inverse[v0, right] * distance
     c, d = inverse[v1, left] * distance, inverse[v1, right] * distance
     low, high = 1 - tolerance, 1 + tolerance
-    if torn[v0, left]:
+    if depth_edge[v0, left]:
         if low < a < high or low < b < high or low < c < high or low < d < high:
             return seen
         return 0
@@ -130,21 +132,21 @@ def prior_agrees(x, y, z, inverse, torn, known, tolerance):  # type: ignore[no-u
 
 
 @njit(**_OPTIONS)
-def prior_distance(x, y, z, inverse, torn, band):  # type: ignore[no-untyped-def]
+def prior_distance(x, y, z, inverse, depth_edge, band):  # type: ignore[no-untyped-def]
     """Signed distance of a point of the camera frame to the prior's surface in its direction, in units of the band."""
     height, width = inverse.shape
     flat = math.sqrt(x * x + y * y)
     u = np.float32((math.pi - math.atan2(y, x)) * (width / (2 * math.pi)) - 0.5)
     v = np.float32((math.pi / 2 - math.atan2(z, flat)) * (height / math.pi) - 0.5)
     away = math.sqrt(flat * flat + z * z)
-    return (np.float32(1) - away * prior_inverse_depth(inverse, torn, u, v)) / band
+    return (np.float32(1) - away * prior_inverse_depth(inverse, depth_edge, u, v)) / band
 
 
 @njit(**_OPTIONS)
-def nearest_prior(x, y, z, inverse, torn, known, camera_from_map, band, all_agree):  # type: ignore[no-untyped-def]
+def nearest_prior(x, y, z, inverse, depth_edge, known, camera_from_map, band, all_agree):  # type: ignore[no-untyped-def]
     """The keyframe whose surface is nearest to a point of the map frame, of those that no newer one has looked through.
 
-    Args: as in ``trace``; all_agree: whether to tell the agreement at all (else it is 0).
+    Args: as in ``trace``; all_agree: whether to compute the agreement (0 otherwise).
 
     Returns:
         Signed distance in units of the newest's band, and what ``prior_agrees`` says (the best of all keyframes).
@@ -153,14 +155,14 @@ def nearest_prior(x, y, z, inverse, torn, known, camera_from_map, band, all_agre
     seen_through = False
     for k in range(inverse.shape[0]):
         px, py, pz = transformed(camera_from_map[k], x, y, z)
-        value = np.float32(prior_distance(px, py, pz, inverse[k], torn[k], band[k]))
+        value = np.float32(prior_distance(px, py, pz, inverse[k], depth_edge[k], band[k]))
         away = np.float32(math.sqrt(px * px + py * py + pz * pz)) * band[k]
         if k == 0:
             best, unit = value, away
         elif not seen_through and abs(value) * away < abs(best) * unit:
             best = value * away / unit
         if all_agree and not seen_through:
-            best_agrees = max(best_agrees, prior_agrees(px, py, pz, inverse[k], torn[k], known[k], band[k]))
+            best_agrees = max(best_agrees, prior_agrees(px, py, pz, inverse[k], depth_edge[k], known[k], band[k]))
         if value > LOOKED_THROUGH and prior_known(px, py, pz, known[k]):
             seen_through = True
     return best, best_agrees
@@ -236,7 +238,7 @@ def transformed(target_from_source, x, y, z):  # type: ignore[no-untyped-def]
 @njit(**_OPTIONS)
 def trace(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, grid, low, cell,
-    inverse, torn, known, camera_from_map, band, share, origin, directions, pixels, depth, confidence
+    inverse, depth_edge, known, camera_from_map, band, share, origin, directions, pixels, depth, confidence
 ):  # fmt: skip
     """Marches rays to the first zero of the signed distance that agrees with a keyframe's depth.
 
@@ -244,8 +246,8 @@ def trace(  # type: ignore[no-untyped-def]
 
     Args:
         grid, low, cell: of the ``Occupancy``.
-        inverse, torn, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …); camera_from_map: (K, 4, 4)
-            float32.
+        inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        camera_from_map: (K, 4, 4) float32.
         share: of the prior in the distance, 0..1; with 1 the field is not asked at all.
         origin: (3,); directions: (P, 3) unit vectors of all pixels, map frame.
         pixels: (N,) which of them to march.
@@ -306,7 +308,7 @@ def trace(  # type: ignore[no-untyped-def]
                 value, before = s[0, i], last_s[n]
                 if share > 0:
                     px, py, pz = at_length(origin, directions[pixel], t[n])
-                    seen, _ = nearest_prior(px, py, pz, inverse, torn, known, camera_from_map, band, False)
+                    seen, _ = nearest_prior(px, py, pz, inverse, depth_edge, known, camera_from_map, band, False)
                     value += share * (seen - value)
                 if t[n] - last_t[n] > 3 * cell:
                     before = NOT_SEEN
@@ -315,7 +317,7 @@ def trace(  # type: ignore[no-untyped-def]
                 if crossed:
                     hit = last_t[n] + (t[n] - last_t[n]) * before / (before - value)
                 px, py, pz = at_length(origin, directions[pixel], hit)
-                _, agrees = nearest_prior(px, py, pz, inverse, torn, known, camera_from_map, band, True)
+                _, agrees = nearest_prior(px, py, pz, inverse, depth_edge, known, camera_from_map, band, True)
                 if agrees > 0:
                     if value <= 0 or crossed:
                         depth[pixel] = hit
@@ -343,12 +345,12 @@ def panorama_pixels(x, y, z, height, width):  # type: ignore[no-untyped-def]
 
 @njit(**_OPTIONS)
 def mix_panorama(  # type: ignore[no-untyped-def]
-    rgb, inverse, torn, known, camera_from_map, gains, band, origin, directions, depth, confidence, share, colour
+    rgb, inverse, depth_edge, known, camera_from_map, gains, band, origin, directions, depth, confidence, share, colour
 ):
     """Mixes the panorama's colour into that of surfaces which a keyframe has seen: of the newest that has.
 
     Args:
-        rgb, inverse, torn, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
+        rgb, inverse, depth_edge, known, band: of the ``PanoramaPrior``s, newest first, stacked: (K, …).
         camera_from_map: (K, 4, 4); gains: (K, 3).
         depth, confidence: (P,), of ``trace``; nothing happens where either is 0.
         share: of the panorama, 0..1.
@@ -361,7 +363,7 @@ def mix_panorama(  # type: ignore[no-untyped-def]
             continue
         for k in range(count):
             x, y, z = along(camera_from_map[k], origin, directions[n], depth[n])
-            if k == count - 1 or prior_agrees(x, y, z, inverse[k], torn[k], known[k], band[k]) > 0:
+            if k == count - 1 or prior_agrees(x, y, z, inverse[k], depth_edge[k], known[k], band[k]) > 0:
                 break
         v0, v1, fv, left, right, fu = panorama_pixels(x, y, z, height, width)
         for c in range(3):

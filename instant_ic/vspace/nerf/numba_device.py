@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from instant_ic.vspace.canvas import CpuCanvas
 from instant_ic.vspace.config import FieldConfig, TrainConfig
@@ -34,7 +35,7 @@ DEPTH_TOLERANCE = 0.08
 
 @dataclass(frozen=True)
 class DrawnField:
-    """What drawing needs: parameters and scene, with what follows from the scene."""
+    """Input of rendering: parameters, scene, and arrays derived from the scene."""
 
     parameters: FieldParameters
     scene: Scene
@@ -79,33 +80,48 @@ class NumbaDevice:
         self._steps = 0
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        drawn, lattice, p = self._drawn, self._drawn.scene.lattice, self._p
-        priors = drawn.priors
+        """One training step: sample rays, gradient, Adam; as ``reference.train_step``."""
+        self._steps += 1
+        weight, sources = self._sample_rays(uniform)
+        colour, distance = self._gradient(uniform, weight, sources)
+        self._adam(table_lr, network_lr)
+        share = np.maximum(weight.mean(axis=0), np.float32(1e-3)).tolist()  # of the samples that count
+        return colour / share[0], distance / share[1]
+
+    def _sample_rays(self, uniform: Floats) -> tuple[Floats, NDArray[np.int32]]:
+        """Fill the batch's points and targets; returns weights (2 N, 2) and the keyframe of each tile."""
+        priors = self._drawn.priors
         columns, rows = volume_rays(self._train) if self._density else (self._train.ray_columns, self._train.ray_rows)
         weight = self._weight[: 2 * columns * rows]
-        self._steps += 1
         sources = ray_sources(len(priors.band), columns * rows // 64, self._steps)
         march.sample_rays(
             uniform, columns, rows, sources,
-            priors.rgb, priors.inverse_depth, priors.torn, priors.usable, priors.trust,
+            priors.rgb, priors.inverse_depth, priors.depth_edge, priors.usable, priors.trust,
             priors.map_from_camera, priors.gains, priors.band, self._points, self._target, weight,
         )  # fmt: skip
+        return weight, sources
+
+    def _gradient(self, uniform: Floats, weight: Floats, sources: NDArray[np.int32]) -> tuple[float, float]:
+        """Add the gradient of the batch to the gradients; returns colour and distance error."""
+        drawn, lattice, p = self._drawn, self._drawn.scene.lattice, self._p
         place = lattice.cells_per_m, lattice.origin, drawn.focus
         grads = self._table_grad, self._touched, *self._network_grads
-        share = np.maximum(weight.mean(axis=0), np.float32(1e-3)).tolist()
         if self._density:
             colour, distance = volume.volume_gradient(
                 p.table, *p.network(), *place, self._points, self._target, weight,
-                uniform[: columns * rows, 2].copy(), sources, drawn.focus[:, :3].copy(), priors.band,
+                uniform[: len(weight) // 2, 2].copy(), sources, drawn.focus[:, :3].copy(), drawn.priors.band,
                 self._losses, *grads,
             )  # fmt: skip
-        else:
-            colour, distance = kernels.gradient(
-                p.table, *p.network(), *place, self._points, self._target,
-                self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1], *grads,
-            )  # fmt: skip
-            colour /= 1 + self._train.band_colour_weight
-            distance /= self._train.distance_weight
+            return colour, distance
+        colour, distance = kernels.gradient(
+            p.table, *p.network(), *place, self._points, self._target,
+            self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1], *grads,
+        )  # fmt: skip
+        return colour / (1 + self._train.band_colour_weight), distance / self._train.distance_weight
+
+    def _adam(self, table_lr: float, network_lr: float) -> None:
+        """One Adam step of table and network; clears the gradients."""
+        p = self._p
         betas = np.float32(BETA1), np.float32(BETA2), np.float32(EPSILON)
         step_sizes = self._level_rates * np.float32(adam_step_size(table_lr, self._steps))
         kernels.adam_touched(p.table, self._table_grad, self._touched, *self._table_moments, step_sizes, *betas)
@@ -115,7 +131,6 @@ class NumbaDevice:
             v += (1 - betas[1]) * (grad * grad - v)
             value -= step_size * m / (np.sqrt(v) + betas[2])
             grad[...] = 0
-        return colour / share[0], distance / share[1]
 
     def draw(self, rays: Rays, panorama_share: float, depth_share: float) -> tuple[Floats, Floats, Floats]:
         height, width = rays.shape
@@ -135,7 +150,7 @@ class NumbaDevice:
         if panorama_share > 0:
             priors = drawn.priors
             march.mix_panorama(
-                priors.rgb, priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.gains,
+                priors.rgb, priors.inverse_depth, priors.depth_edge, priors.known, priors.camera_from_map, priors.gains,
                 priors.band, rays.origin, rays.directions, guide, confidence, np.float32(panorama_share), colour,
             )  # fmt: skip
         return colour, depth, confidence
@@ -182,7 +197,7 @@ class NumbaDevice:
         march.trace(
             p.table, *p.network(), scene.lattice.cells_per_m, scene.lattice.origin, drawn.focus,
             grid.distance, grid.origin, np.float32(grid.cell_m),
-            priors.inverse_depth, priors.torn, priors.known, priors.camera_from_map, priors.band,
+            priors.inverse_depth, priors.depth_edge, priors.known, priors.camera_from_map, priors.band,
             np.float32(depth_share), rays.origin, rays.directions, pixels, depth, confidence,
         )  # fmt: skip
         depth[pixels] *= rays.axial[pixels]

@@ -1,4 +1,8 @@
-"""Plain torch versions of the kernels: what the tests hold the fast ones against, and what runs on CUDA.
+"""The field in plain torch: one training step and one rendered view, in the order in which they happen.
+
+A training step is ``sample_rays`` → ``query`` → ``loss`` → ``adam_touched``, see ``train_step``. A view is ``trace`` →
+``query`` → ``mix_panorama``. The fast kernels have the same names (numba: ``march.py``, ``kernels.py``; Triton:
+``triton_kernels.py``), and tests compare them with these. It also runs on CUDA where Triton does not work.
 
 Differentiable: ``encode``, ``query`` and ``loss`` in table and network (not in the points). Nothing else is.
 """
@@ -10,6 +14,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from instant_ic.vspace.config import TrainConfig
+from instant_ic.vspace.nerf.field import BETA1, BETA2, EPSILON, adam_step_size, ray_sources
 
 _P1 = 2654435761
 _P2 = 805459861
@@ -37,7 +44,7 @@ class TorchField:
 
 @dataclass
 class TorchPrior:
-    """A ``prior.PanoramaPrior`` as tensors; ``rgb`` float32 in 0..255, ``known``, ``torn`` and ``usable`` bool.
+    """A ``prior.PanoramaPrior`` as tensors; ``rgb`` float32 in 0..255, ``known``, ``depth_edge`` and ``usable`` bool.
 
     ``trust``: weight of each pixel's depth, (h, w); ``gain``: to the newest keyframe's exposure, (3,).
     """
@@ -45,7 +52,7 @@ class TorchPrior:
     rgb: Tensor
     inverse_depth: Tensor
     known: Tensor
-    torn: Tensor
+    depth_edge: Tensor
     usable: Tensor
     trust: Tensor
     map_from_camera: Tensor
@@ -61,6 +68,67 @@ class TorchGrid:
     distance: Tensor
     origin: Tensor
     cell_m: float
+
+
+@dataclass
+class TrainState:
+    """What training changes between steps.
+
+    Attributes:
+        moments: Adam's two moments of each parameter.
+        level_rates: learning rate of each level against the coarsest's, (levels, 1, 1).
+        steps: steps so far.
+    """
+
+    moments: list[tuple[Tensor, Tensor]]
+    level_rates: Tensor
+    steps: int = 0
+
+
+def train_step(
+    field: TorchField,
+    priors: list[TorchPrior],
+    state: TrainState,
+    config: TrainConfig,
+    uniform: Tensor,
+    rates: tuple[float, float],
+    weights: tuple[Tensor, Tensor],
+) -> tuple[float, float]:
+    """One training step with a signed distance as geometry; changes ``field`` and ``state``.
+
+    Args:
+        field: parameters and lattice.
+        priors: the keyframes, newest first.
+        state: of the optimiser.
+        config: size of the batch and weights.
+        uniform: (N, 3) in [0, 1), one row a ray.
+        rates: learning rates of table and network.
+        weights: of the batch's samples in the loss, colour's and distance's, each (2 N,) (``field.sample_weights``).
+
+    Returns:
+        Mean squared colour error (0..1 units) and mean squared distance error (units of the band).
+    """
+    state.steps += 1
+    columns, rows = config.ray_columns, config.ray_rows
+    sources = torch.from_numpy(ray_sources(len(priors), columns * rows // 64, state.steps)).to(uniform.device)
+    points, target, weight = sample_rays(uniform, columns, rows, priors, sources)
+    output = query(field, points)
+    colour, distance = loss(output, target, weights[0] * weight[:, 0], weights[1] * weight[:, 1])
+    adam_step(field, state, torch.autograd.grad(colour + distance, field.parameters()), rates)
+    share = weight.mean(dim=0).clamp(min=1e-3)  # of the samples that count
+    colour = colour / share[0] / (1 + config.band_colour_weight)
+    return float(colour.detach()), float((distance / share[1] / config.distance_weight).detach())
+
+
+@torch.no_grad()
+def adam_step(field: TorchField, state: TrainState, grads: tuple[Tensor, ...], rates: tuple[float, float]) -> None:
+    """One Adam step of table and network, in place."""
+    for index, (value, grad) in enumerate(zip(field.parameters(), grads, strict=True)):
+        step_size: float | Tensor = adam_step_size(rates[min(index, 1)], state.steps)
+        if index == 0:
+            step_size = step_size * state.level_rates
+        # A network's row is an entry like the table's: without a gradient it is left alone.
+        adam_touched(value, grad, *state.moments[index], step_size, BETA1, BETA2, EPSILON)
 
 
 def encode(table: Tensor, cells_per_m: Tensor, origin: Tensor, focus: Tensor, points: Tensor) -> Tensor:
@@ -153,7 +221,7 @@ def prior_inverse_depth(prior: TorchPrior, u: Tensor, v: Tensor) -> Tensor:
     inverse = prior.inverse_depth
     left, right, top, bottom, fu, fv = _corners(u, v, inverse.shape[1], inverse.shape[0])
     nearest = inverse[torch.where(fv >= 0.5, bottom, top), torch.where(fu >= 0.5, right, left)]
-    return torch.where(prior.torn[top, left], nearest, bilinear(inverse, u, v))
+    return torch.where(prior.depth_edge[top, left], nearest, bilinear(inverse, u, v))
 
 
 def sample_rays(
@@ -222,7 +290,7 @@ def prior_agrees(prior: TorchPrior, points: Tensor) -> Tensor:
     low, high = 1 - prior.band, 1 + prior.band
     any_near = ((ratios > low) & (ratios < high)).any(dim=0)
     between = (ratios.amin(dim=0) < high) & (ratios.amax(dim=0) > low)
-    return torch.where(torch.where(prior.torn[top, left], any_near, between), seen, torch.zeros_like(seen))
+    return torch.where(torch.where(prior.depth_edge[top, left], any_near, between), seen, torch.zeros_like(seen))
 
 
 def prior_distance(prior: TorchPrior, points: Tensor) -> Tensor:

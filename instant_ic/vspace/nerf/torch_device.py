@@ -12,21 +12,17 @@ from instant_ic.vspace.canvas import Canvas, CpuCanvas
 from instant_ic.vspace.config import FieldConfig, TrainConfig
 from instant_ic.vspace.nerf import reference, volume_reference
 from instant_ic.vspace.nerf.field import (
-    BETA1,
-    BETA2,
-    EPSILON,
     FieldParameters,
     Floats,
     Rays,
     Scene,
-    adam_step_size,
     depth_trust,
     level_rates,
     ray_sources,
     sample_weights,
     volume_rays,
 )
-from instant_ic.vspace.nerf.reference import TorchField, TorchGrid, TorchPrior
+from instant_ic.vspace.nerf.reference import TorchField, TorchGrid, TorchPrior, TrainState
 from instant_ic.vspace.torch_canvas import TorchCanvas
 from instant_ic.vspace.view import LensRays
 
@@ -44,7 +40,7 @@ def torch_priors(scene: Scene, device: str) -> list[TorchPrior]:
             rgb=tensor(prior.rgb),
             inverse_depth=tensor(prior.inverse_depth),
             known=tensor(prior.known, torch.bool),
-            torn=tensor(prior.torn, torch.bool),
+            depth_edge=tensor(prior.depth_edge, torch.bool),
             usable=tensor(prior.usable, torch.bool),
             trust=tensor(depth_trust(prior)),
             map_from_camera=tensor(prior.map_from_camera),
@@ -78,8 +74,7 @@ class TorchDevice:
         levels = parameters.table.shape[0]
         lattice = [torch.zeros(n, device=self._device) for n in ((levels,), (3,), (1, 4))]  # until a scene comes
         self._field = TorchField(*tensors, *lattice)
-        self._moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in tensors]
-        self._steps = 0
+        self._state = self._fresh_state()
 
     def set_scene(self, scene: Scene) -> None:
         grid, lattice = scene.occupancy, scene.lattice
@@ -87,45 +82,35 @@ class TorchDevice:
         # All that needs memory comes first: where there is none, the old scene stays whole.
         priors = torch_priors(scene, self._device)
         distance, corner, cells_per_m, origin, focus = (torch.from_numpy(a).to(self._device) for a in arrays)
-        moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
-        self._priors, self._grid, self._moments = priors, TorchGrid(distance, corner, grid.cell_m), moments
+        state = self._fresh_state()
+        self._priors, self._grid, self._state = priors, TorchGrid(distance, corner, grid.cell_m), state
         self._field.cells_per_m, self._field.origin, self._field.focus = cells_per_m, origin, focus
-        self._steps = 0
+
+    def _fresh_state(self) -> TrainState:
+        moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in self._field.parameters()]
+        return TrainState(moments, self._level_rates)
 
     def step(self, uniform: Floats, table_lr: float, network_lr: float) -> tuple[float, float]:
-        drawn = torch.from_numpy(uniform).to(self._device)
-        self._steps += 1
-        error, colour, distance = self._density_loss(drawn) if self._density else self._distance_loss(drawn)
+        """One training step; ``reference.train_step`` holds it whole."""
+        batch, rates = torch.from_numpy(uniform).to(self._device), (table_lr, network_lr)
+        if self._density:
+            return self._density_step(batch, rates)
+        weights = self._colour_weight, self._distance_weight
+        return reference.train_step(self._field, self._priors, self._state, self._train, batch, rates, weights)
+
+    def _density_step(self, uniform: Tensor, rates: tuple[float, float]) -> tuple[float, float]:
+        self._state.steps += 1
+        error, colour, distance = self._density_loss(uniform)
         grads = torch.autograd.grad(error, self._field.parameters())
-        with torch.no_grad():
-            for index, (value, grad) in enumerate(zip(self._field.parameters(), grads, strict=True)):
-                lr = table_lr if index == 0 else network_lr
-                step_size: float | Tensor = adam_step_size(lr, self._steps)
-                if index == 0:
-                    step_size = step_size * self._level_rates
-                # A network's row is an entry like the table's: without a gradient it is left alone.
-                reference.adam_touched(value, grad, *self._moments[index], step_size, BETA1, BETA2, EPSILON)
+        reference.adam_step(self._field, self._state, grads, rates)
         return float(colour.detach()), float(distance.detach())
 
-    def _rays(self, uniform: Tensor, columns: int, rows: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Points, targets and weights of a batch, and the keyframe of each tile."""
-        sources = torch.from_numpy(ray_sources(len(self._priors), columns * rows // 64, self._steps)).to(self._device)
-        return *reference.sample_rays(uniform, columns, rows, self._priors, sources), sources
-
-    def _distance_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """What training minimises, and ``step``'s two errors."""
-        points, target, weight, _ = self._rays(uniform, self._train.ray_columns, self._train.ray_rows)
-        output = reference.query(self._field, points)
-        weights = self._colour_weight * weight[:, 0], self._distance_weight * weight[:, 1]
-        colour, distance = reference.loss(output, target, *weights)
-        share = weight.mean(dim=0).clamp(min=1e-3)
-        errors = colour / share[0] / (1 + self._train.band_colour_weight), distance / share[1]
-        return colour + distance, errors[0], errors[1] / self._train.distance_weight
-
     def _density_loss(self, uniform: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """As ``_distance_loss``."""
+        """What training minimises, and ``step``'s two errors."""
         columns, rows = volume_rays(self._train)
-        points, target, weight, sources = self._rays(uniform[: columns * rows], columns, rows)
+        numbers = ray_sources(len(self._priors), columns * rows // 64, self._state.steps)
+        sources = torch.from_numpy(numbers).to(self._device)
+        points, target, weight = reference.sample_rays(uniform[: columns * rows], columns, rows, self._priors, sources)
         surface, colours, weight = (a.view(-1, 2, 64, a.shape[1])[:, 0].flatten(0, 1) for a in (points, target, weight))
         number = sources.long().repeat_interleave(64)
         cameras = torch.stack([prior.map_from_camera[:3, 3] for prior in self._priors])[number]

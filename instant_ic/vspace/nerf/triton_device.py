@@ -40,7 +40,7 @@ TRAIN_BLOCK = 64
 ENTRIES = 256
 """Table entries of one program of Adam; the smallest table has four times as many."""
 TILE = 64
-"""Rays of one program, 8 × 8: of a batch's stratum tile, and of a picture."""
+"""Rays of one program, 8 × 8: of a batch's stratum tile, and of an image."""
 
 
 @dataclass
@@ -159,7 +159,7 @@ class TritonDevice:
         h, w = q["inverse_depth"].shape[1:]
         b.sums.zero_()
         kernels.sample_rays[(len(b.sources),)](
-            b.uniform, b.sources, q["rgb"], q["inverse_depth"], q["torn"], q["usable"], q["trust"],
+            b.uniform, b.sources, q["rgb"], q["inverse_depth"], q["depth_edge"], q["usable"], q["trust"],
             q["map_from_camera"], q["band"], q["gains"],
             train.ray_columns, train.ray_rows, width, height, w, h, b.points, b.target, b.weight, TILE,
         )  # fmt: skip
@@ -198,7 +198,7 @@ class TritonDevice:
         h, w = q["inverse_depth"].shape[1:]
         kernels.draw[(math.ceil(rows / 8) * math.ceil(columns / 8),)](
             p.table, size, p.network, scene.cells_per_m, scene.origin, scene.focus, scene.grid, scene.low,
-            q["rgb"], q["inverse_depth"], q["torn"], q["known"], q["camera_from_map"], scene.camera, q["band"],
+            q["rgb"], q["inverse_depth"], q["depth_edge"], q["known"], q["camera_from_map"], scene.camera, q["band"],
             q["gains"], scene.keyframes, view, view[3:], directions, columns, rows, width, height, w, h,
             *scene.grid.shape, scene.cell_m, float(panorama_share), float(depth_share), colour, depth, confidence,
             **self._shape, B=TILE,
@@ -232,7 +232,7 @@ class TritonDevice:
     def _uploaded_scene(self, scene: Scene) -> _GpuScene:
         stacked = StackedPriors.of(scene)
         keys = (
-            *("rgb", "inverse_depth", "known", "torn", "usable", "trust"),
+            *("rgb", "inverse_depth", "known", "depth_edge", "usable", "trust"),
             *("map_from_camera", "camera_from_map", "band", "gains"),
         )
         grid, lattice = scene.occupancy, scene.lattice
@@ -270,7 +270,7 @@ class TritonDevice:
         )
 
     def _forget(self) -> None:
-        """Moments start anew, and so does the graph: it has the addresses of the scene and parameters before."""
+        """Moments start again, and so does the graph: it has the addresses of the scene and parameters before."""
         b = self._buffers
         for moment in (*b.table_moments, *b.network_moments, b.table_grad, b.network_grad):
             moment.zero_()

@@ -1,11 +1,11 @@
-"""The field's kernels for NVIDIA GPUs (Triton): training samples, gradient, Adam on touched entries, whole pictures.
+"""The field's kernels for NVIDIA GPUs (Triton): training samples, gradient, Adam on touched entries, whole images.
 
 Each does what the torch functions of ``reference.py`` do, named in its docstring. Only ``triton_device`` imports this
 module. ``TRITON_INTERPRET=1`` runs all of it on the CPU, for the tests.
 
 Tables are float16 where they are read, with float32 masters; sums are float32. Entries get their gradients by atomics,
 so that two runs differ in the last bits. Sizes that follow from the configuration are compiled in; what changes from
-scene to scene and picture to picture is not, so that nothing is compiled after the start.
+scene to scene and image to image is not, so that nothing is compiled after the start.
 """
 
 # mypy: disable-error-code="no-untyped-def"
@@ -118,7 +118,7 @@ def _bilinear_corners(u, v, width, height):
 
 @triton.jit
 def _panorama_pixel(x, y, z, width, height):
-    """Index coordinates in an equirect picture of points of its camera's frame."""
+    """Index coordinates in an equirect image of points of its camera's frame."""
     u = (_PI - _atan2(y, x)) * (width / (2 * _PI)) - 0.5
     v = (0.5 * _PI - _atan2(z, tl.sqrt(x * x + y * y))) * (height / _PI) - 0.5
     return u, v
@@ -138,7 +138,7 @@ def _panorama_colour(rgb, gain, k, u, v, width, height, wanted, channel: tl.cons
 
 
 @triton.jit
-def _inverse_depth(inverse, torn, k, u, v, width, height, wanted):
+def _inverse_depth(inverse, depth_edge, k, u, v, width, height, wanted):
     """Inverse depth of keyframe ``k``: bilinear on a surface, nearest at an edge; and the four that it is made of."""
     left, right, top, bottom, fu, fv = _bilinear_corners(u, v, width, height)
     start = k * height * width
@@ -146,7 +146,7 @@ def _inverse_depth(inverse, torn, k, u, v, width, height, wanted):
     b = tl.load(inverse + start + top * width + right, mask=wanted, other=1.0)
     c = tl.load(inverse + start + bottom * width + left, mask=wanted, other=1.0)
     d = tl.load(inverse + start + bottom * width + right, mask=wanted, other=1.0)
-    edge = tl.load(torn + start + top * width + left, mask=wanted, other=0) != 0
+    edge = tl.load(depth_edge + start + top * width + left, mask=wanted, other=0) != 0
     nearest = tl.where(fv >= 0.5, tl.where(fu >= 0.5, d, c), tl.where(fu >= 0.5, b, a))
     plain = (a * (1 - fu) + b * fu) * (1 - fv) + (c * (1 - fu) + d * fu) * fv
     at = start + tl.where(fv >= 0.5, bottom, top) * width + tl.where(fu >= 0.5, right, left)
@@ -154,7 +154,7 @@ def _inverse_depth(inverse, torn, k, u, v, width, height, wanted):
 
 
 @triton.jit
-def _against(inverse, torn, known, poses, band, k, px, py, pz, width, height, wanted):
+def _against(inverse, depth_edge, known, poses, band, k, px, py, pz, width, height, wanted):
     """Map points against keyframe ``k``: signed distance in its bands, agreement (0, 1, 2), the band's metres there,
     whether its depth is known there; ``reference.prior_distance`` and ``prior_agrees``.
     """
@@ -163,7 +163,7 @@ def _against(inverse, torn, known, poses, band, k, px, py, pz, width, height, wa
     y = tl.load(m + 4) * px + tl.load(m + 5) * py + tl.load(m + 6) * pz + tl.load(m + 7)
     z = tl.load(m + 8) * px + tl.load(m + 9) * py + tl.load(m + 10) * pz + tl.load(m + 11)
     u, v = _panorama_pixel(x, y, z, width, height)
-    nearness, a, b, c, d, edge, at = _inverse_depth(inverse, torn, k, u, v, width, height, wanted)
+    nearness, a, b, c, d, edge, at = _inverse_depth(inverse, depth_edge, k, u, v, width, height, wanted)
     away = tl.sqrt(x * x + y * y + z * z)
     half = tl.load(band + k)
     value = (1 - away * nearness) / half
@@ -178,12 +178,14 @@ def _against(inverse, torn, known, poses, band, k, px, py, pz, width, height, wa
 
 
 @triton.jit
-def _nearest_prior(inverse, torn, known, poses, band, keyframes, px, py, pz, width, height, wanted):
+def _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, width, height, wanted):
     """Signed distance to the nearest keyframe's surface, and agreement; ``reference.nearest_prior``."""
     best, unit = px * 0 + _NOT_SEEN, px * 0 + 1
     agrees, through = (px * 0).to(tl.int32), px * 0 > 1
     for k in range(keyframes):
-        value, agree, away, seen = _against(inverse, torn, known, poses, band, k, px, py, pz, width, height, wanted)
+        value, agree, away, seen = _against(
+            inverse, depth_edge, known, poses, band, k, px, py, pz, width, height, wanted
+        )
         unit = tl.where(k == 0, away, unit)
         closer = ~through & (tl.abs(value) * away < tl.abs(best) * unit)
         best = tl.where(closer, value * away / unit, best)
@@ -194,7 +196,7 @@ def _nearest_prior(inverse, torn, known, poses, band, keyframes, px, py, pz, wid
 
 @triton.jit(do_not_specialize=["columns", "rows", "width", "height", "w", "h"])
 def sample_rays(
-    uniform, sources, rgb, inverse, torn, usable, trust, map_poses, band, gain,
+    uniform, sources, rgb, inverse, depth_edge, usable, trust, map_poses, band, gain,
     columns, rows, width, height, w, h, points, target, weight, B: tl.constexpr,
 ):  # fmt: skip
     """One ray in each stratum, two samples a ray; ``reference.sample_rays``. One program a tile of 64 rays."""
@@ -211,7 +213,7 @@ def sample_rays(
     fall = _atan2(flat, z) / _PI
     azimuth = _PI * (1 - 2 * turn)
     every = n >= 0
-    nearness, _, _, _, _, _, _ = _inverse_depth(inverse, torn, k, turn * w - 0.5, fall * h - 0.5, w, h, every)
+    nearness, _, _, _, _, _, _ = _inverse_depth(inverse, depth_edge, k, turn * w - 0.5, fall * h - 0.5, w, h, every)
     depth = 1 / nearness
     offset = 2 * tl.load(uniform + 3 * n + 2) - 1
     half = tl.load(band + k)
@@ -361,13 +363,13 @@ def _cell(o, t, d, low, cell, count):
 
 @triton.jit(do_not_specialize=["size", "keyframes", "columns", "rows", "width", "height", "w", "h", "nx", "ny", "nz"])
 def draw(
-    table, size, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, torn, known, poses, camera, band,
-    gain, keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
+    table, size, network, cells_per_m, origin, focus, grid, grid_low, rgb, inverse, depth_edge, known, poses, camera,
+    band, gain, keyframes, eye, turn, directions, columns, rows, width, height, w, h, nx, ny, nz, cell,
     panorama_share, depth_share, colour, depth, confidence,
     LEVELS: tl.constexpr, LP: tl.constexpr, F: tl.constexpr,
     HIDDEN: tl.constexpr, HP: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """A picture: march to the surface, the field's colour there, the panorama's share; one program 8 × 8 pixels.
+    """An image: march to the surface, the field's colour there, the panorama's share; one program 8 × 8 pixels.
 
     ``reference.trace``, ``reference.query`` and ``reference.mix_panorama`` in one.
 
@@ -412,7 +414,7 @@ def draw(
         px, py, pz = ox + t * dx, oy + t * dy, oz + t * dz
         value = t * 0
         if depth_share > 0:
-            of_prior, _ = _nearest_prior(inverse, torn, known, poses, band, keyframes, px, py, pz, w, h, active)
+            of_prior, _ = _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, px, py, pz, w, h, active)
             value = depth_share * of_prior
         if depth_share < 1:
             x = _encode(table, size, cells_per_m, origin, focus, keyframes, px, py, pz, active, LEVELS, LP, F, B)
@@ -424,7 +426,7 @@ def draw(
         step = tl.where(crossed, before - value, 1.0)
         hit = tl.where(crossed, last_t + (t - last_t) * before / step, t)
         hx, hy, hz = ox + hit * dx, oy + hit * dy, oz + hit * dz
-        _, agrees = _nearest_prior(inverse, torn, known, poses, band, keyframes, hx, hy, hz, w, h, active)
+        _, agrees = _nearest_prior(inverse, depth_edge, known, poses, band, keyframes, hx, hy, hz, w, h, active)
         closer = active & (agrees == 2) & (value > 0) & ~crossed & (value < spare_s)
         spare, spare_s = tl.where(closer, hit, spare), tl.where(closer, value, spare_s)
         found = active & ((value <= 0) | crossed) & (agrees > 0)
@@ -459,7 +461,7 @@ def draw(
             x0 = tl.load(m) * px + tl.load(m + 1) * py + tl.load(m + 2) * pz + tl.load(m + 3)
             y0 = tl.load(m + 4) * px + tl.load(m + 5) * py + tl.load(m + 6) * pz + tl.load(m + 7)
             z0 = tl.load(m + 8) * px + tl.load(m + 9) * py + tl.load(m + 10) * pz + tl.load(m + 11)
-            _, agrees, _, _ = _against(inverse, torn, known, poses, band, k, px, py, pz, w, h, waiting)
+            _, agrees, _, _ = _against(inverse, depth_edge, known, poses, band, k, px, py, pz, w, h, waiting)
             mine = waiting & (tl.where(k == keyframes - 1, 1, agrees) > 0)
             waiting = waiting & ~mine
             u, v = _panorama_pixel(x0, y0, z0, width, height)

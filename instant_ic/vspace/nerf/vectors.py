@@ -1,4 +1,4 @@
-"""A table entry as one machine vector: what the compiler does not find by itself (numba intrinsics in LLVM's words).
+"""Table entries as machine vectors, which the compiler does not produce by itself (numba intrinsics in LLVM IR).
 
 ``gather2``, ``gather4`` (rows, entries, weights) → tuple of 2 or 4 float32:
     ``Σ weights[c] · rows[entries[c]]`` over the eight corners of a cell.

@@ -1,4 +1,4 @@
-"""Geometry as density, the paper's way: compositing over samples round the depth, and its gradient by hand (numba).
+"""Geometry as density, as in the paper: compositing of samples around the depth, with its gradient (numba).
 
 The torch functions in ``volume_reference.py`` do the same. Network's output 3 is the logarithm of the density, per band
 of the newest keyframe (``band · distance to its camera`` metres), so that walls near and far look alike to the network.
@@ -153,7 +153,7 @@ def volume_gradient(  # type: ignore[no-untyped-def]
 def composite(  # type: ignore[no-untyped-def]
     table, w1, b1, w2, b2, cells_per_m, lattice_origin, focus, band, depth_share, origin, directions, depth, colour
 ):
-    """Draws rays by compositing round the depth that they were guided to: hash grid, network and sums in one pass.
+    """Renders rays by compositing round the depth that they were guided to: hash grid, network and sums in one pass.
 
     Args:
         band: of the newest keyframe, whose camera is ``focus[0, :3]``.
