@@ -6,30 +6,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from instant_ic.geometry.mesh_parts import is_y_up, mesh_parts
 from instant_ic.sim.lighting import bake_mesh
 from instant_ic.sim.textures import srgb_to_linear, texture_set
 from instant_ic.sim.world import World
 
-_Y_UP = {".glb", ".gltf"}
-#: glTF has y up and looks along z: (x, y, z) becomes (x, -z, y).
-_Z_UP_FROM_Y_UP = np.asarray([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
-
-def _look(material: Any) -> tuple[npt.NDArray[np.float32] | None, tuple[float, float, float]]:
-    """Image (H, W, 3) in sRGB 0..1 or None, and linear colour factor, of a trimesh material."""
-    image = getattr(material, "baseColorTexture", None)
-    if image is None:
-        image = getattr(material, "image", None)
-    factor = getattr(material, "baseColorFactor", None)
-    if factor is None:
-        factor = getattr(material, "diffuse", None) if image is None else None
-    colour = np.ones(3)
-    if factor is not None:
-        factor = np.asarray(factor)
-        # trimesh stores factors as integers in 0..255 or floats in 0..1.
-        colour = factor[:3] / 255.0 if factor.dtype.kind in "ui" else factor[:3].astype(float)
-    picture = None if image is None else np.asarray(image.convert("RGB"), np.float32) / 255.0
-    return picture, (float(colour[0]), float(colour[1]), float(colour[2]))
+def _linear(image: Any) -> npt.NDArray[np.float32]:
+    """Linear light (H, W, 3) of a PIL image."""
+    return srgb_to_linear(np.asarray(image.convert("RGB"), np.float32) / 255.0)
 
 
 def _affine_uv(triangles: npt.NDArray[np.float64], uv: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -84,40 +69,27 @@ def load_world(path: str | Path, y_up: bool | None = None) -> World:
         scene = trimesh.load_scene(str(path))
     except Exception as error:
         raise ValueError(f"world {path}: trimesh cannot read it ({error})") from error
-    if y_up is None:
-        y_up = path.suffix.lower() in _Y_UP
-    turn = _Z_UP_FROM_Y_UP if y_up else np.eye(3)
-
     sources: list[str | npt.NDArray[np.floating]] = []
     known: dict[int, int] = {}
     parts: list[dict[str, npt.NDArray[Any]]] = []
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        mesh = scene.geometry[name]
-        if not hasattr(mesh, "faces") or len(mesh.faces) == 0:
-            continue
-        vertices = (np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]) @ turn.T
-        material = getattr(mesh.visual, "material", None)
-        uv = getattr(mesh.visual, "uv", None)
-        picture, colour = _look(material) if material is not None else (None, (0.7, 0.7, 0.7))
-        if picture is None or uv is None:
-            key, source = -1, np.ones((1, 1, 3), np.float32)
-            corner_uv = np.zeros((len(mesh.faces), 3, 2))
+    for part in mesh_parts(scene, is_y_up(path) if y_up is None else y_up):
+        if part.image is None or part.corner_uv is None:
+            key, corner_uv = -1, np.zeros((*part.faces.shape, 2))
         else:
-            key, source = id(material), srgb_to_linear(picture)
-            corner_uv = np.asarray(uv, float)[mesh.faces]
-            # Image rows run downwards, trimesh's v upwards.
-            corner_uv[..., 1] = 1.0 - corner_uv[..., 1]
+            key, corner_uv = id(part.image), part.corner_uv.astype(float)
         if key not in known:
             known[key] = len(sources)
-            sources.append(source)
-        triangles = vertices[mesh.faces]
+            sources.append(np.ones((1, 1, 3), np.float32) if key == -1 else _linear(part.image))
+        colour = part.factor
+        if colour is None:
+            colour = np.full(3, 0.7 if getattr(part.visual, "material", None) is None else 1.0)
+        triangles = part.vertices[part.faces]
         parts.append(
             {
                 "triangles": triangles,
                 "uv": _affine_uv(triangles, corner_uv),
                 "texture": np.full(len(triangles), known[key], np.int32),
-                "tint": np.repeat(np.asarray([colour], np.float32), len(triangles), axis=0),
+                "tint": np.repeat(colour[None].astype(np.float32), len(triangles), axis=0),
             }
         )
     if not parts:

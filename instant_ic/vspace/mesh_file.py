@@ -1,4 +1,4 @@
-"""A place that was scanned beforehand: triangles with colours, from a mesh file."""
+"""Loader of scanned places: triangles with colours from a mesh file."""
 
 from __future__ import annotations
 
@@ -10,21 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from instant_ic.geometry.mesh_parts import in_shares, is_y_up, mesh_parts
 from instant_ic.vspace.nerf.field import Floats
 
 SUFFIXES = (".glb", ".gltf", ".ply", ".obj")
-_Y_UP = (".glb", ".gltf")
-_Z_UP_FROM_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-"""glTF has y up and looks along z: (x, y, z) becomes (x, −z, y)."""
 GREY = (179.0, 179.0, 179.0)
-"""Of a surface without any colour."""
+"""Colour of a surface without any."""
 MAX_LEVELS = 13
 MAX_FILE_BYTES = 2 << 30
 """Larger files are refused unread: their triangles would not fit into the memory of a robot's station."""
 
 
 class MeshError(ValueError):
-    """A mesh that cannot be used; the message names the file, says why and what to do."""
+    """A mesh cannot be used; the message names the file, the reason and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +31,14 @@ class ScannedMesh:
 
     Attributes:
         triangles: corners, (T, 3, 3).
-        corner_uv: texture coordinates of the corners, v downwards, 1 = the whole picture, (T, 3, 2).
+        corner_uv: texture coordinates of the corners, v downwards, 1 = the whole image, (T, 3, 2).
         corner_rgb: colours of the corners in 0..255 sRGB, (T, 3, 3); counts where there is no texture.
-        texture: index of each triangle's picture, −1 for none, (T,).
+        texture: index of each triangle's image, −1 for none, (T,).
         texel_per_m: texels of the finest level a metre, (T,); of vertex colours, triangles a metre.
-        texels: of all pictures and levels one after another, (N, 3) uint8.
-        start: first texel of each picture's level, (pictures, MAX_LEVELS).
-        sizes: height and width of each picture's level, (pictures, MAX_LEVELS, 2).
-        levels: of each picture, (pictures,).
+        texels: of all images and levels one after another, (N, 3) uint8.
+        start: first texel of each image's level, (images, MAX_LEVELS).
+        sizes: height and width of each image's level, (images, MAX_LEVELS, 2).
+        levels: of each image, (images,).
     """
 
     triangles: Floats
@@ -82,7 +80,7 @@ def load_mesh(path: str | Path, max_triangles: int = 5_000_000) -> ScannedMesh:
             " simplify it first"
         )
     try:
-        if suffix in _Y_UP:
+        if is_y_up(path):
             _check_accessors(path, 3 * max_triangles)
         return _read(path, max_triangles)
     except MeshError:
@@ -96,7 +94,7 @@ def load_mesh(path: str | Path, max_triangles: int = 5_000_000) -> ScannedMesh:
 
 
 def _check_accessors(path: Path, most: int) -> None:
-    """See that a glTF's arrays are in its buffers: one without a buffer is zeros, of any number, in 50 bytes.
+    """Check that a glTF's arrays are in its buffers: 50 bytes can declare any number of zeros without one.
 
     Raises:
         MeshError: an array without a buffer, or of more elements than the mesh may have.
@@ -113,7 +111,7 @@ def _check_accessors(path: Path, most: int) -> None:
 
 
 def _read(path: Path, max_triangles: int) -> ScannedMesh:
-    parts = _parts(_scene(path), _Z_UP_FROM_Y_UP if path.suffix.lower() in _Y_UP else np.eye(3), path, max_triangles)
+    parts = _parts(_scene(path), path, max_triangles)
     pictures: dict[int, NDArray[np.uint8]] = {}
     for part in parts:
         if part["picture"] is not None:
@@ -156,75 +154,47 @@ def _scene(path: Path) -> Any:
     return trimesh.load_scene(str(path), process=False)
 
 
-def _parts(scene: Any, turn: NDArray[np.float64], path: Path, max_triangles: int) -> list[dict[str, Any]]:
-    """Each geometry's triangles and colours; node transforms applied, units as metres.
+def _parts(scene: Any, path: Path, max_triangles: int) -> list[dict[str, Any]]:
+    """Each geometry's triangles and colours.
 
     Raises:
         MeshError: more triangles than are allowed; counted here, as one geometry may stand at many nodes.
     """
     parts = []
     count = 0
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        mesh = scene.geometry[name]
-        if getattr(mesh, "faces", None) is None or len(mesh.faces) == 0:
-            continue
-        count += len(mesh.faces)
+    for part in mesh_parts(scene, is_y_up(path)):
+        count += len(part.faces)
         if count > max_triangles:
             raise MeshError(
                 f"mesh {path}: at least {count} triangles, space.mesh_max_triangles is {max_triangles};"
                 " simplify the mesh, or raise the limit"
             )
-        vertices = (np.asarray(mesh.vertices) @ transform[:3, :3].T + transform[:3, 3]) @ turn.T
-        faces = np.asarray(mesh.faces)
-        uv = getattr(mesh.visual, "uv", None)
-        picture, factor = _material(mesh.visual)
-        if picture is None or uv is None or len(uv) != len(vertices):
-            picture, uv = None, np.zeros((len(vertices), 2))
-        corner_uv = np.asarray(uv, np.float32)[faces]
-        corner_uv[..., 1] = 1 - corner_uv[..., 1]  # trimesh's v runs upwards, a picture's rows downwards
+        factor = None if part.factor is None else part.factor.astype(np.float32)
+        if factor is not None:
+            factor = 255 * (_to_srgb(factor) if part.factor_is_linear else factor)
+        no_uv = np.zeros((*part.faces.shape, 2), np.float32)
         parts.append(
             {
-                "triangles": vertices[faces].astype(np.float32),
-                "corner_uv": corner_uv,
-                "corner_rgb": _corner_colours(mesh.visual, faces, factor),
-                "picture": picture,
+                "triangles": part.vertices[part.faces].astype(np.float32),
+                "corner_uv": no_uv if part.corner_uv is None else part.corner_uv.astype(np.float32),
+                "corner_rgb": _corner_colours(part.visual, part.faces, factor),
+                "picture": part.image,
                 "factor": factor,
             }
         )
     return parts
 
 
-def _material(visual: Any) -> tuple[Any, Floats | None]:
-    """Picture of a material and its colour in 0..255 sRGB (a factor of the picture), None where it has none."""
-    material = getattr(visual, "material", None)
-    if material is None:
-        return None, None
-    picture = getattr(material, "baseColorTexture", None)
-    picture = getattr(material, "image", None) if picture is None else picture
-    linear = getattr(material, "baseColorFactor", None)
-    if linear is not None:  # of glTF: a factor of light
-        return picture, 255 * _to_srgb(_in_shares(linear)[:3])
-    diffuse = getattr(material, "diffuse", None)
-    return picture, None if diffuse is None or picture is not None else 255 * _in_shares(diffuse)[:3]
-
-
-def _in_shares(colour: Any) -> Floats:
-    """Colours as shares of 1: whole numbers are of their type's range (trimesh keeps both), fractions as they are."""
-    values = np.asarray(colour)
-    return (values / np.iinfo(values.dtype).max if values.dtype.kind in "ui" else values).astype(np.float32)
-
-
 def _corner_colours(visual: Any, faces: NDArray[np.integer], factor: Floats | None) -> Floats:
     """Colours of the corners (T, 3, 3) in 0..255: of the vertices, the faces, or the material."""
     kind = getattr(visual, "kind", None)
     if kind == "vertex":
-        return 255 * _in_shares(visual.vertex_colors)[faces][..., :3]
+        return 255 * in_shares(visual.vertex_colors).astype(np.float32)[faces][..., :3]
     if kind == "face":
-        return 255 * np.repeat(_in_shares(visual.face_colors)[:, None, :3], 3, axis=1)
+        return 255 * np.repeat(in_shares(visual.face_colors).astype(np.float32)[:, None, :3], 3, axis=1)
     attributes = getattr(visual, "vertex_attributes", {})
     if "color" in attributes:  # of glTF, beside a material
-        return 255 * _in_shares(attributes["color"])[faces][..., :3]
+        return 255 * in_shares(attributes["color"]).astype(np.float32)[faces][..., :3]
     return np.tile(np.array(GREY, np.float32) if factor is None else factor, (len(faces), 3, 1))
 
 
@@ -243,7 +213,7 @@ def _with_factor(picture: Any, factor: Floats | None) -> NDArray[np.uint8]:
 def _pyramids(
     pictures: list[NDArray[np.uint8]],
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Each picture at full, half, quarter... size, area-averaged."""
+    """Each image at full, half, quarter... size, area-averaged."""
     from instant_ic.vspace.prior import area_average
 
     start = np.zeros((len(pictures), MAX_LEVELS), np.int64)
@@ -267,7 +237,7 @@ def _pyramids(
 def _texel_density(
     uv: Floats, twice_area: NDArray[np.float64], sizes: NDArray[np.int32], texture: NDArray[np.int32]
 ) -> Floats:
-    """Texels a metre, by the areas in the picture and in the world; without a picture, triangles a metre."""
+    """Texels a metre, by the areas in the image and in the world; without an image, triangles a metre."""
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     in_uv = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).astype(np.float64)
     whole = np.append(sizes[:, 0].astype(np.float64).prod(axis=1), 0.0)  # the last is of texture −1
