@@ -13,7 +13,7 @@ from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, Range, check_ranges
 from instant_ic.depth.fusion import FusionConfig
 from instant_ic.depth.inputs import KEEP_NS, HeldImage, RecentInputs, Revolution, RevolutionTrigger, SilenceWatch
-from instant_ic.depth.keyframes import KeyframeConfig, KeyframeSelector, encode_sigma
+from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.metric_depth import Frames, MetricDepth, MetricDepthConfig
 from instant_ic.depth.scaler import ScalerConfig
@@ -57,7 +57,7 @@ class DepthScalerConfig:
     scaler: ScalerConfig = field(default_factory=ScalerConfig)
     lidar: LidarDepthConfig = field(default_factory=LidarDepthConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
-    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    keyframes: KeyframeSelectionConfig = field(default_factory=KeyframeSelectionConfig)
     max_rate_hz: Positive = 2.0
     rows: Annotated[int, Range(32, 1024)] = 256
     body_elevation_deg: Annotated[float, Range(-90, 0)] = -70.0

@@ -12,7 +12,7 @@ from instant_ic.config.ranges import NotNegative, Positive, check_ranges
 
 
 @dataclass(frozen=True)
-class KeyframeConfig:
+class KeyframeSelectionConfig:
     """When keyframes are taken.
 
     Attributes:
@@ -32,8 +32,8 @@ class KeyframeConfig:
 class KeyframeSelector:
     """Decides for each scaled depth picture in turn whether it becomes a keyframe."""
 
-    def __init__(self, config: KeyframeConfig | None = None) -> None:
-        self.config = config or KeyframeConfig()
+    def __init__(self, config: KeyframeSelectionConfig | None = None) -> None:
+        self.config = config or KeyframeSelectionConfig()
         self.count = 0
         self._pose: NDArray[np.float64] | None = None
         self._fit = False

@@ -103,7 +103,6 @@ class DepthSource:
         points: Floats,
         up: Floats,
         camera_height_m: float | None,
-        rgb: NDArray[np.uint8] | None = None,
         size: tuple[int, int] = (256, 512),
     ) -> DepthResult:
         """Depth of one image.
@@ -113,7 +112,6 @@ class DepthSource:
             points: (N, 3) LiDAR points in the camera's frame at the image's time, metres.
             up: (3,) gravity's up in the camera's frame.
             camera_height_m: of the camera over the floor; None where it is not known.
-            rgb: (H, W, 3) uint8 the image, for sources that look at it; none of these does.
             size: height and width of the result where there is no ``raw``; else it has ``raw``'s.
 
         Raises:

@@ -213,7 +213,7 @@ class Evaluator:
             depth = raw
         else:
             assert points is not None
-            result = self.source.estimate(raw, points, _UP, settings.camera_height_m, rgb)
+            result = self.source.estimate(raw, points, _UP, settings.camera_height_m)
             depth, sigma = result.depth_m, result.sigma
             keys = ("ok", "message", "scale", "shift", "quality", "relative_sigma", "points")
             fit = {key: _rounded(getattr(result, key)) for key in keys}

@@ -110,7 +110,7 @@ def take_shot(renderer: EquirectRenderer, pose: NDArray[np.float64], settings: V
     points = measure_world(renderer, pose, LIDAR_HEIGHT_M, CAMERA_HEIGHT_M, Errors(seed=settings.seed))
     scaler = ScalerConfig(output_kind=model.manifest.output_kind)
     source = DepthSource(SourceConfig(source=settings.depth_source, scaler=scaler))
-    result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M, rgb)
+    result = source.estimate(raw, points, np.array([0.0, 0.0, 1.0]), CAMERA_HEIGHT_M)
     if not result.ok:
         raise ValueError(
             f"depth of the panorama at ({pose[0, 3]:.2f}, {pose[1, 3]:.2f}) cannot be scaled: {result.message}"

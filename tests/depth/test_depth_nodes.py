@@ -9,7 +9,7 @@ import torch
 
 from instant_ic.bus import NodeError
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.depth.keyframes import KeyframeConfig, KeyframeSelector, decode_sigma, encode_sigma
+from instant_ic.depth.keyframes import KeyframeSelectionConfig, KeyframeSelector, decode_sigma, encode_sigma
 from instant_ic.depth.lidar_depth import LidarDepthConfig
 from instant_ic.depth.scaler import ScalerConfig
 from instant_ic.geometry.poses import inverse, pose_matrix, transform_points
@@ -312,7 +312,7 @@ def test_depth_as_estimated_makes_keyframes_that_say_so() -> None:
 
 
 def test_unfit_keyframe_goes_out_marked_after_waiting_and_a_fit_one_replaces_it() -> None:
-    config = DepthScalerConfig(keyframes=KeyframeConfig(unfit_after_s=1.0))
+    config = DepthScalerConfig(keyframes=KeyframeSelectionConfig(unfit_after_s=1.0))
     with LockstepBus(START) as bus:
         bus.add(DepthScalerNode, config)
         drive(bus, 1.5, lidar=False)
@@ -380,7 +380,7 @@ def test_estimator_without_model_ends_in_plain_words(tmp_path: Path) -> None:
 
 
 def test_selector_by_hand() -> None:
-    selector = KeyframeSelector(KeyframeConfig(distance_m=1.0, angle_deg=45.0, unfit_after_s=2.0))
+    selector = KeyframeSelector(KeyframeSelectionConfig(distance_m=1.0, angle_deg=45.0, unfit_after_s=2.0))
     here = pose_matrix(0, 0, 1)
     assert selector.take(here, True, 0)
     assert not selector.take(pose_matrix(0.9, 0, 1), True, S)
