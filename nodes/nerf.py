@@ -91,6 +91,7 @@ class NerfNode(Node[NerfConfig]):
     """One thread renders and trains in turns, another prepares a new keyframe; ``JobSchedule`` decides what is next."""
 
     name = "nerf"
+    worker_class: type[SpaceWorker] = SpaceWorker
     live_parameters = ("render_fps", "train_ms_per_frame", "lockstep_iterations", "max_view_pixels", "jpeg_quality")
 
     def setup(self) -> None:
@@ -102,7 +103,7 @@ class NerfNode(Node[NerfConfig]):
         self.view_out = self.publisher("/vspace/view", RenderedView, qos=SENSOR)
         self.image_out = self.publisher("/vspace/image/compressed", CompressedImage, qos=SENSOR)
         self.status_out = self.publisher("/vspace/status", VspaceStatus, qos=LATCHED)
-        self.work = SpaceWorker(config.space, robot, config.train_nice, warm=not self.lockstep)
+        self.work = self.worker_class(config.space, robot, config.train_nice, warm=not self.lockstep)
         renderer = self.background(self.work.run, self.on_rendered)
         preparer = self.background(self.work.run, self.on_prepared)
         turns = Turns(config.render_fps, config.train_ms_per_frame)

@@ -44,6 +44,7 @@ from instant_ic.msg import (
     to_time,
 )
 from instant_ic.msg import pose_matrix as message_pose
+from instant_ic.vspace.jobs import Job, Outcome, SpaceWorker
 
 if TYPE_CHECKING:
     from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
@@ -298,7 +299,7 @@ class SimulatedStack:
             if name == "crawler_base":
                 node_class = type(node_class.__name__, (node_class,), {"open_port": staticmethod(lambda _: port)})
             if name == "nerf" and not config.whole_views:
-                node_class = type(node_class.__name__, (node_class,), {"do": self._draw_small(node_class.do)})
+                node_class = type(node_class.__name__, (node_class,), {"worker_class": self._small_views()})
             self.nodes[name] = self.bus.add(node_class, node.config, name, remaps=remaps.get(name))
         if config.method == "ic":
             looks = self.nodes["depth_estimator" if config.depth == "fused" else "depth_scaler"]
@@ -329,19 +330,22 @@ class SimulatedStack:
             of = stamp_ns(deserialize(record.payload, record.type_name))
             self._keyframe_at = self._drawn.pop(of, self._keyframe_at)
 
-    def _draw_small(self, do: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-        """Wrap a virtual space's work: render views small, and keep what a full-size render of the newest needs."""
+    def _small_views(self) -> type[SpaceWorker]:
+        """A virtual space's worker that renders views small, and keeps what a full-size render of the newest needs."""
+        stack = self
 
-        def small(node: Any, job: Any) -> Any:
-            if job.kind != "draw":
-                return do(node, job)
-            as_now = copy.copy(node)
-            as_now.space = copy.copy(node.space)  # rendering changes the space's state; the keyframes stay the same
-            self._whole = int(job.message.id), lambda: bytes(do(as_now, job).jpeg)
-            width, height = (max(16, int(side) // _SMALLER) for side in (job.message.width, job.message.height))
-            return do(node, replace(job, message=replace(job.message, width=width, height=height)))
+        class SmallViews(SpaceWorker):
+            def do(self, job: Job) -> Outcome:
+                order = job.view
+                if order is None:
+                    return super().do(job)
+                as_now = copy.copy(self)
+                as_now.space = copy.copy(self.space)  # rendering changes the space's state; the keyframes stay the same
+                stack._whole = int(order.id), lambda: _jpeg(SpaceWorker.do(as_now, job))
+                width, height = (max(16, int(side) // _SMALLER) for side in (order.width, order.height))
+                return super().do(replace(job, view=replace(order, width=width, height=height)))
 
-        return small
+        return SmallViews
 
     def _in_world(self, in_map: FloatArray) -> FloatArray:
         return np.asarray(compose2(self.start, in_map))
@@ -488,6 +492,11 @@ class SimulatedStack:
         log.command.append(command)
         log.blocked.append(bool(state.blocked))
         log.reason.append(str(state.reason))
+
+
+def _jpeg(outcome: Outcome) -> bytes:
+    assert outcome.encoded is not None
+    return outcome.encoded.jpeg
 
 
 def _settled(shown: Shown, whole: bool) -> Shown:

@@ -140,7 +140,7 @@ class SpaceWorker:
         """Do a job; errors are part of the outcome."""
         start = time.perf_counter()
         try:
-            outcome = self._do(job)
+            outcome = self.do(job)
         except Exception as error:  # noqa: BLE001 - reported on the node's thread, which must know that this one is free
             if job.kind in _INPUT_JOBS and isinstance(error, ValueError):
                 outcome = Outcome(job, refused=str(error))
@@ -150,7 +150,8 @@ class SpaceWorker:
         status = None if self.space is None else self.space.status
         return replace(outcome, status=status, elapsed_ms=(time.perf_counter() - start) * 1e3)
 
-    def _do(self, job: Job) -> Outcome:
+    def do(self, job: Job) -> Outcome:
+        """Do a job; errors are raised."""
         if job.kind is JobKind.WARM_UP:
             if self._warm:
                 self._yield_to_others()
