@@ -13,13 +13,16 @@ from instant_ic import estop_state
 from instant_ic.bus import ERROR, LATCHED, OK, SENSOR, WARN, Latest, Node, main
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Positive, check_ranges
-from instant_ic.control.arbiter import STEP_AFTER_S, Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
+from instant_ic.control.arbiter import Arbiter, Decision
+from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
 from instant_ic.control.estop import EstopLatch
 from instant_ic.control.freshness import Rhythm
 from instant_ic.control.heights import SortedPoints, sort_points
 from instant_ic.control.kinematics import move
-from instant_ic.control.states import SOURCES
+from instant_ic.control.snapshot import ArbiterInputs, Vspace
+from instant_ic.control.sources import STEP_AFTER_S
+from instant_ic.control.states import SOURCES, Mode
 from instant_ic.control.walls import WallFinder, WallMap
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import Matrix, matrix_from_pose2, pose2_from_matrix, relative2
@@ -531,9 +534,9 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
             vbot_velocity=_twist(self.vbot),
             nav_command=_twist(self.nav),
             shown_pose=None if pose is None else self.shown_pose(pose, velocity),
-            picture_position=None if shown is None else self.picture_position(),
+            image_position=None if shown is None else self.picture_position(),
             view_position=None if shown is None else pose_matrix(shown.view_pose)[:2, 3],
-            view_after_picture_s=0.0 if shown is None else _between_s(shown),
+            view_after_image_s=0.0 if shown is None else _between_s(shown),
             ages=ages,
             usual=self.usual(),
             images_late_s=max(self.picture_delay_s or 0.0, 0.0 if shown is None else float(shown.view_delay_s)),

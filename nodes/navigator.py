@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, check_ranges
-from instant_ic.control.arbiter import Mode
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator, RecoveryConfig, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
+from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
 from instant_ic.geometry.poses import pose2_from_matrix
 from instant_ic.geometry.transforms import TransformError

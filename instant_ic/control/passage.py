@@ -11,6 +11,8 @@ from instant_ic.config.ranges import NotNegative, NotNegativeInt, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.planner import HybridPlanner, Plan
 from instant_ic.control.prediction import Prediction
+from instant_ic.control.reasons import Notice
+from instant_ic.control.states import Reason
 from instant_ic.control.subgoal import behind_obstacle, extend_ahead
 from instant_ic.control.walls import WallMap
 
@@ -36,14 +38,6 @@ class PassageConfig:
         check_ranges(self)
 
 
-@dataclass(frozen=True)
-class Passage:
-    """``open`` when the r-bot can get behind the obstacle; else the reason, as text for the operator."""
-
-    open: bool
-    reason: str
-
-
 def find_passage(
     costmap: Costmap,
     prediction: Prediction,
@@ -51,14 +45,15 @@ def find_passage(
     walls: WallMap | None,
     planner: HybridPlanner,
     config: PassageConfig,
-) -> Passage:
-    """Look straight on from where the predicted trajectory meets an obstacle, then plan a way there.
+) -> Notice | None:
+    """Reason why the r-bot cannot get behind the obstacle ahead; None when it can.
 
+    Looks straight on from where the predicted trajectory meets the obstacle, then plans a way there.
     The first place behind it that is free, or not seen yet, must come before any wall. The path to it may be at most
     ``max_detour_m`` longer than the straight line.
     """
     if prediction.hit_index is None:
-        return Passage(True, "")
+        return None
     hit = prediction.poses[prediction.hit_index]
     heading = hit if forward else hit + np.array([0.0, 0.0, math.pi])
     ahead = extend_ahead(heading, config.max_pass_m, costmap.resolution)
@@ -67,16 +62,18 @@ def find_passage(
     if walls is not None:
         at_wall = np.flatnonzero(walls.distance(ahead[:exit_index, :2]) < config.wall_clearance_m)
         if at_wall.size:
-            return Passage(False, "a wall is in the way")
+            return Notice(Reason.WALL_AHEAD, "a wall is in the way")
     if exit_index == len(ahead):
-        return Passage(False, f"no free space within {config.max_pass_m:.1f} m behind the obstacle")
+        text = f"no free space within {config.max_pass_m:.1f} m behind the obstacle"
+        return Notice(Reason.NO_SPACE_BEHIND, text)
     goal = ahead[exit_index]
     start = prediction.poses[0]
     plan = planner.plan(costmap, start, goal)
     straight = float(np.linalg.norm(goal[:2] - start[:2]))
     if plan.whole_length_m > straight + config.max_detour_m:
-        return Passage(False, f"there is no way round the obstacle ({_why(plan, straight, config)})")
-    return Passage(True, "")
+        text = f"there is no way round the obstacle ({_why(plan, straight, config)})"
+        return Notice(Reason.NO_WAY_ROUND, text)
+    return None
 
 
 def _why(plan: Plan, straight_m: float, config: PassageConfig) -> str:

@@ -1,6 +1,6 @@
-"""The state machine of illusory control as data (paper, III.A): states, guards, actions, sources.
+"""The state machine of illusory control as data (paper, III.A): states, guards, actions, sources, reasons.
 
-``diagram.py`` prints these tables for the docs; ``arbiter.py`` runs them.
+``diagram.py`` prints these tables for the docs; ``arbiter.py`` runs them with the guards of ``guards.py``.
 """
 
 from __future__ import annotations
@@ -32,6 +32,64 @@ class VbotAction(IntEnum):
     HELD = 2
     EASED = 3
     LED_BACK = 4
+
+
+class Reason(IntEnum):
+    """Values of ControlState.reason_code: why the robot drives, is slowed or stands. 0 is a message without a code."""
+
+    UNKNOWN = 0
+    # Driving
+    DRIVE_ROBOT = 1
+    DRIVE_VBOT = 2
+    SWITCHING_TO_VIRTUAL = 3
+    SWITCHING_TO_CAMERA = 4
+    LEADING_BACK = 5
+    ROBOT_CANNOT_FOLLOW = 6
+    NO_SUBGOAL = 7
+    # Blocked: an obstacle is ahead and no switch is possible
+    OBSTACLE_AHEAD = 20
+    CONTACT = 21
+    NO_ROOM_TO_TURN = 22
+    VSPACE_NOT_RUNNING = 23
+    VSPACE_NOT_READY = 24
+    VSPACE_TOO_FAR = 25
+    VSPACE_TOO_POOR = 26
+    NO_VIEW_FITS = 27
+    JUST_RETURNED = 28
+    WALL_AHEAD = 29
+    NO_SPACE_BEHIND = 30
+    NO_WAY_ROUND = 31
+    # Held or stopped: nothing may move
+    ESTOP = 50
+    ESTOP_BUTTON = 51
+    STARTING = 52
+    POSE_UNKNOWN = 53
+    NO_COSTMAP = 54
+    IMAGES_TOO_RARE = 55
+    RELEASE_CONTROLS = 56
+    VSPACE_FAILED = 57
+    VSPACE_LOST = 58
+    # Held or stopped: a source is stale
+    SCAN_STALE = 70
+    POINTS_STALE = 71
+    ODOMETRY_STALE = 72
+    POSE_STALE = 73
+    CAMERA_STALE = 74
+    ESTOP_INPUT_STALE = 75
+    VIEW_STALE = 76
+    VBOT_STALE = 77
+    NAV_STALE = 78
+    OPERATOR_LOST = 79
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing may move."""
+        return self >= Reason.ESTOP
+
+    @property
+    def is_stale_source(self) -> bool:
+        """Whether a source that the state needs is stale."""
+        return self >= Reason.SCAN_STALE
 
 
 @dataclass(frozen=True)
@@ -72,7 +130,9 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.REAL, Mode.ENTERING, "obstacle_and_ready", "call_vbot"),
     Transition(Mode.ENTERING, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.ENTERING, Mode.STOPPED, "source_lost", "stop"),
-    Transition(Mode.ENTERING, Mode.REAL, "entry_moot", "hand_back"),
+    Transition(Mode.ENTERING, Mode.REAL, "vspace_not_ready", "hand_back"),
+    Transition(Mode.ENTERING, Mode.REAL, "no_view_in_time", "abandon_entry"),
+    Transition(Mode.ENTERING, Mode.REAL, "way_free", "hand_back"),
     Transition(Mode.ENTERING, Mode.VIRTUAL, "view_fits", "place_vbot"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "estop_pressed", "stop"),
     Transition(Mode.VIRTUAL, Mode.STOPPED, "source_lost", "stop"),
@@ -82,7 +142,7 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(Mode.RETURNING, Mode.STOPPED, "source_lost", "stop"),
     Transition(Mode.RETURNING, Mode.STOPPED, "vspace_lost", "stop"),
     Transition(Mode.RETURNING, Mode.VIRTUAL, "unsafe_again", "drive_vbot_on"),
-    Transition(Mode.RETURNING, Mode.REAL, "picture_fits", "hand_back"),
+    Transition(Mode.RETURNING, Mode.REAL, "image_fits", "hand_back"),
     Transition(Mode.STOPPED, Mode.REAL, "may_resume", "hand_back"),
 )
 """In order: the first row of the present state whose guard holds is taken, at most one per step."""
@@ -94,14 +154,15 @@ GUARDS: dict[str, str] = {
     "vspace_lost": "the virtual space has failed, or its node is silent",
     "obstacle_and_ready": "the predicted path meets an obstacle, the virtual space is ready, the r-bot has a way "
     "round; after an abandoned entry, also: a view fits, or the operator let go",
-    "entry_moot": "the virtual space is no longer ready; no view fits after enter_timeout_s plus the delay of an image "
-    "and a view; or the command is safe for the r-bot as in `rejoined`",
+    "vspace_not_ready": "the virtual space is no longer ready",
+    "no_view_in_time": "no view fits after enter_timeout_s plus the delay of an image and a view",
+    "way_free": "the command is safe for the r-bot as in `rejoined`",
     "view_fits": "the places of the newest view and the newest camera image agree within picture_position_m and "
     "picture_yaw_deg",
     "rejoined": "r-bot and v-bot agree for return_dwell_s, to within return_near_m or for return_patience_s; the "
     "command is safe for the r-bot over the prediction horizon and over a longer and wider one",
     "unsafe_again": "the command leads the r-bot into an obstacle again",
-    "picture_fits": "the v-bot is on the r-bot within return_picture_m and return_picture_yaw_deg, the r-bot turns no "
+    "image_fits": "the v-bot is on the r-bot within return_picture_m and return_picture_yaw_deg, the r-bot turns no "
     "faster than return_turn_rad_s, and view and image agree as closely (after return_timeout_s the first is enough, "
     "after twice that nothing is required)",
     "may_resume": "the emergency stop is released, every source has been fresh for recover_s, images arrive at least "
@@ -115,6 +176,7 @@ ACTIONS: dict[str, str] = {
     "ease_vbot": "drive the r-bot, ease the v-bot onto it, keep showing the v-bot",
     "drive_vbot_on": "drive the v-bot again, from its present pose",
     "hand_back": "drive and show the r-bot",
+    "abandon_entry": "as hand_back; no new entry until a view fits or the operator lets go",
 }
 
 
@@ -124,9 +186,11 @@ class Source:
 
     key: str
     name: str
+    reason: Reason
+    """Code of the reason while it is stale."""
     modes: tuple[Mode, ...]
-    words: str = ""
-    """Text for the operator when it is lost; empty: "no NAME for SECONDS"."""
+    text: str = ""
+    """Text for the operator while it is stale; empty: "no NAME for SECONDS"."""
     optional: bool = False
     """Needed only after its first message: a robot without 3D points drives by its flat scan."""
     steady: bool = False
@@ -134,21 +198,27 @@ class Source:
     robot off obstacles have fixed time-outs, so that it stops in time on a slow machine too."""
 
 
-OPERATOR_LOST = "the operator's link is lost, the robot waits"
-
 _MOVING = (Mode.REAL, Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
+_CAMERA = (Mode.REAL, Mode.ENTERING, Mode.RETURNING)
+_VIEW = (Mode.VIRTUAL, Mode.RETURNING)
 
 SOURCES: tuple[Source, ...] = (
-    Source("scan", "LiDAR scan", _MOVING),
-    Source("points", "3D points", _MOVING, optional=True),
-    Source("odometry", "wheel odometry", _MOVING),
-    Source("pose", "SLAM pose", _MOVING),
-    Source("camera", "camera image", (Mode.REAL, Mode.ENTERING, Mode.RETURNING), steady=True),
-    Source("estop_input", "message from the emergency stop button", _MOVING, optional=True),
-    Source("view", "view of the virtual space", (Mode.VIRTUAL, Mode.RETURNING), steady=True),
-    Source("vbot", "v-bot", (Mode.VIRTUAL, Mode.RETURNING)),
-    Source("nav", "path follower", (Mode.VIRTUAL,)),
+    Source("scan", "LiDAR scan", Reason.SCAN_STALE, _MOVING),
+    Source("points", "3D points", Reason.POINTS_STALE, _MOVING, optional=True),
+    Source("odometry", "wheel odometry", Reason.ODOMETRY_STALE, _MOVING),
+    Source("pose", "SLAM pose", Reason.POSE_STALE, _MOVING),
+    Source("camera", "camera image", Reason.CAMERA_STALE, _CAMERA, steady=True),
+    Source("estop_input", "message from the emergency stop button", Reason.ESTOP_INPUT_STALE, _MOVING, optional=True),
+    Source("view", "view of the virtual space", Reason.VIEW_STALE, _VIEW, steady=True),
+    Source("vbot", "v-bot", Reason.VBOT_STALE, _VIEW),
+    Source("nav", "path follower", Reason.NAV_STALE, (Mode.VIRTUAL,)),
     # Where the operator drives the r-bot, silence is only a zero command; in VIRTUAL the r-bot would go on to the
     # v-bot by itself.
-    Source("command", "operator's link", (Mode.VIRTUAL,), OPERATOR_LOST),
+    Source(
+        "command",
+        "operator's link",
+        Reason.OPERATOR_LOST,
+        (Mode.VIRTUAL,),
+        "the operator's link is lost, the robot waits",
+    ),
 )

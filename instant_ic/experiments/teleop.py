@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.arbiter import Mode
+from instant_ic.control.states import Mode
 from instant_ic.control.warmup import warm_up
 from instant_ic.experiments import teleop_figures as figures
 from instant_ic.experiments.processes import process_pool

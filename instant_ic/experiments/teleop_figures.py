@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.arbiter import Mode
 from instant_ic.control.kinematics import MotionLimits, accelerate
+from instant_ic.control.states import Mode
 from instant_ic.experiments.teleop_stack import Log, Shown
 from instant_ic.geometry.poses import relative2, wrap_angle
 

@@ -12,8 +12,8 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.arbiter import Mode
 from instant_ic.control.footprint import Footprint
+from instant_ic.control.states import Mode
 from instant_ic.experiments.pictures import save_figure
 from instant_ic.experiments.teleop import decode, photograph
 from instant_ic.experiments.teleop_figures import TRACK_S, Drive

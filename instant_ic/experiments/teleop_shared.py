@@ -9,12 +9,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode
+from instant_ic.control.arbiter import Arbiter, Decision
+from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import UNKNOWN, Costmap
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.prediction import Prediction
+from instant_ic.control.snapshot import ArbiterInputs
+from instant_ic.control.states import Mode
 from instant_ic.control.subgoal import extend_ahead
 from instant_ic.geometry.poses import wrap_angle
 

@@ -11,14 +11,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, Mode, Vspace
+from instant_ic.control.arbiter import Arbiter, Decision
+from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.costmap import CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
 from instant_ic.control.follower import FollowerConfig, PathFollower
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.navigator import Navigator, meeting_pose
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
-from instant_ic.control.states import VbotAction
+from instant_ic.control.snapshot import ArbiterInputs, Vspace
+from instant_ic.control.states import Mode, VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 from instant_ic.control.walls import WallMap
 
@@ -208,9 +210,9 @@ class Loop:
             vbot_velocity=self.vbot.velocity,
             nav_command=self.nav,
             shown_pose=self.shown_pose(robot),
-            picture_position=picture[:2],
+            image_position=picture[:2],
             view_position=None if view is None else view[:2],
-            view_after_picture_s=self.view_after_picture_s(),
+            view_after_image_s=self.view_after_picture_s(),
             ages=dict(self.ages),
         )
         self.decision = self.arbiter.step(inputs, now_ns)

@@ -7,11 +7,13 @@ import math
 import numpy as np
 import pytest
 
-from instant_ic.control.arbiter import Arbiter, ArbiterInputs, Mode
+from instant_ic.control.arbiter_config import ArbiterConfig
+from instant_ic.control.commands import CommandRules
 from instant_ic.control.costmap import CostmapConfig, RollingCostmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.heights import sort_points
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig, parse_polygon
+from instant_ic.control.snapshot import ArbiterInputs
 
 OFF = PolygonConfig(enabled=False)
 AHEAD = "[[1.0, 0.4], [1.0, -0.4], [0.0, -0.4], [0.0, 0.4]]"
@@ -118,18 +120,16 @@ def test_the_arbiter_holds_before_a_low_thing_that_only_its_memory_knows() -> No
     points = (kerb - pose[:3, 3]).astype(np.float32)
     sweep = sort_points(points, np.zeros(len(points), np.float32), pose[None], 0.0, CostmapConfig().points)
     costmap = rolling.update(np.zeros(3), None, None, sweep)
-    arbiter = Arbiter()
-    arbiter.mode = Mode.REAL
+    rules = CommandRules(ArbiterConfig())
     inputs = ArbiterInputs(
         robot_pose=np.zeros(3),
-        operator_command=(0.4, 0.0),
         costmap=costmap,
         ages=dict.fromkeys(["scan", "odometry", "pose", "camera", "command"], 0.0),
     )
-    sent = arbiter._monitored((0.4, 0.0), arbiter._assess(inputs, 0))
+    sent = rules.monitored((0.4, 0.0), inputs)
     # Padded nose at 0.34 m, kerb from 0.625 m: 0.285 m at 0.4 m/s is 0.71 s of 1.2 s.
     assert sent.action == "approach"
     assert sent.command[0] == pytest.approx(0.4 * 0.71 / 1.2, abs=0.03)
-    assert arbiter._monitored((-0.4, 0.0), arbiter._assess(inputs, 0)).action == "free"
+    assert rules.monitored((-0.4, 0.0), inputs).action == "free"
     old = ArbiterInputs(**{**vars(inputs), "ages": {**inputs.ages, "points": 0.6}})
-    assert arbiter._monitored((-0.4, 0.0), arbiter._assess(old, 0)).polygon == "source_timeout"
+    assert rules.monitored((-0.4, 0.0), old).polygon == "source_timeout"

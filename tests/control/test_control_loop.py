@@ -12,12 +12,15 @@ import pytest
 from control_world import Loop, World, corridor, draw_map, rectangle
 
 from instant_ic.control import diagram
-from instant_ic.control.arbiter import Arbiter, ArbiterInputs, SwitchConfig, Vspace
+from instant_ic.control.arbiter import Arbiter
+from instant_ic.control.arbiter_config import SwitchConfig
 from instant_ic.control.costmap import LETHAL, Costmap
 from instant_ic.control.footprint import Footprint
 from instant_ic.control.freshness import TimeoutConfig
+from instant_ic.control.guards import GUARD_FUNCTIONS
 from instant_ic.control.kinematics import MotionLimits
 from instant_ic.control.prediction import PredictionConfig, Predictor
+from instant_ic.control.snapshot import ArbiterInputs, Vspace
 from instant_ic.control.states import ACTIONS, GUARDS, SOURCES, TRANSITIONS, Mode
 
 BOX = (2.5, -0.25, 3.0, 0.25)
@@ -126,7 +129,7 @@ def test_a_post_in_the_blind_zone_is_remembered() -> None:
     assert made.frames[-1].decision.blocked
     # The collision monitor alone, as in virtual mode, holds too.
     points = made.costmap.lethal_near(made.base.pose, 0.45)
-    assert made.arbiter.monitor.limit((0.0, 0.8), points).action != "free"
+    assert made.arbiter.rules.monitor.limit((0.0, 0.8), points).action != "free"
 
 
 def test_side_walls_block_but_let_go() -> None:
@@ -403,9 +406,8 @@ def test_at_the_return_the_way_is_free_beyond_the_horizon_that_switches_in() -> 
 
 class TestTable:
     def test_every_guard_and_action_is_explained_and_there(self) -> None:
-        arbiter = Arbiter()
-        assert {row.guard for row in TRANSITIONS} == set(GUARDS) == set(arbiter._guards)
-        assert {row.action for row in TRANSITIONS} == set(ACTIONS) == set(arbiter._actions)
+        assert {row.guard for row in TRANSITIONS} == set(GUARDS) == set(GUARD_FUNCTIONS)
+        assert {row.action for row in TRANSITIONS} == set(ACTIONS) == set(Arbiter()._actions)
 
     def test_every_moving_state_can_be_stopped_first(self) -> None:
         for mode in set(Mode) - {Mode.STOPPED}:

@@ -11,11 +11,13 @@ from control_world import Loop, World, corridor, draw_map, rectangle
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from instant_ic.control.arbiter import Arbiter, ArbiterConfig, ArbiterInputs, Decision, SwitchConfig, Vspace, _Situation
+from instant_ic.control.arbiter import Arbiter, Decision
+from instant_ic.control.arbiter_config import ArbiterConfig, SwitchConfig
 from instant_ic.control.costmap import LETHAL, Costmap
 from instant_ic.control.freshness import Rhythm, TimeoutConfig
+from instant_ic.control.guards import way_free
 from instant_ic.control.kinematics import move
-from instant_ic.control.passage import Passage
+from instant_ic.control.snapshot import ArbiterInputs, Vspace
 from instant_ic.control.states import SOURCES, STATES, TRANSITIONS, Mode, VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
 
@@ -45,7 +47,7 @@ class Drive:
     def __init__(self, map_: Costmap, switch: SwitchConfig | None = None) -> None:
         self.arbiter = Arbiter(ArbiterConfig(switch=switch or SwitchConfig()))
         # What is behind the obstacle is not the question here, and planning takes time.
-        self.arbiter._passage = lambda situation, costmap: Passage(True, "")  # type: ignore[method-assign]
+        self.arbiter._blocked_passage = lambda snapshot, now_ns: None  # type: ignore[method-assign]
         self.map = map_
         self.robot, self.speed = np.zeros(3), NOTHING
         self.vbot = VirtualRobot(VbotConfig(), self.arbiter.config.limits)
@@ -75,9 +77,9 @@ class Drive:
             vspace=self.vspace,
             vbot_pose=self.vbot.pose.copy(),
             vbot_velocity=self.vbot.velocity,
-            picture_position=robot[:2],
+            image_position=robot[:2],
             view_position=self.vbot.pose[:2] + [self.apart_m, 0.0],
-            view_after_picture_s=self.view_after_picture_s,
+            view_after_image_s=self.view_after_picture_s,
             ages=dict(self.ages),
         )
         self.obey = decision = self.arbiter.step(inputs, round(len(self.steps) * DT * 1e9))
@@ -125,10 +127,12 @@ def test_what_switches_in_and_what_switches_out_never_hold_together(
     pose: np.ndarray, velocity: tuple[float, float], command: tuple[float, float], boxes: list[tuple[float, float]]
 ) -> None:
     arbiter, map_ = Arbiter(), costmap(boxes)
-    inputs = ArbiterInputs(robot_pose=pose, robot_velocity=velocity, operator_command=command, costmap=map_)
-    prediction = arbiter.predictor.predict(pose, velocity, command, map_)
-    situation = _Situation(inputs, 0, command, prediction, pose, pose, 0.0, 0.0)
-    assert not (prediction.hit_index is not None and arbiter._safe_ahead(situation))
+    inputs = ArbiterInputs(
+        robot_pose=pose, robot_velocity=velocity, operator_command=command, costmap=map_, ages={"command": 0.0}
+    )
+    snapshot = arbiter._assess(inputs, 0)
+    assert snapshot.command == command
+    assert not (snapshot.obstacle_ahead and way_free(snapshot))
 
 
 phases = st.tuples(

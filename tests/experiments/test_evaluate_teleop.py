@@ -15,7 +15,7 @@ import pytest
 
 from instant_ic.bag.writer import BagWriter
 from instant_ic.cli.main import main
-from instant_ic.control.arbiter import Mode
+from instant_ic.control.states import Mode
 from instant_ic.experiments import teleop, teleop_figures, teleop_results, teleop_worlds
 from instant_ic.experiments.teleop_figures import Drive, Switch
 from instant_ic.experiments.teleop_operator import RecordedOperator, ScriptedOperator, Sight, read_commands
@@ -489,9 +489,9 @@ def test_each_method_drives(method: str, short_course: teleop_worlds.Course, tmp
 
 def test_shared_control_goes_round_by_itself_and_gives_back() -> None:
     """On a costmap written by hand: a box straight ahead, seen from its front."""
-    from instant_ic.control.arbiter import ArbiterInputs
     from instant_ic.control.costmap import CostmapConfig, RollingCostmap, scan_rays
     from instant_ic.control.footprint import Footprint
+    from instant_ic.control.snapshot import ArbiterInputs
     from instant_ic.experiments.teleop_shared import SharedControl
 
     angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)

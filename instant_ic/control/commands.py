@@ -1,0 +1,158 @@
+"""The command for the r-bot in each state, after the collision monitor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from instant_ic.control.arbiter_config import ArbiterConfig
+from instant_ic.control.guards import hold
+from instant_ic.control.kinematics import clip_twist
+from instant_ic.control.reasons import Notice, stale_notice
+from instant_ic.control.safety import CollisionMonitor, MonitoredCommand
+from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Snapshot, Twist2
+from instant_ic.control.sources import SourceMonitor, images_too_rare
+from instant_ic.control.states import Mode, Reason
+
+_SLOW_S = 0.8
+"""Longer than the v-bot takes to reach full speed."""
+
+
+@dataclass(frozen=True)
+class DriveCommand:
+    """A command for ``/cmd_vel``."""
+
+    twist: Twist2
+    notice: Notice
+    blocked: bool = False
+    """An obstacle limits the operator's command."""
+    hard: bool = False
+    """If the command is zero, it has another cause than the operator: the base must brake hard."""
+
+
+class CommandRules:
+    """Turns a snapshot into a command; holds no state."""
+
+    def __init__(self, config: ArbiterConfig) -> None:
+        self.config = config
+        self.monitor = CollisionMonitor(config.collision_monitor, config.footprint)
+        self.sources = SourceMonitor(config)
+
+    def command(self, s: Snapshot, stopped_by: Notice) -> DriveCommand:
+        """Command of the present state; ``stopped_by``: what led to STOPPED."""
+        if s.mode == Mode.STOPPED:
+            return DriveCommand(NO_MOTION, why_stopped(s, stopped_by), hard=True)
+        held = hold(s)
+        if held is not None:
+            return DriveCommand(NO_MOTION, held, hard=True)
+        return self._virtual(s) if s.mode == Mode.VIRTUAL else self._real(s)
+
+    def _virtual(self, s: Snapshot) -> DriveCommand:
+        """The path follower's command; the operator drives the v-bot."""
+        hard = not s.fresh
+        if s.leading_back:
+            text = "no command: the view goes back to the robot; drive to continue"
+            return DriveCommand(NO_MOTION, Notice(Reason.LEADING_BACK, text), hard=hard)
+        text = "you drive the virtual robot" + _far_from_keyframe(s)
+        if s.subgoal is None:
+            text += "; no free place for the robot near it"
+            return DriveCommand(NO_MOTION, Notice(Reason.NO_SUBGOAL, text), hard=hard)
+        wanted = clip_twist(*s.inputs.nav_command, self.config.limits)
+        if s.inputs.age("nav") > self.config.timeouts.nav:
+            wanted = NO_MOTION  # at first: the follower has not sent a command yet
+        sent = self.monitored(self._paced(wanted, s), s.inputs)
+        notice = Notice(Reason.DRIVE_VBOT, text)
+        left_s = self.config.switch.lead_back_after_s - s.idle_s
+        if s.agree_s < 0.0 and 0.0 < left_s < self.config.switch.lead_back_after_s - 1.0:
+            text = f"the robot cannot reach your place: the view goes back to the robot in {left_s:.0f} s"
+            notice = Notice(Reason.ROBOT_CANNOT_FOLLOW, text)
+        elif sent.action != "free":
+            notice = Notice(Reason.DRIVE_VBOT, text + "; the robot slows down near an obstacle")
+        elif s.slow_s > _SLOW_S:
+            notice = Notice(Reason.DRIVE_VBOT, text + "; slowed: a wall is ahead, or the robot must catch up")
+        return DriveCommand(sent.command, notice, hard=hard or sent.action == "stop")
+
+    def _real(self, s: Snapshot) -> DriveCommand:
+        """The operator's command, slowed before an obstacle and during a switch."""
+        command, blocked, notice = s.command, False, Notice(Reason.DRIVE_ROBOT, "you drive the robot")
+        if s.prediction is not None and s.obstacle_ahead and command != NO_MOTION:
+            command = self._slowed(command, s.prediction.distance_m, s.predictor.reach_m)
+            if s.mode == Mode.REAL:
+                blocked = True
+                why = s.against_switch or Notice(Reason.OBSTACLE_AHEAD, "obstacle ahead")
+                notice = why.prefixed(f"blocked: obstacle in {s.prediction.distance_m:.1f} m; ")
+        if s.mode == Mode.ENTERING:
+            notice = Notice(Reason.SWITCHING_TO_VIRTUAL, "obstacle ahead: switching to the virtual space")
+            waited = s.in_mode_s / self.config.switch.enter_timeout_s
+            left = max(0.0, 1.0 - waited**2)  # hardly noticed if the view comes in time
+            command = (command[0] * left, command[1] * left)
+        elif s.mode == Mode.RETURNING:
+            notice = Notice(Reason.SWITCHING_TO_CAMERA, "you drive the robot; switching back to the camera")
+        paced = self._paced(command, s)
+        if paced != command and not blocked:
+            notice = Notice(notice.reason, notice.text + "; slowed: the image rate is low")
+        sent = self.monitored(paced, s.inputs)
+        if sent.action in ("approach", "stop") and not blocked:
+            blocked = True
+            notice = Notice(Reason.CONTACT, f"blocked: contact in {sent.time_to_collision_s:.1f} s")
+        elif sent.action != "free" and not blocked:
+            notice = Notice(notice.reason, notice.text + "; slowed down near an obstacle")
+        return DriveCommand(sent.command, notice, blocked, hard=not s.fresh or sent.action == "stop")
+
+    def monitored(self, command: Twist2, inputs: ArbiterInputs) -> MonitoredCommand:
+        """The command after the collision monitor, which gets all points seen and remembered near the robot."""
+        points = inputs.scan_points
+        if inputs.costmap is not None and inputs.robot_pose is not None:
+            config = self.config.collision_monitor
+            memory = inputs.costmap.memory_near(inputs.robot_pose, config.blind_radius_m, config.memory_range_m)
+            points = np.concatenate([points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
+        return self.monitor.limit(command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
+
+    def _slowed(self, command: Twist2, distance_m: float, reach_m: float) -> Twist2:
+        """The command slowed so that the robot can stop ``stop_margin_m`` before the obstacle."""
+        left = max(0.0, distance_m - self.config.switch.stop_margin_m)
+        # Half of the base's deceleration; the other half covers the latency.
+        allowed = math.sqrt(self.config.limits.max_linear_accel_m_s2 * left)
+        speed = abs(command[0]) + reach_m * abs(command[1])
+        factor = min(1.0, allowed / speed) if speed > 0 else 1.0
+        return command[0] * factor, command[1] * factor
+
+    def _paced(self, command: Twist2, s: Snapshot) -> Twist2:
+        """The command slowed to what the image rate allows, with the same curvature."""
+        factor = min(1.0, self.sources.speed_limit_m_s(s.inputs, s.mode) / max(abs(command[0]), 1e-9))
+        return command[0] * factor, command[1] * factor
+
+
+def why_stopped(s: Snapshot, stopped_by: Notice) -> Notice:
+    """What keeps the robot in STOPPED; ``stopped_by``: what led there."""
+    inputs = s.inputs
+    if inputs.estop_button:
+        text = "emergency stop button is pressed: release it, then release the stop here"
+        return Notice(Reason.ESTOP_BUTTON, text)
+    if inputs.estop:
+        return Notice(Reason.ESTOP, inputs.estop_why or "emergency stop: release it to continue")
+    if s.stale_in_real:
+        return stale_notice(s.stale_in_real).prefixed("stopped: ")
+    if inputs.robot_pose is None:
+        return Notice(Reason.POSE_UNKNOWN, "stopped: the robot's pose in the map is not known")
+    if images_too_rare(inputs, s.config):
+        longest_s = s.config.timeouts.slowest_image_s
+        text = f"stopped: waiting for a camera image every {longest_s:g} s or more often"
+        return Notice(Reason.IMAGES_TOO_RARE, text)
+    if s.command != NO_MOTION:
+        return Notice(Reason.RELEASE_CONTROLS, f"let go of the controls to continue (stopped: {stopped_by.text})")
+    return stopped_by.prefixed("stopped: ")
+
+
+def _far_from_keyframe(s: Snapshot) -> str:
+    """Text for a v-bot outside the region that the virtual space shows well; "" inside."""
+    expected_db = s.inputs.vspace.expected_psnr_db
+    if 0.0 < expected_db < s.config.switch.min_expected_psnr_db:
+        return f"; most of the view is guessed here ({expected_db:.0f} dB expected)"
+    vspace = s.last_ready_vspace
+    away_m = 0.0 if vspace is None else float(np.linalg.norm(s.vbot_pose[:2] - vspace.position))
+    if vspace is None or away_m <= vspace.ready_radius_m:
+        return ""
+    return f"; the view gets worse {away_m:.1f} m from its keyframe"

@@ -1,0 +1,202 @@
+"""Guards of the transition table in ``states.py``: pure functions of a snapshot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from instant_ic.control.freshness import IMAGES
+from instant_ic.control.reasons import Notice, stale_notice
+from instant_ic.control.snapshot import NO_MOTION, Snapshot
+from instant_ic.control.sources import images_too_rare
+from instant_ic.control.states import Reason
+
+
+def estop_pressed(s: Snapshot) -> bool:
+    return s.inputs.estop or s.inputs.estop_button
+
+
+def source_lost(s: Snapshot) -> bool:
+    return bool(s.lost)
+
+
+def vspace_lost(s: Snapshot) -> bool:
+    return s.inputs.vspace.failed or min(s.inputs.age("vspace"), s.in_mode_s) > s.config.timeouts.vspace
+
+
+def obstacle_and_ready(s: Snapshot) -> bool:
+    return s.obstacle_ahead and hold(s) is None and s.against_switch is None
+
+
+def vspace_not_ready(s: Snapshot) -> bool:
+    return s.inputs.age("vspace") > s.config.timeouts.vspace or not s.vspace.ready
+
+
+def no_view_in_time(s: Snapshot) -> bool:
+    slow = sum(s.config.timeouts.allowed_s(key, s.inputs.usual.get(key)) for key in IMAGES)
+    return s.in_mode_s > s.config.switch.enter_timeout_s + slow + s.inputs.images_late_s
+
+
+def way_free(s: Snapshot) -> bool:
+    """The way that triggers an entry must be free, and also a longer and wider one.
+
+    Thus the conditions for entry and return never hold together.
+    """
+    inputs, switch, command = s.inputs, s.config.switch, s.command
+    if inputs.robot_pose is None or inputs.costmap is None:
+        return False
+    if command == NO_MOTION and s.idle_s < switch.neutral_return_s:
+        # Hands off before the obstacle: the next command is most likely the last one again. The real view returns
+        # only after a while.
+        command = s.last_command
+    return all(
+        s.predictor.predict(
+            inputs.robot_pose, inputs.robot_velocity, command, inputs.costmap, extra_m=extra_m, side_m=side_m
+        ).hit_index
+        is None
+        for extra_m, side_m in ((0.0, 0.0), (switch.return_margin_m, switch.return_side_m))
+    )
+
+
+def view_fits(s: Snapshot) -> bool:
+    switch = s.config.switch
+    vbot_placed = s.inputs.age("vbot") < s.in_mode_s
+    return vbot_placed and hold(s) is None and images_agree(s, switch.picture_position_m, switch.picture_yaw_deg)
+
+
+def rejoined(s: Snapshot) -> bool:
+    switch = s.config.switch
+    if s.agree_s < switch.return_dwell_s or s.in_mode_s < switch.min_virtual_s:
+        return False
+    if s.gap_m > switch.return_near_m and s.agree_s < switch.return_patience_s:
+        return False
+    return not s.stale_in_real and hold(s) is None and way_free(s)
+
+
+def unsafe_again(s: Snapshot) -> bool:
+    return s.command != NO_MOTION and s.obstacle_ahead
+
+
+def image_fits(s: Snapshot) -> bool:
+    if hold(s) is not None:
+        return False
+    switch = s.config.switch
+    waited = s.in_mode_s / switch.return_timeout_s
+    if waited >= 2.0:
+        return True  # the pose jitters by more than the thresholds; the page eases the rest
+    within_m, within_deg = switch.return_picture_m, switch.return_picture_yaw_deg
+    # In two consecutive steps: SLAM's heading jitters, and the pose shown before counts too.
+    yaw_gap = max(abs(s.yaw_gap_rad), abs(s.yaw_gap_before_rad))
+    if s.gap_m > within_m or yaw_gap > math.radians(within_deg):
+        return False
+    if waited >= 1.0:
+        return True
+    turns = abs(s.inputs.robot_velocity[1]) > switch.return_turn_rad_s
+    return not turns and images_agree(s, within_m, within_deg)
+
+
+def may_resume(s: Snapshot) -> bool:
+    if estop_pressed(s) or s.command != NO_MOTION or s.inputs.robot_pose is None:
+        return False
+    if (s.awaits_operator and not s.fresh) or images_too_rare(s.inputs, s.config):
+        return False
+    return s.fresh_s >= s.config.timeouts.recover_s
+
+
+GUARD_FUNCTIONS: dict[str, Callable[[Snapshot], bool]] = {
+    guard.__name__: guard
+    for guard in (
+        estop_pressed,
+        source_lost,
+        vspace_lost,
+        obstacle_and_ready,
+        vspace_not_ready,
+        no_view_in_time,
+        way_free,
+        view_fits,
+        rejoined,
+        unsafe_again,
+        image_fits,
+        may_resume,
+    )
+}
+"""By the names in ``states.GUARDS``, where they are explained."""
+
+
+def hold(s: Snapshot) -> Notice | None:
+    """Reason why nothing may move in this state; None when it may."""
+    if s.stale:
+        return stale_notice(s.stale).prefixed("stopped: ")
+    if s.inputs.robot_pose is None:
+        return Notice(Reason.POSE_UNKNOWN, "the robot's pose in the map is not known")
+    if s.inputs.costmap is None:
+        return Notice(Reason.NO_COSTMAP, "there is no costmap yet")
+    return None
+
+
+def images_agree(s: Snapshot, within_m: float, within_deg: float) -> bool:
+    """Whether view and camera image show the same place, so that a switch between them does not jump.
+
+    They arrive at different times. The distance driven between the two arrivals is motion, not an error; but the
+    operator sees even that as a jump when it is large.
+    """
+    inputs, switch = s.inputs, s.config.switch
+    if inputs.robot_pose is None or abs(s.yaw_gap_rad) > math.radians(within_deg):
+        return False
+    if not (switch.require_view and switch.require_camera):
+        return True
+    if inputs.age("view") > s.config.timeouts.allowed_s("view", inputs.usual.get("view")):
+        return False
+    if inputs.view_position is None or inputs.image_position is None:
+        return False
+    apart = inputs.view_position[:2] - inputs.image_position[:2]
+    yaw = float(inputs.robot_pose[2])
+    driven = inputs.robot_velocity[0] * inputs.view_after_image_s * np.array([math.cos(yaw), math.sin(yaw)])
+    return bool(np.linalg.norm(apart - driven) <= within_m and np.linalg.norm(apart) <= 2.0 * within_m)
+
+
+def against_switch(s: Snapshot) -> Notice | None:
+    """Reason against a switch although an obstacle is ahead, except that there is no way round it; None for none."""
+    inputs, switch, vspace = s.inputs, s.config.switch, s.vspace
+    assert inputs.robot_pose is not None
+    if abs(s.command[0]) < switch.min_switch_speed_m_s:
+        return Notice(Reason.NO_ROOM_TO_TURN, "there is no room to turn")
+    if inputs.age("vspace") > s.config.timeouts.vspace:
+        return Notice(Reason.VSPACE_NOT_RUNNING, "no virtual space is running")
+    if not vspace.ready:
+        why = f" ({vspace.message})" if vspace.message else ""
+        return Notice(Reason.VSPACE_NOT_READY, "the virtual space is not ready" + why)
+    away_m = float(np.linalg.norm(vspace.position - inputs.robot_pose[:2]))
+    if away_m > vspace.ready_radius_m:
+        return Notice(
+            Reason.VSPACE_TOO_FAR,
+            f"the virtual space is valid within {vspace.ready_radius_m:.1f} m of its keyframe, "
+            f"which is {away_m:.1f} m away",
+        )
+    if 0.0 < vspace.expected_psnr_db < switch.min_expected_psnr_db:  # NaN means unknown
+        return Notice(
+            Reason.VSPACE_TOO_POOR,
+            f"the virtual space shows this place too poorly ({vspace.expected_psnr_db:.0f} dB expected, "
+            f"{switch.min_expected_psnr_db:.0f} dB needed)",
+        )
+    if s.no_view_fits:
+        text = "no view of the virtual space fits here; let go, then drive on to try again"
+        return Notice(Reason.NO_VIEW_FITS, text)
+    if s.since_return_s < switch.min_real_s:
+        return Notice(Reason.JUST_RETURNED, "just back from the virtual space")
+    if inputs.costmap is None:
+        return Notice(Reason.NO_COSTMAP, "there is no costmap yet")
+    return None
+
+
+def stop_notice(s: Snapshot) -> Notice:
+    """Reason of a transition to STOPPED."""
+    if estop_pressed(s):
+        return Notice(Reason.ESTOP, "emergency stop")
+    if s.lost:
+        return stale_notice(s.lost)
+    if s.inputs.vspace.failed:
+        return Notice(Reason.VSPACE_FAILED, f"the virtual space failed: {s.inputs.vspace.message}")
+    return Notice(Reason.VSPACE_LOST, "the virtual space is silent")

@@ -1,0 +1,144 @@
+"""Inputs of the arbiter and the snapshot of one step, on which guards and commands decide."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.arbiter_config import ArbiterConfig
+from instant_ic.control.costmap import Costmap
+from instant_ic.control.prediction import Prediction, Predictor
+from instant_ic.control.reasons import Notice, Stale
+from instant_ic.control.states import Mode
+from instant_ic.control.subgoal import Subgoal
+from instant_ic.control.walls import WallMap
+
+Twist2 = tuple[float, float]
+"""Linear m/s, angular rad/s."""
+NO_MOTION: Twist2 = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Vspace:
+    """State that the virtual space reports (VspaceStatus)."""
+
+    ready: bool = False
+    training: bool = False
+    failed: bool = False
+    position: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    """(2,) position of the newest keyframe in the map frame."""
+    ready_radius_m: float = 0.0
+    message: str = ""
+    expected_psnr_db: float = 0.0
+    """Of the view requested last; 0 or NaN: unknown."""
+
+
+@dataclass(frozen=True)
+class ArbiterInputs:
+    """Inputs of one step; an age is inf until the first message."""
+
+    robot_pose: NDArray[np.float64] | None = None
+    """(3,) map_from_base of the r-bot; None while unknown."""
+    robot_velocity: Twist2 = (0.0, 0.0)
+    operator_command: Twist2 = (0.0, 0.0)
+    operator_gone: bool = False
+    """The client that sent the command has left since: the command is void, whatever its age."""
+    estop: bool = False
+    estop_button: bool = False
+    """The button on the robot is pressed; only releasing it ends the stop."""
+    estop_why: str = ""
+    """Text for the operator of a stop that nobody pressed in this run; empty: the usual text."""
+    scan_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    """(N, 2) hits of the newest scan and 3D points in ``base_link``, at the robot's present pose."""
+    costmap: Costmap | None = None
+    walls: WallMap | None = None
+    vspace: Vspace = field(default_factory=Vspace)
+    vbot_pose: NDArray[np.float64] | None = None
+    """(3,) pose of the v-bot in the map frame."""
+    vbot_velocity: Twist2 = (0.0, 0.0)
+    nav_command: Twist2 = (0.0, 0.0)
+    shown_pose: NDArray[np.float64] | None = None
+    """(3,) position of the r-bot when the camera image now shown was taken, with its present heading, to which the page
+    turns each image; None: ``robot_pose``."""
+    image_position: NDArray[np.float64] | None = None
+    """(2,) position of the camera in the map frame for the newest image that the operator has."""
+    view_position: NDArray[np.float64] | None = None
+    """(2,) position of the camera in the map frame for the newest rendered view that the operator has."""
+    view_after_image_s: float = 0.0
+    """Seconds from the arrival of that image to the arrival of that view."""
+    ages: dict[str, float] = field(default_factory=dict)
+    """Seconds since the last message of: scan, odometry, pose, camera, view, vbot, nav, command, vspace; points and
+    estop_input from their first message on."""
+    usual: dict[str, float] = field(default_factory=dict)
+    """Usual age of a source in seconds when its next message arrives (``freshness.Rhythm``)."""
+    images_late_s: float = 0.0
+    """Seconds until the operator has an image, from its exposure, or from the view's request if that takes longer."""
+
+    def age(self, key: str) -> float:
+        """Age of a source in seconds; inf before its first message."""
+        return self.ages.get(key, math.inf)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Everything that guards and commands of one step may look at; nothing changes it."""
+
+    config: ArbiterConfig
+    predictor: Predictor
+    inputs: ArbiterInputs
+    mode: Mode
+    in_mode_s: float
+    """Seconds since the last change of mode."""
+    command: Twist2
+    """The operator's command; zero when stale."""
+    fresh: bool
+    """The operator's command is not stale, and its client is still there."""
+    last_command: Twist2
+    """The operator's last command that was not zero."""
+    idle_s: float
+    """Seconds since that command."""
+    stale: tuple[Stale, ...]
+    """Stale sources that the present mode needs."""
+    lost: tuple[Stale, ...]
+    """Those of them that have been silent for so long that the robot must go to STOPPED."""
+    stale_in_real: tuple[Stale, ...]
+    """Stale sources that REAL needs."""
+    fresh_s: float
+    """Seconds for which every source that REAL needs has been fresh; -1 while one is stale."""
+    vspace: Vspace
+    """The virtual space, held for a short time while it learns its next keyframe."""
+    last_ready_vspace: Vspace | None
+    """The virtual space when it was last ready."""
+    target: NDArray[np.float64]
+    """(3,) pose of the r-bot as it is, or will be, shown."""
+    vbot_pose: NDArray[np.float64]
+    gap_m: float
+    """Distance between v-bot and target."""
+    yaw_gap_rad: float
+    yaw_gap_before_rad: float
+    """Yaw gap of the previous step."""
+    agree_s: float
+    """Seconds for which the two robots have agreed; -1 while they do not."""
+    prediction: Prediction | None
+    """Of the driven robot."""
+    since_return_s: float
+    """Seconds since the last return or abandoned entry; inf: none."""
+    awaits_operator: bool
+    """STOPPED because the operator's link was lost."""
+    slow_s: float
+    """Seconds for which the v-bot has driven slower than commanded."""
+    no_view_fits: bool = False
+    """An entry was abandoned, and neither has a view fitted since nor has the operator let go."""
+    leading_back: bool = False
+    """The v-bot returns to the r-bot by itself."""
+    subgoal: Subgoal | None = None
+    against_switch: Notice | None = None
+    """REAL with an obstacle ahead: reason against a switch; None: nothing speaks against it."""
+
+    @property
+    def obstacle_ahead(self) -> bool:
+        """Whether the predicted path meets an obstacle."""
+        return self.prediction is not None and self.prediction.hit_index is not None

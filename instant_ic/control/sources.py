@@ -1,0 +1,99 @@
+"""Which sources a mode needs, which of them are stale, and how fast their rates let the robot drive."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from instant_ic.control.arbiter_config import ArbiterConfig
+from instant_ic.control.freshness import IMAGES
+from instant_ic.control.reasons import Stale
+from instant_ic.control.snapshot import ArbiterInputs
+from instant_ic.control.states import SOURCES, Mode, Source
+
+STEP_AFTER_S = 0.001
+"""Delay of a step after the time-out it checks: the source is then surely stale. Time-outs end that much sooner."""
+_CATCH_UP = 0.8
+"""Speed limit of the v-bot as a share of the r-bot's."""
+
+
+@dataclass(frozen=True)
+class SourceMonitor:
+    """Time-outs of the sources under one configuration."""
+
+    config: ArbiterConfig
+
+    def stale(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float) -> tuple[Stale, ...]:
+        """Stale sources that ``mode`` needs, with their ages, ``in_mode_s`` after the last change of mode."""
+        found = []
+        for source in self._required(mode):
+            if source.optional and source.key not in inputs.ages:
+                continue
+            age_s = _age_s(source, inputs, in_mode_s)
+            if age_s > self._allowed_s(source, inputs) or (source.key == "command" and inputs.operator_gone):
+                found.append(Stale(source, age_s))
+        return tuple(found)
+
+    def is_lost(self, stale: Stale, inputs: ArbiterInputs) -> bool:
+        """Whether a stale source has been silent for so long that the robot must go to STOPPED."""
+        source, age_s = stale
+        return age_s > self.config.timeouts.lost_s(source.key, _usual_s(source, inputs))
+
+    def command_is_fresh(self, inputs: ArbiterInputs) -> bool:
+        """Whether the operator's command counts: young enough, and its client is still there."""
+        return inputs.age("command") <= self._command_s and not inputs.operator_gone
+
+    def stale_in_s(self, inputs: ArbiterInputs, mode: Mode, in_mode_s: float) -> float:
+        """Seconds until the first fresh source becomes stale; inf for none."""
+        left = [
+            self._allowed_s(source, inputs) - _age_s(source, inputs, in_mode_s)
+            for source in SOURCES
+            if mode in source.modes
+        ]
+        left.append(self._command_s - inputs.age("command"))
+        # 0: not stale yet, but right after this step.
+        return min((one for one in left if one >= 0.0), default=math.inf)
+
+    def speed_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
+        """Speed at which the robot drives at most ``image_travel_m`` until a missing image stops it.
+
+        Rare images therefore slow the robot, instead of stopping it at each late one.
+        """
+        images = [source for source in self._required(mode) if source.key in IMAGES]
+        longest_s = max((self._allowed_s(source, inputs) for source in images), default=0.0)
+        most = self.config.limits.max_linear_m_s
+        return min(most, self.config.timeouts.image_travel_m / longest_s) if longest_s > 0 else most
+
+    def vbot_limit_m_s(self, inputs: ArbiterInputs, mode: Mode) -> float:
+        """Speed limit of the v-bot; below full speed it is slow enough for the r-bot to catch up."""
+        limit = self.speed_limit_m_s(inputs, mode)
+        return limit if limit >= self.config.limits.max_linear_m_s else _CATCH_UP * limit
+
+    def _required(self, mode: Mode) -> list[Source]:
+        switch = self.config.switch
+        unused = {key for key, used in (("camera", switch.require_camera), ("view", switch.require_view)) if not used}
+        return [source for source in SOURCES if mode in source.modes and source.key not in unused]
+
+    def _allowed_s(self, source: Source, inputs: ArbiterInputs) -> float:
+        return self.config.timeouts.allowed_s(source.key, _usual_s(source, inputs)) - STEP_AFTER_S
+
+    @property
+    def _command_s(self) -> float:
+        """Age in seconds up to which the operator's command counts."""
+        return self.config.timeouts.command - STEP_AFTER_S
+
+
+def images_too_rare(inputs: ArbiterInputs, config: ArbiterConfig) -> bool:
+    """Whether camera images are too rare to drive by, or their rate is not known yet."""
+    usual_s = inputs.usual.get("camera", 0.0) if config.switch.require_camera else 0.0
+    return usual_s > config.timeouts.slowest_image_s
+
+
+def _usual_s(source: Source, inputs: ArbiterInputs) -> float | None:
+    return inputs.usual.get(source.key) if source.steady else None
+
+
+def _age_s(source: Source, inputs: ArbiterInputs, in_mode_s: float) -> float:
+    # A source that REAL does not need may be silent before the change: its age counts from the change.
+    age_s = inputs.age(source.key)
+    return min(age_s, in_mode_s) if Mode.REAL not in source.modes else age_s
