@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from instant_ic.bus import LATCHED, OK, SENSOR, WARN, Node, main
 from instant_ic.config.ranges import Positive, check_ranges
-from instant_ic.control.costmap import StaticMap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, move
+from instant_ic.control.kinematics import MotionLimits, extrapolate
 from instant_ic.control.states import VbotAction
 from instant_ic.control.vbot import VbotConfig, VirtualRobot
-from instant_ic.control.walls import WallFinder, WallMap
+from instant_ic.control.walls import WallFinder, WallSearch
 from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
 from instant_ic.msg import (
     ControlState,
@@ -63,9 +60,7 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
 
     def setup(self) -> None:
         self.robot = VirtualRobot(self.config.vbot, self.config.limits, self.config.footprint)
-        self.walls: WallMap | None = None
-        self.map: StaticMap | None = None
-        self.map_is_new = False
+        self.walls = WallSearch()
         self.action: VbotAction | None = None
         self.stepped_ns = self.clock.steady_ns()
         self.odom = self.publisher("/vbot/odom", Odometry, qos=SENSOR)
@@ -75,32 +70,16 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         self.subscribe("/operator/cmd_vel", TwistStamped, self.on_command, qos=SENSOR)
         self.state = self.latest("/ic/state", ControlState, self.config.state_timeout_s, qos=LATCHED)
         if self.config.walls_block:
-            self.wall_worker = self.background(WallFinder(self.config.wall_min_length_m).find, self.on_walls)
-            self.subscribe("/map", OccupancyGrid, self.on_map, qos=LATCHED)
-            self.timer(self.config.wall_period_s, self.update_walls)
+            finder = WallFinder(self.config.wall_min_length_m)
+            self.walls.submit = self.background(finder.find, self.walls.on_found).submit
+            self.subscribe("/map", OccupancyGrid, lambda m: self.walls.on_map(*grid_array(m)), qos=LATCHED)
+            self.timer(self.config.wall_period_s, self.walls.update)
         self.timer(1.0 / self.config.rate_hz, self.on_timer)
 
     def reconfigure(self, config: VirtualRobotConfig) -> None:
         super().reconfigure(config)
         self.robot.config, self.robot.limits = config.vbot, config.limits
         self.command.max_age_s, self.state.max_age_s = config.command_timeout_s, config.state_timeout_s
-
-    def on_map(self, message: OccupancyGrid) -> None:
-        grid, resolution, origin = grid_array(message)
-        if grid.size == 0:
-            return
-        self.map, self.map_is_new = StaticMap(grid, resolution, np.array(origin)), True
-        if self.walls is None:
-            self.update_walls()  # the first map at once
-
-    def update_walls(self) -> None:
-        """Search for walls in the newest map, outside the node's thread."""
-        if self.map_is_new:
-            self.map_is_new = False
-            self.wall_worker.submit(self.map)
-
-    def on_walls(self, walls: WallMap) -> None:
-        self.walls = walls
 
     def on_command(self, message: TwistStamped) -> None:
         """Obey a changed command at once: the next timer is half a period away on average."""
@@ -136,20 +115,20 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
         robot_twist = twist_values(state.robot_twist)
         age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
         # The arbiter's message is up to a period old, and the r-bot moves on.
-        target = move(pose2_from_matrix(pose_matrix(state.vbot_target)), *robot_twist, min(max(age_s, 0.0), 0.1))
+        target = extrapolate(pose2_from_matrix(pose_matrix(state.vbot_target)), robot_twist, age_s)
         if before is None and action != VbotAction.WITH_ROBOT:
             self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_pose)), (0.0, 0.0))  # the node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:
             self.obeyed = self.operator()
-            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls, float(state.vbot_limit_m_s))
+            self.robot.step(self.obeyed, robot_pose, dt_s, self.walls.found, float(state.vbot_limit_m_s))
         elif action == VbotAction.HELD:
-            self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls)
+            self.robot.step((0.0, 0.0), robot_pose, dt_s, self.walls.found)
         elif action == VbotAction.EASED:
             self.robot.ease(target, robot_twist, dt_s)
         else:
-            self.robot.lead_back(robot_pose, dt_s, self.walls)
+            self.robot.lead_back(robot_pose, dt_s, self.walls.found)
         slowed = f", slowed by {self.robot.slowed_by}" if self.robot.slowed_by else ""
         self.diagnose("state", OK, action.name.lower().replace("_", " ") + slowed)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from instant_ic import estop_state
 
 FUTURE_NS = 500_000_000
 """A release stamped farther ahead than this was published before the clock was set back."""
@@ -78,3 +81,39 @@ class EstopLatch:
         same = publisher == self.publisher
         self.pressed_ns = publish_ns if same else max(publish_ns, self.pressed_ns)
         self.pressed, self.publisher = True, publisher
+
+
+class KeptEstop(EstopLatch):
+    """A latch that survives a restart: of the node, of the stack, and of the machine (``estop_state``).
+
+    Attributes:
+        why: text for the operator of a stop that nobody pressed in this run; empty otherwise.
+    """
+
+    def __init__(self, run_dir: Path | None, now_ns: int) -> None:
+        """Start stopped if the emergency stop was pressed when the last run ended, or that run broke off."""
+        super().__init__()
+        self._run_dir = run_dir
+        self._kept = None if run_dir is None else estop_state.read(run_dir)
+        if self._kept is not None:
+            # Clamp to now, in case the clock was set since: any release from here on is newer.
+            self._kept = replace(self._kept, pressed_ns=min(self._kept.pressed_ns, now_ns))
+            self.hear(True, self._kept.publisher, self._kept.pressed_ns, now_ns)
+
+    @property
+    def why(self) -> str:
+        return "" if self._kept is None else self._kept.why
+
+    def save(self) -> bool:
+        """Save a press, or delete a released one; return whether anything had to be written. The disk may be slow.
+
+        Raises:
+            estop_state.EstopStateError: the folder cannot be written.
+        """
+        before, now = self._kept, estop_state.KeptStop(self.publisher, self.pressed_ns) if self.pressed else None
+        same = before is not None and now is not None and before.pressed_ns == now.pressed_ns
+        if self._run_dir is None or same or now == before:
+            return False
+        estop_state.write(self._run_dir, now)
+        self._kept = now
+        return True

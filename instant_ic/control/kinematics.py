@@ -44,3 +44,8 @@ def move(pose: NDArray[np.float64], linear: float, angular: float, dt_s: float) 
     chord = linear * dt_s * float(np.sinc(turn / (2.0 * math.pi)))
     heading = yaw + 0.5 * turn
     return np.array([x + chord * math.cos(heading), y + chord * math.sin(heading), wrap_angle(yaw + turn)])
+
+
+def extrapolate(pose: NDArray[np.float64], velocity: tuple[float, float], age_s: float) -> NDArray[np.float64]:
+    """Present pose (3,) from one of a message that is up to a period old: at most 0.1 s on at its velocity."""
+    return move(pose, *velocity, min(max(age_s, 0.0), 0.1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,3 +79,32 @@ class WallFinder:
                 )
             )
         )
+
+
+class WallSearch:
+    """The newest map, and the walls found in it by slow work elsewhere."""
+
+    def __init__(self) -> None:
+        self.map: StaticMap | None = None
+        self.found: WallMap | None = None
+        self.submit: Callable[[StaticMap], None] = lambda static: None
+        """Starts a search (``WallFinder.find``), whose result arrives at :meth:`on_found`."""
+        self._map_is_new = False
+
+    def on_map(self, grid: NDArray[np.int8], resolution: float, origin: tuple[float, float]) -> None:
+        """Take a map; the first one is searched at once, later ones by :meth:`update`."""
+        if grid.size == 0:
+            return
+        self.map, self._map_is_new = StaticMap(grid, resolution, np.array(origin)), True
+        if self.found is None:
+            self.update()
+
+    def update(self) -> None:
+        """Search the newest map, if it has not been searched yet."""
+        if self._map_is_new and self.map is not None:
+            self._map_is_new = False
+            self.submit(self.map)
+
+    def on_found(self, walls: WallMap) -> None:
+        """Take the result of a search."""
+        self.found = walls

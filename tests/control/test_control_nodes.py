@@ -492,7 +492,7 @@ def test_diagnoses_of_the_start_are_cleared() -> None:
 def test_walls_are_looked_for_when_the_map_has_changed_and_not_more_often_than_set() -> None:
     stack = Stack(np.zeros((0, 2, 2)))
     nodes = [node for node in stack.bus.nodes if isinstance(node, ArbiterNode | VirtualRobotNode)]
-    first = [node.walls for node in nodes]
+    first = [node.walls.found for node in nodes]
     assert all(walls is not None and walls.mask.any() for walls in first)
     grid = first[0].static.occupancy.copy()
     origin = tuple(first[0].static.origin)
@@ -502,16 +502,16 @@ def test_walls_are_looked_for_when_the_map_has_changed_and_not_more_often_than_s
 
     publish()  # the same map again
     stack.drive(2.5, None)
-    assert [node.walls for node in nodes] == first
+    assert [node.walls.found for node in nodes] == first
     stack.drive(1.45, None)
     column = grid.shape[1] // 2
     grid[:, column] = 100  # a new wall across the corridor
     publish()
-    assert [node.walls for node in nodes] == first  # 3.95 s: due at 4 s
+    assert [node.walls.found for node in nodes] == first  # 3.95 s: due at 4 s
     stack.drive(0.1, None)
     for node, before in zip(nodes, first, strict=True):
-        assert node.walls is not before
-        assert node.walls.mask[grid.shape[0] // 2, column]
+        assert node.walls.found is not before
+        assert node.walls.found.mask[grid.shape[0] // 2, column]
 
 
 def test_pictures_are_not_decoded() -> None:

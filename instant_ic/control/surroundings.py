@@ -1,0 +1,228 @@
+"""What the robot knows of its surroundings: the newest scan and 3D points in its own frame, and the costmap."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.control.costmap import Costmap, CostmapConfig, RollingCostmap, StaticMap, scan_points, scan_rays
+from instant_ic.control.footprint import Footprint
+from instant_ic.control.heights import SortedPoints, sort_points
+from instant_ic.geometry.poses import Matrix, pose2_from_matrix, relative2
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+
+_MOTION_SAMPLES = 9
+"""Poses of the sensor over a sweep of points; between them its motion counts as even."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """A flat scan as it arrived (LaserScan)."""
+
+    frame: str
+    stamp_ns: int
+    arrived_ns: int
+    """Steady clock."""
+    ranges: NDArray[np.floating]
+    """(N,) metres."""
+    angle_min: float
+    angle_increment: float
+    range_min: float
+    range_max: float
+
+    @property
+    def beams(self) -> tuple[NDArray[np.floating], float, float, float, float]:
+        """Arguments of ``scan_points`` and ``scan_rays``."""
+        return self.ranges, self.angle_min, self.angle_increment, self.range_min, self.range_max
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A sweep of 3D points as it arrived (PointCloud2)."""
+
+    frame: str
+    stamp_ns: int
+    arrived_ns: int
+    """Steady clock."""
+    points: NDArray[Any]
+    """(N,) structured: x, y, z in metres; optionally time in seconds since the first point."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """State of one input, for a diagnosis."""
+
+    ok: bool
+    text: str
+    values: dict[str, Any] = field(default_factory=dict)
+
+
+class Surroundings:
+    """Places scans and 3D points by the transforms, and updates the costmap with them.
+
+    A scan whose transform has not arrived yet does not count: the previous one and its age stay.
+    """
+
+    def __init__(
+        self, config: CostmapConfig, footprint: Footprint, tf: TransformBuffer, jump_m: float, jump_deg: float
+    ) -> None:
+        self.config = config
+        self.jump_m, self.jump_deg = jump_m, jump_deg
+        """Motion of map → odom between two updates above which the map has jumped."""
+        self.costmap: Costmap | None = None
+        self.points_seen = False
+        self.map_jumped = False
+        """At the last update."""
+        self.findings: dict[str, Finding] = {}
+        """By input: scan, points, costmap, pose."""
+        if not config.points.enabled:
+            self._find("points", True, "not used (costmap.points.enabled is false)")
+        else:
+            self._find("points", True, "no 3D points yet: low and hanging things are not seen")
+        self._tf = tf
+        self._rolling = RollingCostmap(config, footprint)
+        self._map_from_odom: Matrix | None = None
+        self._scan_hits: NDArray[np.float64] | None = None  # (N, 2) of the newest scan with a transform, in odom
+        self._sweep: SortedPoints | None = None  # newest 3D points, in odom
+        self._used: dict[str, tuple[int, int]] = {}  # last scan and points with a transform: stamp, arrival
+        self._published_ns: int | None = None
+        self._in_costmap: tuple[int, int] = (-1, -1)  # stamps of the scan and the points in the costmap
+
+    def robot_pose(self) -> NDArray[np.float64] | None:
+        """Pose (3,) of the robot in the map; None while unknown."""
+        try:
+            pose = pose2_from_matrix(self._tf.lookup("map", "base_link"))
+        except TransformError as error:
+            self._find("pose", False, str(error))
+            return None
+        self._find("pose", True, "known")
+        return pose
+
+    def near_points(self, scan: Scan | None) -> NDArray[np.float64] | None:
+        """Hits (N, 2) of the newest scan and 3D points in ``base_link`` now, by odometry, which does not jump.
+
+        None while there is no scan, or its place is unknown.
+        """
+        if scan is None:
+            self._scan_hits = None
+        elif self._scan_hits is None or self._used["scan"][0] != scan.stamp_ns:
+            self._place(scan)
+        if self._scan_hits is None:
+            return None
+        near = self._scan_hits
+        if self._sweep is not None:
+            near = np.concatenate([near, self._sweep.nearest])
+        try:
+            base_from_odom = np.linalg.inv(self._tf.lookup("odom", "base_link"))
+        except TransformError as error:
+            self._find("scan", False, f"scan cannot be placed: {error}")
+            return None
+        return np.asarray(near @ base_from_odom[:2, :2].T + base_from_odom[:2, 3])
+
+    def used_age_s(self, key: str, now_ns: int, steady_ns: int) -> float:
+        """Age of the last ``scan`` or ``points`` with a transform, since its arrival or its stamp, whichever is longer.
+
+        Seconds; inf without one.
+        """
+        if key not in self._used:
+            return math.inf
+        stamp_ns, arrived_ns = self._used[key]
+        return max(now_ns - stamp_ns, steady_ns - arrived_ns) / 1e9
+
+    def refuse_points(self, reason: str) -> None:
+        """Report 3D points that cannot be used; no later transform makes them usable."""
+        self.points_seen = True
+        self._used.pop("points", None)
+        self._find("points", False, f"3D points cannot be used: {reason}")
+
+    def update_costmap(self, scan: Scan | None, cloud: Cloud | None, static: StaticMap | None) -> Costmap | None:
+        """Add the newest scan and 3D points to the costmap; return it, None if nothing is new or known."""
+        points_ns = -1 if cloud is None else self._take(cloud)
+        pose = self.robot_pose()
+        if pose is None or scan is None:
+            missing = "no pose" if pose is None else "no LiDAR scan"
+            self._find("costmap", self.costmap is None, f"costmap is not updated: {missing}")
+            return None
+        if (scan.stamp_ns, points_ns) == self._in_costmap:
+            return None
+        try:
+            # SLAM's correction changes slowly and arrives later than the scan: the newest one is good enough.
+            map_from_odom = self._tf.lookup("map", "odom")
+            map_from_lidar = map_from_odom @ self._tf.lookup("odom", scan.frame, scan.stamp_ns)
+        except TransformError as error:
+            self._find("costmap", False, f"costmap is not updated: {error}")
+            return None
+        self.map_jumped = self._map_from_odom is not None and self._jumped(self._map_from_odom, map_from_odom)
+        if self.map_jumped:
+            self._rolling.reset()
+        self._map_from_odom = map_from_odom
+        rays = scan_rays(*scan.beams, map_from_lidar, self.config)
+        new_points = self._sweep if points_ns not in (-1, self._in_costmap[1]) else None
+        self.costmap = self._rolling.update(pose, static, rays, new_points, pose2_from_matrix(map_from_odom))
+        self._in_costmap = (scan.stamp_ns, points_ns)
+        self._find("costmap", True, "up to date", static_map=static is not None)
+        return self.costmap
+
+    def publish_due(self, steady_ns: int) -> bool:
+        """Whether the costmap is to be published now, by ``publish_frequency``; it then counts as published."""
+        # A little early counts: updates come at the scan's rate, not at the publish frequency.
+        due_ns = 0.9e9 / self.config.publish_frequency
+        sent_ns = self._published_ns  # later than now if the clock went back: a bag player restarted
+        if sent_ns is not None and 0 <= steady_ns - sent_ns < due_ns:
+            return False
+        self._published_ns = steady_ns
+        return True
+
+    def _find(self, name: str, ok: bool, text: str, **values: Any) -> None:
+        self.findings[name] = Finding(ok, text, values)
+
+    def _place(self, scan: Scan) -> None:
+        try:
+            odom_from_lidar = self._tf.lookup("odom", scan.frame, scan.stamp_ns)
+        except TransformError as error:
+            self._find("scan", False, f"scan cannot be placed: {error}")
+            return
+        points = scan_points(*scan.beams)
+        self._find("scan", True, f"{len(points)} points")
+        self._scan_hits = np.asarray(points @ odom_from_lidar[:2, :2].T + odom_from_lidar[:2, 3])
+        self._used["scan"] = scan.stamp_ns, scan.arrived_ns
+
+    def _take(self, cloud: Cloud) -> int:
+        """Sort new 3D points by height, in ``odom``; return their stamp, -1 if they cannot be used."""
+        self.points_seen = True
+        if cloud.stamp_ns == self._in_costmap[1]:
+            return cloud.stamp_ns
+        names = cloud.points.dtype.names or ()
+        if not {"x", "y", "z"} <= set(names):
+            self.refuse_points(f"/lidar/points has the fields {', '.join(names)}; x, y and z are needed")
+            return -1
+        try:
+            self._sweep = self._sorted(cloud)
+        except TransformError as error:
+            self._find("points", False, f"3D points cannot be used: {error}")
+            return -1
+        self._used["points"] = cloud.stamp_ns, cloud.arrived_ns
+        counts = self._sweep.counts
+        self._find("points", True, f"{counts['obstacle']} obstacle points", **counts)
+        return cloud.stamp_ns
+
+    def _sorted(self, cloud: Cloud) -> SortedPoints:
+        points = cloud.points
+        time_s = points["time"] if "time" in (points.dtype.names or ()) else np.zeros(len(points), np.float32)
+        duration_s = float(min(max(time_s.max(initial=0.0), 0.0), 1.0))
+        instants = [
+            cloud.stamp_ns + round(1e9 * duration_s * k / (_MOTION_SAMPLES - 1)) for k in range(_MOTION_SAMPLES)
+        ]
+        poses = np.stack([self._tf.lookup("odom", cloud.frame, ns) for ns in instants])
+        xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
+        return sort_points(xyz, time_s, poses, duration_s, self.config.points)
+
+    def _jumped(self, before: Matrix, after: Matrix) -> bool:
+        # Compared once per costmap period, which is shorter than SLAM's: a correction arrives in one piece.
+        moved = relative2(pose2_from_matrix(before), pose2_from_matrix(after))
+        far = math.hypot(float(moved[0]), float(moved[1])) > self.jump_m
+        return far or abs(float(moved[2])) > math.radians(self.jump_deg)

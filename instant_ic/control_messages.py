@@ -1,0 +1,215 @@
+"""Messages of the control topics to the plain values of ``instant_ic.control``, and back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from instant_ic.bus import LATCHED, Latest
+from instant_ic.bus.clock import Clock
+from instant_ic.control.arbiter import Decision
+from instant_ic.control.estop import KeptEstop
+from instant_ic.control.freshness import TimeoutConfig
+from instant_ic.control.kinematics import extrapolate
+from instant_ic.control.operator_view import OperatorView, PageReport
+from instant_ic.control.snapshot import ArbiterInputs, Vspace
+from instant_ic.control.surroundings import Cloud, Scan, Surroundings
+from instant_ic.control.walls import WallMap
+from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
+from instant_ic.msg import (
+    ControlState,
+    LaserScan,
+    MessageError,
+    Odometry,
+    PointCloud2,
+    Pose,
+    PoseWithCovarianceStamped,
+    ShownPictures,
+    TwistStamped,
+    VspaceStatus,
+    cloud_array,
+    header,
+    pose_matrix,
+    pose_message,
+    stamp_ns,
+    twist_message,
+    twist_values,
+)
+
+
+class ArbiterInbox:
+    """Newest messages of the arbiter's topics, as the inputs of its step.
+
+    Args:
+        latest: subscribes to a topic (``Node.latest``).
+        clock: the node's.
+        surroundings, view: place scans, 3D points and images.
+    """
+
+    def __init__(
+        self, latest: Callable[..., Latest], clock: Clock, surroundings: Surroundings, view: OperatorView
+    ) -> None:
+        self._clock, self._surroundings, self._view = clock, surroundings, view
+        self._sources = {
+            "scan": latest("/scan", LaserScan, max_age_s=10.0),
+            "odometry": latest("/wheel/odom", Odometry, max_age_s=10.0),
+            "pose": latest("/pose", PoseWithCovarianceStamped, max_age_s=10.0),
+            "vbot": latest("/vbot/odom", Odometry, max_age_s=10.0),
+            "nav": latest("/nav/cmd_vel", TwistStamped, max_age_s=10.0),
+            "command": latest("/operator/cmd_vel", TwistStamped, max_age_s=10.0),
+        }
+        self._points: Latest | None = None
+        if surroundings.config.points.enabled:
+            self._points = latest("/lidar/points", PointCloud2, max_age_s=10.0)
+        self._shown = latest("/view/shown", ShownPictures, max_age_s=1.0)
+        self._vspace = latest("/vspace/status", VspaceStatus, max_age_s=60.0, qos=LATCHED)
+        self.button_ns: int | None = None
+        """Last report of the robot's own emergency stop, steady clock."""
+
+    def scan(self) -> Scan | None:
+        """The newest scan."""
+        latest = self._sources["scan"]
+        m = latest.message
+        if m is None:
+            return None
+        beams = (m.ranges, m.angle_min, m.angle_increment, m.range_min, m.range_max)
+        return Scan(m.header.frame_id, stamp_ns(m), self._arrived_ns(latest), *beams)
+
+    def cloud(self) -> Cloud | None:
+        """The newest 3D points; a message that cannot be read is reported to the surroundings."""
+        if self._points is None or self._points.message is None:
+            return None
+        message = self._points.message
+        try:
+            points = cloud_array(message)
+        except MessageError as error:
+            self._surroundings.refuse_points(str(error))
+            return None
+        return Cloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self._points), points)
+
+    def operator_gone(self) -> bool:
+        """Whether the console has lost its driver since the newest command."""
+        shown, command = self._shown.message, self._sources["command"].message
+        return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
+
+    def ages(self, timeouts: TimeoutConfig) -> dict[str, float]:
+        """Seconds since the newest message of each source, as ``ArbiterInputs.ages``."""
+        now_ns, steady_ns = self._clock.now_ns(), self._clock.steady_ns()
+        ages = {key: _age_s(latest) for key, latest in self._sources.items()} | {"vspace": self._vspace.age_s}
+        ages |= self._view.ages(page_report(self._shown.message), self._shown.age_s, steady_ns)
+        if self._points is not None and self._surroundings.points_seen:
+            ages["points"] = max(_age_s(self._points), self._surroundings.used_age_s("points", now_ns, steady_ns))
+        if self.button_ns is not None and timeouts.estop_input > 0:
+            ages["estop_input"] = (steady_ns - self.button_ns) / 1e9
+        return ages
+
+    def inputs(self, latch: KeptEstop, walls: WallMap | None, timeouts: TimeoutConfig) -> ArbiterInputs:
+        """Inputs of a step now."""
+        now_ns, steady_ns = self._clock.now_ns(), self._clock.steady_ns()
+        view, surroundings = self._view, self._surroundings
+        ages, near = self.ages(timeouts), surroundings.near_points(self.scan())
+        used_s = math.inf if near is None else surroundings.used_age_s("scan", now_ns, steady_ns)
+        ages["scan"] = max(ages["scan"], used_s)
+        pose, velocity = surroundings.robot_pose(), self._twist("odometry")
+        vbot, status = self._sources["vbot"].message, self._vspace.message
+        report = page_report(self._shown.message)
+        return ArbiterInputs(
+            robot_pose=pose,
+            robot_velocity=velocity,
+            operator_command=self._twist("command"),
+            operator_gone=self.operator_gone(),
+            estop=latch.pressed,
+            estop_button=latch.button,
+            estop_why=latch.why,
+            scan_points=np.zeros((0, 2)) if near is None else near,
+            costmap=surroundings.costmap,
+            walls=walls,
+            vspace=Vspace() if status is None else _vspace(status),
+            vbot_pose=None if vbot is None else _present_pose(vbot, now_ns),
+            vbot_velocity=self._twist("vbot"),
+            nav_command=self._twist("nav"),
+            shown_pose=view.shown_pose(report, pose, velocity, now_ns),
+            image_position=None if report is None else view.image_position(),
+            view_position=None if report is None else report.view_position,
+            view_after_image_s=0.0 if report is None else report.view_after_image_s,
+            ages=ages,
+            usual=view.usual(with_page=report is not None),
+            images_late_s=view.delay_s(report),
+        )
+
+    def _twist(self, key: str) -> tuple[float, float]:
+        message = self._sources[key].message
+        return (0.0, 0.0) if message is None else twist_values(message)
+
+    def _arrived_ns(self, latest: Latest) -> int:
+        return self._clock.steady_ns() - round(latest.age_s * 1e9)
+
+
+def page_report(shown: ShownPictures | None) -> PageReport | None:
+    """Report of the operator's page; None without one."""
+    if shown is None:
+        return None
+    return PageReport(
+        image_stamp_ns=stamp_ns(shown.picture_stamp),
+        image_age_s=float(shown.picture_age_s),
+        view_id=int(shown.view_id),
+        view_age_s=float(shown.view_age_s),
+        view_delay_s=float(shown.view_delay_s),
+        view_position=pose_matrix(shown.view_pose)[:2, 3],
+    )
+
+
+def control_state(decision: Decision, inputs: ArbiterInputs, now_ns: int) -> ControlState:
+    """ControlState of one step of the arbiter."""
+    return ControlState(
+        header=header("map", now_ns),
+        mode=int(decision.mode),
+        reason=decision.reason,
+        estop=decision.estop,
+        blocked=decision.blocked,
+        transitions=decision.transitions,
+        robot_pose=_pose(np.zeros(3) if inputs.robot_pose is None else inputs.robot_pose),
+        vbot_start=_pose(decision.vbot_start),
+        vbot_pose=_pose(decision.vbot_pose),
+        operator_command=twist_message(*decision.operator_command),
+        applied_command=twist_message(*decision.command),
+        pose_gap_m=decision.pose_gap_m,
+        yaw_gap_rad=decision.yaw_gap_rad,
+        time_to_obstacle_s=decision.time_to_obstacle_s,
+        shown=ControlState.SHOWN_VIRTUAL if decision.mode.shows_vbot else ControlState.SHOWN_REAL,
+        vbot_action=int(decision.vbot_action),
+        vbot_target=_pose(decision.vbot_target),
+        robot_twist=twist_message(*inputs.robot_velocity),
+        vbot_limit_m_s=decision.vbot_limit_m_s,
+        reason_code=int(decision.reason_code),
+    )
+
+
+def _pose(pose: NDArray[np.float64]) -> Pose:
+    return pose_message(matrix_from_pose2(pose))
+
+
+def _age_s(latest: Latest) -> float:
+    """Seconds since the newest message, by its stamp; inf without one."""
+    return math.inf if latest.message is None else latest.stamp_age_s
+
+
+def _present_pose(odometry: Odometry, now_ns: int) -> NDArray[np.float64]:
+    """Pose (3,) extrapolated to now: the message is up to a period old."""
+    pose = pose2_from_matrix(pose_matrix(odometry))
+    return extrapolate(pose, twist_values(odometry), (now_ns - stamp_ns(odometry)) / 1e9)
+
+
+def _vspace(status: VspaceStatus) -> Vspace:
+    return Vspace(
+        ready=status.state == VspaceStatus.READY,
+        training=status.state == VspaceStatus.TRAINING,
+        failed=status.state == VspaceStatus.FAILED,
+        position=pose_matrix(status.keyframe_pose)[:2, 3],
+        ready_radius_m=float(status.ready_radius_m),
+        message=status.message,
+        expected_psnr_db=float(status.expected_psnr_db),
+    )
