@@ -229,7 +229,7 @@ class Robot:
                 vbot_pose=pose_message(self.vbot), operator_command=twist_message(), applied_command=twist_message(),
                 pose_gap_m=0.0, yaw_gap_rad=0.0, time_to_obstacle_s=float("inf"), shown=ControlState.SHOWN_VIRTUAL,
                 vbot_action=ControlState.VBOT_DRIVEN, vbot_target=pose_message(np.eye(4)), robot_twist=twist_message(),
-                vbot_limit_m_s=0.5,
+                vbot_limit_m_s=0.5, reason_code=ControlState.REASON_DRIVE_VBOT,
             )
         )  # fmt: skip
 

@@ -52,6 +52,7 @@ from instant_ic.base.config import RoboclawConfig
 from instant_ic.bus import LATCHED, registry
 from instant_ic.console.client import ConsoleClient
 from instant_ic.console.drive import DriveConfig
+from instant_ic.control.states import Reason
 from instant_ic.experiments.drive import pump
 from instant_ic.experiments.impaired_link import ImpairedLink
 from instant_ic.experiments.stack import Stack, StackError, free_port, machine_pace
@@ -249,7 +250,7 @@ class Rig:
         if self.state is None or not self.truth:
             return False
         fresh = self.pace.now_ns() - stamp_ns(self.state) < 0.3e9
-        held = self.state.reason.startswith(("stopped", "emergency", "the robot's pose", "there is no costmap"))
+        held = Reason(self.state.reason_code).holds
         return fresh and self.state.mode == ControlState.REAL and not held and self.truth[-1].speed < STANDS_M_S
 
     def pid(self, node: str) -> int:

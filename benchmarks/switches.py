@@ -18,16 +18,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader
 
+from instant_ic.bag import BagReader
+from instant_ic.control.states import Mode, Reason
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.msg import ControlState, deserialize, pose_matrix, stamp_ns, transform_matrix
+from instant_ic.msg import deserialize, pose_matrix, stamp_ns, transform_matrix
 
 SOURCES = (
     *("/scan", "/lidar/points", "/wheel/odom", "/pose", "/camera/image/compressed", "/vspace/view"),
     *("/vbot/odom", "/nav/cmd_vel", "/operator/cmd_vel"),
 )
-NAMES = {getattr(ControlState, name): name.lower() for name in ("REAL", "VIRTUAL", "STOPPED", "ENTERING", "RETURNING")}
 
 
 def main() -> None:
@@ -45,14 +45,13 @@ def measure(bag: Path) -> dict[str, Any]:
     """Figures of the drive in ``bag``."""
     tree, states, pages, stamps = TransformBuffer(cache_s=86400.0), [], [], {topic: [] for topic in SOURCES}
     wanted = {"/ic/state", "/view/shown", "/tf", "/tf_static", *SOURCES}
-    with AnyReader([bag]) as reader:
-        connections = [c for c in reader.connections if c.topic in wanted]
-        for connection, at_ns, raw in reader.messages(connections):
-            topic = connection.topic
+    with BagReader(bag) as reader:
+        for entry in reader.current_messages(wanted):
+            topic, at_ns = entry.topic, entry.stamp_ns
             if topic in stamps:
                 stamps[topic].append(at_ns)
                 continue
-            message = deserialize(raw, connection.msgtype)
+            message = deserialize(entry.payload, entry.type_name)
             if topic == "/ic/state":
                 states.append((at_ns, message))
             elif topic == "/view/shown":
@@ -63,12 +62,14 @@ def measure(bag: Path) -> dict[str, Any]:
                     tree.set(parent, child, stamp_ns(t), transform_matrix(t), static=topic == "/tf_static")
     return {
         "seconds": seconds_by_state(states),
-        "transitions": [NAMES[m.mode] for k, (_, m) in enumerate(states) if k == 0 or states[k - 1][1].mode != m.mode],
+        "transitions": [
+            Mode(m.mode).label for k, (_, m) in enumerate(states) if k == 0 or states[k - 1][1].mode != m.mode
+        ],
         "held_s": holds(states),
         "switches": [
             jump(tree, pages, at_ns, before, after)
             for (_, before), (at_ns, after) in pairwise(states)
-            if before.shown != after.shown and ControlState.STOPPED not in (before.mode, after.mode)
+            if before.shown != after.shown and Mode.STOPPED not in (before.mode, after.mode)
         ],
         "gap_ms": {topic: gaps(np.array(times)) for topic, times in stamps.items() if len(times) > 2},
     }
@@ -78,17 +79,18 @@ def seconds_by_state(states: list[tuple[int, Any]]) -> dict[str, float]:
     """Seconds in each state."""
     total: Counter[str] = Counter()
     for (at, message), (then, _) in pairwise(states):
-        total[NAMES[message.mode]] += (then - at) / 1e9
+        total[Mode(message.mode).label] += (then - at) / 1e9
     return {name: round(seconds, 2) for name, seconds in total.items()}
 
 
 def holds(states: list[tuple[int, Any]]) -> dict[str, float]:
-    """Seconds for which a moving state was held, by message without its numbers."""
+    """Seconds for which a moving state was held because a source was stale, by reason."""
     total: Counter[str] = Counter()
     for (at, message), (then, _) in pairwise(states):
-        if message.mode != ControlState.STOPPED and message.reason.startswith("stopped: "):
-            total[message.reason.partition(" for ")[0]] += (then - at) / 1e9
-    return {words: round(seconds, 2) for words, seconds in total.items()}
+        reason = Reason(message.reason_code)
+        if message.mode != Mode.STOPPED and reason.is_stale_source:
+            total[reason.label] += (then - at) / 1e9
+    return {name: round(seconds, 2) for name, seconds in total.items()}
 
 
 def jump(tree: TransformBuffer, pages: list[tuple[int, Any]], at_ns: int, before: Any, after: Any) -> dict[str, Any]:
@@ -102,7 +104,7 @@ def jump(tree: TransformBuffer, pages: list[tuple[int, Any]], at_ns: int, before
         except TransformError:
             pass
     return {
-        "to": NAMES[after.mode],
+        "to": Mode(after.mode).label,
         "position_error_m": round(error_m, 4) if math.isfinite(error_m) else None,
         "yaw_error_deg": round(abs(math.degrees(before.yaw_gap_rad)), 3),
     }

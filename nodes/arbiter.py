@@ -186,7 +186,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
     def publish_decision(self, decision: Decision, inputs: ArbiterInputs, now_ns: int) -> None:
         self.state.publish(control_state(decision, inputs, now_ns))
         if decision.changed:
-            self.log.info("%s: %s", decision.mode.name.lower(), decision.reason)
+            self.log.info("%s: %s", decision.mode.label, decision.reason)
         level = WARN if decision.mode == Mode.STOPPED or decision.blocked else OK
         names = {"mode": decision.mode.name, "reason": decision.reason_code.name}
         self.diagnose("control", level, decision.reason, **names)

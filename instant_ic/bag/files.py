@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -19,6 +19,7 @@ from instant_ic.bag.bounded import guard_rosbags
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import REPEATED, preset_of, schema_of, schema_or_unknown, store_of
+from instant_ic.bag.upgrade import upgrade_of
 from instant_ic.bus.qos import QoS
 from instant_ic.msg import deserialize
 
@@ -227,6 +228,29 @@ class BagReader:
         except Exception as error:  # noqa: BLE001 - a parser or decompressor may raise anything on damaged bytes
             raise BagError(f"bag {self.path} is damaged: {error}; try ic bag recover {self.path}") from None
 
+    def current_messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
+        """As :meth:`messages`, with messages of an older definition converted to the present one (``upgrade.py``).
+
+        Raises:
+            BagError: a file is damaged.
+        """
+        upgrades = {(topic.topic, topic.type_name): upgrade_of(topic.schema) for topic in self.topics}
+        for message in self.messages(topics, start_ns, stop_ns):
+            upgrade = upgrades.get((message.topic, message.type_name))
+            if upgrade is None:
+                yield message
+                continue
+            try:
+                payload = upgrade(message.payload)
+            except Exception as error:  # noqa: BLE001 - generated code may raise anything on damaged bytes
+                raise BagError(f"bag {self.path}, topic {message.topic}: a message is damaged: {error}") from None
+            yield replace(message, payload=payload)
+
     def decoder(self, topic: TopicSummary) -> Callable[[bytes], Any]:
         """Return a function that decodes a topic's bytes: by our type, or by the bag's definition where that differs.
 
@@ -242,11 +266,12 @@ class BagReader:
         return lambda payload: store.deserialize_cdr(payload, topic.type_name)
 
     def differing_types(self) -> list[str]:
-        """Types whose definition in the bag differs from ours: their messages do not fit our nodes."""
+        """Types whose definition in the bag differs from ours and cannot be converted: they do not fit our nodes."""
         found = set()
         for topic in self.topics:
             own = schema_or_unknown(topic.type_name)
-            if own.encoding and topic.schema.type_hash and topic.schema.type_hash != own.type_hash:
+            differs = own.encoding and topic.schema.type_hash and topic.schema.type_hash != own.type_hash
+            if differs and upgrade_of(topic.schema) is None:
                 found.add(topic.type_name)
         return sorted(found)
 

@@ -13,6 +13,7 @@ from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
+from instant_ic.bag.upgrade import upgrade_of
 
 NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics", "/parameter_events")
 """The time itself, and what nodes report about themselves: the running nodes publish their own."""
@@ -117,7 +118,7 @@ class BagPlayer:
         own = schema_or_unknown(topic.type_name)
         if not own.encoding and topic.schema.encoding != "ros2msg":
             return "its type is unknown, and the bag has no definition of it"
-        if own.encoding and topic.schema.type_hash not in ("", own.type_hash):
+        if own.encoding and topic.schema.type_hash not in ("", own.type_hash) and upgrade_of(topic.schema) is None:
             return "the bag defines its type differently"
         return ""
 
@@ -263,7 +264,7 @@ class BagPlayer:
         return self._seek_ns is None
 
     def _messages(self, topics: set[str], start_ns: int | None, stop_ns: int) -> Iterator[BagMessage]:
-        messages = self._reader.messages(topics, start_ns, stop_ns)
+        messages = self._reader.current_messages(topics, start_ns, stop_ns)
         return (message for message in messages if message.type_name == self._types[message.topic])
 
     def _anchor(self, stamp_ns: int) -> None:

@@ -172,7 +172,7 @@ def replay(
                 _check_types(reader, bus)
                 span_ns = max(1, reader.end_ns - reader.start_ns)
                 result.bag_s, result.setup_s = span_ns / 1e9, time.monotonic() - began_s
-                messages = stack.enter_context(ReadAhead(reader.messages(), threading.Event()))
+                messages = stack.enter_context(ReadAhead(reader.current_messages(), threading.Event()))
                 for message in messages:
                     made_topics = {p.topic for node in running for p in node.publishers}
                     payload = _what_to_feed(message, made_topics, made_frames)

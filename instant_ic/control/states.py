@@ -19,6 +19,11 @@ class Mode(IntEnum):
     RETURNING = 4
 
     @property
+    def label(self) -> str:
+        """Name on the operator's page, in reports and in figures."""
+        return self.name.lower()
+
+    @property
     def shows_vbot(self) -> bool:
         """Whether the operator sees the virtual space."""
         return self in (Mode.VIRTUAL, Mode.RETURNING)
@@ -80,6 +85,11 @@ class Reason(IntEnum):
     VBOT_STALE = 77
     NAV_STALE = 78
     OPERATOR_LOST = 79
+
+    @property
+    def label(self) -> str:
+        """Name in reports."""
+        return self.name.lower().replace("_", " ")
 
     @property
     def holds(self) -> bool:

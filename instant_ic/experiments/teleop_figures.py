@@ -242,12 +242,10 @@ def judge(drive: Drive, log: Log, centres: FloatArray) -> None:
     drive.flicker = count_flicker(drive.switches)
     modes = np.array(log.mode)
     drive.transitions = int((np.diff(modes) != 0).sum())
-    drive.mode_seconds = {mode.name.lower(): round(float((modes == mode).sum()) * STEP_S, 2) for mode in Mode}
+    drive.mode_seconds = {mode.label: round(float((modes == mode).sum()) * STEP_S, 2) for mode in Mode}
     robot, vbot = np.array(log.robot), np.array(log.vbot)
     disobeyed = obeys(log) == 0.0
-    drive.disobeyed_seconds = {
-        mode.name.lower(): round(float(disobeyed[modes == mode].sum()) * STEP_S, 2) for mode in Mode
-    }
+    drive.disobeyed_seconds = {mode.label: round(float(disobeyed[modes == mode].sum()) * STEP_S, 2) for mode in Mode}
     drive.driven_m = float(np.linalg.norm(np.diff(robot[:, :2], axis=0), axis=1).sum())
     virtual = np.array(log.virtual)
     if virtual.any():

@@ -75,7 +75,26 @@ def empty_state():
     pose = pose_message(matrix_from_pose2(np.zeros(3)))
     still = twist_message()
     return ControlState(
-        header("map", 0), 0, "", False, False, 0, pose, pose, pose, still, still, 0.0, 0.0, 0.0, 0, 0, pose, still, 0.5
+        header("map", 0),
+        0,
+        "",
+        False,
+        False,
+        0,
+        pose,
+        pose,
+        pose,
+        still,
+        still,
+        0.0,
+        0.0,
+        0.0,
+        0,
+        0,
+        pose,
+        still,
+        0.5,
+        0,
     )
 
 

@@ -97,6 +97,7 @@ def control(bus, mode, **values):
         "vbot_target": pose,
         "robot_twist": twist_message(),
         "vbot_limit_m_s": 0.5,
+        "reason_code": 0,
     }
     return ControlState(**(fields | values))
 

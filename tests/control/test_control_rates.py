@@ -10,7 +10,7 @@ from rate_world import FORWARD, NOTHING, Rates, RateWorld
 from instant_ic import pace
 from instant_ic.control.freshness import TimeoutConfig
 from instant_ic.control.kinematics import MotionLimits
-from instant_ic.msg import twist_values
+from instant_ic.msg import ControlState, twist_values
 
 BOX = (2.2, -0.25, 2.7, 0.25)
 THROUGH = ["STOPPED", "REAL", "ENTERING", "VIRTUAL", "RETURNING", "REAL"]
@@ -99,7 +99,7 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     began_s, began_x = made.time_s, made.base.pose[0]
     assert made.run(2.0, lambda: twist_values(made.state.applied_command) == NOTHING)
     assert made.time_s - began_s <= 1.0 / camera_hz + 0.3 + 0.06
-    assert "no camera image" in made.state.reason
+    assert made.state.reason_code == ControlState.REASON_CAMERA_STALE
     assert made.run(3.0, lambda: made.modes[-1] == "STOPPED")
     # What is driven on one image, and then the base's latency and its braking.
     travel_m, speed = TimeoutConfig().image_travel_m, FORWARD[0]
@@ -122,7 +122,7 @@ def test_lost_views_stop_both_robots_in_the_virtual_space_at_one_view_per_second
     began_s = made.time_s
     assert made.run(3.0, lambda: twist_values(made.state.applied_command) == NOTHING)
     assert made.time_s - began_s <= 1.0 + 0.3 + 0.06
-    assert "no view of the virtual space" in made.state.reason
+    assert made.state.reason_code == ControlState.REASON_VIEW_STALE
     assert made.run(3.0, lambda: made.modes[-1] == "STOPPED")
 
 
@@ -148,7 +148,7 @@ def test_a_scan_that_comes_before_its_transform_holds_by_its_age_and_does_not_st
     made.silent.clear()
     made.run(0.5)
     assert made.modes[-1] == "REAL"
-    assert made.state.reason == "you drive the robot"
+    assert made.state.reason_code == ControlState.REASON_DRIVE_ROBOT
     # Without any transform the last scan that could be placed grows old as a silent LiDAR does.
     made.silent.add("tf")
     assert made.run(1.0, lambda: twist_values(made.state.applied_command) == NOTHING)

@@ -82,7 +82,7 @@ class Rig:
         self.command = (0.0, 0.0)
         for _ in range(round(10.0 / STEP_S)):
             self.step()
-            if self.stack.state.mode == ControlState.REAL and "you drive" in self.stack.state.reason:
+            if self.stack.state.reason_code == ControlState.REASON_DRIVE_ROBOT:
                 break
         else:
             raise AssertionError(f"cannot be driven: {self.stack.state.reason}")

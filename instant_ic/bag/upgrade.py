@@ -1,0 +1,55 @@
+"""Messages recorded with an older definition of a type, as messages of the present one."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from instant_ic.bag.mcap_writer import Schema
+from instant_ic.bag.metadata import schema_or_unknown, store_of
+from instant_ic.msg import message_type, serialize, typestore
+
+_DEFAULTS = {"bool": False, "string": "", **dict.fromkeys(("float32", "float64"), 0.0)}
+_INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+
+
+@functools.lru_cache(maxsize=200)
+def upgrade_of(schema: Schema) -> Callable[[bytes], bytes] | None:
+    """Function that converts a payload of ``schema`` to the present definition of its type; None where none can.
+
+    A type may have grown by fields of plain numbers, booleans and strings at its end; they get 0, False or "".
+    Any other difference could change the meaning of a field.
+    """
+    own = schema_or_unknown(schema.name)
+    if not own.encoding or schema.encoding != "ros2msg" or schema.type_hash in ("", own.type_hash):
+        return None
+    try:
+        store = store_of(schema)
+        before, now = (list(types.get_msgdef(schema.name).fields) for types in (store, typestore()))
+    except Exception:  # noqa: BLE001 - a parser may raise anything on a damaged definition
+        return None
+    added = {name: _default(kind) for name, kind in now[len(before) :]}
+    nested = (name for name in store.fielddefs if name != schema.name)
+    unchanged = before == now[: len(before)] and all(_same(store, name) for name in nested)
+    if not unchanged or None in added.values():
+        return None
+    message_class = message_type(schema.name)
+
+    def upgrade(payload: bytes) -> bytes:
+        message = store.deserialize_cdr(payload, schema.name)
+        kept = {name: getattr(message, name) for name, _ in before}
+        return bytes(serialize(message_class(**kept, **added)))
+
+    return upgrade
+
+
+def _default(kind: Any) -> bool | float | str | None:
+    """Value of an added field; None where the type has no plain default."""
+    name = kind[1][0] if isinstance(kind[1], tuple) else None
+    return 0 if name in _INTEGERS else _DEFAULTS.get(str(name))
+
+
+def _same(store: Any, name: str) -> bool:
+    known = typestore().fielddefs
+    return name in known and bool(known[name][1] == store.fielddefs[name][1])
