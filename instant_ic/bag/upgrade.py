@@ -10,7 +10,7 @@ from instant_ic.bag.mcap_writer import Schema
 from instant_ic.bag.metadata import schema_or_unknown, store_of
 from instant_ic.msg import message_type, serialize, typestore
 
-_DEFAULTS = {"bool": False, "string": "", **dict.fromkeys(("float32", "float64"), 0.0)}
+_DEFAULTS: dict[str, bool | float | str] = {"bool": False, "string": "", **dict.fromkeys(("float32", "float64"), 0.0)}
 _INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 
 

@@ -31,7 +31,7 @@ class TwistLimiter:
             raise ValueError(f"twist must be finite (got v={v}, w={w})")
         if dt_s < 0.0:
             raise ValueError(f"dt_s must be >= 0 (got {dt_s})")
-        v, w = clamp_twist(v, w, self.config)
+        v, w = self.config.clip(v, w)
         self.v = _towards(self.v, v, self.config.max_linear_accel_m_s2 * dt_s)
         self.w = _towards(self.w, w, self.config.max_angular_accel_rad_s2 * dt_s)
         return self.v, self.w
@@ -46,16 +46,6 @@ class TwistLimiter:
         """Restart from a twist, for example after an emergency stop."""
         self.v = v
         self.w = w
-
-
-def clamp_twist(v: float, w: float, config: LimitsConfig) -> tuple[float, float]:
-    """Scale both parts of the twist by one factor to bring it within the speed limits."""
-    scale = 1.0
-    if abs(v) > config.max_linear_m_s:
-        scale = config.max_linear_m_s / abs(v)
-    if abs(w) * scale > config.max_angular_rad_s:
-        scale = config.max_angular_rad_s / abs(w)
-    return v * scale, w * scale
 
 
 def _towards(value: float, target: float, step: float) -> float:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.geometry.twists import clip_twist
 
 Metres = Annotated[float, Range(-100, 100)]
 Degrees = Annotated[float, Range(-360, 360)]
@@ -50,6 +51,10 @@ class MotionLimits:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+
+    def clip(self, linear: float, angular: float) -> tuple[float, float]:
+        """The twist within the speed limits, with the same curvature; zero if it is not finite."""
+        return clip_twist(linear, angular, self.max_linear_m_s, self.max_angular_rad_s)
 
 
 @dataclass(frozen=True)

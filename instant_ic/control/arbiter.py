@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.commands import CommandRules
 from instant_ic.control.guards import GUARD_FUNCTIONS, against_switch, estop_pressed, hold, images_agree, stop_notice
-from instant_ic.control.kinematics import clip_twist
 from instant_ic.control.passage import find_passage
 from instant_ic.control.planner import HybridPlanner
 from instant_ic.control.prediction import Prediction, Predictor
@@ -184,7 +183,7 @@ class Arbiter:
         """Snapshot of this step; keeps the instants from which its durations count."""
         in_mode_s = self._since_s(self._since_ns, now_ns, 0.0)
         fresh = self._sources.command_is_fresh(inputs)
-        command = clip_twist(*inputs.operator_command, self.config.limits) if fresh else NO_MOTION
+        command = self.config.limits.clip(*inputs.operator_command) if fresh else NO_MOTION
         if command != NO_MOTION:
             self._driven = (command, now_ns)
         last_command, driven_ns = self._driven or (NO_MOTION, self._since_ns)

@@ -9,7 +9,6 @@ import numpy as np
 
 from instant_ic.control.arbiter_config import ArbiterConfig
 from instant_ic.control.guards import hold
-from instant_ic.control.kinematics import clip_twist
 from instant_ic.control.reasons import Notice, stale_notice
 from instant_ic.control.safety import CollisionMonitor, MonitoredCommand
 from instant_ic.control.snapshot import NO_MOTION, ArbiterInputs, Snapshot, Twist2
@@ -59,7 +58,7 @@ class CommandRules:
         if s.subgoal is None:
             text += "; no free place for the robot near it"
             return DriveCommand(NO_MOTION, Notice(Reason.NO_SUBGOAL, text), hard=hard)
-        wanted = clip_twist(*s.inputs.nav_command, self.config.limits)
+        wanted = self.config.limits.clip(*s.inputs.nav_command)
         if s.inputs.age("nav") > self.config.timeouts.nav:
             wanted = NO_MOTION  # at first: the follower has not sent a command yet
         sent = self.monitored(self._paced(wanted, s), s.inputs)

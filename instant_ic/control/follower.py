@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, clip_twist, move
+from instant_ic.control.kinematics import MotionLimits, move
 from instant_ic.control.planner import Plan
 from instant_ic.geometry.poses import relative2, wrap_angle
 
@@ -165,7 +165,7 @@ class PathFollower:
         linear, angular = goal_velocity
         v = linear * math.cos(turn) + c.track_gain_x * ahead
         w = angular + linear * (c.track_gain_y * left + c.track_gain_yaw * math.sin(turn))
-        return clip_twist(self._cap(v), w, self.limits)
+        return self.limits.clip(self._cap(v), w)
 
     def _pursue(
         self, pose: NDArray[np.float64], speed_m_s: float, plan: Plan, costmap: Costmap | None
@@ -198,7 +198,7 @@ class PathFollower:
         radius = 1.0 / abs(curvature) if curvature != 0.0 else math.inf
         v *= min(1.0, radius / c.regulated_linear_scaling_min_radius)
         v = sign * max(v, c.regulated_linear_scaling_min_speed)
-        return FollowerCommand(clip_twist(v, v * curvature, self.limits), "reverse" if back else "pursue")
+        return FollowerCommand(self.limits.clip(v, v * curvature), "reverse" if back else "pursue")
 
     def _rotate(self, pose: NDArray[np.float64], bearing: float, costmap: Costmap | None) -> FollowerCommand:
         """Turn on the spot; the other way round if the shorter turn is blocked."""

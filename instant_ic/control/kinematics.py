@@ -11,15 +11,6 @@ from instant_ic.config.robot import MotionLimits
 from instant_ic.geometry.poses import wrap_angle
 
 
-def clip_twist(linear: float, angular: float, limits: MotionLimits) -> tuple[float, float]:
-    """Clip a twist to the speed limits; curvature is kept where the linear speed is cut.
-
-    A command that is not finite gives zero.
-    """
-    if not (math.isfinite(linear) and math.isfinite(angular)):
-        return 0.0, 0.0
-    excess = max(abs(linear) / limits.max_linear_m_s, abs(angular) / limits.max_angular_rad_s, 1.0)
-    return linear / excess, angular / excess
 
 
 def _towards(value: float, target: float, step: float) -> float:

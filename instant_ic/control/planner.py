@@ -11,7 +11,7 @@ import heapq
 import itertools
 import math
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -198,6 +198,65 @@ class HybridPlanner:
         return keep
 
 
+class _Map(NamedTuple):
+    """What the kernels know of a costmap. Positions are in cells (x along the columns), headings in bins."""
+
+    costs: NDArray[np.uint8]
+    weights: NDArray[np.float32]
+    """(H, W) cost of one cell length; 0 where the robot's centre may not go."""
+    clearance: NDArray[np.float32]
+    """(H, W) distance to the nearest lethal cell."""
+    body: NDArray[np.float64]
+    """(M, 2) points of the footprint, farthest first."""
+    bodies: NDArray[np.float64]
+    """(bins, M, 2) the same at each heading."""
+    reach: float
+    """Nothing can touch where the clearance is larger."""
+
+
+class _Pose(NamedTuple):
+    x: float
+    y: float
+    yaw: float
+
+
+class _Rules(NamedTuple):
+    """``PlannerConfig`` in cells."""
+
+    may_reverse: bool
+    reverse_penalty: float
+    change_penalty: float
+    curve_penalty: float
+    turn_price: float
+    """Price of one radian."""
+    escape: float
+    max_iterations: int
+
+
+class _Nodes(NamedTuple):
+    """Poses that the search has reached, (N,) each."""
+
+    place: NDArray[np.float64]
+    """(N, 2)"""
+    heading: NDArray[np.int32]
+    parent: NDArray[np.int32]
+    """-1 for the start."""
+    drive: NDArray[np.int8]
+    """How it was reached: FORWARD, BACKWARD or TURN."""
+    price: NDArray[np.float32]
+    overlap: NDArray[np.int32]
+    """Points of the body on lethal cells."""
+
+
+FORWARD, BACKWARD, TURN = 0, 1, 2
+ROOM = 4096
+"""Nodes for which the search reserves memory at first."""
+TURNS = np.array([0, 1, -1, 2, -2, 1, -1, 0, 1, -1])
+"""Change of heading of each primitive, in bins."""
+LENGTHS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, -1.0]) * STEP_CELLS
+"""Signed length of each primitive; 0 turns on the spot. The last three need ``may_reverse``."""
+
+
 class _Grid:
     """One costmap prepared for the search: cell weights, distance to obstacles, the footprint at each heading."""
 
@@ -233,11 +292,11 @@ class _Grid:
         body = body[np.argsort(-(body**2).sum(axis=1), kind="stable")]
         yaw = 2.0 * math.pi * np.arange(self.bins) / self.bins
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-        self.body = np.ascontiguousarray(body)
-        self.bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
+        bodies = np.stack([c * body[:, 0] - s * body[:, 1], s * body[:, 0] + c * body[:, 1]], axis=-1)
         # A pose may lie anywhere in its cell: nothing can touch from 0.71 cells farther on.
         reach = planner.footprint.circumscribed_radius_m + 1.5 * config.footprint_padding
-        self.reach = reach / costmap.resolution + 1.42
+        reach = reach / costmap.resolution + 1.42
+        self.map = _Map(costmap.costs, self.weights, self.clearance, np.ascontiguousarray(body), bodies, reach)
 
     def connected(self, row: int, column: int) -> NDArray[np.bool_]:
         """Mask (H, W) of the cells that the robot's centre can reach from one."""
@@ -284,21 +343,7 @@ class _Grid:
     ) -> tuple[NDArray[np.float64], bool, int]:
         """Poses (N, 4) in cells and radians, the fourth 1 where reached backwards; found; number of poses expanded."""
         config, resolution = self.config, self.costmap.resolution
-        origin = self.costmap.origin
-        return _search(
-            self.costmap.costs,
-            self.weights,
-            self.clearance,
-            to_go,
-            self.bodies,
-            self.body,
-            self.reach,
-            (start[0] - origin[0]) / resolution,
-            (start[1] - origin[1]) / resolution,
-            start[2],
-            (goal[0] - origin[0]) / resolution,
-            (goal[1] - origin[1]) / resolution,
-            goal[2],
+        rules = _Rules(
             config.allow_reverse_expansion,
             config.reverse_penalty,
             config.change_penalty / resolution,
@@ -307,10 +352,15 @@ class _Grid:
             config.escape_radius_m / resolution,
             config.max_iterations,
         )
+        return _search(self.map, to_go, self._in_cells(start), self._in_cells(goal), rules)
+
+    def _in_cells(self, pose: NDArray[np.float64]) -> _Pose:
+        x, y = (pose[:2] - self.costmap.origin) / self.costmap.resolution
+        return _Pose(float(x), float(y), float(pose[2]))
 
     def smooth(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Replace runs of poses by straight pieces where these cost no more; metres in the map frame."""
-        kept = _smooth(self.costmap.costs, self.weights, self.clearance, self.body, self.reach, nodes)
+        kept = _smooth(self.map, nodes)
         kept[:, :2] = kept[:, :2] * self.costmap.resolution + self.costmap.origin
         return kept
 
@@ -460,64 +510,43 @@ def _turned(body: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _line_cost(
-    costs: NDArray[np.uint8],
-    weights: NDArray[np.float32],
-    clearance: NDArray[np.float32],
-    body: NDArray[np.float64],
-    reach: float,
-    ax: float,
-    ay: float,
-    bx: float,
-    by: float,
-    yaw: float,
-    dearest: float,
-) -> float:
+def _line_cost(grid: _Map, ax: float, ay: float, bx: float, by: float, yaw: float, dearest: float) -> float:
     """Cost in cells of a straight way at a heading.
 
     Inf where the footprint meets something, or a cell is dearer than ``dearest``.
     """
-    height, width = costs.shape
+    height, width = grid.costs.shape
     length = math.hypot(bx - ax, by - ay)
     count = max(1, math.ceil(length))
-    turned = body
+    turned = grid.body
     is_turned = False
     total = 0.0
     for k in range(count + 1):
         x, y = ax + (bx - ax) * k / count, ay + (by - ay) * k / count
         c, r = math.floor(x), math.floor(y)
-        if c < 0 or r < 0 or c >= width or r >= height or weights[r, c] == 0.0:
+        if c < 0 or r < 0 or c >= width or r >= height or grid.weights[r, c] == 0.0:
             return np.inf
-        if weights[r, c] > dearest:
+        if grid.weights[r, c] > dearest:
             return np.inf
-        if clearance[r, c] <= reach:
+        if grid.clearance[r, c] <= grid.reach:
             if not is_turned:
-                turned = _turned(body, yaw)
+                turned = _turned(grid.body, yaw)
                 is_turned = True
-            if _overlap(costs, clearance, x, y, turned) > 0:
+            if _overlap(grid.costs, grid.clearance, x, y, turned) > 0:
                 return np.inf
         if k > 0:
-            total += weights[r, c] * length / count
+            total += grid.weights[r, c] * length / count
     return total
 
 
 @njit(cache=True)
-def _turn_is_free(
-    costs: NDArray[np.uint8],
-    clearance: NDArray[np.float32],
-    body: NDArray[np.float64],
-    reach: float,
-    x: float,
-    y: float,
-    yaw: float,
-    turn: float,
-) -> bool:
+def _turn_is_free(grid: _Map, x: float, y: float, yaw: float, turn: float) -> bool:
     """Whether the footprint can turn on the spot from ``yaw`` by ``turn`` without contact."""
-    if clearance[math.floor(y), math.floor(x)] > reach:
+    if grid.clearance[math.floor(y), math.floor(x)] > grid.reach:
         return True
     count = max(1, math.ceil(abs(turn) / 0.15))
-    for k in range(count + 1):  # noqa: SIM110 (numba knows no generators in all())
-        if _overlap(costs, clearance, x, y, _turned(body, yaw + turn * k / count)) > 0:
+    for k in range(count + 1):
+        if _overlap(grid.costs, grid.clearance, x, y, _turned(grid.body, yaw + turn * k / count)) > 0:
             return False
     return True
 
@@ -528,177 +557,221 @@ def _wrapped(angle: float) -> float:
 
 
 @njit(cache=True)
+def _new_nodes(room: int) -> _Nodes:
+    return _Nodes(
+        np.empty((room, 2)),
+        np.empty(room, dtype=np.int32),
+        np.empty(room, dtype=np.int32),
+        np.empty(room, dtype=np.int8),
+        np.empty(room, dtype=np.float32),
+        np.zeros(room, dtype=np.int32),
+    )
+
+
+@njit(cache=True)
+def _doubled(nodes: _Nodes) -> _Nodes:
+    """The same nodes with twice the room."""
+    room = len(nodes.price)
+    more = _new_nodes(2 * room)
+    more.place[:room], more.heading[:room], more.parent[:room] = nodes.place, nodes.heading, nodes.parent
+    more.drive[:room], more.price[:room], more.overlap[:room] = nodes.drive, nodes.price, nodes.overlap
+    return more
+
+
+@njit(cache=True)
+def _set_node(
+    nodes: _Nodes, node: int, x: float, y: float, heading: int, parent: int, drive: int, price: float, overlap: int
+) -> None:
+    nodes.place[node, 0], nodes.place[node, 1] = x, y
+    nodes.heading[node], nodes.parent[node], nodes.drive[node] = heading, parent, drive
+    nodes.price[node], nodes.overlap[node] = price, overlap
+
+
+@njit(cache=True)
 def _search(
-    costs: NDArray[np.uint8],
-    weights: NDArray[np.float32],
-    clearance: NDArray[np.float32],
-    to_go: NDArray[np.float32],
-    bodies: NDArray[np.float64],
-    body: NDArray[np.float64],
-    reach: float,
-    start_x: float,
-    start_y: float,
-    start_yaw: float,
-    goal_x: float,
-    goal_y: float,
-    goal_yaw: float,
-    may_reverse: bool,
-    reverse_penalty: float,
-    change_penalty: float,
-    curve_penalty: float,
-    turn_price: float,
-    escape: float,
-    most: int,
+    grid: _Map, to_go: NDArray[np.float32], start: _Pose, goal: _Pose, rules: _Rules
 ) -> tuple[NDArray[np.float64], bool, int]:
     """Hybrid A*. Headings stay on the bins, positions are continuous; one pose is kept per cell and heading."""
-    height, width = costs.shape
-    bins = bodies.shape[0]
+    height, width = grid.costs.shape
+    bins = grid.bodies.shape[0]
     per_bin = 2.0 * math.pi / bins
-    # Signed change of heading (bins) and signed length of each primitive; a length of 0 turns on the spot.
-    turns = np.array([0, 1, -1, 2, -2, 1, -1, 0, 1, -1])
-    lengths = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, -1.0, -1.0, -1.0]) * STEP_CELLS
-    kinds = len(turns) if may_reverse else 7
+    first = math.floor(start.yaw / per_bin + 0.5) % bins
+    start_row, start_column = math.floor(start.y), math.floor(start.x)
     best = np.full(bins * height * width, np.inf, dtype=np.float32)
-    room = 4096
-    place = np.empty((room, 2))
-    heading = np.empty(room, dtype=np.int32)
-    parent = np.empty(room, dtype=np.int32)
-    back = np.empty(room, dtype=np.int8)  # 0 forward, 1 backward, 2 turned on the spot
-    price = np.empty(room, dtype=np.float32)
-    overlap = np.zeros(room, dtype=np.int32)
-    first = math.floor(start_yaw / per_bin + 0.5) % bins
-    place[0, 0], place[0, 1] = start_x, start_y
-    heading[0], parent[0], back[0], price[0] = first, -1, 2, 0.0
-    overlap[0] = _overlap(costs, clearance, start_x, start_y, bodies[first])
-    count, opened = 1, 0
-    start_row, start_column = math.floor(start_y), math.floor(start_x)
+    closed = np.zeros(bins * height * width, dtype=np.bool_)
     best[(first * height + start_row) * width + start_column] = 0.0
+    nodes = _new_nodes(ROOM)
+    overlap = _overlap(grid.costs, grid.clearance, start.x, start.y, grid.bodies[first])
+    _set_node(nodes, 0, start.x, start.y, first, -1, TURN, 0.0, overlap)
+    count, opened = 1, 0
     queue = [(HURRY * float(to_go[start_row, start_column]), 0)]
     # The goal is one more node, reached from any node by a turn, a straight line and a turn.
     goal_price, goal_parent, goal_backwards = np.inf, -1, 0
     nearest, nearest_to_go = 0, np.float32(np.inf)
-    closed = np.zeros(bins * height * width, dtype=np.bool_)
-    while len(queue) > 0 and opened < most:
+    while len(queue) > 0 and opened < rules.max_iterations:
         f, node = heapq.heappop(queue)
         if f >= goal_price:
             break
-        x, y, b = place[node, 0], place[node, 1], heading[node]
+        x, y, heading = nodes.place[node, 0], nodes.place[node, 1], nodes.heading[node]
         row, column = math.floor(y), math.floor(x)
-        state = (b * height + row) * width + column
+        state = (heading * height + row) * width + column
         if closed[state]:
             continue
         closed[state] = True
         opened += 1
         left = to_go[row, column]
-        if left < nearest_to_go and (costs[row, column] != 255):
+        if left < nearest_to_go and (grid.costs[row, column] != 255):
             nearest, nearest_to_go = node, left
-        # Try the straight way to the goal, forwards or (from near) backwards: always from near, sometimes from far.
-        away = math.hypot(goal_x - x, goal_y - y)
-        if overlap[node] == 0 and (away < 20.0 or opened % max(1, int(away / 12.0)) == 0):
-            for backwards in range(2 if may_reverse and 0.2 < away < 20.0 else 1):
-                yaw = math.atan2(goal_y - y, goal_x - x) + backwards * math.pi if away > 0.2 else b * per_bin
-                turn = _wrapped(yaw - b * per_bin)
-                end_turn = 0.0 if np.isnan(goal_yaw) else _wrapped(goal_yaw - yaw)
-                total = price[node] + turn_price * (abs(turn) + abs(end_turn))
-                if backwards and back[node] == 0 and abs(turn) < 0.1:
-                    total += change_penalty
-                share = reverse_penalty if backwards else 1.0
-                if total + share * away >= goal_price:
-                    continue
-                if not _turn_is_free(costs, clearance, body, reach, x, y, b * per_bin, turn):
-                    continue
-                line = _line_cost(costs, weights, clearance, body, reach, x, y, goal_x, goal_y, yaw, np.inf)
-                total += share * line
-                # The point robot's way gives no bound at a place beside a better line.
-                if total < goal_price and line <= 1.05 * left + 3.0:
+        # Try the straight way to the goal: always from near, sometimes from far.
+        away = math.hypot(goal.x - x, goal.y - y)
+        if nodes.overlap[node] == 0 and (away < 20.0 or opened % max(1, int(away / 12.0)) == 0):
+            for backwards in range(2 if rules.may_reverse and 0.2 < away < 20.0 else 1):
+                total = _price_to_goal(grid, nodes, node, goal, rules, backwards, left, goal_price)
+                if total < goal_price:
                     goal_price, goal_parent, goal_backwards = total, node, backwards
-        for k in range(kinds):
-            length = lengths[k]
-            other = (b + turns[k]) % bins
-            if length == 0.0:
-                new_x, new_y = x, y
-            else:
-                middle = (b + 0.5 * turns[k]) * per_bin
-                half = 0.5 * turns[k] * per_bin
-                chord = length * (math.sin(half) / half if turns[k] != 0 else 1.0)
-                new_x, new_y = x + chord * math.cos(middle), y + chord * math.sin(middle)
+        for k in range(len(TURNS) if rules.may_reverse else 7):
+            new_x, new_y = _moved(x, y, heading, k, per_bin)
             c, r = math.floor(new_x), math.floor(new_y)
-            if c < 0 or r < 0 or c >= width or r >= height:
+            if c < 0 or r < 0 or c >= width or r >= height or not np.isfinite(to_go[r, c]):
                 continue
-            left = to_go[r, c]
-            if not np.isfinite(left):
-                continue
+            other = (heading + TURNS[k]) % bins
             key = (other * height + r) * width + c
             if closed[key]:
                 continue
-            weight = weights[r, c]
+            weight = grid.weights[r, c]
             if weight == 0.0:
-                if overlap[node] == 0 and costs[row, column] < 253:
+                if nodes.overlap[node] == 0 and grid.costs[row, column] < 253:
                     continue  # out of closed cells, never into them
                 weight = DEAR
-            direction = 2 if length == 0.0 else (1 if length < 0.0 else 0)
-            if length == 0.0:
-                step = turn_price * per_bin * weight
-            else:
-                step = abs(length) * weight * (curve_penalty if turns[k] != 0 else 1.0)
-                if direction == 1:
-                    step *= reverse_penalty
-                if back[node] != 2 and back[node] != direction:
-                    step += change_penalty
-            new = price[node] + step
+            new = nodes.price[node] + _step_price(k, weight, nodes.drive[node], per_bin, rules)
             if new >= best[key] - 1e-4:
                 continue
             touching = 0
-            if clearance[r, c] <= reach:
-                touching = _overlap(costs, clearance, new_x, new_y, bodies[other])
-                if touching > 0:
-                    # Only for a robot that already stands on an obstacle, and only to leave it.
-                    near = math.hypot(new_x - start_x, new_y - start_y) <= escape
-                    if overlap[node] == 0 or touching > overlap[node] or not near:
-                        continue
-                    new += 2.0 * touching / body.shape[0] * 100.0
-                elif length != 0.0 and overlap[node] == 0:
-                    # Check halfway too: a primitive is three cells long.
-                    turned = bodies[b] if turns[k] == 0 else _turned(body, (b + 0.5 * turns[k]) * per_bin)
-                    if _overlap(costs, clearance, 0.5 * (x + new_x), 0.5 * (y + new_y), turned) > 0:
-                        continue
+            if grid.clearance[r, c] <= grid.reach:
+                touching = _touching(grid, nodes, node, k, new_x, new_y, start, rules.escape)
+                if touching < 0:
+                    continue
+                new += 2.0 * touching / grid.body.shape[0] * 100.0
             best[key] = new
-            if count == room:
-                room *= 2
-                place = np.concatenate((place, np.empty_like(place)))
-                heading = np.concatenate((heading, np.empty_like(heading)))
-                parent = np.concatenate((parent, np.empty_like(parent)))
-                back = np.concatenate((back, np.empty_like(back)))
-                price = np.concatenate((price, np.empty_like(price)))
-                overlap = np.concatenate((overlap, np.zeros_like(overlap)))
-            place[count, 0], place[count, 1] = new_x, new_y
-            heading[count], parent[count], back[count] = other, node, direction
-            price[count], overlap[count] = new, touching
-            heapq.heappush(queue, (float(new + HURRY * left), count))
+            if count == len(nodes.price):
+                nodes = _doubled(nodes)
+            _set_node(nodes, count, new_x, new_y, other, node, _drive_of(k), new, touching)
+            heapq.heappush(queue, (float(new + HURRY * to_go[r, c]), count))
             count += 1
     found = goal_parent >= 0
-    walk = goal_parent if found else nearest
-    number, node = 0, walk
+    return _path_to(nodes, goal_parent if found else nearest, bins, start, goal, found, goal_backwards), found, opened
+
+
+@njit(cache=True)
+def _drive_of(k: int) -> int:
+    """Drive of primitive ``k``."""
+    if LENGTHS[k] == 0.0:
+        return TURN
+    return BACKWARD if LENGTHS[k] < 0.0 else FORWARD
+
+
+@njit(cache=True)
+def _moved(x: float, y: float, heading: int, k: int, per_bin: float) -> tuple[float, float]:
+    """End of primitive ``k`` from a place and a heading."""
+    length = LENGTHS[k]
+    if length == 0.0:
+        return x, y
+    middle = (heading + 0.5 * TURNS[k]) * per_bin
+    half = 0.5 * TURNS[k] * per_bin
+    chord = length * (math.sin(half) / half if TURNS[k] != 0 else 1.0)
+    return x + chord * math.cos(middle), y + chord * math.sin(middle)
+
+
+@njit(cache=True)
+def _step_price(k: int, weight: float, before: int, per_bin: float, rules: _Rules) -> float:
+    """Price of primitive ``k`` into a cell of ``weight``, from a node that was reached by the drive ``before``."""
+    drive = _drive_of(k)
+    if drive == TURN:
+        return rules.turn_price * per_bin * weight
+    price = abs(LENGTHS[k]) * weight * (rules.curve_penalty if TURNS[k] != 0 else 1.0)
+    if drive == BACKWARD:
+        price *= rules.reverse_penalty
+    if before != TURN and before != drive:
+        price += rules.change_penalty
+    return price
+
+
+@njit(cache=True)
+def _touching(grid: _Map, nodes: _Nodes, node: int, k: int, x: float, y: float, start: _Pose, escape: float) -> int:
+    """Points of the body on lethal cells at the end (x, y) of primitive ``k`` from ``node``; -1 where it may not go."""
+    bins = grid.bodies.shape[0]
+    heading, before = nodes.heading[node], nodes.overlap[node]
+    touching = _overlap(grid.costs, grid.clearance, x, y, grid.bodies[(heading + TURNS[k]) % bins])
+    if touching > 0:
+        # Only for a robot that already stands on an obstacle, and only to leave it.
+        near = math.hypot(x - start.x, y - start.y) <= escape
+        return -1 if before == 0 or touching > before or not near else touching
+    if LENGTHS[k] != 0.0 and before == 0:
+        # Check halfway too: a primitive is three cells long.
+        turned = grid.bodies[heading]
+        if TURNS[k] != 0:
+            turned = _turned(grid.body, (heading + 0.5 * TURNS[k]) * (2.0 * math.pi / bins))
+        if (
+            _overlap(
+                grid.costs, grid.clearance, 0.5 * (nodes.place[node, 0] + x), 0.5 * (nodes.place[node, 1] + y), turned
+            )
+            > 0
+        ):
+            return -1
+    return 0
+
+
+@njit(cache=True)
+def _price_to_goal(
+    grid: _Map, nodes: _Nodes, node: int, goal: _Pose, rules: _Rules, backwards: int, left: float, most: float
+) -> float:
+    """Price of the goal by a turn, a straight line and a turn from ``node``; inf where not free or not below ``most``.
+
+    ``left``: cost-to-go of the point robot.
+    """
+    x, y = nodes.place[node, 0], nodes.place[node, 1]
+    heading = nodes.heading[node] * (2.0 * math.pi / grid.bodies.shape[0])
+    away = math.hypot(goal.x - x, goal.y - y)
+    yaw = math.atan2(goal.y - y, goal.x - x) + backwards * math.pi if away > 0.2 else heading
+    turn = _wrapped(yaw - heading)
+    end_turn = 0.0 if np.isnan(goal.yaw) else _wrapped(goal.yaw - yaw)
+    total = nodes.price[node] + rules.turn_price * (abs(turn) + abs(end_turn))
+    if backwards and nodes.drive[node] == FORWARD and abs(turn) < 0.1:
+        total += rules.change_penalty
+    share = rules.reverse_penalty if backwards else 1.0
+    if total + share * away >= most or not _turn_is_free(grid, x, y, heading, turn):
+        return np.inf
+    line = _line_cost(grid, x, y, goal.x, goal.y, yaw, np.inf)
+    # The point robot's way gives no bound at a place beside a better line.
+    return total + share * line if line <= 1.05 * left + 3.0 else np.inf
+
+
+@njit(cache=True)
+def _path_to(
+    nodes: _Nodes, end: int, bins: int, start: _Pose, goal: _Pose, found: bool, goal_backwards: int
+) -> NDArray[np.float64]:
+    """Poses (N, 4) from the start to node ``end``, and on to the goal where it was found."""
+    number, node = 0, end
     while node >= 0:
         number += 1
-        node = int(parent[node])
+        node = int(nodes.parent[node])
     path = np.empty((number + (2 if found else 0), 4))
-    node, i = walk, number - 1
+    node, i = end, number - 1
     while node >= 0:
-        path[i, 0], path[i, 1] = place[node, 0], place[node, 1]
-        path[i, 2] = heading[node] * per_bin
-        path[i, 3] = 1.0 if back[node] == 1 else 0.0
-        node, i = int(parent[node]), i - 1
-    path[0, 2] = start_yaw
+        path[i, 0], path[i, 1] = nodes.place[node, 0], nodes.place[node, 1]
+        path[i, 2] = nodes.heading[node] * (2.0 * math.pi / bins)
+        path[i, 3] = 1.0 if nodes.drive[node] == BACKWARD else 0.0
+        node, i = int(nodes.parent[node]), i - 1
+    path[0, 2] = start.yaw
     if found:
-        x, y = place[walk, 0], place[walk, 1]
+        x, y = nodes.place[end, 0], nodes.place[end, 1]
         yaw = path[number - 1, 2]
-        if math.hypot(goal_x - x, goal_y - y) > 0.2:
-            yaw = math.atan2(goal_y - y, goal_x - x) + goal_backwards * math.pi
+        if math.hypot(goal.x - x, goal.y - y) > 0.2:
+            yaw = math.atan2(goal.y - y, goal.x - x) + goal_backwards * math.pi
         for k in range(2):
-            path[number + k, 0], path[number + k, 1] = (x, y) if k == 0 else (goal_x, goal_y)
+            path[number + k, 0], path[number + k, 1] = (x, y) if k == 0 else (goal.x, goal.y)
             path[number + k, 2], path[number + k, 3] = yaw, float(k * goal_backwards)
-    return path, found, opened
+    return path
 
 
 @njit(cache=True)
@@ -707,45 +780,35 @@ def _weight_at(weights: NDArray[np.float32], node: NDArray[np.float64]) -> float
 
 
 @njit(cache=True)
-def _smooth(
-    costs: NDArray[np.uint8],
-    weights: NDArray[np.float32],
-    clearance: NDArray[np.float32],
-    body: NDArray[np.float64],
-    reach: float,
-    nodes: NDArray[np.float64],
-) -> NDArray[np.float64]:
+def _smooth(grid: _Map, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Replace runs of forward nodes by straight lines that cost no more."""
     count = len(nodes)
     along = np.zeros(count)  # cost from the first node on
     for i in range(1, count):
         length = math.hypot(nodes[i, 0] - nodes[i - 1, 0], nodes[i, 1] - nodes[i - 1, 1])
-        along[i] = along[i - 1] + length * max(_weight_at(weights, nodes[i]), 1.0)
+        along[i] = along[i - 1] + length * max(_weight_at(grid.weights, nodes[i]), 1.0)
     kept = np.empty((2 * count, 4))
     kept[0] = nodes[0]
     number, i = 1, 0
     while i < count - 1:
         last = i + 1
-        dearest = max(_weight_at(weights, nodes[i]), _weight_at(weights, nodes[i + 1]))
+        dearest = max(_weight_at(grid.weights, nodes[i]), _weight_at(grid.weights, nodes[i + 1]))
         for j in range(i + 2, min(count, i + 80)):
             if nodes[j, 3] != 0.0 or nodes[i + 1, 3] != 0.0:
                 break
-            dearest = max(dearest, _weight_at(weights, nodes[j]))
+            dearest = max(dearest, _weight_at(grid.weights, nodes[j]))
             dx, dy = nodes[j, 0] - nodes[i, 0], nodes[j, 1] - nodes[i, 1]
             if math.hypot(dx, dy) < 1.0:
                 continue
             yaw = math.atan2(dy, dx)
-            line = _line_cost(
-                *(costs, weights, clearance, body, reach),
-                *(nodes[i, 0], nodes[i, 1], nodes[j, 0], nodes[j, 1], yaw, 1.05 * dearest),
-            )
+            line = _line_cost(grid, nodes[i, 0], nodes[i, 1], nodes[j, 0], nodes[j, 1], yaw, 1.05 * dearest)
             if line > 1.01 * (along[j] - along[i]) + 0.2:
                 continue
             before = kept[number - 1, 2]
             turn = _wrapped(yaw - before)
             end_turn = _wrapped(nodes[j, 2] - yaw) if j < count - 1 else 0.0
-            if _turn_is_free(costs, clearance, body, reach, nodes[i, 0], nodes[i, 1], before, turn) and _turn_is_free(
-                costs, clearance, body, reach, nodes[j, 0], nodes[j, 1], yaw, end_turn
+            if _turn_is_free(grid, nodes[i, 0], nodes[i, 1], before, turn) and _turn_is_free(
+                grid, nodes[j, 0], nodes[j, 1], yaw, end_turn
             ):
                 last = j
         if last > i + 1:

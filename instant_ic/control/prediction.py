@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from instant_ic.config.ranges import NotNegative, Positive, check_ranges
 from instant_ic.control.costmap import Costmap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
+from instant_ic.control.kinematics import MotionLimits, accelerate, move
 
 
 @dataclass(frozen=True)
@@ -100,9 +100,9 @@ class Predictor:
         costmap the way is free.
         """
         step = self.config.step_s
-        command = clip_twist(*command, self.limits)
+        command = self.limits.clip(*command)
         # Delayed encoder readings can give a speed that the base cannot drive: the horizon would be metres too long.
-        velocity = clip_twist(*velocity, self.limits)
+        velocity = self.limits.clip(*velocity)
         faster = command if _speed(command, self.reach_m) >= _speed(velocity, self.reach_m) else velocity
         length = self.horizon(*faster)
         length += extra_m if length > 0 else 0.0

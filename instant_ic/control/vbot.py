@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
+from instant_ic.control.kinematics import MotionLimits, accelerate, move
 from instant_ic.control.walls import WallMap
 from instant_ic.geometry.poses import wrap_angle
 
@@ -70,7 +70,7 @@ class VirtualRobot:
     def place(self, pose: NDArray[np.float64], velocity: tuple[float, float]) -> None:
         """Place the v-bot at ``pose`` (x, y, yaw), moving at ``velocity`` (m/s, rad/s)."""
         self.pose = np.asarray(pose, dtype=np.float64).copy()
-        self.velocity = clip_twist(*velocity, self.limits)
+        self.velocity = self.limits.clip(*velocity)
         self.slowed_by = ""
         self._track = []
 
@@ -83,7 +83,7 @@ class VirtualRobot:
         speed_limit_m_s: float = math.inf,
     ) -> NDArray[np.float64]:
         """Move by ``dt_s`` under the operator's command; return the new pose (3,) in the map frame."""
-        linear, angular = clip_twist(*command, self.limits)
+        linear, angular = self.limits.clip(*command)
         slower = min(1.0, speed_limit_m_s / max(abs(linear), 1e-9))
         linear, angular = linear * slower, angular * slower
         factor = self.lead_factor(linear, robot_pose)
@@ -111,7 +111,7 @@ class VirtualRobot:
         moved = move(self.pose, *velocity, dt_s)
         share = min(1.0, dt_s / config.ease_time_s)
         self.pose = _towards(moved, target, share, config.ease_m_s * dt_s, math.radians(config.ease_deg_s) * dt_s)
-        self.velocity = clip_twist(*velocity, self.limits)
+        self.velocity = self.limits.clip(*velocity)
         self.slowed_by = ""
         return self.pose
 

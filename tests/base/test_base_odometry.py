@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from instant_ic.base.config import LimitsConfig, OdometryNoiseConfig, RoboclawConfig, SkidSteerConfig
 from instant_ic.base.kinematics import SkidSteer
-from instant_ic.base.limits import TwistLimiter, clamp_twist
+from instant_ic.base.limits import TwistLimiter
 from instant_ic.base.odometry import UNMEASURED_VARIANCE, WheelOdometry, unwrap_counts
 
 GEOMETRY = SkidSteerConfig(track_width=0.4, track_width_multiplier=1.5, pulses_per_metre=4000.0)
@@ -120,12 +120,6 @@ def test_limiter_ramps_as_worked_out_by_hand() -> None:
     assert (limiter.v, limiter.w) == (0.0, 0.0)
     with pytest.raises(ValueError, match="finite"):
         limiter.step(float("nan"), 0.0, 0.1)
-
-
-def test_too_fast_a_twist_keeps_its_curve() -> None:
-    assert clamp_twist(1.0, 1.0, LimitsConfig()) == pytest.approx((0.5, 0.5))
-    assert clamp_twist(0.5, -2.0, LimitsConfig()) == pytest.approx((0.25, -1.0))
-    assert clamp_twist(0.2, 0.1, LimitsConfig()) == (0.2, 0.1)
 
 
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5), st.floats(0, 0.2)), min_size=1, max_size=50))

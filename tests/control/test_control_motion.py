@@ -10,7 +10,7 @@ from control_world import corridor, draw_map, rectangle
 
 from instant_ic.control.costmap import LETHAL, Costmap, StaticMap
 from instant_ic.control.footprint import Footprint
-from instant_ic.control.kinematics import MotionLimits, accelerate, clip_twist, move
+from instant_ic.control.kinematics import MotionLimits, accelerate, move
 from instant_ic.control.navigator import meeting_pose
 from instant_ic.control.prediction import PredictionConfig, Predictor
 from instant_ic.control.safety import CollisionMonitor, CollisionMonitorConfig, PolygonConfig
@@ -29,9 +29,9 @@ def test_move_follows_the_exact_arc() -> None:
 
 
 def test_twists_are_cut_with_their_curvature() -> None:
-    assert clip_twist(1.0, 1.0, LIMITS) == (0.5, 0.5)
-    assert clip_twist(0.4, -4.0, LIMITS) == pytest.approx((0.1, -1.0))
-    assert clip_twist(math.nan, 0.0, LIMITS) == (0.0, 0.0)
+    assert LIMITS.clip(1.0, 1.0) == (0.5, 0.5)
+    assert LIMITS.clip(0.4, -4.0) == pytest.approx((0.1, -1.0))
+    assert LIMITS.clip(math.nan, 0.0) == (0.0, 0.0)
     assert accelerate((0.0, 0.0), (0.5, -1.0), LIMITS, 0.1) == pytest.approx((0.08, -0.2))
 
 
