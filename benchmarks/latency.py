@@ -54,6 +54,7 @@ from instant_ic.msg import (
     compressed_image_message,
     header,
     image_message,
+    matrix_from_pose,
     message_type,
     odometry_message,
     pose_message,
@@ -63,7 +64,6 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
-from instant_ic.msg import pose_matrix as matrix_of
 
 CHROMIUM_FLAGS = [
     "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
@@ -155,19 +155,19 @@ class Robot:
         return on_command
 
     def on_vbot(self, message: Any) -> None:
-        self.vbot = matrix_of(message)
+        self.vbot = matrix_from_pose(message)
         if any(twist_values(message)):
             self.mark("vbot")
 
     def on_request(self, message: Any) -> None:
-        pose = matrix_of(message.pose)
+        pose = matrix_from_pose(message.pose)
         if np.abs(pose - self.requested).max() > 0.0005:
             self.mark("request")
         self.requested = pose
 
     def on_view(self, message: Any) -> None:
         self.views += 1
-        if "request" in self.marks and np.abs(matrix_of(message.pose) - self.requested).max() < 1e-6:
+        if "request" in self.marks and np.abs(matrix_from_pose(message.pose) - self.requested).max() < 1e-6:
             self.mark("view")
 
     def on_state(self, message: Any) -> None:

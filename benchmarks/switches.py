@@ -22,7 +22,7 @@ import numpy as np
 from instant_ic.bag import BagReader
 from instant_ic.control.states import Mode, Reason
 from instant_ic.geometry.transforms import TransformBuffer, TransformError
-from instant_ic.msg import deserialize, pose_matrix, stamp_ns, transform_matrix
+from instant_ic.msg import deserialize, matrix_from_pose, stamp_ns, transform_matrix
 
 SOURCES = (
     *("/scan", "/lidar/points", "/wheel/odom", "/pose", "/camera/image/compressed", "/vspace/view"),
@@ -100,7 +100,7 @@ def jump(tree: TransformBuffer, pages: list[tuple[int, Any]], at_ns: int, before
     if had:
         try:
             taken = tree.lookup("map", "camera", stamp_ns(had[-1].picture_stamp))[:2, 3]
-            error_m = float(np.linalg.norm(taken - pose_matrix(had[-1].view_pose)[:2, 3]))
+            error_m = float(np.linalg.norm(taken - matrix_from_pose(had[-1].view_pose)[:2, 3]))
         except TransformError:
             pass
     return {

@@ -32,7 +32,7 @@ from instant_ic.msg import (
     VspaceStatus,
     cloud_array,
     header,
-    pose_matrix,
+    matrix_from_pose,
     pose_message,
     stamp_ns,
     twist_message,
@@ -158,7 +158,7 @@ def page_report(shown: ShownPictures | None) -> PageReport | None:
         view_id=int(shown.view_id),
         view_age_s=float(shown.view_age_s),
         view_delay_s=float(shown.view_delay_s),
-        view_position=pose_matrix(shown.view_pose)[:2, 3],
+        view_position=matrix_from_pose(shown.view_pose)[:2, 3],
     )
 
 
@@ -199,7 +199,7 @@ def _age_s(latest: Latest) -> float:
 
 def _present_pose(odometry: Odometry, now_ns: int) -> NDArray[np.float64]:
     """Pose (3,) extrapolated to now: the message is up to a period old."""
-    pose = pose2_from_matrix(pose_matrix(odometry))
+    pose = pose2_from_matrix(matrix_from_pose(odometry))
     return extrapolate(pose, twist_values(odometry), (now_ns - stamp_ns(odometry)) / 1e9)
 
 
@@ -208,7 +208,7 @@ def _vspace(status: VspaceStatus) -> Vspace:
         ready=status.state == VspaceStatus.READY,
         training=status.state == VspaceStatus.TRAINING,
         failed=status.state == VspaceStatus.FAILED,
-        position=pose_matrix(status.keyframe_pose)[:2, 3],
+        position=matrix_from_pose(status.keyframe_pose)[:2, 3],
         ready_radius_m=float(status.ready_radius_m),
         message=status.message,
         expected_psnr_db=float(status.expected_psnr_db),

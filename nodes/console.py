@@ -51,8 +51,8 @@ from instant_ic.msg import (
     VspaceStatus,
     grid_array,
     header,
+    matrix_from_pose,
     path_array,
-    pose_matrix,
     pose_message,
     stamp_ns,
     to_time,
@@ -284,7 +284,7 @@ class ConsoleNode(Node[ConsoleConfig]):
 
     def on_view(self, message: RenderedView) -> None:
         """Forward a rendered view, then request the next one."""
-        camera = pose_matrix(message.pose)
+        camera = matrix_from_pose(message.pose)
         if not (0 < message.fov_rad < math.pi):
             self.diagnose("view", ERROR, f"rendered view dropped: its field of view is {message.fov_rad:.3g} rad")
             return
@@ -476,7 +476,7 @@ class ConsoleNode(Node[ConsoleConfig]):
             {
                 "trajectory": self.points(self.trajectory.message),
                 "path": self.points(self.path.message) if virtual else [],
-                "subgoal": None if subgoal is None else _planar(pose_matrix(subgoal)),
+                "subgoal": None if subgoal is None else _planar(matrix_from_pose(subgoal)),
             },
         )
 
@@ -568,14 +568,14 @@ class ConsoleNode(Node[ConsoleConfig]):
         """Return map_from_base of the r-bot; the arbiter's estimate if the tree has a gap."""
         pose = self.lookup("map", "base_link")
         if pose is None and self.control.message is not None:
-            return pose_matrix(self.control.message.robot_pose)
+            return matrix_from_pose(self.control.message.robot_pose)
         return pose
 
     def vbot_pose(self) -> Matrix | None:
         """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its own."""
         if self.vbot.message is not None:
-            return pose_matrix(self.vbot.message)
-        return None if self.control.message is None else pose_matrix(self.control.message.vbot_pose)
+            return matrix_from_pose(self.vbot.message)
+        return None if self.control.message is None else matrix_from_pose(self.control.message.vbot_pose)
 
     def camera_place(self) -> Matrix:
         """Return base_from_camera with the identity as rotation."""

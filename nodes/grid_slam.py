@@ -22,7 +22,7 @@ from instant_ic.msg import (
     String,
     grid_message,
     header,
-    pose_matrix,
+    matrix_from_pose,
     pose_message,
     stamp_ns,
 )
@@ -84,7 +84,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         self.limiter.reset()
 
     def on_odometry(self, message: Any) -> None:
-        if self.queue.add_odometry(stamp_ns(message), pose2_from_matrix(pose_matrix(message))):
+        if self.queue.add_odometry(stamp_ns(message), pose2_from_matrix(matrix_from_pose(message))):
             self.place_ready()
         else:
             self.diagnose("odometry", WARN, "dropped a message that is not finite, or not newer than the last")
@@ -153,7 +153,7 @@ class GridSlamNode(Node[GridSlamConfig]):
         try:
             if message.header.frame_id not in ("", self.config.map_frame):
                 raise ValueError(f"it is in frame {message.header.frame_id!r}, not {self.config.map_frame!r}")
-            self.slam.set_pose(pose2_from_matrix(pose_matrix(message)))
+            self.slam.set_pose(pose2_from_matrix(matrix_from_pose(message)))
             self.limiter.reset()
         except ValueError as error:
             self.log.warning("/initialpose is not used: %s", error)

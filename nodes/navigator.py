@@ -27,8 +27,8 @@ from instant_ic.msg import (
     PoseStamped,
     TwistStamped,
     grid_array,
+    matrix_from_pose,
     path_message,
-    pose_matrix,
     twist_stamped,
     twist_values,
 )
@@ -114,7 +114,7 @@ class NavigatorNode(Node[NavigatorConfig]):
             return self.stand(str(error))
         occupancy, resolution, origin = grid_array(grid)
         costmap = Costmap.from_occupancy(occupancy, resolution, np.array(origin))
-        subgoal, velocity = self.moving(pose2_from_matrix(pose_matrix(goal)), state)
+        subgoal, velocity = self.moving(pose2_from_matrix(matrix_from_pose(goal)), state)
         step = self.navigator.step(pose, self.speed, subgoal, costmap, self.clock.steady_ns(), velocity)
         if step.replanned and (self.path.subscriber_count or self.lockstep):
             self.path.publish(path_message(step.plan.poses, "map", self.clock.now_ns()))
@@ -127,9 +127,11 @@ class NavigatorNode(Node[NavigatorConfig]):
         """Subgoal and its velocity; if it is the v-bot, the v-bot's own newer pose and twist."""
         vbot = self.vbot.message
         if vbot is not None:
-            pose = pose2_from_matrix(pose_matrix(vbot))
+            pose = pose2_from_matrix(matrix_from_pose(vbot))
             if float(np.linalg.norm(pose[:2] - subgoal[:2])) < 0.15:
-                shown, robot = (pose2_from_matrix(pose_matrix(one)) for one in (state.vbot_target, state.robot_pose))
+                shown, robot = (
+                    pose2_from_matrix(matrix_from_pose(one)) for one in (state.vbot_target, state.robot_pose)
+                )
                 return meeting_pose(pose, shown, robot), twist_values(vbot)
         return subgoal, (0.0, 0.0)
 

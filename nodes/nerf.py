@@ -21,7 +21,7 @@ from instant_ic.msg import (
     compressed_image_message,
     header,
     image_array,
-    pose_matrix,
+    matrix_from_pose,
     pose_message,
     to_time,
 )
@@ -84,7 +84,7 @@ def decode_keyframe(keyframe: Any) -> KeyframeArrays:
     if keyframe.depth.encoding != "32FC1":
         raise KeyframeError(f"depth must be 32FC1 (got {keyframe.depth.encoding!r})")
     sigma = decode_sigma(image_array(keyframe.sigma)) if keyframe.sigma.data.size else keyframe.relative_sigma
-    return rgb, image_array(keyframe.depth), pose_matrix(keyframe.pose), sigma
+    return rgb, image_array(keyframe.depth), matrix_from_pose(keyframe.pose), sigma
 
 
 class NerfNode(Node[NerfConfig]):
@@ -133,7 +133,7 @@ class NerfNode(Node[NerfConfig]):
             text = f"{request.width} x {request.height} requested, max_view_pixels is {most}"
             self.diagnose("view", WARN, text)
         else:
-            pose = functools.partial(pose_matrix, request.pose)
+            pose = functools.partial(matrix_from_pose, request.pose)
             size = request.width, request.height, request.fov_rad
             self.schedule.request_view(ViewOrder(request.id, request, pose, *size, self.config.jpeg_quality))
 

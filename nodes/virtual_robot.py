@@ -18,8 +18,8 @@ from instant_ic.msg import (
     Odometry,
     TwistStamped,
     grid_array,
+    matrix_from_pose,
     odometry_message,
-    pose_matrix,
     stamp_ns,
     twist_values,
 )
@@ -111,13 +111,13 @@ class VirtualRobotNode(Node[VirtualRobotConfig]):
     def obey(self, state: ControlState, dt_s: float) -> None:
         """Act as the arbiter's state demands."""
         action, before, self.action = VbotAction(state.vbot_action), self.action, VbotAction(state.vbot_action)
-        robot_pose = pose2_from_matrix(pose_matrix(state.robot_pose))
+        robot_pose = pose2_from_matrix(matrix_from_pose(state.robot_pose))
         robot_twist = twist_values(state.robot_twist)
         age_s = (self.clock.now_ns() - stamp_ns(state)) / 1e9
         # The arbiter's message is up to a period old, and the r-bot moves on.
-        target = extrapolate(pose2_from_matrix(pose_matrix(state.vbot_target)), robot_twist, age_s)
+        target = extrapolate(pose2_from_matrix(matrix_from_pose(state.vbot_target)), robot_twist, age_s)
         if before is None and action != VbotAction.WITH_ROBOT:
-            self.robot.place(pose2_from_matrix(pose_matrix(state.vbot_pose)), (0.0, 0.0))  # the node was restarted
+            self.robot.place(pose2_from_matrix(matrix_from_pose(state.vbot_pose)), (0.0, 0.0))  # the node was restarted
         if action == VbotAction.WITH_ROBOT:
             self.robot.place(target, robot_twist)
         elif action == VbotAction.DRIVEN:

@@ -29,8 +29,7 @@ from instant_ic.experiments.pictures import (
 from instant_ic.experiments.stack import Stack, StackError, free_ports
 from instant_ic.geometry.image_quality import psnr_db
 from instant_ic.geometry.poses import inverse, pose_matrix, yaw_of
-from instant_ic.msg import grid_array, image_array, message_type, pose_message, stamp_ns, to_time
-from instant_ic.msg import pose_matrix as matrix_of_pose
+from instant_ic.msg import grid_array, image_array, matrix_from_pose, message_type, pose_message, stamp_ns, to_time
 from instant_ic.pace import read as read_pace
 
 _YAWS_DEG = (0, 90, 180, -90)
@@ -132,7 +131,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
 
     encoded = np.asarray(keyframe.panorama.data)
     photo = cv2.cvtColor(cv2.imdecode(encoded, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-    map_from_camera = matrix_of_pose(keyframe.pose)
+    map_from_camera = matrix_from_pose(keyframe.pose)
     rows = []
     scores, likeness = {}, {}
     places = [(yaw, 0.0) for yaw in _YAWS_DEG] + [(yaw, _AHEAD_M) for yaw in (0, -90)]
@@ -164,7 +163,7 @@ def _watch(stack: Stack, out: Path, timeout_s: float, tell: Callable[[str], None
     depth = image_array(keyframe.depth)
     save_depth(out / "depth.png", photo, depth, f"depth: {keyframe.message}")
     grid, resolution, origin = grid_array(maps[-1])
-    robot = matrix_of_pose(poses[-1])
+    robot = matrix_from_pose(poses[-1])
     save_map(out / "map.png", grid, resolution, origin, (robot[0, 3], robot[1, 3], yaw_of(robot)))
     span_s = (stamp_ns(scans[-1]) - stamp_ns(scans[0])) / 1e9
     return {

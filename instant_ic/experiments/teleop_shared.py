@@ -67,8 +67,8 @@ class SharedControl(Arbiter):
         self._speed_m_s = step.command[0]
         monitor = self.config.collision_monitor
         memory = costmap.memory_near(pose, monitor.blind_radius_m, monitor.memory_range_m)
-        points = np.concatenate([inputs.scan_points, np.repeat(memory, self.monitor.most_points_needed, axis=0)])
-        sent = self.monitor.limit(step.command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
+        points = np.concatenate([inputs.scan_points, np.repeat(memory, self.rules.monitor.most_points_needed, axis=0)])
+        sent = self.rules.monitor.limit(step.command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
         hard = sent.action == "stop"
         return replace(
             decision, command=sent.command, hard=hard, blocked=False, reason="the robot goes round by itself"

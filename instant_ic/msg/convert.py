@@ -265,7 +265,7 @@ def pose_message(matrix: Matrix) -> Any:
     )
 
 
-def pose_matrix(pose: Any) -> Matrix:
+def matrix_from_pose(pose: Any) -> Matrix:
     """4×4 matrix from a Pose, PoseStamped, PoseWithCovariance(Stamped) or Odometry.
 
     Raises:
@@ -393,4 +393,4 @@ def path_message(poses: ArrayLike, frame_id: str, stamp: int) -> Any:
 
 def path_array(message: Any) -> NDArray[np.float64]:
     """Planar poses (N, 3) from a nav_msgs/Path."""
-    return np.array([pose2_from_matrix(pose_matrix(p)) for p in message.poses]).reshape(-1, 3)
+    return np.array([pose2_from_matrix(matrix_from_pose(p)) for p in message.poses]).reshape(-1, 3)

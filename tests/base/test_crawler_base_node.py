@@ -14,7 +14,7 @@ from instant_ic.base.controller import BaseController, ControllerConfig, Control
 from instant_ic.base.recent import RecentCount
 from instant_ic.bus import ERROR, OK, WARN
 from instant_ic.bus.lockstep import LockstepBus
-from instant_ic.msg import Twist, Vector3, pose_matrix, stamp_ns, twist_stamped, twist_values
+from instant_ic.msg import Twist, Vector3, matrix_from_pose, stamp_ns, twist_stamped, twist_values
 from instant_ic.sim.roboclaw_emulator import RoboclawEmulator
 from nodes.crawler_base import CrawlerBaseConfig, CrawlerBaseNode
 
@@ -64,10 +64,10 @@ def test_drives_forward_and_tells_odometry_transform_and_battery(bench: Bench) -
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
     assert twist_values(odometry)[0] == pytest.approx(0.4, abs=0.02)
     # 0.5 s of ramp (0.8 m/s^2) lose 0.1 m of 0.8 m; connecting and steps lose a little more.
-    assert 0.60 < pose_matrix(odometry)[0, 3] < 0.71
+    assert 0.60 < matrix_from_pose(odometry)[0, 3] < 0.71
     assert len(bench.bus.messages("/wheel/odom")) > 50
     transform = bench.bus.last("/tf").transforms[0]
-    assert transform.transform.translation.x == pytest.approx(pose_matrix(odometry)[0, 3])
+    assert transform.transform.translation.x == pytest.approx(matrix_from_pose(odometry)[0, 3])
     assert stamp_ns(transform) == stamp_ns(odometry)
     assert bench.bus.last("/battery").voltage == pytest.approx(24.1)
     assert bench.level("link") == bench.level("battery") == bench.level("controller") == OK

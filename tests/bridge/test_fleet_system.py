@@ -14,7 +14,7 @@ from instant_ic.bus import LATCHED, SENSOR
 from instant_ic.bus.registry import list_topics
 from instant_ic.experiments.stack import Stack, free_port, free_ports, machine_pace, observer
 from instant_ic.geometry.poses import pose2_from_matrix
-from instant_ic.msg import ControlState, Odometry, TwistStamped, pose_matrix, twist_stamped
+from instant_ic.msg import ControlState, Odometry, TwistStamped, matrix_from_pose, twist_stamped
 from instant_ic.pace import read as read_pace
 
 pytest.importorskip("zenoh")
@@ -51,7 +51,7 @@ def drive_robot2(stack, station, robots):
         return True
 
     def place(name):
-        return pose2_from_matrix(pose_matrix(truth[name][-1]))[:2]
+        return pose2_from_matrix(matrix_from_pose(truth[name][-1]))[:2]
 
     stack.wait_for(lambda: spin() and all(truth.values()), START_S, "ground truth of every robot")
     stack.wait_for(lambda: spin() and states and states[-1].mode == ControlState.REAL, START_S, "robot2 in real mode")

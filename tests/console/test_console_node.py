@@ -18,6 +18,7 @@ from instant_ic.msg import (
     compressed_image_message,
     grid_message,
     header,
+    matrix_from_pose,
     message_type,
     odometry_message,
     path_message,
@@ -29,7 +30,6 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
-from instant_ic.msg import pose_matrix as matrix_of
 from nodes.console import ConsoleConfig, ConsoleNode
 
 START = 1_000_000_000
@@ -216,7 +216,7 @@ def test_virtual_mode_asks_for_the_view_from_the_vbot_where_the_operator_looks(s
     bus.publish("/vbot/odom", vbot)
     bus.advance(0.06)
     request = bus.last("/view/request")
-    map_from_camera = matrix_of(request.pose)
+    map_from_camera = matrix_from_pose(request.pose)
     np.testing.assert_allclose(map_from_camera[:3, 3], [3, 2, 1.5], atol=1e-6)  # mount of /tf_static
     np.testing.assert_allclose(map_from_camera[:3, 0], [1, 0, 0], atol=1e-6)  # north, then 90° right: east
     assert request.fov_rad >= 1.2 * 1.15 - 1e-6
@@ -267,7 +267,7 @@ def test_a_step_of_the_vbot_is_shown_and_its_view_asked_for_at_once(setup):
     asked = len(bus.messages("/view/request"))
     bus.publish("/vbot/odom", odometry_message(pose_matrix(x=0.01), 0.2, 0.1, "map", "vbot", bus.clock.now_ns()))
     assert len(bus.messages("/view/request")) == asked + 1
-    assert matrix_of(bus.last("/view/request").pose)[0, 3] == pytest.approx(0.01)
+    assert matrix_from_pose(bus.last("/view/request").pose)[0, 3] == pytest.approx(0.01)
     assert server.texts["state"]["vbot"][0] == pytest.approx(0.01)
     assert server.texts["state"]["twist"] == pytest.approx([0.2, 0.1])
 
@@ -290,7 +290,7 @@ def test_a_watchers_view_goes_to_him_alone_and_is_not_told_to_the_arbiter(setup)
     assert views.count(7) in (3, 4, 5)  # 2 Hz for 2 s
     assert views.count(8) == 0  # has enough of the driver's
     assert views.count(None) >= 8
-    mine = [r for r in bus.messages("/view/request") if matrix_of(r.pose)[1, 0] > 0.9]  # looks left
+    mine = [r for r in bus.messages("/view/request") if matrix_from_pose(r.pose)[1, 0] > 0.9]  # looks left
     assert len(mine) in (views.count(7), views.count(7) + 1)
     told = {int(message.view_id) for message in bus.messages("/view/shown")}
     assert not told & {int(request.id) for request in mine}
@@ -346,7 +346,7 @@ def test_the_page_leads_with_the_vbot_and_the_arbiter_hears_what_is_displayed(se
             bus.publish("/vbot/odom", vbot)
             bus.publish("/vspace/view", view_message(bus, 1, near_m=near_m))  # from x = 1, y = 2
             bus.advance(0.05)
-        shown = matrix_of(bus.last("/view/shown").view_pose)
+        shown = matrix_from_pose(bus.last("/view/shown").view_pose)
         assert shown[:3, 0] == pytest.approx([math.cos(0.3), math.sin(0.3), 0])  # it is turned by the page alone
         assert shown[1:3, 3] == pytest.approx([2, 1.5])
         return server.texts["state"]["lead"], shown[0, 3] - 1.0

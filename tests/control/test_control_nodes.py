@@ -34,8 +34,8 @@ from instant_ic.msg import (
     grid_array,
     grid_message,
     header,
+    matrix_from_pose,
     odometry_message,
-    pose_matrix,
     pose_message,
     scan_message,
     serialize,
@@ -200,8 +200,8 @@ def test_the_nodes_together_bring_the_operator_through_and_back() -> None:
     assert states[-1].transitions == 5
     # The v-bot went straight through the box, the r-bot round it.
     virtual = [s for s in states if s.mode == ControlState.VIRTUAL]
-    vbot = np.array([pose2_from_matrix(pose_matrix(s.vbot_pose)) for s in virtual])
-    robot = np.array([pose2_from_matrix(pose_matrix(s.robot_pose)) for s in virtual])
+    vbot = np.array([pose2_from_matrix(matrix_from_pose(s.vbot_pose)) for s in virtual])
+    robot = np.array([pose2_from_matrix(matrix_from_pose(s.robot_pose)) for s in virtual])
     assert np.abs(vbot[:, 1]).max() < 0.01
     assert ((vbot[:, 0] > 2.5) & (vbot[:, 0] < 3.0)).sum() > 10
     assert np.abs(robot[:, 1]).max() > 0.5

@@ -23,11 +23,9 @@ from instant_ic.msg import (
     header,
     image_array,
     image_message,
+    matrix_from_pose,
     stamp_ns,
     transform_message,
-)
-from instant_ic.msg import (
-    pose_matrix as message_pose,
 )
 from instant_ic.training.export import export_model
 from instant_ic.training.slicenet import SliceNet, SliceNetConfig
@@ -182,7 +180,7 @@ def test_scaler_scales_and_makes_keyframes() -> None:
         assert k.header.frame_id == "map" and k.fit and k.quality > 0.95 and k.source == "fused"
         assert k.scale == pytest.approx(2.0, rel=0.03)
         assert 0 < k.relative_sigma < 0.05
-        np.testing.assert_allclose(message_pose(k.pose), base_at(stamp_ns(k)) @ BASE_FROM_CAMERA, atol=2e-3)
+        np.testing.assert_allclose(matrix_from_pose(k.pose), base_at(stamp_ns(k)) @ BASE_FROM_CAMERA, atol=2e-3)
         assert bytes(k.panorama.data) == jpeg(round((stamp_ns(k) - START) / S * 50))
         assert np.quantile(far_off(image_array(k.depth), stamp_ns(k)), 0.95) < 0.03
         sigma = decode_sigma(image_array(k.sigma))

@@ -64,7 +64,7 @@ def test_scan_grid_path_odometry():
     assert msg.path_array(round_trip(msg.path_message(poses, "map", 1))) == pytest.approx(poses)
     matrix = pose_matrix(1, 2, 0, yaw=0.7)
     odometry = round_trip(msg.odometry_message(matrix, 0.4, -0.2, "odom", "base_link", 1))
-    assert msg.pose_matrix(odometry) == pytest.approx(matrix)
+    assert msg.matrix_from_pose(odometry) == pytest.approx(matrix)
     assert msg.twist_values(odometry) == (0.4, -0.2)
     transform = round_trip(msg.transform_message(matrix, "odom", "base_link", 4))
     assert msg.transform_matrix(transform) == pytest.approx(matrix)
@@ -90,7 +90,7 @@ def test_unknown_and_wrong():
     with pytest.raises(msg.MessageError, match="quaternion"):
         pose = msg.pose_message(np.eye(4))
         pose.orientation.w = 0.0
-        msg.pose_matrix(pose)
+        msg.matrix_from_pose(pose)
 
 
 @settings(max_examples=200)

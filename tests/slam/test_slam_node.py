@@ -22,6 +22,7 @@ from instant_ic.msg import (
     TFMessage,
     grid_array,
     header,
+    matrix_from_pose,
     odometry_message,
     pose_message,
     scan_message,
@@ -29,7 +30,6 @@ from instant_ic.msg import (
     transform_matrix,
     transform_message,
 )
-from instant_ic.msg import pose_matrix as message_pose
 from nodes.grid_slam import GridSlamConfig, GridSlamNode
 
 START_NS = 1_700_000_000_000_000_000
@@ -84,7 +84,7 @@ class Rig:
         errors = []
         for message in self.bus.messages("/pose"):
             truth = self.truths[stamp_ns(message)]
-            error = relative2(truth, pose2_from_matrix(message_pose(message)))
+            error = relative2(truth, pose2_from_matrix(matrix_from_pose(message)))
             errors.append(math.hypot(error[0], error[1]))
         return errors
 
@@ -105,7 +105,7 @@ def test_pose_map_and_transform_of_a_drive_on_slipping_tracks() -> None:
     # map→odom ∘ odom→base_link is the pose, at the scan's stamp.
     stamp, map_from_odom = rig.transforms("odom")[-1]
     assert stamp == stamp_ns(pose)
-    assert np.allclose(compose2(map_from_odom, rig.odometry), pose2_from_matrix(message_pose(pose)), atol=1e-6)
+    assert np.allclose(compose2(map_from_odom, rig.odometry), pose2_from_matrix(matrix_from_pose(pose)), atol=1e-6)
     assert len(rig.transforms("odom")) == 41
     assert rig.transforms("base_link") == []  # odometry is the wheels' own
 

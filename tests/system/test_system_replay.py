@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 from instant_ic.bag import BagReader
 from instant_ic.experiments.stack import machine_pace
 from instant_ic.geometry.poses import pose2_from_matrix, relative2
-from instant_ic.msg import deserialize, grid_array, pose_matrix, stamp_ns
+from instant_ic.msg import deserialize, grid_array, matrix_from_pose, stamp_ns
 
 pytestmark = [pytest.mark.system, pytest.mark.xdist_group("stack"), pytest.mark.timeout(900)]
 BAG = Path(__file__).resolve().parents[1] / "data" / "corridor_drive"
@@ -40,7 +40,7 @@ def messages(bag: Path, topic: str) -> list[Any]:
 
 
 def planar(message: Any) -> np.ndarray:
-    return np.asarray(pose2_from_matrix(pose_matrix(message)))
+    return np.asarray(pose2_from_matrix(matrix_from_pose(message)))
 
 
 def poses_in_truth(bag: Path) -> tuple[np.ndarray, np.ndarray]:
