@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from instant_ic.bus import LATCHED, Latest
+from instant_ic.bus import Latest
 from instant_ic.bus.clock import Clock
 from instant_ic.control.arbiter import Decision
 from instant_ic.control.estop import KeptEstop
@@ -21,14 +21,10 @@ from instant_ic.control.walls import WallMap
 from instant_ic.geometry.poses import matrix_from_pose2, pose2_from_matrix
 from instant_ic.msg import (
     ControlState,
-    LaserScan,
     MessageError,
     Odometry,
-    PointCloud2,
     Pose,
-    PoseWithCovarianceStamped,
     ShownPictures,
-    TwistStamped,
     VspaceStatus,
     cloud_array,
     header,
@@ -40,38 +36,25 @@ from instant_ic.msg import (
 )
 
 
+@dataclass
 class ArbiterInbox:
-    """Newest messages of the arbiter's topics, as the inputs of its step.
+    """Newest messages of the arbiter's topics, as the inputs of its step."""
 
-    Args:
-        latest: subscribes to a topic (``Node.latest``).
-        clock: the node's.
-        surroundings, view: place scans, 3D points and images.
-    """
-
-    def __init__(
-        self, latest: Callable[..., Latest], clock: Clock, surroundings: Surroundings, view: OperatorView
-    ) -> None:
-        self._clock, self._surroundings, self._view = clock, surroundings, view
-        self._sources = {
-            "scan": latest("/scan", LaserScan, max_age_s=10.0),
-            "odometry": latest("/wheel/odom", Odometry, max_age_s=10.0),
-            "pose": latest("/pose", PoseWithCovarianceStamped, max_age_s=10.0),
-            "vbot": latest("/vbot/odom", Odometry, max_age_s=10.0),
-            "nav": latest("/nav/cmd_vel", TwistStamped, max_age_s=10.0),
-            "command": latest("/operator/cmd_vel", TwistStamped, max_age_s=10.0),
-        }
-        self._points: Latest | None = None
-        if surroundings.config.points.enabled:
-            self._points = latest("/lidar/points", PointCloud2, max_age_s=10.0)
-        self._shown = latest("/view/shown", ShownPictures, max_age_s=1.0)
-        self._vspace = latest("/vspace/status", VspaceStatus, max_age_s=60.0, qos=LATCHED)
-        self.button_ns: int | None = None
-        """Last report of the robot's own emergency stop, steady clock."""
+    clock: Clock
+    surroundings: Surroundings
+    view: OperatorView
+    sources: dict[str, Latest]
+    """scan, odometry, pose, vbot, nav and command."""
+    points: Latest | None
+    """3D points; None: not used."""
+    shown: Latest
+    vspace: Latest
+    button_ns: int | None = None
+    """Last report of the robot's own emergency stop, steady clock."""
 
     def scan(self) -> Scan | None:
         """The newest scan."""
-        latest = self._sources["scan"]
+        latest = self.sources["scan"]
         m = latest.message
         if m is None:
             return None
@@ -80,42 +63,42 @@ class ArbiterInbox:
 
     def cloud(self) -> Cloud | None:
         """The newest 3D points; a message that cannot be read is reported to the surroundings."""
-        if self._points is None or self._points.message is None:
+        if self.points is None or self.points.message is None:
             return None
-        message = self._points.message
+        message = self.points.message
         try:
             points = cloud_array(message)
         except MessageError as error:
-            self._surroundings.refuse_points(str(error))
+            self.surroundings.refuse_points(str(error))
             return None
-        return Cloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self._points), points)
+        return Cloud(message.header.frame_id, stamp_ns(message), self._arrived_ns(self.points), points)
 
     def operator_gone(self) -> bool:
         """Whether the console has lost its driver since the newest command."""
-        shown, command = self._shown.message, self._sources["command"].message
+        shown, command = self.shown.message, self.sources["command"].message
         return shown is not None and command is not None and stamp_ns(command) <= stamp_ns(shown.operator_lost)
 
     def ages(self, timeouts: TimeoutConfig) -> dict[str, float]:
         """Seconds since the newest message of each source, as ``ArbiterInputs.ages``."""
-        now_ns, steady_ns = self._clock.now_ns(), self._clock.steady_ns()
-        ages = {key: _age_s(latest) for key, latest in self._sources.items()} | {"vspace": self._vspace.age_s}
-        ages |= self._view.ages(page_report(self._shown.message), self._shown.age_s, steady_ns)
-        if self._points is not None and self._surroundings.points_seen:
-            ages["points"] = max(_age_s(self._points), self._surroundings.used_age_s("points", now_ns, steady_ns))
+        now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
+        ages = {key: _age_s(latest) for key, latest in self.sources.items()} | {"vspace": self.vspace.age_s}
+        ages |= self.view.ages(page_report(self.shown.message), self.shown.age_s, steady_ns)
+        if self.points is not None and self.surroundings.points_seen:
+            ages["points"] = max(_age_s(self.points), self.surroundings.used_age_s("points", now_ns, steady_ns))
         if self.button_ns is not None and timeouts.estop_input > 0:
             ages["estop_input"] = (steady_ns - self.button_ns) / 1e9
         return ages
 
     def inputs(self, latch: KeptEstop, walls: WallMap | None, timeouts: TimeoutConfig) -> ArbiterInputs:
         """Inputs of a step now."""
-        now_ns, steady_ns = self._clock.now_ns(), self._clock.steady_ns()
-        view, surroundings = self._view, self._surroundings
+        now_ns, steady_ns = self.clock.now_ns(), self.clock.steady_ns()
+        view, surroundings = self.view, self.surroundings
         ages, near = self.ages(timeouts), surroundings.near_points(self.scan())
         used_s = math.inf if near is None else surroundings.used_age_s("scan", now_ns, steady_ns)
         ages["scan"] = max(ages["scan"], used_s)
         pose, velocity = surroundings.robot_pose(), self._twist("odometry")
-        vbot, status = self._sources["vbot"].message, self._vspace.message
-        report = page_report(self._shown.message)
+        vbot, status = self.sources["vbot"].message, self.vspace.message
+        report = page_report(self.shown.message)
         return ArbiterInputs(
             robot_pose=pose,
             robot_velocity=velocity,
@@ -141,11 +124,11 @@ class ArbiterInbox:
         )
 
     def _twist(self, key: str) -> tuple[float, float]:
-        message = self._sources[key].message
+        message = self.sources[key].message
         return (0.0, 0.0) if message is None else twist_values(message)
 
     def _arrived_ns(self, latest: Latest) -> int:
-        return self._clock.steady_ns() - round(latest.age_s * 1e9)
+        return self.clock.steady_ns() - round(latest.age_s * 1e9)
 
 
 def page_report(shown: ShownPictures | None) -> PageReport | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from instant_ic import msg
@@ -71,18 +70,27 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.latch = KeptEstop(self.run_dir, self.clock.now_ns())
         if self.latch.pressed:
             self.log.warning("emergency stop: %s", self.latch.why or "still pressed from before this start")
-        self.inbox = ArbiterInbox(self.latest, self.clock, self.surroundings, self.view)
         self.obeyed = (0.0, 0.0)  # operator's command of the last step
         self.early = False  # a step was made ahead of its time since the last timer
         self.was_gone = False  # a step was made for the loss of the driver
         self.ticks = 0
-
         self.cmd_vel = self.publisher("/cmd_vel", msg.TwistStamped, qos=SENSOR)
         self.state = self.publisher("/ic/state", ControlState, qos=LATCHED)
         self.subgoal = self.publisher("/ic/subgoal", msg.PoseStamped, qos=SENSOR)
         self.trajectory = self.publisher("/ic/trajectory", msg.Path, qos=SENSOR)
         self.costmap_out = self.publisher("/costmap", msg.OccupancyGrid, qos=SENSOR)
-
+        sources = {
+            "scan": self.latest("/scan", msg.LaserScan, 10.0),
+            "odometry": self.latest("/wheel/odom", msg.Odometry, 10.0),
+            "pose": self.latest("/pose", msg.PoseWithCovarianceStamped, 10.0),
+            "vbot": self.latest("/vbot/odom", msg.Odometry, 10.0),
+            "nav": self.latest("/nav/cmd_vel", msg.TwistStamped, 10.0),
+            "command": self.latest("/operator/cmd_vel", msg.TwistStamped, 10.0),
+        }
+        points = self.latest("/lidar/points", msg.PointCloud2, 10.0) if c.costmap.points.enabled else None
+        shown = self.latest("/view/shown", msg.ShownPictures, 1.0)
+        vspace = self.latest("/vspace/status", msg.VspaceStatus, 60.0, qos=LATCHED)
+        self.inbox = ArbiterInbox(self.clock, self.surroundings, self.view, sources, points, shown, vspace)
         self.subscribe("/operator/cmd_vel", msg.TwistStamped, self.on_command, qos=SENSOR)
         self.subscribe("/view/shown", msg.ShownPictures, self.on_shown, qos=SENSOR)
         self.subscribe("/map", msg.OccupancyGrid, lambda m: self.walls.on_map(*msg.grid_array(m)), qos=LATCHED)
@@ -92,7 +100,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         self.subscribe_raw("/camera/image/compressed", self.on_camera, qos=SENSOR)
         self.timer(c.wall_period_s, self.walls.update)
         self.timer(1.0 / c.costmap.update_frequency, self.update_costmap)
-        self.cancel_extra: Callable[[], None] = lambda: None  # cancels a step between two timers
+        self.cancel_extra = lambda: None  # cancels a step between two timers
         self.timer(1.0 / c.rate_hz, self.on_timer)
 
     def reconfigure(self, config: ArbiterNodeConfig) -> None:
@@ -142,33 +150,30 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
 
     def on_shown(self, message: msg.ShownPictures) -> None:
         """Step at once if a switch waits for the new images, or the driver was lost."""
-        mode, gone, was_gone = self.arbiter.mode, self.inbox.operator_gone(), self.was_gone
+        mode, was_gone = self.arbiter.mode, self.was_gone
         wanted = mode in (Mode.ENTERING, Mode.VIRTUAL, Mode.RETURNING)
         new = self.view.report(page_report(message), wanted, self.clock.now_ns(), self.clock.steady_ns())
-        self.was_gone = gone
+        self.was_gone = gone = self.inbox.operator_gone()
         if (new and mode in (Mode.ENTERING, Mode.RETURNING)) or (gone and not was_gone):
             self.tick()
 
     def update_costmap(self) -> None:
-        scan, cloud = self.inbox.scan(), self.inbox.cloud()
-        costmap = self.surroundings.update_costmap(scan, cloud, self.walls.map)
+        scan = self.inbox.scan()
+        costmap = self.surroundings.update_costmap(scan, self.inbox.cloud(), self.walls.map)
         self.diagnose_surroundings()
         if costmap is None or scan is None:
             return
         if self.surroundings.map_jumped:
             self.log.info("the map has jumped: the marks of scans are cleared from the costmap")
         if self.surroundings.publish_due(self.clock.steady_ns()):
-            x, y = (float(value) for value in costmap.origin)
-            self.costmap_out.publish(
-                msg.grid_message(costmap.occupancy(), costmap.resolution, (x, y), "map", scan.stamp_ns)
-            )
+            grid, (x, y) = costmap.occupancy(), costmap.origin.tolist()
+            self.costmap_out.publish(msg.grid_message(grid, costmap.resolution, (x, y), "map", scan.stamp_ns))
 
     def diagnose_surroundings(self) -> None:
         for name, found in self.surroundings.findings.items():
             self.diagnose(name, OK if found.ok else WARN, found.text, **found.values)
 
     def tick(self) -> None:
-        """Make one step of the arbiter and publish its decision."""
         now_ns = self.clock.now_ns()
         inputs = self.inbox.inputs(self.latch, self.walls.found, self.config.timeouts)
         self.obeyed = inputs.operator_command
@@ -177,6 +182,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         frame = msg.HARD_STOP if decision.hard else "base_link"
         self.cmd_vel.publish(msg.twist_stamped(*decision.command, now_ns, frame))
         self.publish_decision(decision, inputs, now_ns)
+        self.diagnose_surroundings()
         # One more step if the next timer may be later than a time-out: time-outs are exact.
         self.cancel_extra()
         stale_in_s = self.arbiter.stale_in_s(inputs, self.clock.steady_ns())
@@ -188,9 +194,7 @@ class ArbiterNode(Node[ArbiterNodeConfig]):
         if decision.changed:
             self.log.info("%s: %s", decision.mode.label, decision.reason)
         level = WARN if decision.mode == Mode.STOPPED or decision.blocked else OK
-        names = {"mode": decision.mode.name, "reason": decision.reason_code.name}
-        self.diagnose("control", level, decision.reason, **names)
-        self.diagnose_surroundings()
+        self.diagnose("control", level, decision.reason, mode=decision.mode.name, reason=decision.reason_code.name)
         self.ticks += 1
         if self.ticks % 2 and not decision.changed:
             return  # 10 Hz is enough for display and planning

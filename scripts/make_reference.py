@@ -41,7 +41,7 @@ def topics(source: str) -> dict[str, dict[str, str]]:
                 kind = arguments[1]
                 if name in ("subscribe_raw", "subscribe_received"):  # raw bytes, passed on or decoded by the callback
                     kind = next((k.value for k in call.keywords if k.arg == "message_class"), ast.Name("bytes"))
-                found[CALLS[name]][topic] = ast.unparse(kind)
+                found[CALLS[name]][topic] = ast.unparse(kind).removeprefix("msg.")
         elif name == "tf_broadcast":
             found["gives"]["/tf"] = "TFMessage"
         elif name == "tf_broadcast_static":

@@ -103,7 +103,7 @@ class Snapshot:
     stale: tuple[Stale, ...]
     """Stale sources that the present mode needs."""
     lost: tuple[Stale, ...]
-    """Those of them that have been silent for so long that the robot must go to STOPPED."""
+    """Those of them that are older than ``stop_after_s``: the robot must go to STOPPED."""
     stale_in_real: tuple[Stale, ...]
     """Stale sources that REAL needs."""
     fresh_s: float

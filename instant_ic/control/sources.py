@@ -35,7 +35,7 @@ class SourceMonitor:
         return tuple(found)
 
     def is_lost(self, stale: Stale, inputs: ArbiterInputs) -> bool:
-        """Whether a stale source has been silent for so long that the robot must go to STOPPED."""
+        """Whether a stale source is older than ``TimeoutConfig.lost_s``: the robot must go to STOPPED."""
         source, age_s = stale
         return age_s > self.config.timeouts.lost_s(source.key, _usual_s(source, inputs))
 

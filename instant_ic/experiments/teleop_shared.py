@@ -17,7 +17,7 @@ from instant_ic.control.navigator import Navigator
 from instant_ic.control.planner import HybridPlanner, PlannerConfig
 from instant_ic.control.prediction import Prediction
 from instant_ic.control.snapshot import ArbiterInputs
-from instant_ic.control.states import Mode
+from instant_ic.control.states import Mode, Reason
 from instant_ic.control.subgoal import extend_ahead
 from instant_ic.geometry.poses import wrap_angle
 
@@ -65,13 +65,14 @@ class SharedControl(Arbiter):
             return self._given_back(decision)
         step = self.navigator.step(pose, self._speed_m_s, self.goal, costmap, now_ns)
         self._speed_m_s = step.command[0]
-        monitor = self.config.collision_monitor
-        memory = costmap.memory_near(pose, monitor.blind_radius_m, monitor.memory_range_m)
-        points = np.concatenate([inputs.scan_points, np.repeat(memory, self.rules.monitor.most_points_needed, axis=0)])
-        sent = self.rules.monitor.limit(step.command, points, max(inputs.age("scan"), inputs.ages.get("points", 0.0)))
-        hard = sent.action == "stop"
+        sent = self.rules.monitored(step.command, inputs)
         return replace(
-            decision, command=sent.command, hard=hard, blocked=False, reason="the robot goes round by itself"
+            decision,
+            command=sent.command,
+            hard=sent.action == "stop",
+            blocked=False,
+            reason="the robot goes round by itself",
+            reason_code=Reason.DRIVE_ROBOT,
         )
 
     def _given_back(self, decision: Decision) -> Decision:

@@ -35,7 +35,7 @@ def command_age(arbiter: ArbiterNode) -> float:
 def test_setting_the_clock_makes_nothing_older_or_younger(jump_s: int) -> None:
     bus, clock = clocked()
     arbiter = bus.add(ArbiterNode)
-    latest = arbiter.inbox._sources["command"]
+    latest = arbiter.inbox.sources["command"]
     bus.publish("/operator/cmd_vel", twist_stamped(0.2, 0.0, clock.now_ns() - S // 5))
     assert (latest.age_s, latest.stamp_age_s) == (0.0, pytest.approx(0.2))
     clock.set_by_ns = jump_s * S
@@ -47,7 +47,7 @@ def test_setting_the_clock_makes_nothing_older_or_younger(jump_s: int) -> None:
 
 def test_a_stamp_ahead_counts_from_its_arrival() -> None:
     bus, clock = clocked()
-    latest = bus.add(ArbiterNode).inbox._sources["command"]
+    latest = bus.add(ArbiterNode).inbox.sources["command"]
     bus.publish("/operator/cmd_vel", twist_stamped(0.2, 0.0, clock.now_ns() + 100 * S))
     clock.set(clock.steady_ns() + 2 * S)
     assert latest.stamp_age_s == pytest.approx(2.0)
