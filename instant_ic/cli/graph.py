@@ -1,14 +1,20 @@
-"""The graph of nodes and topics: as an image (SVG, PNG), graphviz or mermaid text, or a tree for the terminal."""
+"""The graph of nodes and topics: a tree for the terminal, Graphviz or Mermaid text, or an image by Graphviz."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 EVERYBODYS = ("/heartbeat", "/diagnostics", "/rosout", "/parameter_events", "/clock")
 """Topics that every node has; they do not show how the stack is connected."""
 TRANSFORMS = ("/tf", "/tf_static")
+IMAGES = ("svg", "png", "pdf")
+_FILLS = {"degraded": "#ffe0b8", "starting": "#fff3c4", "failed": "#f6c6c6", "silent": "#f6c6c6"}
+_RENDER_TIMEOUT_S = 60.0
 
 
 @dataclass
@@ -85,7 +91,7 @@ def make_graph(
     return graph
 
 
-def rate_words(rate_hz: float | None) -> str:
+def rate_text(rate_hz: float | None) -> str:
     """``10 Hz``, ``0.5 Hz``; empty where the rate is zero or unknown."""
     if not rate_hz:
         return ""
@@ -99,7 +105,7 @@ def tree(graph: StackGraph) -> str:
         lines.append(node + (f"  ({state})" if state not in ("", "running") else ""))
         topics = [topic for name, topic in graph.publishes if name == node]
         for topic in topics:
-            flow = rate_words(graph.publishes[node, topic])
+            flow = rate_text(graph.publishes[node, topic])
             kind = graph.topics[topic].rsplit("/", 1)[-1]
             readers = [
                 reader + (f" (lost {graph.subscribes[topic, reader]})" if graph.subscribes[topic, reader] else "")
@@ -117,17 +123,20 @@ def tree(graph: StackGraph) -> str:
 
 
 def dot(graph: StackGraph) -> str:
-    """The graph in graphviz's DOT language."""
+    """The graph in Graphviz's DOT language; the fill of a node shows its state."""
     lines = [
         "digraph stack {",
         "  rankdir=LR; node [fontname=Helvetica, fontsize=10]; edge [fontname=Helvetica, fontsize=8];",
     ]
-    lines += [f'  "{node}" [shape=box, style="rounded,filled", fillcolor="#dce8f7"];' for node in graph.nodes]
+    lines += [
+        f'  "{node}" [shape=box, style="rounded,filled", fillcolor="{_FILLS.get(state, "#dce8f7")}"];'
+        for node, state in graph.nodes.items()
+    ]
     lines += [
         f'  "{topic}" [shape=plain, label="{topic}\\n{kind.rsplit("/", 1)[-1]}"];'
         for topic, kind in graph.topics.items()
     ]
-    lines += [f'  "{n}" -> "{t}" [label="{rate_words(rate)}"];' for (n, t), rate in graph.publishes.items()]
+    lines += [f'  "{n}" -> "{t}" [label="{rate_text(rate)}"];' for (n, t), rate in graph.publishes.items()]
     for (topic, node), lost in graph.subscribes.items():
         label = f' [label="lost {lost}", color=red]' if lost else ""
         lines.append(f'  "{topic}" -> "{node}"{label};')
@@ -135,14 +144,50 @@ def dot(graph: StackGraph) -> str:
 
 
 def mermaid(graph: StackGraph) -> str:
-    """The graph as a mermaid flowchart, which Markdown pages can show."""
+    """The graph as a Mermaid flowchart, which Markdown pages can show."""
     keys = {name: f"v{number}" for number, name in enumerate([*graph.nodes, *graph.topics])}
     lines = ["flowchart LR"]
     lines += [f'  {keys[node]}["{node}"]' for node in graph.nodes]
     lines += [f'  {keys[topic]}(["{topic}"])' for topic in graph.topics]
     for (node, topic), rate in graph.publishes.items():
-        label = f'|"{rate_words(rate)}"|' if rate_words(rate) else ""
+        label = f'|"{rate_text(rate)}"|' if rate_text(rate) else ""
         lines.append(f"  {keys[node]} -->{label} {keys[topic]}")
     for (topic, node), lost in graph.subscribes.items():
         lines.append(f"  {keys[topic]} -->" + (f'|"lost {lost}"| ' if lost else " ") + keys[node])
     return "\n".join([*lines, ""])
+
+
+def write(graph: StackGraph, path: Path) -> None:
+    """Write the graph as ``.dot`` or ``.mmd`` text, or as an image that Graphviz's ``dot`` renders.
+
+    Raises:
+        ValueError: the suffix is not supported, or an image is requested and ``dot`` is missing or fails.
+        OSError: the file cannot be written.
+    """
+    kind = path.suffix.lstrip(".").lower()
+    if kind == "dot":
+        path.write_text(dot(graph))
+    elif kind == "mmd":
+        path.write_text(mermaid(graph))
+    elif kind in IMAGES:
+        path.write_bytes(_render(graph, kind, path))
+    else:
+        known = ", ".join(f".{suffix}" for suffix in ("dot", "mmd", *IMAGES))
+        raise ValueError(f"{path}: the name must end in one of {known}")
+
+
+def _render(graph: StackGraph, kind: str, path: Path) -> bytes:
+    program = shutil.which("dot")
+    if program is None:
+        raise ValueError(
+            f"{path}: images are rendered by Graphviz, which is not installed (sudo apt install graphviz). "
+            f"Or write {path.with_suffix('.mmd')}: GitHub, VS Code and mermaid.live render it"
+        )
+    command = [program, f"-T{kind}"]
+    try:
+        done = subprocess.run(command, input=dot(graph).encode(), capture_output=True, timeout=_RENDER_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        raise ValueError(f"{path}: dot did not finish within {_RENDER_TIMEOUT_S:g} s; write a .dot file") from None
+    if done.returncode:
+        raise ValueError(f"{path}: dot failed: {done.stderr.decode(errors='replace').strip()}")
+    return done.stdout

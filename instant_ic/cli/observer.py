@@ -44,6 +44,8 @@ class Observer:
             pace.use(pace.read(self._run_dir))
         except pace.PaceError as error:
             raise registry.RegistryError(str(error)) from error
+        self.received = 0
+        """Messages yielded by :meth:`batches`."""
         self._ready = threading.Event()
         self.transport = LocalTransport(self._run_dir, f"ic_{os.getpid()}", self.clock.now_ns)
         try:
@@ -77,7 +79,9 @@ class Observer:
             self._ready.wait(min(period_s, left_s))
             self._ready.clear()
             self.follow_clock()
-            yield [received for topic in self.topics for received in self.subscriptions[topic].take()]
+            batch = [received for topic in self.topics for received in self.subscriptions[topic].take()]
+            self.received += len(batch)
+            yield batch
 
     def follow_clock(self) -> None:
         """Set the clock to the newest ``/clock`` message where simulated time is used."""
@@ -92,12 +96,17 @@ class Observer:
             if topic not in known:
                 print(f"ic: {unknown_topic(topic, known)}; waiting for it", file=sys.stderr)
 
-    def nothing_heard(self, seconds: float) -> UserError:
-        """Error for a command that received nothing, with the likely reason."""
+    def too_few(self, seconds: float) -> UserError:
+        """Error for a command that received no message, or fewer than it needs, with the likely reason."""
         known = {info.topic for info in registry.list_topics(self._run_dir)}
         missing = [topic for topic in self.topics if topic not in known]
         silent = [topic for topic in self.topics if topic in known]
         why = [unknown_topic(topic, known) for topic in missing]
+        if self.received:
+            if self._sim_clock is not None and not self.clock.now_ns():
+                why.append(f"no message on {_CLOCK}: leave out --use-sim-time")
+            plural = "s" * (self.received > 1)
+            return UserError("; ".join([f"only {self.received} message{plural} received in {seconds:.0f} s", *why]))
         if silent:
             why.append(f"{', '.join(silent)} has a publisher that sends nothing (ic topic info -v {silent[0]})")
         return UserError(f"nothing received in {seconds:.0f} s: {'; '.join(why)}")

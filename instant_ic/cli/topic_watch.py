@@ -42,8 +42,8 @@ def echo(args: argparse.Namespace) -> int:
                 count += 1
                 if count == wanted:
                     return 0
-        if count < wanted or not count:
-            raise observer.nothing_heard(args.timeout)
+        if count < max(wanted, 1):
+            raise observer.too_few(args.timeout)
     return 0
 
 
@@ -58,7 +58,7 @@ def rate(args: argparse.Namespace) -> int:
             lambda topic: rates[topic].line(observer.lost_by(topic)),
         )
         if all(one.count < 2 for one in rates.values()):
-            raise observer.nothing_heard(args.duration)
+            raise observer.too_few(args.duration)
     return 0
 
 
@@ -95,7 +95,7 @@ def bandwidth(args: argparse.Namespace) -> int:
             lambda topic: f"{flows[topic].line()}  lost: {losses(observer.lost_by(topic))}",
         )
         if not any(flow.sizes.count for flow in flows.values()):
-            raise observer.nothing_heard(args.duration)
+            raise observer.too_few(args.duration)
     return 0
 
 
@@ -129,7 +129,7 @@ def delay(args: argparse.Namespace) -> int:
 
         _watch(observer, args.duration, take, line)
         if not any(window.count for window in delays.values()):
-            raise observer.nothing_heard(args.duration)
+            raise observer.too_few(args.duration)
     return 0
 
 

@@ -90,6 +90,8 @@ def test_echo(ic):
     assert status == 1 and "/scam has no publisher (did you mean '/scan'?); waiting for it" in error
     status, _, error = ic("topic", "echo", "/heard", "--timeout", "0.3")
     assert status == 1 and "/heard has a publisher that sends nothing" in error
+    status, out, error = ic("topic", "echo", "/flag", "-n", "2", "--timeout", "2")
+    assert status == 1 and out.count("---") == 1 and error == "ic: only 1 message received in 2 s\n"
 
 
 def test_hz_bw_and_delay(ic):

@@ -1,4 +1,4 @@
-"""``ic graph``: nodes and topics of the running stack as a tree or an image."""
+"""``ic graph``: nodes and topics of the running stack as a tree, text or image."""
 
 from __future__ import annotations
 
@@ -14,16 +14,20 @@ def add_parser(subparsers: Any) -> None:
     """Add the verb."""
     parser = subparsers.add_parser(
         "graph",
-        help="nodes and topics as a tree or an image",
-        description="Show publishers and subscribers as a tree, or as an image with -o.",
-        epilog="example: ic graph -o stack.svg",
+        help="nodes and topics as a tree, Graphviz or Mermaid text, or an image",
+        description="Show publishers and subscribers as a tree, or write them to a file with -o.",
+        epilog="example: ic graph -o stack.mmd",
     )
     completion.offer(
         parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these and their neighbours (default: all)"),
         completion.nodes,
     )
     parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", help=".svg, .png, .pdf, .dot (graphviz), .mmd (mermaid)"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help=".mmd (Mermaid), .dot (Graphviz), or .svg, .png, .pdf, which need Graphviz",
     )
     parser.add_argument(
         "-a",
@@ -36,11 +40,10 @@ def add_parser(subparsers: Any) -> None:
 
 
 def show(args: argparse.Namespace) -> int:
-    """Print the tree, or write the image."""
+    """Print the tree, or write the file."""
     from instant_ic import paths
     from instant_ic.bus import registry
-    from instant_ic.cli.graph import make_graph, tree
-    from instant_ic.cli.graph_picture import write
+    from instant_ic.cli.graph import make_graph, tree, write
     from instant_ic.cli.heartbeats import hear
     from instant_ic.cli.names import find_node, nobody_runs
 
