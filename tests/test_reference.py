@@ -68,3 +68,12 @@ def test_documented_defaults_are_those_of_a_constructed_configuration(module):
         assert documented.pop(key) in ("''", "[]")
         actual.pop(key)
     assert documented == actual
+
+
+def test_messages_of_every_topic_are_documented():
+    page = (ROOT / "docs/reference.md").read_text()
+    documented = {name.rsplit("/", 1)[1] for name in re.findall(r"^### (\S+/msg/\S+)$", page, re.MULTILINE)}
+    lines = re.findall(r"^(?:Takes|Gives): (.*)$", page, re.MULTILINE)
+    used = {kind for line in lines for kind in re.findall(r"`/\S+` ([A-Z]\w+)", line)}
+    assert len(used) > 15
+    assert used <= documented

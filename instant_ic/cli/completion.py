@@ -57,12 +57,18 @@ def parameters(args: Any) -> Iterable[str]:
 
 @_quiet
 def types(args: Any) -> Iterable[str]:
-    """Message types: those in use on the bus first, then the other ROS 2 types."""
-    from instant_ic.cli.names import topic_types
+    """Message types of ROS 2 and of this project."""
+    from instant_ic.msg import typestore
 
-    found = set(topic_types().values()) - {"any"}
-    definitions = Path(__file__).resolve().parents[1] / "msg" / "definitions"
-    return sorted(found | {f"{path.parent.name}/msg/{path.stem}" for path in definitions.glob("*/*.msg")})
+    return sorted(typestore().types)
+
+
+@_quiet
+def packages(args: Any) -> Iterable[str]:
+    """Packages of message types."""
+    from instant_ic.msg import typestore
+
+    return sorted({name.split("/")[0] for name in typestore().types})
 
 
 @_quiet

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from instant_ic.cli.errors import UserError
+from instant_ic.cli.names import find_type
 from instant_ic.config.params import ParameterError, yaml_value
-from instant_ic.msg import MessageError, message_type, to_time, type_name, typestore
+from instant_ic.msg import message_type, to_time, type_name, typestore
 
 _INTEGERS = {
     name: (np.iinfo(kind).min, np.iinfo(kind).max)
@@ -48,14 +49,7 @@ def fields(name: str) -> list[tuple[str, Any]]:
     Raises:
         UserError: there is no such type.
     """
-    try:
-        full = type_name(message_type(name))
-    except MessageError as error:
-        short = [known.rsplit("/", 1)[1] for known in typestore().types]
-        close = difflib.get_close_matches(name.rsplit("/", 1)[-1], short, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise UserError(f"{error}{hint}", 2) from None
-    return list(typestore().get_msgdef(full).fields)
+    return list(typestore().get_msgdef(find_type(name)).fields)
 
 
 def build(name: str, values: Any, now_ns: int, path: str = "") -> Any:

@@ -1,4 +1,4 @@
-"""Look up topic and node names that the user types; an unknown name gets a suggestion."""
+"""Look up topics, nodes and message types that the user types; an unknown name gets a suggestion."""
 
 from __future__ import annotations
 
@@ -58,3 +58,21 @@ def find_node(name: str) -> registry.NodeInfo:
         hint = near(name.strip("/"), nodes, f"running: {', '.join(nodes)}")
         raise UserError(f"node {name!r} is not running in {paths.run_dir()} ({hint})")
     return nodes[name.strip("/")]
+
+
+def find_type(name: str) -> str:
+    """Full name of a message type, from its full or short name.
+
+    Raises:
+        UserError: there is no such type.
+    """
+    from instant_ic.msg import MessageError, message_type, type_name, typestore
+
+    try:
+        return type_name(message_type(name))
+    except MessageError as error:
+        short = name.rsplit("/", 1)[-1]
+        known = {full.rsplit("/", 1)[1]: full for full in typestore().types}
+        close = difflib.get_close_matches(short, known, n=1)
+        suggestion = (known[close[0]] if "/" in name else close[0]) if close else ""
+        raise UserError(f"{error}" + (f"; did you mean {suggestion!r}?" if close else ""), 2) from None

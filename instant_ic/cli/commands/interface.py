@@ -1,0 +1,77 @@
+"""``ic interface``: message types and their fields."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from instant_ic.cli import completion
+from instant_ic.cli.errors import UserError
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the verb."""
+    parser = subparsers.add_parser(
+        "interface",
+        help="list and show message types",
+        description="List message types and show their fields with units and frames.",
+        epilog="example: ic interface show instant_ic_msgs/msg/Keyframe",
+    )
+    verbs = parser.add_subparsers(metavar="VERB", required=True)
+    added = verbs.add_parser(
+        "list",
+        help="all message types",
+        description="List the message types of ROS 2 and of this project.",
+        epilog="example: ic interface list",
+    )
+    added.set_defaults(func=list_types)
+    added = verbs.add_parser(
+        "package",
+        help="message types of one package",
+        description="List the message types of one package.",
+        epilog="example: ic interface package instant_ic_msgs",
+    )
+    completion.offer(added.add_argument("package", metavar="NAME"), completion.packages)
+    added.set_defaults(func=list_package)
+    added = verbs.add_parser(
+        "show",
+        help="definition of a message type",
+        description="Show the definition of a message type, with the fields of nested types.",
+        epilog="example: ic interface show sensor_msgs/msg/LaserScan",
+    )
+    completion.offer(added.add_argument("type", metavar="TYPE", help="full or short name"), completion.types)
+    added.add_argument("--all-comments", action="store_true", help="also show the comments of nested types")
+    added.set_defaults(func=show)
+
+
+def list_types(args: argparse.Namespace) -> int:
+    """Print all types."""
+    from instant_ic.msg import typestore
+
+    print("Messages:")
+    for name in sorted(typestore().types):
+        print(f"    {name}")
+    return 0
+
+
+def list_package(args: argparse.Namespace) -> int:
+    """Print the types of a package."""
+    from instant_ic.cli.names import near
+    from instant_ic.msg import typestore
+
+    types = sorted(typestore().types)
+    found = [name for name in types if name.split("/")[0] == args.package]
+    if not found:
+        packages = {name.split("/")[0] for name in types}
+        raise UserError(f"no package {args.package!r} ({near(args.package, packages, 'see ic interface list')})", 2)
+    print("\n".join(found))
+    return 0
+
+
+def show(args: argparse.Namespace) -> int:
+    """Print the definition of a type."""
+    from instant_ic.cli.names import find_type
+    from instant_ic.msg.definition import expanded_definition
+
+    print(expanded_definition(find_type(args.type), args.all_comments))
+    return 0
