@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from mcap.opcode import Opcode
+
 from instant_ic.bag.bounded import decompress
 from instant_ic.bag.errors import BagError
-from instant_ic.bag.mcap_writer import CHANNEL, CHUNK, DATA_END, HEADER, MAGIC, MESSAGE, METADATA, SCHEMA, Schema
+from instant_ic.bag.mcap_writer import LIBRARY, MAGIC, Schema
 
-OWN_LIBRARY = "instant_ic"
 _KNOWN_OPCODES = range(0x01, 0x10)  # opcodes from 0x80 on are private
 _MOST_DAMAGED = 1000
 """Damaged records that are listed; a hostile file may contain nothing else."""
@@ -91,9 +92,9 @@ class McapScan:
             if opcode not in _KNOWN_OPCODES and opcode < 0x80:
                 self._stop(at, f"{opcode:#04x} is not a valid opcode")
                 return
-            if opcode == CHUNK:
+            if opcode == Opcode.CHUNK:
                 yield from self._chunk(data[body : min(end, len(data))], at, end <= len(data))
-            elif opcode == DATA_END:
+            elif opcode == Opcode.DATA_END:
                 self.whole = end <= len(data) and bytes(data[-len(MAGIC) :]) == MAGIC
                 if not self.whole:
                     self._stop(at, "the index after the messages is truncated")
@@ -143,28 +144,28 @@ class McapScan:
             inner = end
 
     def _record(self, opcode: int, body: memoryview) -> Iterator[ScannedMessage]:
-        if opcode == MESSAGE:
+        if opcode == Opcode.MESSAGE:
             number, _, stamp_ns, publish_ns = struct.unpack_from("<HIQQ", body, 0)
             if number not in self._channels:
                 raise ValueError(f"a message of unknown channel {number} (its definition was damaged)")
             topic, schema, encoding, metadata = self._channels[number]
-            repeated = self.library == OWN_LIBRARY and publish_ns != stamp_ns
+            repeated = self.library == LIBRARY and publish_ns != stamp_ns
             known = self._schemas.get(schema, Schema("", "", "", ""))
             yield ScannedMessage(topic, known, encoding, metadata, stamp_ns, bytes(body[22:]), repeated)
-        elif opcode == SCHEMA:
+        elif opcode == Opcode.SCHEMA:
             name, at = _string(body, 2)
             encoding, at = _string(body, at)
             text, at = _string(body, at)
             self._schemas[struct.unpack_from("<H", body)[0]] = Schema(name, encoding, text, "")
-        elif opcode == CHANNEL:
+        elif opcode == Opcode.CHANNEL:
             number, schema = struct.unpack_from("<HH", body)
             topic, at = _string(body, 4)
             encoding, at = _string(body, at)
             self._channels[number] = (topic, schema, encoding, _string_map(body, at)[0])
-        elif opcode == METADATA:
+        elif opcode == Opcode.METADATA:
             name, at = _string(body, 0)
             self.metadata[name] = _string_map(body, at)[0]
-        elif opcode == HEADER:
+        elif opcode == Opcode.HEADER:
             _, at = _string(body, 0)
             self.library = _string(body, at)[0]
 

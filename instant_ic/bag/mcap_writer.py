@@ -1,7 +1,8 @@
 """Writes one MCAP file (https://mcap.dev/spec) in chunks, without copying the payloads.
 
-Each chunk is one gathered write, so the file always ends with a complete chunk. On a full disk the writer truncates
-the file to the last complete chunk. The index at the end is built from memory.
+The `mcap` package encodes all records except messages and chunks. Its writer cannot pass on an open chunk, copies each
+payload, and leaves a broken file on a full disk. Here each chunk is one gathered write, so the file always ends with a
+complete chunk. On a full disk the writer truncates the file to the last complete chunk and builds the index from memory.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from instant_ic.private import open_file
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
-MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(0x01, 0x09)
-STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0C, 0x0D, 0x0E, 0x0F
+from instant_ic.private import open_file
 
 CHUNK_BYTES = 1 << 20
 """A chunk is closed once it is larger than this."""
 
-_LIBRARY = "instant_ic"
+LIBRARY = "instant_ic"
 _IOV_MOST = 1000  # IOV_MAX limits a gathered write to 1024 parts
 
 Buffer = bytes | memoryview
@@ -49,16 +51,9 @@ class Schema:
 
 @dataclass(frozen=True)
 class _Chunk:
-    """Index entry of a chunk, written at the end of the file."""
+    """Index entry of a chunk, and its number of messages by channel."""
 
-    start_ns: int
-    end_ns: int
-    offset: int
-    length: int
-    end_offset: int
-    index_offsets: dict[int, int]
-    compressed_size: int
-    size: int
+    index: records.ChunkIndex
     counts: dict[int, int]
 
 
@@ -77,6 +72,7 @@ class McapWriter:
     def __init__(self, path: Path, compressed: bool = False, level: int = 3) -> None:
         self.path = path
         self.compressed = compressed
+        self._compression = "zstd" if compressed else ""
         self._compressor: Any = None
         if compressed:
             import zstandard
@@ -84,13 +80,13 @@ class McapWriter:
             self._compressor = zstandard.ZstdCompressor(level=level)
         self._fd = open_file(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
         self._offset = 0
-        self._schemas: dict[int, bytes] = {}
-        self._channels: dict[int, tuple[int, bytes]] = {}
+        self._schemas: list[records.Schema] = []
+        self._channels: list[records.Channel] = []
         self._chunks: list[_Chunk] = []
-        self._metadata: list[tuple[int, int, str]] = []
+        self._metadata: list[records.MetadataIndex] = []
         self._clear()
         try:
-            self._put([MAGIC, *_record(HEADER, _string("ros2") + _string(_LIBRARY))])
+            self._put([MAGIC, _encode(records.Header(profile="ros2", library=LIBRARY))])
         except OSError:
             os.close(self._fd)
             path.unlink(missing_ok=True)
@@ -104,17 +100,19 @@ class McapWriter:
     def add_schema(self, schema: Schema) -> int:
         """Add a message type and return its number in this file."""
         number = len(self._schemas) + 1
-        body = struct.pack("<H", number) + _string(schema.name) + _string(schema.encoding) + _string(schema.text)
-        self._schemas[number] = b"".join(_record(SCHEMA, body))
-        self._append(self._schemas[number])
+        record = records.Schema(id=number, name=schema.name, encoding=schema.encoding, data=schema.text.encode())
+        self._schemas.append(record)
+        self._append(_encode(record))
         return number
 
     def add_channel(self, topic: str, schema: int, metadata: Mapping[str, str]) -> int:
         """Add a topic with its type and return its number in this file."""
         number = len(self._channels) + 1
-        body = struct.pack("<HH", number, schema) + _string(topic) + _string("cdr") + _string_map(metadata)
-        self._channels[number] = (schema, b"".join(_record(CHANNEL, body)))
-        self._append(self._channels[number][1])
+        record = records.Channel(
+            id=number, schema_id=schema, topic=topic, message_encoding="cdr", metadata=dict(metadata)
+        )
+        self._channels.append(record)
+        self._append(_encode(record))
         return number
 
     def write(self, channel: int, stamp_ns: int, payload: Buffer, publish_ns: int | None = None) -> None:
@@ -125,7 +123,7 @@ class McapWriter:
         """
         self._index.setdefault(channel, []).append((stamp_ns, self._chunk_bytes))
         publish = stamp_ns if publish_ns is None else publish_ns
-        self._append(struct.pack("<BQHIQQ", MESSAGE, 22 + len(payload), channel, 0, stamp_ns, publish))
+        self._append(struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + len(payload), channel, 0, stamp_ns, publish))
         self._append(payload)
         if self._chunk_bytes > CHUNK_BYTES or len(self._parts) > 100_000:
             self.flush()
@@ -136,8 +134,8 @@ class McapWriter:
         Raises:
             OSError: the disk is full.
         """
-        record = b"".join(_record(METADATA, _string(name) + _string_map(values)))
-        self._metadata.append((self._offset, len(record), name))
+        record = _encode(records.Metadata(name=name, metadata=dict(values)))
+        self._metadata.append(records.MetadataIndex(offset=self._offset, length=len(record), name=name))
         try:
             self._put([record])
         except OSError:
@@ -166,20 +164,27 @@ class McapWriter:
             stored_size = len(stored[0])
         start_ns = min(stamp for entries in index.values() for stamp, _ in entries)
         end_ns = max(stamp for entries in index.values() for stamp, _ in entries)
-        kind = _string("zstd" if self.compressed else "")
-        head = struct.pack("<QQQI", start_ns, end_ns, size, crc) + kind + struct.pack("<Q", stored_size)
+        kind = self._compression.encode()
+        head = struct.pack(f"<QQQII{len(kind)}sQ", start_ns, end_ns, size, crc, len(kind), kind, stored_size)
         length = 9 + len(head) + stored_size
         tail, offsets, at = [], {}, self._offset + length
         for channel, entries in index.items():
-            flat = [number for entry in entries for number in entry]
-            body = struct.pack(f"<HI{len(flat)}Q", channel, 8 * len(flat), *flat)
             offsets[channel] = at
-            tail.append(b"".join(_record(MESSAGE_INDEX, body)))
+            tail.append(_encode(records.MessageIndex(channel, entries)))
             at += len(tail[-1])
-        counts = {channel: len(entries) for channel, entries in index.items()}
-        chunk = _Chunk(start_ns, end_ns, self._offset, length, at, offsets, stored_size, size, counts)
-        self._put([struct.pack("<BQ", CHUNK, len(head) + stored_size), head, *stored, *tail])
-        self._chunks.append(chunk)
+        entry = records.ChunkIndex(
+            chunk_start_offset=self._offset,
+            chunk_length=length,
+            compression=self._compression,
+            compressed_size=stored_size,
+            uncompressed_size=size,
+            message_start_time=start_ns,
+            message_end_time=end_ns,
+            message_index_length=at - self._offset - length,
+            message_index_offsets=offsets,
+        )
+        self._put([struct.pack("<BQ", Opcode.CHUNK, len(head) + stored_size), head, *stored, *tail])
+        self._chunks.append(_Chunk(entry, {channel: len(entries) for channel, entries in index.items()}))
 
     def finish(self) -> OSError | None:
         """Write index and footer and close the file. On a full disk, drop the last chunks to make room for them.
@@ -204,7 +209,7 @@ class McapWriter:
                     full = _if_full(error)
                     if not self._chunks:
                         raise
-                    self._cut_back(self._chunks.pop().offset)
+                    self._cut_back(self._chunks.pop().index.chunk_start_offset)
         finally:
             self.abandon()
 
@@ -218,19 +223,20 @@ class McapWriter:
     @property
     def count(self) -> int:
         """Messages in complete chunks on the disk."""
-        return sum(sum(chunk.counts.values()) for chunk in self._chunks)
+        return sum(self.counts.values())
 
     @property
     def span_ns(self) -> tuple[int, int]:
         """First and last stamp in complete chunks; (0, 0) if there are none."""
         if not self._chunks:
             return 0, 0
-        return min(c.start_ns for c in self._chunks), max(c.end_ns for c in self._chunks)
+        indexes = [chunk.index for chunk in self._chunks]
+        return min(i.message_start_time for i in indexes), max(i.message_end_time for i in indexes)
 
     @property
     def counts(self) -> dict[int, int]:
         """Messages in complete chunks, by channel."""
-        counts = dict.fromkeys(self._channels, 0)
+        counts = {channel.id: 0 for channel in self._channels}
         for chunk in self._chunks:
             for channel, count in chunk.counts.items():
                 counts[channel] += count
@@ -273,60 +279,47 @@ class McapWriter:
         os.ftruncate(self._fd, offset)
         os.lseek(self._fd, offset, os.SEEK_SET)
         self._offset = offset
-        self._metadata = [entry for entry in self._metadata if entry[0] < offset]
+        self._metadata = [entry for entry in self._metadata if entry.offset < offset]
 
     def _summary(self) -> list[bytes]:
         """Return everything after the last chunk: data end, schemas, channels, indexes, statistics, footer."""
-        data_end = b"".join(_record(DATA_END, struct.pack("<I", 0)))
-        summary_start = self._offset + len(data_end)
-        used = self.counts
-        channels = [record for _, record in self._channels.values()]
+        data_end = _encode(records.DataEnd(0))
         start_ns, end_ns = self.span_ns
-        statistics = struct.pack(
-            "<QHIIIIQQI",
-            sum(used.values()),
-            len(self._schemas),
-            len(self._channels),
-            0,
-            len(self._metadata),
-            len(self._chunks),
-            start_ns,
-            end_ns,
-            10 * len(used),
-        ) + b"".join(struct.pack("<HQ", channel, count) for channel, count in used.items())
-        groups = [
-            (SCHEMA, list(self._schemas.values())),
-            (CHANNEL, channels),
-            (CHUNK_INDEX, [b"".join(_record(CHUNK_INDEX, self._chunk_index(chunk))) for chunk in self._chunks]),
-            (METADATA_INDEX, [b"".join(_record(METADATA_INDEX, struct.pack("<QQ", at, size) + _string(name)))
-                              for at, size, name in self._metadata]),
-            (STATISTICS, [b"".join(_record(STATISTICS, statistics))]),
-        ]  # fmt: skip
-        records: list[bytes] = []
-        offsets: list[bytes] = []
-        at = summary_start
-        for opcode, group in groups:
-            size = sum(len(record) for record in group)
-            if group:
-                offsets.append(b"".join(_record(SUMMARY_OFFSET, struct.pack("<BQQ", opcode, at, size))))
-            records += group
-            at += size
-        footer = struct.pack("<BQQQ", FOOTER, 20, summary_start, at)
-        crc = 0
-        for part in (*records, *offsets, footer):
-            crc = zlib.crc32(part, crc)
-        return [data_end, *records, *offsets, footer, struct.pack("<I", crc), MAGIC]
-
-    def _chunk_index(self, chunk: _Chunk) -> bytes:
-        offsets = b"".join(struct.pack("<HQ", channel, at) for channel, at in chunk.index_offsets.items())
-        index_length = chunk.end_offset - chunk.offset - chunk.length
-        return (
-            struct.pack("<QQQQI", chunk.start_ns, chunk.end_ns, chunk.offset, chunk.length, len(offsets))
-            + offsets
-            + struct.pack("<Q", index_length)
-            + _string("zstd" if self.compressed else "")
-            + struct.pack("<QQ", chunk.compressed_size, chunk.size)
+        counts = self.counts
+        statistics = records.Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(counts.values()),
+            message_start_time=start_ns,
+            message_end_time=end_ns,
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
         )
+        groups: dict[Opcode, Sequence[records.McapRecord]] = {
+            Opcode.SCHEMA: self._schemas,
+            Opcode.CHANNEL: self._channels,
+            Opcode.CHUNK_INDEX: [chunk.index for chunk in self._chunks],
+            Opcode.METADATA_INDEX: self._metadata,
+            Opcode.STATISTICS: [statistics],
+        }
+        start = self._offset + len(data_end)
+        summary = RecordBuilder()
+        offsets: list[records.SummaryOffset] = []
+        for opcode, group in groups.items():
+            begin = summary.count
+            for record in group:
+                record.write(summary)
+            if group:
+                offsets.append(records.SummaryOffset(opcode, start + begin, summary.count - begin))
+        offsets_start = start + summary.count
+        for offset in offsets:
+            offset.write(summary)
+        data = summary.end()
+        unsigned = _encode(records.Footer(start, offsets_start, 0))[:-4]
+        crc = zlib.crc32(unsigned, zlib.crc32(data))
+        return [data_end, data, unsigned, struct.pack("<I", crc), MAGIC]
 
 
 def _if_full(error: OSError) -> OSError:
@@ -336,15 +329,7 @@ def _if_full(error: OSError) -> OSError:
     return error
 
 
-def _record(opcode: int, body: bytes) -> tuple[bytes, bytes]:
-    return struct.pack("<BQ", opcode, len(body)), body
-
-
-def _string(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
-
-
-def _string_map(values: Mapping[str, str]) -> bytes:
-    body = b"".join(_string(key) + _string(value) for key, value in values.items())
-    return struct.pack("<I", len(body)) + body
+def _encode(record: records.McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()

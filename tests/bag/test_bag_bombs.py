@@ -11,13 +11,14 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from rosbags.interfaces import ConnectionExtRosbag1
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from instant_ic.bag import BagError, BagReader, bounded
 from instant_ic.bag.mcap_scan import McapScan
-from instant_ic.bag.mcap_writer import CHUNK, DATA_END, FOOTER, HEADER, MAGIC
+from instant_ic.bag.mcap_writer import MAGIC
 from instant_ic.bag.recover import recover, reindex
 from instant_ic.msg import typestore
 
@@ -62,10 +63,10 @@ def bomb(path: Path, compression: str, declared: int) -> Path:
     chunk = struct.pack("<QQQI", 0, 1, declared, 0) + text(compression) + struct.pack("<Q", len(data)) + data
     path.write_bytes(
         MAGIC
-        + record(HEADER, text("ros2") + text(""))
-        + record(CHUNK, chunk)
-        + record(DATA_END, bytes(4))
-        + record(FOOTER, bytes(20))
+        + record(Opcode.HEADER, text("ros2") + text(""))
+        + record(Opcode.CHUNK, chunk)
+        + record(Opcode.DATA_END, bytes(4))
+        + record(Opcode.FOOTER, bytes(20))
         + MAGIC
     )
     return path

@@ -742,12 +742,12 @@ def _bag_errors() -> tuple[type[BaseException], ...]:
 
 def fix_chunk(data: bytes, rng: random.Random) -> bytes:
     """Take away the check sums of chunks, so that what is inside is read."""
-    from instant_ic.bag.mcap_writer import CHUNK
+    from mcap.opcode import Opcode
 
     out, at = bytearray(data), 8
     while at + 9 <= len(out):
         opcode, length = struct.unpack_from("<BQ", out, at)
-        if opcode == CHUNK and at + 37 <= len(out):
+        if opcode == Opcode.CHUNK and at + 37 <= len(out):
             out[at + 9 + 24 : at + 9 + 28] = bytes(4)
         at += 9 + length
     return bytes(out)
