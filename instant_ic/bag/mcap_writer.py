@@ -2,7 +2,7 @@
 
 The `mcap` package encodes all records except messages and chunks. Its writer cannot pass on an open chunk, copies each
 payload, and leaves a broken file on a full disk. Here each chunk is one gathered write, so the file always ends with a
-complete chunk. On a full disk the writer truncates the file to the last complete chunk and builds the index from memory.
+complete chunk. On a full disk the writer truncates the file to it and builds the index from memory.
 """
 
 from __future__ import annotations
