@@ -2,46 +2,32 @@
 
 from __future__ import annotations
 
-import fnmatch
 import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from instant_ic.bag import BagError, BagMessage
-from instant_ic.bag.choice import TopicChoice
-from instant_ic.bag.player import RATES, BagPlayer, PlayOptions
+from instant_ic.bag.live_nodes import missing_readers, reached_base
+from instant_ic.bag.player import BagPlayer, PlayOptions
 from instant_ic.bag.transforms import TRANSFORM_TOPICS, without_children
 from instant_ic.bus import RELIABLE, Node, NodeError, Publisher, main, registry
 from instant_ic.bus.clock import ManualClock
-from instant_ic.config.ranges import NotNegative, Positive, Range, check_ranges
+from instant_ic.config.ranges import NotNegative, Positive
 from instant_ic.msg import message_type, register_type, to_time
 
-_BASE = "crawler_base"
 _BASE_PERIOD_S = 0.5
-_ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
-"""Topics that a robot's nodes act on, in the namespace of its base."""
-_HARMLESS = {"/clock", "/rosout", "/diagnostics", "/heartbeat", "/parameter_events"}
-"""Topics that every node publishes. On any other topic a second publisher would mix the bag with the live robot."""
 
 
 @dataclass(frozen=True)
-class BagPlayerConfig:
-    """Parameters of the player.
+class BagPlayerConfig(PlayOptions):
+    """Parameters, in addition to those of playing.
 
     Attributes:
         bag: folder of the bag, or a ``.mcap``, ``.db3`` or ROS 1 ``.bag`` file.
-        rate: 2 plays twice as fast.
-        start_offset_s: seconds to skip at the start; latched messages from the skipped part are still published.
-        duration_s: seconds of the bag to play; 0 plays to the end.
-        loop: restart at the end; the time then jumps back.
-        start_paused: wait at the start until resumed or stepped.
-        topics: names or patterns of the topics to play; empty plays everything.
-        exclude: names or patterns of the topics to leave out.
         drop_transforms: child frames whose transforms are left out of ``/tf`` because another node broadcasts them.
         publish_clock: whether to publish ``/clock``.
-        clock_hz: lowest rate of ``/clock``, also while paused and in gaps of the bag.
         delay_s: seconds for which the time stands still at the start, so that subscribers find the topics.
         wait_for: nodes that must run, with all their subscriptions connected, before playback starts.
         wait_timeout_s: seconds to wait for these nodes before giving up.
@@ -50,16 +36,8 @@ class BagPlayerConfig:
     """
 
     bag: str = ""
-    rate: Annotated[float, Range(*RATES)] = 1.0
-    start_offset_s: NotNegative = 0.0
-    duration_s: NotNegative = 0.0
-    loop: bool = False
-    start_paused: bool = False
-    topics: tuple[str, ...] = ()
-    exclude: tuple[str, ...] = ()
     drop_transforms: tuple[str, ...] = ()
     publish_clock: bool = True
-    clock_hz: Annotated[float, Range(1, 1000)] = 40.0
     delay_s: NotNegative = 0.5
     wait_for: tuple[str, ...] = ()
     wait_timeout_s: Positive = 60.0
@@ -69,19 +47,7 @@ class BagPlayerConfig:
     def __post_init__(self) -> None:
         if not self.bag:
             raise ValueError("bag must name a folder (got '')")
-        check_ranges(self)
-
-    def play_options(self) -> PlayOptions:
-        """The player's part of the parameters."""
-        return PlayOptions(
-            rate=self.rate,
-            start_offset_s=self.start_offset_s,
-            duration_s=self.duration_s,
-            loop=self.loop,
-            choice=TopicChoice(self.topics, self.exclude),
-            start_paused=self.start_paused,
-            clock_hz=self.clock_hz,
-        )
+        super().__post_init__()
 
 
 class BagPlayerNode(Node[BagPlayerConfig]):
@@ -97,7 +63,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
     def setup(self) -> None:
         """Open the bag, create its topics, start the thread."""
         try:
-            self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config.play_options())
+            self.player = BagPlayer(Path(self.config.bag).expanduser(), self.config)
         except BagError as error:
             raise NodeError(str(error)) from None
         try:
@@ -135,25 +101,15 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         if self.run_dir is None or self.config.force:
             return
         nodes = [node for node in registry.list_nodes(self.run_dir) if node.name != self.name]
-        live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
-        for base in nodes:
-            if base.executable != _BASE:
-                continue
-            spaces = {"", *(topic.removesuffix("/cmd_vel") for topic in base.subscribes if topic.endswith("/cmd_vel"))}
-            acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
-            played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
-            wrong = [
-                played[topic]
-                for topic in sorted(played)
-                if any(fnmatch.fnmatchcase(topic, pattern) for pattern in acted_on)
-            ]
-            if wrong:
-                left_out = " ".join(f"-x {topic}" for topic in wrong)
-                raise NodeError(
-                    f"{self.config.bag}: {', '.join(wrong)} would reach the robot of {base.name}, which runs in "
-                    f"{self.run_dir}. Leave them out ({left_out}), rename them (--remap "
-                    f"{wrong[0]}:=/bag{wrong[0]}), end the stack, or play them all the same with --force"
-                )
+        played = {self.resolve(topic.topic): topic.topic for topic in self.player.topics}
+        if reached := reached_base(nodes, played):
+            base, topics = reached
+            left_out = " ".join(f"-x {topic}" for topic in topics)
+            raise NodeError(
+                f"{self.config.bag}: {', '.join(topics)} would reach the robot of {base}, which runs in "
+                f"{self.run_dir}. Leave them out ({left_out}), rename them (--remap "
+                f"{topics[0]}:=/bag{topics[0]}), end the stack, or play them all the same with --force"
+            )
 
     def _run(self) -> None:
         assert self.player is not None
@@ -162,7 +118,7 @@ class BagPlayerNode(Node[BagPlayerConfig]):
             length_s = (self.player.end_ns - self.player.start_ns) / 1e9
             self.log.info("playing %.1f s of %s", length_s, self.config.bag)
             began_s = time.monotonic()
-            if self.player.play(self._send, self._stop, on_clock=self._tell_time):
+            if self.player.play(self._send, self._stop, on_clock=self._publish_time):
                 late = f", up to {self.player.latest_s:.2f} s late" if self.player.latest_s > 0.1 else ""
                 self.log.info("played to the end in %.1f s%s", time.monotonic() - began_s, late)
                 self._stop.wait(self.config.linger_s)
@@ -180,13 +136,13 @@ class BagPlayerNode(Node[BagPlayerConfig]):
         payload: bytes | None = message.payload
         if self.config.drop_transforms and message.topic in TRANSFORM_TOPICS:
             payload = without_children(message, self.config.drop_transforms)
-        self._tell_time(message.stamp_ns)
+        self._publish_time(message.stamp_ns)
         if payload is not None:
             # Not from the clock: this node also receives its own /clock, a little later, which sets the time back.
             stamp_ns = message.stamp_ns if isinstance(self.clock, ManualClock) else None
             self._out[message.topic].publish_bytes(payload, stamp_ns)
 
-    def _tell_time(self, stamp_ns: int) -> None:
+    def _publish_time(self, stamp_ns: int) -> None:
         """Publish the time before each message, and keep it running where there are none."""
         if isinstance(self.clock, ManualClock):
             self.clock.set(stamp_ns)
@@ -202,52 +158,26 @@ class BagPlayerNode(Node[BagPlayerConfig]):
     def status(self) -> dict[str, Any]:
         """The state that ``ic bag status`` shows."""
         assert self.player is not None
-        player = self.player
-        return {
-            "bag": self.config.bag,
-            "state": "paused" if player.paused else "playing",
-            "position_s": round((player.position_ns - player.start_ns) / 1e9, 3),
-            "length_s": round((player.end_ns - player.start_ns) / 1e9, 3),
-            "rate": player.rate,
-            "sent": player.sent,
-            "rounds": player.rounds,
-            "late_s": round(player.latest_s, 3),
-        }
+        return {"bag": self.config.bag, **self.player.status()}
 
     def _wait_for_readers(self) -> None:
-        """Wait until each node of ``wait_for`` runs, reads a topic of the bag, and is connected to all its topics."""
+        """Let subscribers find the topics, then wait until the nodes of ``wait_for`` are connected to all of them."""
         if self.run_dir is None or self.player is None:
             return
         begin_s = time.monotonic() + self.config.delay_s
         while time.monotonic() < begin_s and not self._stop.wait(1.0 / self.config.clock_hz):
-            self._tell_time(self.player.start_ns)
+            self._publish_time(self.player.start_ns)
         if not self.config.wait_for:
             return
         deadline_s = time.monotonic() + self.config.wait_timeout_s
-        missing = ""
+        missing: list[str] = []
         while time.monotonic() < deadline_s:
-            self._tell_time(self.player.start_ns)
-            nodes = {info.name: info for info in registry.list_nodes(self.run_dir)}
-            played = {publisher.topic for publisher in self._out.values()}
-            # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
-            absent = [
-                name for name in self.config.wait_for if name not in nodes or played.isdisjoint(nodes[name].subscribes)
-            ]
-            readers = [topic for name in self.config.wait_for if name in nodes for topic in nodes[name].subscribes]
-            unread = [
-                topic
-                for topic, publisher in self._out.items()
-                if publisher.subscriber_count < readers.count(publisher.topic)
-            ]
-            if not absent and not unread:
+            self._publish_time(self.player.start_ns)
+            publishers = {name: (out.topic, out.subscriber_count) for name, out in self._out.items()}
+            missing = missing_readers(self.config.wait_for, registry.list_nodes(self.run_dir), publishers)
+            if not missing or self._stop.wait(0.1):
                 return
-            missing = ", ".join(
-                [f"node {name} to read what is played" for name in absent]
-                + [f"a reader of {topic}" for topic in unread]
-            )
-            if self._stop.wait(0.1):
-                return
-        raise NodeError(f"waited {self.config.wait_timeout_s:.0f} s for {missing}")
+        raise NodeError(f"waited {self.config.wait_timeout_s:.0f} s for {', '.join(missing)}")
 
     def teardown(self) -> None:
         """End the thread and close the bag."""

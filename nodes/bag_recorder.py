@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -14,17 +13,18 @@ from typing import Annotated, Any
 from instant_ic.bag import BagError
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.on_demand import OnDemand
-from instant_ic.bag.recorder import DISK_FULL, FAILED, PAUSED, Recorder, RecordOptions, Subscribe, TakeMessage
+from instant_ic.bag.recorder import Recorder, RecordOptions, Subscribe, TakeMessage
 from instant_ic.bus import ERROR, OK, RECORD, WARN, Node, NodeError, main, registry
 from instant_ic.bus.node import Subscription
+from instant_ic.bus.topic_watch import TopicWatch
 from instant_ic.bus.transport import Received, Stats
-from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, Range, check_ranges
+from instant_ic.config.ranges import NotNegative, Range
 from instant_ic.msg import Bool, ControlState
 
 
 @dataclass(frozen=True)
-class BagRecorderConfig:
-    """Parameters of the recorder.
+class BagRecorderConfig(RecordOptions):
+    """Parameters, in addition to those of writing.
 
     Attributes:
         path: folder of the bag, which must not exist; empty creates ``runs/bag_DATE_TIME`` in the working directory. In
@@ -34,18 +34,9 @@ class BagRecorderConfig:
         discovery_period_s: seconds between searches for new topics.
         duration_s: seconds after which recording ends; 0 records until stopped.
         parameters: whether to save the nodes' parameters in the bag's metadata.
-        compressed: compress with zstd.
-        max_bag_size: size in bytes at which the next file begins; 0 writes one file.
-        max_bag_duration: length in seconds at which the next file begins; 0 writes one file.
-        queue_mb: largest queue for the disk, MB; messages beyond it are dropped and counted.
-        min_free_mb: stop recording when the disk has less free space, MB.
         start_paused: record only after a resume command.
-        snapshot: keep the last seconds in memory and write only on request (``ic bag snapshot``, emergency stop).
-            Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
-        snapshot_seconds: seconds before the request that a snapshot holds.
         snapshot_after_s: seconds after the request that a snapshot also holds.
         snapshot_on_estop: write a snapshot at each emergency stop.
-        max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
     """
 
     path: str = ""
@@ -54,38 +45,15 @@ class BagRecorderConfig:
     discovery_period_s: Annotated[float, Range(0.01, 10.0)] = 0.2
     duration_s: NotNegative = 0.0
     parameters: bool = True
-    compressed: bool = False
-    max_bag_size: NotNegativeInt = 0
-    max_bag_duration: NotNegative = 0.0
-    queue_mb: PositiveInt = 256
-    min_free_mb: NotNegativeInt = 100
     start_paused: bool = False
-    snapshot: bool = False
-    snapshot_seconds: Positive = 30.0
     snapshot_after_s: NotNegative = 2.0
     snapshot_on_estop: bool = True
-    max_cache_mb: PositiveInt = 256
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
 
     def folder(self) -> Path:
         """Folder of the bag."""
         if self.path:
             return Path(self.path).expanduser()
         return Path("runs") / f"{'snapshots' if self.snapshot else 'bag'}_{datetime.now():%Y%m%d_%H%M%S}"
-
-    def options(self) -> RecordOptions:
-        """The recorder's part of the parameters."""
-        return RecordOptions(
-            compressed=self.compressed,
-            max_bytes=self.max_bag_size,
-            max_duration_s=self.max_bag_duration,
-            queue_bytes=self.queue_mb * 1_000_000,
-            reserve_bytes=self.min_free_mb * 1_000_000,
-            snapshot_s=self.snapshot_seconds if self.snapshot else 0.0,
-            cache_bytes=self.max_cache_mb * 1_000_000,
-        )
 
 
 class BagRecorderNode(Node[BagRecorderConfig]):
@@ -95,16 +63,16 @@ class BagRecorderNode(Node[BagRecorderConfig]):
     live_parameters = ("duration_s", "snapshot_after_s", "snapshot_on_estop")
     recorder: Recorder | None = None
     on_demand: OnDemand | None = None
-    _next_look_s = 0.0
-    _seen: tuple[tuple[str, int], ...] = ()
+    _next_nodes_s = 0.0
 
     def setup(self) -> None:
         """Create the bag and start discovery."""
         if self.run_dir is None:
             raise NodeError("the recorder needs the real bus; lockstep replay records by itself")
+        self._watch = TopicWatch(self.run_dir)
         self._choice = TopicChoice(self.config.topics, self.config.exclude)
         try:
-            self.recorder = self._recorder(self.config.folder(), self._listen, self.config.options())
+            self.recorder = self._recorder(self.config.folder(), self._listen, self.config)
         except BagError as error:
             raise NodeError(str(error)) from None
         if self.config.start_paused:
@@ -119,7 +87,7 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         self.commands = {
             "pause": self.recorder.pause,
             "resume": self.recorder.resume,
-            "toggle": self._toggle,
+            "toggle": self.recorder.toggle,
             "split": self.recorder.split,
             "snapshot": self._snapshot,
             "record": self._record,
@@ -132,12 +100,12 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         threading.Thread(target=self._look, name="discovery", daemon=True).start()
 
     def _look(self) -> None:
-        next_tell_s = 0.0
+        next_report_s = 0.0
         while not self._stop.wait(self.config.discovery_period_s):
             self.call_soon(self._discover)
-            if time.monotonic() >= next_tell_s:
-                next_tell_s = time.monotonic() + 1.0
-                self.call_soon(self._tell)
+            if time.monotonic() >= next_report_s:
+                next_report_s = time.monotonic() + 1.0
+                self.call_soon(self._report)
             if self.config.duration_s and time.monotonic() >= self._began_s + self.config.duration_s:
                 self.stop()
 
@@ -165,26 +133,18 @@ class BagRecorderNode(Node[BagRecorderConfig]):
             for subscription in taken:
                 self.drop(subscription)
 
-        return self._recorder(path, listen, replace(self.config.options(), snapshot_s=0.0)), drop
+        return self._recorder(path, listen, replace(self.config, snapshot=False)), drop
 
     def _discover(self) -> None:
         assert self.recorder is not None and self.run_dir is not None
-        due = time.monotonic() >= self._next_look_s
-        changed = _changes(self.run_dir / "topics")
-        # Reading every publisher's entry five times a second would cost more than recording.
-        if due or changed != self._seen:
-            self._seen = changed
-            nodes: list[registry.NodeInfo] = []
-            if due:
-                self._next_look_s = time.monotonic() + 2.0
-                nodes = registry.list_nodes(self.run_dir) if self.config.parameters else []
-            topics = registry.list_topics(self.run_dir)
-            self.recorder.discover(topics, nodes)
-            if self.on_demand is not None:
-                self.on_demand.discover(topics, nodes)
-        self.recorder.tick()
-        if self.on_demand is not None:
-            self.on_demand.tick()
+        nodes: list[registry.NodeInfo] = []
+        if self.config.parameters and time.monotonic() >= self._next_nodes_s:
+            self._next_nodes_s = time.monotonic() + 2.0
+            nodes = registry.list_nodes(self.run_dir)
+        for recorder in (self.recorder, self.on_demand):
+            if recorder is not None:
+                recorder.discover(self._watch.topics(), nodes)
+                recorder.tick()
 
     def _snapshot(self, reason: str = "") -> dict[str, Any]:
         assert self.recorder is not None
@@ -211,15 +171,8 @@ class BagRecorderNode(Node[BagRecorderConfig]):
 
     def _status(self) -> dict[str, Any]:
         assert self.recorder is not None
-        told = self.recorder.status()
-        return told if self.on_demand is None else told | {"recording": self.on_demand.status()}
-
-    def _toggle(self) -> None:
-        assert self.recorder is not None
-        if self.recorder.state == PAUSED:
-            self.recorder.resume()
-        else:
-            self.recorder.pause()
+        status = self.recorder.status()
+        return status if self.on_demand is None else status | {"recording": self.on_demand.status()}
 
     def _on_stop(self, who: str, stopped: bool) -> None:
         """Write a snapshot at each stop, except one that was latched before this recorder started."""
@@ -228,25 +181,16 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         if stopped and before is False and self.config.snapshot_on_estop:
             self._snapshot("estop")
 
-    def _tell(self) -> None:
+    def _report(self) -> None:
         assert self.recorder is not None
-        told = self.recorder.status()
-        words = f"{told['messages']} messages, {told['topics']} topics, {self.recorder.state}"
-        if "bytes" in told:
-            words += f", {told['bytes'] / 1e6:.1f} MB in {told['files']} files"
+        recorder = self.recorder
+        if error := (self.on_demand.trouble() if self.on_demand else "") or recorder.problem():
+            self.diagnose("bag", ERROR, error)
+        elif warning := recorder.warning():
+            self.diagnose("bag", WARN, warning, **{topic.strip("/"): n for topic, n in recorder.lost().items()})
         else:
-            words += f", the last {told['cached_s']:g} s at hand ({told['cached_bytes'] / 1e6:.0f} MB)"
-        if self.on_demand is not None and (trouble := self.on_demand.trouble()):
-            self.diagnose("bag", ERROR, trouble)
-        elif self.recorder.state in (FAILED, DISK_FULL):
-            self.diagnose("bag", ERROR, self.recorder.error)
-        elif self.recorder.told.overflow:
-            self.diagnose("bag", ERROR, f"{words}; the disk is too slow, dropped: {_numbers(told['overflow'])}")
-        elif lost := self.recorder.lost():
-            self.diagnose("bag", WARN, f"{words}; lost: {_numbers(lost)}", **{t.strip("/"): n for t, n in lost.items()})
-        else:
-            self.diagnose("bag", OK, words, messages=told["messages"])
-        if unknown := self.recorder.unknown_types():
+            self.diagnose("bag", OK, recorder.summary(), messages=recorder.count)
+        if unknown := recorder.unknown_types():
             named = ", ".join(f"{type_name} ({topic})" for type_name, topic in sorted(unknown.items()))
             self.diagnose("types", WARN, f"recorded without type definition, which is unknown here: {named}")
 
@@ -266,19 +210,6 @@ class BagRecorderNode(Node[BagRecorderConfig]):
         if self.recorder.failed:
             self.log.error("the bag is incomplete: %s", self.recorder.error or "see the errors above")
             raise SystemExit(1)
-
-
-def _changes(topics: Path) -> tuple[tuple[str, int], ...]:
-    """Topic folders with the times of their last change."""
-    try:
-        with os.scandir(topics) as entries:
-            return tuple(sorted((entry.name, entry.stat().st_mtime_ns) for entry in entries))
-    except OSError:  # one just removed, or no publisher yet: the next search finds out
-        return ()
-
-
-def _numbers(counts: dict[str, int]) -> str:
-    return ", ".join(f"{topic} {number}" for topic, number in sorted(counts.items()))
 
 
 if __name__ == "__main__":

@@ -5,16 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated
 
 from instant_ic.bag.choice import TopicChoice
 from instant_ic.bridge.commands import CommandGate, CommandLimits
-from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerSettings
-from instant_ic.bridge.topic_watch import TopicWatch
+from instant_ic.bridge.foxglove_server import FoxgloveError, FoxgloveServer, ServerConfig
 from instant_ic.bridge.web_access import is_loopback
 from instant_ic.bus import OK, WARN, Node, NodeError, main, registry
-from instant_ic.config.ranges import Range, check_ranges
+from instant_ic.bus.topic_watch import TopicWatch
+from instant_ic.config.ranges import Range
 
 _TIME_S = 0.05
 _REFUSED_S = 1.0
@@ -22,49 +21,20 @@ _LEAST_S = 0.02
 
 
 @dataclass(frozen=True)
-class FoxgloveBridgeConfig:
-    """Parameters.
+class FoxgloveBridgeConfig(ServerConfig):
+    """Parameters, in addition to those of the server.
 
     Attributes:
-        title: name that Foxglove shows.
-        host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
-        port: TCP port; 0: any free port, reported in the log.
-        tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
-        tls_key: its private key, PKCS#8 in PEM.
-        allowed_origins: web pages that may connect, by their Origin, besides those of this machine; "*" allows every
-            page. Programs that are not browsers send no Origin and are allowed.
-        allowed_hosts: names under which clients may reach the server, besides localhost and any address.
-        max_clients: largest number of clients at a time.
-        backlog: messages queued for a client that cannot keep up; the oldest are dropped first, so that it never gets a
-            burst of old ones.
         topics: names or patterns of the topics to offer; empty offers all.
         exclude: names or patterns of the topics to leave out.
-        accept_operator: whether clients may drive (/operator/cmd_vel) and stop (/operator/estop) the robot.
-        set_parameters: whether clients may change parameters, except safety parameters.
         limits: limits on the clients' commands.
         discovery_period_s: seconds between searches for new and removed topics.
     """
 
-    title: str = "Instant IC"
-    host: str = "127.0.0.1"
-    port: Annotated[int, Range(0, 65535)] = 8765
-    tls_cert: str = ""
-    tls_key: str = ""
-    allowed_origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
-    allowed_hosts: tuple[str, ...] = ()
-    max_clients: Annotated[int, Range(1, 256)] = 16
-    backlog: Annotated[int, Range(1, 1024)] = 32
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-    accept_operator: bool = False
-    set_parameters: bool = False
     limits: CommandLimits = field(default_factory=CommandLimits)
     discovery_period_s: Annotated[float, Range(0.05, 10)] = 0.25
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if bool(self.tls_cert) != bool(self.tls_key):
-            raise ValueError("tls_cert and tls_key go together: give both or none")
 
 
 class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
@@ -77,25 +47,11 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         config = self.config
         if self.run_dir is None:
             raise NodeError("the bridge needs the real bus: it cannot run in lockstep")
-        settings = ServerSettings(
-            title=config.title,
-            host=config.host,
-            port=config.port,
-            tls_cert=Path(config.tls_cert).expanduser() if config.tls_cert else None,
-            tls_key=Path(config.tls_key).expanduser() if config.tls_key else None,
-            allowed_origins=config.allowed_origins,
-            allowed_hosts=config.allowed_hosts,
-            max_clients=config.max_clients,
-            backlog=config.backlog,
-            accept_operator=config.accept_operator,
-            set_parameters=config.set_parameters,
-            server_time=self.use_sim_time,
-        )
         self.gate = CommandGate(config.limits)
         self._watch = TopicWatch(self.run_dir)
         choice = TopicChoice(config.topics, config.exclude)
         try:
-            self.server = FoxgloveServer(self, self.run_dir, settings, choice.takes, self.gate)
+            self.server = FoxgloveServer(self, self.run_dir, config, choice.takes, self.gate, self.use_sim_time)
         except FoxgloveError as error:
             raise NodeError(str(error)) from None
         scheme = "wss" if config.tls_cert else "ws"
@@ -113,7 +69,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
 
     def _look(self) -> None:
         assert self.server is not None
-        next_s, told_ns = 0.0, 0
+        next_s, sent_ns = 0.0, 0
         while not self.stopping:
             now_s = time.monotonic()
             if now_s >= next_s or self.server.wake.is_set():
@@ -121,8 +77,8 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
                 self.server.wake.clear()
                 self.call_soon(self.reconcile)
                 time.sleep(_LEAST_S)  # limits the cost of a client that connects and disconnects without end
-            if self.use_sim_time and (now_ns := self.clock.now_ns()) != told_ns:
-                told_ns = now_ns
+            if self.use_sim_time and (now_ns := self.clock.now_ns()) != sent_ns:
+                sent_ns = now_ns
                 self.server.tell_time(now_ns)
             self.server.wake.wait(_TIME_S if self.use_sim_time else max(next_s - time.monotonic(), 0.0))
 
@@ -134,11 +90,11 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
         self.server.parameters.nodes = tuple(node.name for node in nodes)
         self.server.reconcile(self._watch.topics(), nodes)
         refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
-        words = f"{len(self.server.watched)} of {len(self.server.topics)} topics watched"
+        text = f"{len(self.server.watched)} of {len(self.server.topics)} topics watched"
         self.diagnose(
             "topics",
             OK,
-            words,
+            text,
             messages=self.server.count,
             megabytes=self.server.bytes / 1e6,
             dropped=self.server.dropped,

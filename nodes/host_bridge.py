@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from instant_ic.base.recent import RecentCount
 from instant_ic.bridge.host_bus import ExportedTopics, ImportedTopics
 from instant_ic.bridge.host_connector import ConnectingLink
 from instant_ic.bridge.host_keys import KeyFileError, KeyStore
@@ -18,22 +16,20 @@ from instant_ic.bridge.host_link import (
     HostLink,
     LinkError,
     LinkEvent,
-    PeerStatus,
     Problem,
     Stranger,
     check_endpoint,
 )
 from instant_ic.bridge.host_listener import ListeningLink
+from instant_ic.bridge.host_report import LinkReport
 from instant_ic.bridge.host_session import Announced, Arrived, ClockStepped, Ended, LinkTimes, Refused, Side, Up
-from instant_ic.bridge.host_topics import TopicCounts, parse_rules
-from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main
+from instant_ic.bridge.host_topics import parse_rules
+from instant_ic.bus import Node, NodeError, main
 from instant_ic.config.ranges import Positive, check_ranges
 from instant_ic.msg import type_hash
 
 LOOK_S = 0.5
 LATE_READERS_S = 0.1
-RECENT_S = 10.0
-UNLISTED = "of no list"
 
 
 @dataclass(frozen=True)
@@ -108,20 +104,13 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         except (KeyFileError, LinkError) as error:
             raise NodeError(str(error)) from None
         self.outgoing = ExportedTopics(self, exports, self.link, self.trouble)
-        self.problem = ""
-        self.lost_link = ""
-        self.strangers = RecentCount(RECENT_S)
-        self.misses = RecentCount(RECENT_S)
-        self.missed = 0
-        self.clock_told: set[str] = set()
+        self.report = LinkReport(self.link, self.diagnose, {*to_station, *to_robot})
         self.next_step_s = 0.0
-        self.troubled: set[str] = set()
-        self.listed = {*to_station, *to_robot}
         self.outgoing.look()
         self.link.start()
         self.timer(LOOK_S, self.outgoing.look)
         self.timer(LATE_READERS_S, self.incoming.serve_late_readers)
-        self.timer(1.0, self.tell)
+        self.timer(1.0, self.update)
 
     def teardown(self) -> None:
         if self.link is not None:
@@ -149,14 +138,12 @@ class HostBridgeNode(Node[HostBridgeConfig]):
         match event:
             case Up():
                 self.log.info("linked with %s", peer)
-                for topic in self.troubled:
-                    self.diagnose(f"topic {topic}", OK, "no fault since the newest link")
-                self.troubled.clear()
-                self.tell()
+                self.report.clear_troubles()
+                self.update()
             case Ended():
-                self.lost_link = f"the link with {peer} ended: {event.reason}"
-                self.log.warning("%s", self.lost_link)
-                self.tell()
+                self.report.lost_link = f"the link with {peer} ended: {event.reason}"
+                self.log.warning("%s", self.report.lost_link)
+                self.update()
             case Refused():
                 where = "here" if event.here else f"by {peer}"
                 self.trouble(event.topic, f"refused {where}: {event.reason}")
@@ -165,7 +152,7 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                     self.next_step_s = time.monotonic() + 1.0
                     self.log.warning("the clock of %s jumped by %+.3f s", peer, event.step_ns / 1e9)
             case Stranger():
-                self.strangers.add(1, time.time_ns())
+                self.report.stranger()
                 self.log.warning(
                     "refused: %s, key %s, %d attempts since the last such line (allowed hosts: ic keys list)",
                     event.address,
@@ -176,91 +163,16 @@ class HostBridgeNode(Node[HostBridgeConfig]):
                 self.log.error("%s", event.text)
                 self.stop()  # the launcher restarts it
             case Problem():
-                self.problem = event.text
-                self.tell()
+                self.report.problem = event.text
+                self.update()
 
     def trouble(self, topic: str, text: str) -> None:
-        """Report a topic that is not transferred; topics on no list of this host share one diagnosis."""
-        if topic not in self.listed:
-            topic, text = UNLISTED, f"{topic}: {text}"
-        self.troubled.add(topic)
-        self.diagnose(f"topic {topic}", ERROR, text)
+        """Report a topic that is not transferred."""
+        self.report.trouble(topic, text)
 
-    # -- reports -------------------------------------------------------------------------------------
-
-    def tell(self) -> None:
-        """Report the state of the link, clocks, topics and strangers."""
-        assert self.link is not None
-        peers = self.link.peers()
-        self.tell_link(peers)
-        for peer in peers:
-            if not math.isnan(peer.offset_ms):  # not yet known right after the handshake
-                self.tell_clock(peer)
-        for name in self.clock_told - {peer.name for peer in peers}:
-            self.diagnose(f"clock of {name}", OK, "no link, not measured")
-        self.clock_told = {peer.name for peer in peers}
-        out, into = self.link.counts()
-        bad = sum(counts.bad for counts in (*out.values(), *into.values()))
-        self.misses.add(bad - self.missed, time.time_ns())
-        self.missed = bad
-        recent = self.misses.count(time.time_ns())
-        text = f"{recent} messages missed in the last {RECENT_S:g} s" if recent else "nothing missed lately"
-        self.diagnose("topics", WARN if recent else OK, text, **_numbers("out", out), **_numbers("in", into))
-        if isinstance(self.link, ListeningLink):
-            strangers = self.strangers.count(time.time_ns())
-            text = "refused a host without an allowed key" if strangers else "no host refused recently"
-            self.diagnose("door", WARN if strangers else OK, text, tries=self.link.strangers)
-
-    def tell_link(self, peers: list[PeerStatus]) -> None:
-        """Report which hosts are linked, or why none is."""
-        if self.problem:
-            self.diagnose("link", ERROR, self.problem)
-        elif not peers:
-            self.diagnose("link", WARN, self.lost_link or "no station is connected")
-        else:
-            notices = [text for peer in peers for text in peer.notices.values()]
-            driver = next((peer.name for peer in peers if peer.drives), "nobody")
-            words = ", ".join(f"{peer.name} ({peer.address}, {peer.rtt_ms:.1f} ms)" for peer in peers)
-            if isinstance(self.link, ListeningLink):
-                words += f"; {driver} drives"
-            values = {f"{peer.name} {key}": value for peer in peers for key, value in _values(peer).items()}
-            self.diagnose("link", WARN if notices else OK, "; ".join([f"linked with {words}", *notices]), **values)
-
-    def tell_clock(self, peer: PeerStatus) -> None:
-        """Report the offset of the other host's clock."""
-        level, text = judge_clock(peer.offset_ms, peer.rtt_ms, self.config.max_offset_ms)
-        values = {"offset_ms": peer.offset_ms, "rtt_ms": peer.rtt_ms, "jitter_ms": peer.jitter_ms}
-        self.diagnose(f"clock of {peer.name}", level, text, **{key: round(value, 3) for key, value in values.items()})
-
-
-def judge_clock(offset_ms: float, rtt_ms: float, max_offset_ms: float) -> tuple[int, str]:
-    """Level and text for a clock that is ``offset_ms`` ahead: stamps in messages are not changed on the way."""
-    text = f"{abs(offset_ms):.1f} ms {'ahead of' if offset_ms > 0 else 'behind'} this one"
-    if abs(offset_ms) <= max_offset_ms + rtt_ms / 2:  # half the round trip is uncertainty
-        return OK, text
-    return WARN, f"{text}, more than {max_offset_ms:g} ms: run chrony on both (sudo apt install chrony)"
-
-
-def _values(peer: PeerStatus) -> dict[str, Any]:
-    return {
-        "role": peer.role,
-        "fingerprint": peer.fingerprint,
-        "up_s": round(peer.up_s, 1),
-        "rtt_ms": round(peer.rtt_ms, 3),
-        "window_bytes": peer.window_bytes,
-    }
-
-
-def _numbers(direction: str, topics: dict[str, TopicCounts]) -> dict[str, str]:
-    """One line per topic: what was transferred, and why the rest was not."""
-    lines = {}
-    for topic, counts in sorted(topics.items()):
-        words = [f"{counts.messages} messages", f"{counts.bytes} bytes"]
-        for name in ("thinned", "superseded", "expired", "overflowed", "lost", "not_driving"):
-            if number := getattr(counts, name):
-                words.append(f"{number} {name.replace('_', ' ')}")
-        lines[f"{direction} {topic}"] = ", ".join(words)
-    return lines
+    def update(self) -> None:
+        """Report the state of the link, clocks, topics and refused hosts."""
+        self.report.update(self.config.max_offset_ms)
 
 
 if __name__ == "__main__":

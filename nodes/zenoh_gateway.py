@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from instant_ic.bridge.commands import CommandGate, CommandLimits
-from instant_ic.bridge.topic_watch import TopicWatch
-from instant_ic.bridge.zenoh_incoming import Incoming
+from instant_ic.bridge.zenoh_incoming import Incoming, topic_counts
 from instant_ic.bridge.zenoh_outgoing import Outgoing
-from instant_ic.bridge.zenoh_security import beyond_loopback, insecurity
+from instant_ic.bridge.zenoh_security import command_security
 from instant_ic.bridge.zenoh_session import (
     CLIENT_DEFAULTS,
     SESSION_DEFAULTS,
@@ -22,6 +21,7 @@ from instant_ic.bridge.zenoh_session import (
 )
 from instant_ic.bridge.zenoh_topics import COMMANDS, Namespace, parse_publish, parse_subscribe
 from instant_ic.bus import ERROR, OK, WARN, Node, NodeError, main, registry
+from instant_ic.bus.topic_watch import TopicWatch
 from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.msg import MessageError
 
@@ -77,7 +77,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
     name = "zenoh_gateway"
     session: RosSession | None = None
     _zenoh: Any
-    _no_commands: str
+    _no_commands = ""
 
     def setup(self) -> None:
         """Open the session."""
@@ -96,7 +96,10 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             defaults = CLIENT_DEFAULTS if config.mode == "client" else SESSION_DEFAULTS
             self._zenoh = load_config(config_path(config.session_file), config.connect, defaults=defaults)
             client = is_client(self._zenoh)
-            self._no_commands = self.check_link() if config.commands else ""
+            if config.commands:
+                level, text = command_security(self._zenoh, config.insecure_loopback_commands)
+                self.diagnose("commands", level, text)
+                self._no_commands = text if level == ERROR else ""
             if not client:
                 self.opened(RosSession(self._zenoh, config.domain))
         except (ZenohError, MessageError, FileNotFoundError, registry.RegistryError) as error:
@@ -106,23 +109,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
             self._opener.submit(None)
             self.timer(_AGAIN_S, self.try_again)
         self.timer(config.discovery_period_s, self.look)
-        self.timer(1.0, self.tell)
-
-    def check_link(self) -> str:
-        """Why commands are refused over this configuration's links; empty where they are accepted."""
-        why = insecurity(self._zenoh)
-        if why and self.config.insecure_loopback_commands:
-            if beyond := beyond_loopback(self._zenoh):
-                why = f"insecure_loopback_commands: {beyond}"
-            else:
-                self.diagnose("commands", WARN, "taken without TLS from every program of this machine")
-                return ""
-        if not why:
-            self.diagnose("commands", OK, "taken over TLS, from hosts with a certificate")
-            return ""
-        why = f"no commands are taken but emergency stops: {why} (docs/fleet.md, TLS and access control)"
-        self.diagnose("commands", ERROR, why)
-        return why
+        self.timer(1.0, self.report)
 
     def open(self, _: None) -> RosSession | ZenohError:
         """Try to reach the router (background thread)."""
@@ -160,7 +147,7 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         self.outgoing.reconcile(self._watch.topics())
         self.incoming.reconcile()
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Report links, counts and losses."""
         if self.session is None:
             return
@@ -170,27 +157,11 @@ class ZenohGatewayNode(Node[ZenohGatewayConfig]):
         else:
             where = ", ".join(self.config.connect) or self.config.session_file or "tcp/localhost:7447"
             self.diagnose("link", WARN, f"no router answers at {where}: is it running? (ic run zenoh_router)")
-        lost_by = self.incoming.lost_by()
-        lost = sum(count for by in lost_by.values() for count in by.values())
-        words = (
-            f"{self.outgoing.count} messages out on {len(self.outgoing.topics)} topics, "
-            f"{self.incoming.count} in on {len(self.incoming.topics)}"
-        )
-        losses = {f"lost {topic} from {gid[:8]}": n for topic, by in lost_by.items() for gid, n in by.items()}
-        if lost:
-            words += f"; lost: {', '.join(f'{topic} {sum(by.values())}' for topic, by in sorted(lost_by.items()))}"
+        text, lost, values = topic_counts(self.outgoing, self.incoming)
         level = WARN if lost > self._lost else OK
         self._lost = lost
         refused = {f"refused: {reason}": count for reason, count in sorted(self.gate.refused.items())}
-        self.diagnose(
-            "topics",
-            level,
-            words,
-            thinned=self.outgoing.thinned,
-            malformed=self.incoming.malformed(),
-            **losses,
-            **refused,
-        )
+        self.diagnose("topics", level, text, **values, **refused)
 
     def teardown(self) -> None:
         """Leave the ROS graph."""

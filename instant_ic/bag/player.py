@@ -7,13 +7,15 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
-from instant_ic.bag.choice import EVERYTHING, TopicChoice
+from instant_ic.bag.choice import TopicChoice
 from instant_ic.bag.errors import BagError
 from instant_ic.bag.files import BagMessage, BagReader, TopicSummary
 from instant_ic.bag.metadata import schema_or_unknown
 from instant_ic.bag.read_ahead import ReadAhead
 from instant_ic.bag.upgrade import upgrade_of
+from instant_ic.config.ranges import NotNegative, Range, check_ranges
 
 NEVER_PLAYED = ("/clock", "/rosout", "/heartbeat", "/diagnostics", "/parameter_events")
 """The time itself, and what nodes report about themselves: the running nodes publish their own."""
@@ -27,30 +29,27 @@ class PlayOptions:
     """How a bag is played.
 
     Attributes:
-        rate: playback speed; 2 plays twice as fast.
-        start_offset_s: seconds to skip at the start; latched values of the skipped part are still sent.
+        rate: 2 plays twice as fast.
+        start_offset_s: seconds to skip at the start; latched messages from the skipped part are still published.
         duration_s: seconds of the bag to play; 0 plays to the end.
-        loop: start again at the end.
-        choice: topics to play.
-        start_paused: wait at the start for :meth:`BagPlayer.resume` or :meth:`BagPlayer.step`.
-        clock_hz: lowest rate of clock updates, also while paused and between messages.
+        loop: restart at the end; the time then jumps back.
+        start_paused: wait at the start until resumed or stepped.
+        topics: names or patterns of the topics to play; empty plays everything.
+        exclude: names or patterns of the topics to leave out.
+        clock_hz: lowest rate of ``/clock``, also while paused and in gaps of the bag.
     """
 
-    rate: float = 1.0
-    start_offset_s: float = 0.0
-    duration_s: float = 0.0
+    rate: Annotated[float, Range(*RATES)] = 1.0
+    start_offset_s: NotNegative = 0.0
+    duration_s: NotNegative = 0.0
     loop: bool = False
-    choice: TopicChoice = EVERYTHING
     start_paused: bool = False
-    clock_hz: float = 40.0
+    topics: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    clock_hz: Annotated[float, Range(1, 1000)] = 40.0
 
     def __post_init__(self) -> None:
-        for key in ("rate", "clock_hz"):
-            if not getattr(self, key) > 0:
-                raise ValueError(f"{key} must be > 0 (got {getattr(self, key)})")
-        for key in ("start_offset_s", "duration_s"):
-            if getattr(self, key) < 0:
-                raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 class BagPlayer:
@@ -66,13 +65,14 @@ class BagPlayer:
 
     def __init__(self, path: Path, options: PlayOptions) -> None:
         self.options = options
+        choice = TopicChoice(options.topics, options.exclude)
         self._reader = BagReader(path)
         self.left_out: dict[str, str] = {}
         """Topics and types that are not sent, with the reason."""
         chosen: dict[str, TopicSummary] = {}
         # Of a topic with several types, play the one with most messages: a publisher has one type.
         for topic in sorted(self._reader.topics, key=lambda topic: -topic.count):
-            if topic.topic in NEVER_PLAYED or not options.choice.takes(topic.topic):
+            if topic.topic in NEVER_PLAYED or not choice.takes(topic.topic):
                 continue
             if why := self._why_not(topic) or ("the topic also has another type" if topic.topic in chosen else ""):
                 self.left_out[f"{topic.topic} ({topic.type_name}, {topic.count} messages)"] = why
@@ -185,6 +185,18 @@ class BagPlayer:
         if not 0 <= offset_s <= length_s:
             raise ValueError(f"offset_s must lie in 0..{length_s:.3f} (got {offset_s})")
         self._seek_ns = self.start_ns + int(offset_s * 1e9)
+
+    def status(self) -> dict[str, Any]:
+        """State, position and rate, for display."""
+        return {
+            "state": "paused" if self.paused else "playing",
+            "position_s": round((self.position_ns - self.start_ns) / 1e9, 3),
+            "length_s": round((self.end_ns - self.start_ns) / 1e9, 3),
+            "rate": self.rate,
+            "sent": self.sent,
+            "rounds": self.rounds,
+            "late_s": round(self.latest_s, 3),
+        }
 
     # -- playing -----------------------------------------------------------------------------------
 

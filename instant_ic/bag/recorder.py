@@ -12,7 +12,7 @@ import shutil
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -25,6 +25,7 @@ from instant_ic.bag.snapshot import Entry, SnapshotCache
 from instant_ic.bag.writer import BagWriter
 from instant_ic.bus.qos import PRESETS, SENSOR, QoS
 from instant_ic.bus.registry import NodeInfo, TopicInfo
+from instant_ic.config.ranges import NotNegative, NotNegativeInt, Positive, PositiveInt, check_ranges
 from instant_ic.private import make_folder
 
 FOREIGN_CLOCK_NS = 10_000_000_000
@@ -32,6 +33,7 @@ FOREIGN_CLOCK_NS = 10_000_000_000
 
 RECORDING, PAUSED, DISK_FULL, FAILED, ENDED = "recording", "paused", "disk full", "failed", "ended"
 
+_MB = 1_000_000
 _LEVEL = 1  # of zstd: it must keep pace
 _FLUSH_S = 1.0
 _KEEP_CUSTOM_S = 10.0
@@ -69,30 +71,28 @@ class RecordOptions:
     """How a recording is written.
 
     Attributes:
-        compressed: compress chunks with zstd.
-        max_bytes: file size at which a new file starts; 0 writes one file.
-        max_duration_s: duration in seconds after which a new file starts; 0 writes one file.
-        queue_bytes: bytes that may wait for the disk.
-        reserve_bytes: stop while the disk has less free space than this.
-        snapshot_s: keep only the last seconds in memory and write them on request; 0 writes everything immediately.
-        cache_bytes: memory for those seconds.
+        compressed: compress with zstd.
+        max_bag_size: size in bytes at which the next file begins; 0 writes one file.
+        max_bag_duration: length in seconds at which the next file begins; 0 writes one file.
+        queue_mb: largest queue for the disk, MB; messages beyond it are dropped and counted.
+        min_free_mb: stop recording when the disk has less free space, MB.
+        snapshot: keep the last seconds in memory and write only on request (``ic bag snapshot``, emergency stop).
+            Between the commands ``record`` and ``stop`` (the page's button) it records into a bag of its own.
+        snapshot_seconds: seconds before the request that a snapshot holds.
+        max_cache_mb: memory for the last seconds, MB; with more traffic the snapshot is shorter.
     """
 
     compressed: bool = False
-    max_bytes: int = 0
-    max_duration_s: float = 0.0
-    queue_bytes: int = 256_000_000
-    reserve_bytes: int = 100_000_000
-    snapshot_s: float = 0.0
-    cache_bytes: int = 256_000_000
+    max_bag_size: NotNegativeInt = 0
+    max_bag_duration: NotNegative = 0.0
+    queue_mb: PositiveInt = 256
+    min_free_mb: NotNegativeInt = 100
+    snapshot: bool = False
+    snapshot_seconds: Positive = 30.0
+    max_cache_mb: PositiveInt = 256
 
     def __post_init__(self) -> None:
-        for key in ("max_bytes", "max_duration_s", "reserve_bytes", "snapshot_s"):
-            if getattr(self, key) < 0:
-                raise ValueError(f"{key} must be >= 0 (got {getattr(self, key)})")
-        for key in ("queue_bytes", "cache_bytes"):
-            if getattr(self, key) < 1_000_000:
-                raise ValueError(f"{key} must be >= 1000000 (got {getattr(self, key)})")
+        check_ranges(self)
 
 
 class _Queue:
@@ -205,17 +205,17 @@ class Recorder:
         self._parameters: dict[str, object] = {}
         self._writer: BagWriter | None = None
         self._cache: SnapshotCache | None = None
-        if self.options.snapshot_s:
+        if self.options.snapshot:
             try:
                 make_folder(path, exist_ok=True)
             except OSError as error:
                 raise BagError(f"folder {path} for snapshots cannot be created: {error.strerror}") from None
-            self._cache = SnapshotCache(self.options.snapshot_s, self.options.cache_bytes)
+            self._cache = SnapshotCache(self.options.snapshot_seconds, self.options.max_cache_mb * _MB)
         else:
             self._writer = BagWriter(
-                path, self.options.compressed, self.options.max_bytes, self.options.max_duration_s, _LEVEL
+                path, self.options.compressed, self.options.max_bag_size, self.options.max_bag_duration, _LEVEL
             )
-        self._queue = _Queue(self.options.queue_bytes)
+        self._queue = _Queue(self.options.queue_mb * _MB)
         self._counting = threading.Lock()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="bag writer", daemon=True)
@@ -276,6 +276,13 @@ class Recorder:
         if self._paused:
             self._paused = False
             self.tick()
+
+    def toggle(self) -> None:
+        """Pause, or resume."""
+        if self.state == PAUSED:
+            self.resume()
+        else:
+            self.pause()
 
     def split(self) -> None:
         """End the current file; the next message starts another.
@@ -346,6 +353,27 @@ class Recorder:
             told |= {"cached_bytes": cache.bytes, "cached_s": round(cache.span_s, 1)}
             told["snapshots"] = [{"path": str(s.path), "state": s.state, "words": s.words} for s in self.snapshots]
         return told
+
+    def summary(self) -> str:
+        """One line on the content of the recording."""
+        status = self.status()
+        text = f"{status['messages']} messages, {status['topics']} topics, {self.state}"
+        if "bytes" in status:
+            return f"{text}, {status['bytes'] / 1e6:.1f} MB in {status['files']} files"
+        return f"{text}, the last {status['cached_s']:g} s at hand ({status['cached_bytes'] / 1e6:.0f} MB)"
+
+    def problem(self) -> str:
+        """Why messages are not recorded; empty when recording works."""
+        if self.state in (FAILED, DISK_FULL):
+            return self.error
+        if overflow := self.told.overflow:
+            return f"{self.summary()}; the disk is too slow, dropped: {_counts(overflow)}"
+        return ""
+
+    def warning(self) -> str:
+        """Losses before the recorder; empty without losses."""
+        lost = self.lost()
+        return f"{self.summary()}; lost: {_counts(lost)}" if lost else ""
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Complete the bag; its metadata contain the losses and the nodes' parameters.
@@ -474,7 +502,7 @@ class Recorder:
         except OSError as error:
             self._stop(FAILED, f"bag {self.path}: {error.strerror}: its folder was removed")
             return
-        reserve = self.options.reserve_bytes
+        reserve = self.options.min_free_mb * _MB
         if self._state == RECORDING and free < reserve:
             words = f"only {free / 1e6:.0f} MB are free where {self.path} is, {reserve / 1e6:.0f} MB are the reserve"
             if self._writer is not None:
@@ -544,3 +572,7 @@ def dated(folder: Path, words: str, prefix: str = "") -> Path:
         number += 1
         path = folder / f"{name}_{number}"
     return path
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{topic} {number}" for topic, number in sorted(counts.items()))

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
@@ -29,6 +29,7 @@ from instant_ic.bus import ERROR, OK, WARN, Node, Subscription
 from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
+from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.msg import MessageError, typestore
 
 _START_S = 10.0
@@ -67,33 +68,41 @@ def schema_text(type_name: str) -> str:
 
 
 @dataclass(frozen=True)
-class ServerSettings:
-    """Settings of the server.
+class ServerConfig:
+    """Parameters of the server.
 
     Attributes:
-        title: name shown by Foxglove.
-        host, port: address to listen on; port 0 takes a free one.
-        tls_cert, tls_key: PEM files; with them the server accepts wss:// only.
-        backlog: messages queued for a slow client; the oldest are dropped first.
-        max_clients: largest number of clients.
-        allowed_origins, allowed_hosts: see :func:`.web_access.refusal`.
-        accept_operator: whether clients may drive and stop the robot.
+        title: name that Foxglove shows.
+        host: address to listen on; 0.0.0.0 opens the server to the network (there is no sign-in).
+        port: TCP port; 0: any free port, reported in the log.
+        tls_cert: certificate in PEM; with tls_key the server speaks wss:// only.
+        tls_key: its private key, PKCS#8 in PEM.
+        allowed_origins: web pages that may connect, by their Origin, besides those of this machine; "*" allows every
+            page. Programs that are not browsers send no Origin and are allowed.
+        allowed_hosts: names under which clients may reach the server, besides localhost and any address.
+        max_clients: largest number of clients at a time.
+        backlog: messages queued for a client that cannot keep up; the oldest are dropped first, so that it never gets a
+            burst of old ones.
+        accept_operator: whether clients may drive (/operator/cmd_vel) and stop (/operator/estop) the robot.
         set_parameters: whether clients may change parameters, except safety parameters.
-        server_time: whether to send the time to clients (for simulated time).
     """
 
-    title: str
-    host: str
-    port: int
-    tls_cert: Path | None = None
-    tls_key: Path | None = None
-    backlog: int = 32
-    max_clients: int = 16
-    allowed_origins: tuple[str, ...] = ()
+    title: str = "Instant IC"
+    host: str = "127.0.0.1"
+    port: Annotated[int, Range(0, 65535)] = 8765
+    tls_cert: str = ""
+    tls_key: str = ""
+    allowed_origins: tuple[str, ...] = ("https://app.foxglove.dev", "file://")
     allowed_hosts: tuple[str, ...] = ()
+    max_clients: Annotated[int, Range(1, 256)] = 16
+    backlog: Annotated[int, Range(1, 1024)] = 32
     accept_operator: bool = False
     set_parameters: bool = False
-    server_time: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+        if bool(self.tls_cert) != bool(self.tls_key):
+            raise ValueError("tls_cert and tls_key go together: give both or none")
 
 
 class FoxgloveServer:
@@ -102,9 +111,10 @@ class FoxgloveServer:
     Args:
         node: the bridge's node, on whose bus the server subscribes.
         run_dir: its run directory.
-        settings: see :class:`ServerSettings`.
+        config: see :class:`ServerConfig`.
         takes: whether to offer a topic.
         gate: checks the clients' commands.
+        server_time: whether to send the time to clients (for simulated time).
 
     Attributes:
         count, bytes: messages of the bus that were passed to clients, and their size.
@@ -116,12 +126,19 @@ class FoxgloveServer:
     """
 
     def __init__(
-        self, node: Node[Any], run_dir: Path, settings: ServerSettings, takes: Callable[[str], bool], gate: CommandGate
+        self,
+        node: Node[Any],
+        run_dir: Path,
+        config: ServerConfig,
+        takes: Callable[[str], bool],
+        gate: CommandGate,
+        server_time: bool = False,
     ) -> None:
-        tls = _tls(settings)
+        tls = _tls(config)
         self._node = node
         self._takes = takes
-        self._settings = settings
+        self._config = config
+        self._server_time = server_time
         self._lock = threading.Lock()  # guards channels, watchers, clients and their queues; held only briefly
         self._channels: dict[str, _Channel] = {}
         self._next_channel = 1
@@ -133,8 +150,8 @@ class FoxgloveServer:
         self._time_ns: int | None = None
         self._flush_due = False
         self.parameters = Parameters(run_dir)
-        self.may_set = settings.set_parameters
-        self.commands = Commands(node, gate, self._tell_client) if settings.accept_operator else None
+        self.may_set = config.set_parameters
+        self.commands = Commands(node, gate, self._tell_client) if config.accept_operator else None
         self.wake = threading.Event()
         self.count = 0
         self.bytes = 0
@@ -149,7 +166,7 @@ class FoxgloveServer:
         self._start()
 
     def _start(self) -> None:
-        where = f"{self._settings.host}:{self._settings.port}"
+        where = f"{self._config.host}:{self._config.port}"
         self._thread.start()
         if not self._started.wait(_START_S):
             raise FoxgloveError(f"no server on {where}: not started within {_START_S:g} s; set host or port")
@@ -298,7 +315,7 @@ class FoxgloveServer:
         server = web.Server(self._handle, access_log=None, logger=_http_log, keepalive_timeout=_HANDSHAKE_S)
 
         def accept() -> asyncio.Protocol:
-            if len(server.connections) >= self._settings.max_clients + _WAITING_CONNECTIONS:
+            if len(server.connections) >= self._config.max_clients + _WAITING_CONNECTIONS:
                 self._refuse("too many connections")
                 return _Refusing()
             connection = server()
@@ -307,8 +324,8 @@ class FoxgloveServer:
 
         listener = await self._loop.create_server(
             accept,
-            self._settings.host,
-            self._settings.port,
+            self._config.host,
+            self._config.port,
             ssl=tls,
             ssl_handshake_timeout=_HANDSHAKE_S if tls else None,
         )
@@ -334,16 +351,16 @@ class FoxgloveServer:
 
     async def _handle(self, request: web.BaseRequest) -> web.StreamResponse:
         """Serve one request; for an accepted client, until it disconnects."""
-        settings = self._settings
+        config = self._config
         why = refusal(
-            request.headers.get("Origin"), request.headers.get("Host"), settings.allowed_origins, settings.allowed_hosts
+            request.headers.get("Origin"), request.headers.get("Host"), config.allowed_origins, config.allowed_hosts
         )
         if why:
             self._refuse(why)
             return web.Response(status=403, text=f"{why} of foxglove_bridge\n")
-        if len(self._clients) >= settings.max_clients:
+        if len(self._clients) >= config.max_clients:
             self._refuse("too many clients")
-            return web.Response(status=503, text=f"{settings.max_clients} clients are connected; see max_clients\n")
+            return web.Response(status=503, text=f"{config.max_clients} clients are connected; see max_clients\n")
         socket = web.WebSocketResponse(
             protocols=protocol.SUBPROTOCOLS,
             max_msg_size=_MAX_CLIENT_FRAME,
@@ -355,7 +372,7 @@ class FoxgloveServer:
         if not socket.can_prepare(request).ok or not _asks_for_protocol(request):
             return web.Response(status=400, text=f"a WebSocket of {' or '.join(protocol.SUBPROTOCOLS)} is expected\n")
         await socket.prepare(request)
-        client = _Client(self._next_client, socket, request, settings.backlog)
+        client = _Client(self._next_client, socket, request, config.backlog)
         self._next_client += 1
         with self._lock:
             client.texts.append(self._server_info())
@@ -384,14 +401,14 @@ class FoxgloveServer:
             self.commands.left(client.number)
 
     def _server_info(self) -> str:
-        settings = self._settings
+        config = self._config
         capabilities = ["parameters", "connectionGraph"]
-        capabilities += ["clientPublish"] * settings.accept_operator + ["time"] * settings.server_time
+        capabilities += ["clientPublish"] * config.accept_operator + ["time"] * self._server_time
         return protocol.text(
             "serverInfo",
-            name=settings.title,
+            name=config.title,
             capabilities=capabilities,
-            supportedEncodings=["cdr", "json"] if settings.accept_operator else None,
+            supportedEncodings=["cdr", "json"] if config.accept_operator else None,
             metadata={},
             sessionId=str(id(self)),
         )
@@ -696,10 +713,11 @@ class _Quiet:
         self._left_out = 0
 
 
-def _tls(settings: ServerSettings) -> ssl.SSLContext | None:
-    if settings.tls_cert is None or settings.tls_key is None:
+def _tls(config: ServerConfig) -> ssl.SSLContext | None:
+    if not config.tls_cert:
         return None
-    for path in (settings.tls_cert, settings.tls_key):
+    files = [Path(name).expanduser() for name in (config.tls_cert, config.tls_key)]
+    for path in files:
         try:
             path.read_bytes()
         except OSError as error:
@@ -707,11 +725,9 @@ def _tls(settings: ServerSettings) -> ssl.SSLContext | None:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        context.load_cert_chain(settings.tls_cert, settings.tls_key)
+        context.load_cert_chain(*files)
     except ssl.SSLError as error:
-        raise FoxgloveError(
-            f"{settings.tls_cert} and {settings.tls_key}: not a certificate with its key: {error}"
-        ) from None
+        raise FoxgloveError(f"{files[0]} and {files[1]}: not a certificate with its key: {error}") from None
     return context
 
 

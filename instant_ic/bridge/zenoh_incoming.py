@@ -10,6 +10,7 @@ from typing import Any
 
 from instant_ic.bridge.commands import CommandGate, CommandRefused
 from instant_ic.bridge.zenoh_format import Attachment, Token, TopicQoS
+from instant_ic.bridge.zenoh_outgoing import Outgoing
 from instant_ic.bridge.zenoh_session import RosNode, RosSubscription
 from instant_ic.bridge.zenoh_topics import (
     ACTED_ON,
@@ -276,3 +277,16 @@ class Incoming:
             self._count_before += entry.subscription.count
         if not entry.own_publisher:
             self._node.drop(entry.publisher)
+
+
+def topic_counts(outgoing: Outgoing, incoming: Incoming) -> tuple[str, int, dict[str, int]]:
+    """Traffic in both directions: a line of text, the number of lost messages, and the values of the diagnosis."""
+    lost_by = incoming.lost_by()
+    values = {f"lost {topic} from {gid[:8]}": n for topic, by in lost_by.items() for gid, n in by.items()}
+    lost = sum(count for by in lost_by.values() for count in by.values())
+    text = (
+        f"{outgoing.count} messages out on {len(outgoing.topics)} topics, {incoming.count} in on {len(incoming.topics)}"
+    )
+    if lost:
+        text += f"; lost: {', '.join(f'{topic} {sum(by.values())}' for topic, by in sorted(lost_by.items()))}"
+    return text, lost, {"thinned": outgoing.thinned, "malformed": incoming.malformed(), **values}

@@ -7,10 +7,29 @@ import re
 from typing import Any
 
 from instant_ic.bridge.web_access import is_loopback
+from instant_ic.bus import ERROR, OK, WARN
 
 _ENDPOINT = re.compile(r"(?P<link>\w+)/(\[(?P<ipv6>[^\]]+)\]|(?P<host>[^:\[\]/]+)):\d+(\?[^#]*)?\Z")
 _TLS_LINKS = ("tls", "quic")
 _LOOPBACK_LINKS = ("tcp", *_TLS_LINKS)
+
+
+def command_security(config: Any, loopback_allowed: bool) -> tuple[int, str]:
+    """Diagnosis of the operators' commands over a configuration's links; ERROR where they must be refused.
+
+    Args:
+        config: the Zenoh configuration.
+        loopback_allowed: accept commands without TLS where every link stays within this machine.
+    """
+    why = insecurity(config)
+    if not why:
+        return OK, "taken over TLS, from hosts with a certificate"
+    if loopback_allowed:
+        beyond = beyond_loopback(config)
+        if not beyond:
+            return WARN, "taken without TLS from every program of this machine"
+        why = f"insecure_loopback_commands: {beyond}"
+    return ERROR, f"no commands are taken but emergency stops: {why} (docs/fleet.md, TLS and access control)"
 
 
 def insecurity(config: Any) -> str:

@@ -73,7 +73,7 @@ def test_rosbag2_1049_latched_topic_published_before_the_recording_is_in_the_bag
 
 
 def test_rosbag2_1159_latched_topics_are_in_every_file_of_a_split_bag(tmp_path: Path) -> None:
-    made = recorder(tmp_path / "bag", {"/tf_static": LATCHED, "/scan": SENSOR}, max_duration_s=10.0)
+    made = recorder(tmp_path / "bag", {"/tf_static": LATCHED, "/scan": SENSOR}, max_bag_duration=10.0)
     made.take("/tf_static", TF, tf_static("camera"), 1 * S, "camera")
     made.take("/tf_static", TF, tf_static("velodyne"), 1 * S, "lidar")
     for second in range(1, 40):
@@ -189,7 +189,7 @@ def test_a_loop_of_the_player_does_not_stop_timers_or_keep_old_data_fresh(follow
 def test_dora_3518_a_recorder_that_cannot_follow_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import os
 
-    made = recorder(tmp_path / "bag", {"/scan": SENSOR}, queue_bytes=1_000_000)
+    made = recorder(tmp_path / "bag", {"/scan": SENSOR}, queue_mb=1)
     made.take("/scan", BOOL, b"x", S)
     slow, writev = threading.Event(), os.writev
     monkeypatch.setattr(os, "writev", lambda fd, parts: (slow.wait(60), writev(fd, parts))[1])

@@ -86,7 +86,7 @@ class SlowDisk:
 def test_taking_never_waits_for_the_disk_and_what_is_left_out_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorder, disk = make(tmp_path / "bag", queue_bytes=3_000_000), SlowDisk(monkeypatch)
+    recorder, disk = make(tmp_path / "bag", queue_mb=3), SlowDisk(monkeypatch)
     recorder.take("/scan", BOOL, b"first", 1 * S)
     disk.hang()
     # Twenty times 1 MB while the disk takes nothing: three find a place in the queue, some are in the writer's hands.
@@ -139,7 +139,7 @@ def test_pause_keeps_latched_values_for_its_end(tmp_path: Path) -> None:
 
 def test_reserve_of_the_disk_ends_the_file_and_recording_goes_on_when_there_is_room(tmp_path: Path) -> None:
     free = [10**12]
-    recorder = make(tmp_path / "bag", lambda path: free[0], reserve_bytes=1_000_000_000)
+    recorder = make(tmp_path / "bag", lambda path: free[0], min_free_mb=1000)
     recorder.take("/scan", BOOL, b"1", 1 * S)
     wait_for(lambda: recorder.count == 1, "the first message")
     free[0] = 900_000_000
@@ -204,7 +204,7 @@ def test_folder_taken_away_is_told(tmp_path: Path) -> None:
 
 
 def test_files_by_time_and_on_demand(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "bag", max_duration_s=10.0)
+    recorder = make(tmp_path / "bag", max_bag_duration=10.0)
     recorder.take("/estop", BOOL, NO, 1 * S, "console")
     for stamp_s in (1, 5, 12):
         recorder.take("/scan", BOOL, bytes([stamp_s]), stamp_s * S)
@@ -277,7 +277,7 @@ def test_snapshot_cache_is_bounded_by_bytes() -> None:
 
 
 def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "snaps", snapshot_s=60.0)
+    recorder = make(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
     recorder.take("/estop", BOOL, NO, 1 * S)
     recorder.take("/scan", BOOL, b"1", 2 * S)
     assert list((tmp_path / "snaps").iterdir()) == []  # nothing is written until asked
@@ -296,7 +296,7 @@ def test_snapshots_are_bags_of_their_own(tmp_path: Path) -> None:
 
 
 def test_snapshot_that_cannot_be_written_is_told_and_the_next_succeeds(tmp_path: Path) -> None:
-    recorder = make(tmp_path / "snaps", snapshot_s=60.0)
+    recorder = make(tmp_path / "snaps", snapshot=True, snapshot_seconds=60.0)
     empty = recorder.snapshot("early")
     wait_for(lambda: empty.state == "failed", "the failure")
     assert "no message has been received yet" in empty.words
@@ -316,7 +316,14 @@ def test_recorder_that_writes_at_once_keeps_no_snapshots(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "bad", [{"max_bytes": -1}, {"max_duration_s": -1.0}, {"queue_bytes": 10}, {"cache_bytes": 0}, {"snapshot_s": -1.0}]
+    "bad",
+    [
+        {"max_bag_size": -1},
+        {"max_bag_duration": -1.0},
+        {"queue_mb": 0},
+        {"max_cache_mb": 0},
+        {"snapshot_seconds": -1.0},
+    ],
 )
 def test_bad_options_name_the_key(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} must be"):

@@ -10,13 +10,14 @@ from instant_ic.bridge import host_listener
 from instant_ic.bridge.host_bus import ImportedTopics
 from instant_ic.bridge.host_keys import KeyStore, Peer
 from instant_ic.bridge.host_protocol import Announce
+from instant_ic.bridge.host_report import judge_clock
 from instant_ic.bridge.host_session import Arrived, ClockStepped, LinkTimes
 from instant_ic.bridge.host_topics import TopicRule
 from instant_ic.bus import ERROR, LATCHED, OK, RELIABLE, SENSOR, WARN, Node, NodeError, ParameterError, registry
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.config import params
 from instant_ic.msg import Bool, String, TFMessage, TwistStamped, deserialize, serialize, twist_stamped
-from nodes.host_bridge import HostBridgeConfig, HostBridgeNode, judge_clock
+from nodes.host_bridge import HostBridgeConfig, HostBridgeNode
 
 TO_STATION = ("/picture lane=bulk", "/state", "/tf_static", "/log shared=true", "/queue")
 TO_ROBOT = (

@@ -27,8 +27,11 @@ class TopicWatch:
     def topics(self) -> list[registry.TopicInfo]:
         """Return the topics with a live publisher, by name."""
         now = time.monotonic()
-        with os.scandir(self._run_dir / "topics") as folders:
-            seen = sorted((folder.name, folder.stat().st_mtime_ns) for folder in folders)
+        try:
+            with os.scandir(self._run_dir / "topics") as folders:
+                seen = sorted((folder.name, folder.stat().st_mtime_ns) for folder in folders)
+        except OSError:  # one was just removed, or there is no publisher yet: the next call finds out
+            seen = []
         if seen != self._seen or now >= self._next_full_look_s:
             self._seen, self._next_full_look_s = seen, now + _FULL_LOOK_S
             self._topics = registry.list_topics(self._run_dir)

@@ -1,0 +1,63 @@
+"""The nodes that run beside a player: would its messages reach a robot, and are its readers ready?"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Collection, Mapping
+
+from instant_ic.bus.registry import NodeInfo
+
+_BASE = "crawler_base"
+_COMMAND = "/cmd_vel"
+_ACTED_ON = ("/cmd_vel", "/nav/cmd_vel", "/operator/*", "/robot/estop", "/ic/*", "/vbot/odom")
+"""Topics that a robot's nodes act on, in the namespace of its base."""
+_HARMLESS = {"/clock", "/rosout", "/diagnostics", "/heartbeat", "/parameter_events"}
+"""Topics that every node publishes. On any other topic a second publisher would mix the bag with the live robot."""
+
+
+def reached_base(nodes: Collection[NodeInfo], played: Mapping[str, str]) -> tuple[str, list[str]] | None:
+    """Find a base, real or simulated, that could obey the played messages.
+
+    Args:
+        nodes: running nodes, without the player.
+        played: topic on the bus → topic in the bag.
+
+    Returns:
+        Name of the base and the topics of the bag that would reach it; None where there is none.
+    """
+    live = {topic for node in nodes for topic in node.publishes} - _HARMLESS
+    for base in nodes:
+        if base.executable != _BASE:
+            continue
+        spaces = {"", *(topic.removesuffix(_COMMAND) for topic in base.subscribes if topic.endswith(_COMMAND))}
+        acted_on = {*live, *base.subscribes, *(f"{space}{topic}" for space in spaces for topic in _ACTED_ON)}
+        found = [
+            played[topic]
+            for topic in sorted(played)
+            if any(fnmatch.fnmatchcase(topic, pattern) for pattern in acted_on)
+        ]
+        if found:
+            return base.name, found
+    return None
+
+
+def missing_readers(
+    wait_for: Collection[str], nodes: Collection[NodeInfo], publishers: Mapping[str, tuple[str, int]]
+) -> list[str]:
+    """Describe what is missing before nodes receive everything that is played.
+
+    Args:
+        wait_for: names of the nodes, which must subscribe to at least one played topic.
+        nodes: running nodes.
+        publishers: topic in the bag → (topic on the bus, number of connected subscribers).
+
+    Returns:
+        The missing nodes and connections as text; empty when all are there.
+    """
+    running = {node.name: node for node in nodes if node.name in wait_for}
+    played = {topic for topic, _ in publishers.values()}
+    # A recorder subscribes only after it has found the topics: it is ready once it subscribes to one of them.
+    absent = [name for name in wait_for if name not in running or played.isdisjoint(running[name].subscribes)]
+    readers = [topic for node in running.values() for topic in node.subscribes]
+    unread = [name for name, (topic, connected) in publishers.items() if connected < readers.count(topic)]
+    return [f"node {name} to read what is played" for name in absent] + [f"a reader of {name}" for name in unread]
