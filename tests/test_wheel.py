@@ -1,14 +1,25 @@
 """An installed wheel holds all that the stack needs: nodes, launch files, configuration, model, page."""
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
+import sysconfig
+import tempfile
+import time
 import zipfile
 from pathlib import Path
 
 import pytest
 
+from instant_ic.bus import registry
+from instant_ic.experiments.stack import free_ports, machine_pace, processes_of
+
 ROOT = Path(__file__).resolve().parents[1]
+PURELIB = "import sysconfig; print(sysconfig.get_paths()['purelib'])"
+ENVIRONMENT = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "INSTANT_IC_RUN_DIR")}
+NODES = {"simulator", "theta_camera", "vlp16_driver", "crawler_base", "grid_slam", "depth_scaler", "arbiter"}
 
 
 @pytest.fixture(scope="module")
@@ -32,19 +43,67 @@ def test_wheel_holds_every_shipped_file(wheel):
             assert f"instant_ic/share/{name}" in names
 
 
-def test_installed_wheel_finds_its_files(wheel, tmp_path):
-    site = tmp_path / "site"
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
-    subprocess.run(pip, check=True, timeout=240)
-    environment = {**os.environ, "PYTHONPATH": str(site), "INSTANT_IC_RUN_DIR": str(tmp_path / "r")}
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """A new environment with the wheel; its dependencies are those of this interpreter, without the checkout."""
+    folder = tmp_path_factory.mktemp("installed")
+    python = folder / "venv/bin/python"
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(folder / "venv")], check=True, timeout=240)
+    pip = [sys.executable, "-m", "pip", "--python", str(python), "install", "-q", "--no-deps", "--no-index", str(wheel)]
+    subprocess.run(pip, check=True, timeout=240, env=ENVIRONMENT)
+    site = Path(subprocess.check_output([python, "-c", PURELIB], text=True, timeout=60).strip())
+    # The line of a .pth file adds a folder, but does not read its .pth files: the editable install stays unseen.
+    (site / "dependencies.pth").write_text(f"{sysconfig.get_paths()['purelib']}\n")
+    return python
 
-    def python(*arguments: str) -> str:
-        command = [sys.executable, *arguments]
-        result = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=120)
-        assert result.returncode == 0, result.stderr
-        return result.stdout
 
-    found = python("-c", "import instant_ic.paths as p; print(p.shipped_file('launch', 'sim.yaml'))")
-    assert Path(found.strip()) == site / "instant_ic/share/launch/sim.yaml"
-    assert "console_port" in python("-m", "instant_ic.cli.main", "launch", "sim", "--show-args")
-    assert "--params-file" in python("-m", "instant_ic.cli.main", "run", "simulator", "--help")
+def run(installed, folder, *arguments):
+    """Output of a command in the new environment, outside the checkout."""
+    result = subprocess.run(
+        [installed, *arguments], env=ENVIRONMENT, cwd=folder, capture_output=True, text=True, timeout=120
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_installed_wheel_finds_its_files(installed, tmp_path):
+    found = Path(
+        run(
+            installed, tmp_path, "-c", "import instant_ic.paths as p; print(p.shipped_file('launch', 'sim.yaml'))"
+        ).strip()
+    )
+    assert found.is_relative_to(installed.parents[1]) and found.parts[-4:-1] == ("instant_ic", "share", "launch")
+    assert "console_port" in run(installed, tmp_path, "-m", "instant_ic.cli.main", "launch", "sim", "--show-args")
+    assert "--params-file" in run(installed, tmp_path, "-m", "instant_ic.cli.main", "run", "simulator", "--help")
+
+
+@pytest.mark.system
+@pytest.mark.timeout(600)
+def test_installed_wheel_runs_the_simulated_stack(installed, tmp_path):
+    run_dir = Path(tempfile.mkdtemp(prefix="ic-"))
+    ports = [f"{name}:={value}" for name, value in free_ports().items()]
+    ic = installed.parent / "ic"
+    environment = {**ENVIRONMENT, "INSTANT_IC_RUN_DIR": str(run_dir)}
+    log = (tmp_path / "log").open("w+")
+    launch = subprocess.Popen(
+        [ic, "launch", "sim", "--plain", "--pace", str(machine_pace()), "headless:=true", "vspace:=false", *ports],
+        env=environment, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    try:
+        deadline_s = time.monotonic() + 240
+        while not {node.name for node in registry.list_nodes(run_dir)} >= NODES:
+            assert launch.poll() is None and time.monotonic() < deadline_s, Path(log.name).read_text()
+            time.sleep(0.2)
+        echo = [ic, "topic", "echo", "/pose", "--once", "--timeout", "90"]
+        assert subprocess.run(echo, env=environment, cwd=tmp_path, stdout=log, timeout=120).returncode == 0
+        assert {process.cmdline()[0] for process in processes_of(run_dir)} == {str(installed)}
+        launch.send_signal(signal.SIGINT)
+        assert launch.wait(90) == 0, Path(log.name).read_text()
+        assert [process.cmdline() for process in processes_of(run_dir)] == []
+        assert "Traceback" not in Path(log.name).read_text()
+    finally:
+        for process in [launch, *processes_of(run_dir)]:
+            process.kill()
+        launch.wait(30)
+        log.close()
+        shutil.rmtree(run_dir, ignore_errors=True)

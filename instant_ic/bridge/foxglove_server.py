@@ -725,7 +725,7 @@ def _tls(config: ServerConfig) -> ssl.SSLContext | None:
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     context.minimum_version = ssl.TLSVersion.TLSv1_2
     try:
-        context.load_cert_chain(*files)
+        context.load_cert_chain(files[0], files[1])
     except ssl.SSLError as error:
         raise FoxgloveError(f"{files[0]} and {files[1]}: not a certificate with its key: {error}") from None
     return context

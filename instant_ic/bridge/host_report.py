@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 from instant_ic.base.recent import RecentCount
 from instant_ic.bridge.host_link import HostLink, PeerStatus
@@ -16,18 +17,12 @@ RECENT_S = 10.0
 UNLISTED = "of no list"
 
 
-class Diagnose(Protocol):
-    """Sets one diagnosis of a node, as :meth:`Node.diagnose`."""
-
-    def __call__(self, name: str, level: int, message: str, /, **values: object) -> None: ...
-
-
 class LinkReport:
     """Turns the state of a link into diagnoses.
 
     Args:
         link: the link.
-        diagnose: sets a diagnosis.
+        diagnose: sets a diagnosis, as :meth:`Node.diagnose`.
         listed: topics of this host's lists.
 
     Attributes:
@@ -35,7 +30,7 @@ class LinkReport:
         lost_link: how the last link ended.
     """
 
-    def __init__(self, link: HostLink, diagnose: Diagnose, listed: set[str]) -> None:
+    def __init__(self, link: HostLink, diagnose: Callable[..., None], listed: set[str]) -> None:
         self.problem = ""
         self.lost_link = ""
         self._link, self._diagnose, self._listed = link, diagnose, listed
