@@ -191,6 +191,7 @@ class ControlServer:
 
         Raises:
             NodeBusyError: the node's thread was busy for too long; the function will not run later.
+            _RequestError: the function has started, but has not finished in time; its effect may follow.
         """
         future: concurrent.futures.Future[Any] = concurrent.futures.Future()
 
@@ -207,7 +208,13 @@ class ControlServer:
             return future.result(_CHANGE_S)
         except concurrent.futures.TimeoutError:
             if not future.cancel():  # it has just started
-                return future.result(_CHANGE_S)
+                try:
+                    return future.result(_CHANGE_S)
+                except concurrent.futures.TimeoutError:
+                    raise _RequestError(
+                        f"{self._node.node_name} has started the change but not finished it within {_CHANGE_S:g} s; "
+                        "it may still take effect: look before you repeat it"
+                    ) from None
             what, busy_s = self._node.activity()
             doing = f"{what} has been running for {busy_s:.1f} s" if what else "its loop is not running"
             raise NodeBusyError(f"{self._node.node_name} is busy ({doing}); nothing was changed") from None

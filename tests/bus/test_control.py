@@ -185,6 +185,16 @@ def test_busy_node_still_answers_and_drops_the_change(tuned, monkeypatch):
     assert node.config.rate_hz == 10.0  # the dropped change did not come after all
 
 
+def test_command_that_has_started_is_not_reported_as_dropped(tuned, monkeypatch):
+    node, client = tuned
+    monkeypatch.setattr(control, "_CHANGE_S", 0.2)
+    go_on = threading.Event()
+    node.commands = {"slow": lambda: go_on.wait(30)}
+    with pytest.raises(ControlError, match="has started the change .* it may still take effect"):
+        client.call("slow")
+    go_on.set()
+
+
 def test_log_level(tuned):
     node, client = tuned
     heard = []
