@@ -190,7 +190,7 @@ def test_command_that_has_started_is_not_reported_as_dropped(tuned, monkeypatch)
     monkeypatch.setattr(control, "_CHANGE_S", 0.2)
     go_on = threading.Event()
     node.commands = {"slow": lambda: go_on.wait(30)}
-    with pytest.raises(ControlError, match="has started the change .* it may still take effect"):
+    with pytest.raises(ControlError, match=r"has started the change .* it may still take effect"):
         client.call("slow")
     go_on.set()
 
