@@ -249,9 +249,9 @@ class _Comparison:
             largest: dict[str, tuple[str, float]] = {}
             for index, (x, y) in enumerate(zip(a, b, strict=True)):
                 for inner, (words, size) in self._values(x, y, f"{path}[]"):
-                    told = words.replace(f"{path}[]", f"{path}[{index}]", 1)
+                    text = words.replace(f"{path}[]", f"{path}[{index}]", 1)
                     if inner not in largest or size > largest[inner][1]:
-                        largest[inner] = (largest.get(inner, (told, 0.0))[0], size)
+                        largest[inner] = (largest.get(inner, (text, 0.0))[0], size)
             yield from largest.items()
         elif isinstance(a, float) and isinstance(b, float) and not isinstance(a, bool):
             yield from self._arrays(np.array([a]), np.array([b]), path, scalar=True)

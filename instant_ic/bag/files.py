@@ -178,9 +178,9 @@ class BagReader:
             return [PartSummary(self.path, self.start_ns, self.end_ns, self.count)]
         found = []
         for storage in self._storages:
-            told, path = storage.metadata, Path(storage.path)
-            count = int(told.message_count) - self._repeated.get(path.name, Counter()).total()
-            span = (int(told.start_time), int(told.end_time) - 1) if told.message_count else (0, 0)
+            meta, path = storage.metadata, Path(storage.path)
+            count = int(meta.message_count) - self._repeated.get(path.name, Counter()).total()
+            span = (int(meta.start_time), int(meta.end_time) - 1) if meta.message_count else (0, 0)
             found.append(PartSummary(path, *span, count))
         return found
 

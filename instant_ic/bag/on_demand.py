@@ -78,16 +78,16 @@ class OnDemand:
         if self._closing is None:
             self._recorder.tick()
         elif not self._closing.is_alive():
-            self._last = self._told(self._recorder)
+            self._last = self._state(self._recorder)
             self._recorder = self._closing = None
 
     def trouble(self) -> str:
         """Return why the current bag is not being written or the last one is incomplete; empty when all is well."""
         if self._recorder is None or self._closing is not None:
             return self.error
-        told = self._recorder.status()
-        if told["overflow"]:
-            return f"{told['path']}: the disk is too slow; dropped: {sum(told['overflow'].values())} messages"
+        status = self._recorder.status()
+        if status["overflow"]:
+            return f"{status['path']}: the disk is too slow; dropped: {sum(status['overflow'].values())} messages"
         return self._recorder.error
 
     def status(self) -> dict[str, Any]:
@@ -96,12 +96,12 @@ class OnDemand:
         Keys: ``state`` (``idle``, ``ending`` or the recorder's), ``path``, ``seconds``, ``bytes``, ``messages``,
         ``error``, and ``free_bytes`` of the disk, None where that is unknown.
         """
-        told = {"state": IDLE, **self._last} if self._recorder is None else self._told(self._recorder)
+        status = {"state": IDLE, **self._last} if self._recorder is None else self._state(self._recorder)
         try:
-            told["free_bytes"] = shutil.disk_usage(self.folder).free
+            status["free_bytes"] = shutil.disk_usage(self.folder).free
         except OSError:
-            told["free_bytes"] = None
-        return told
+            status["free_bytes"] = None
+        return status
 
     def close(self) -> None:
         """Complete the bag and wait for it.
@@ -127,14 +127,14 @@ class OnDemand:
         if self.error:
             log.error("%s: %s", recorder.path, self.error)
 
-    def _told(self, recorder: Recorder) -> dict[str, Any]:
-        told = recorder.status()
+    def _state(self, recorder: Recorder) -> dict[str, Any]:
+        status = recorder.status()
         ended = self._closing is not None and not self._closing.is_alive()
         return {
-            "state": IDLE if ended else ENDING if self._closing is not None else told["state"],
-            "path": told["path"],
+            "state": IDLE if ended else ENDING if self._closing is not None else status["state"],
+            "path": status["path"],
             "seconds": round((self._ended_s or time.monotonic()) - self._began_s, 1),
-            "bytes": told["bytes"],
-            "messages": told["messages"],
-            "error": self.error or told["error"],
+            "bytes": status["bytes"],
+            "messages": status["messages"],
+            "error": self.error or status["error"],
         }

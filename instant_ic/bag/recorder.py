@@ -146,7 +146,7 @@ class Snapshot:
 
 
 @dataclass
-class _Told:
+class _Dropped:
     """Counts for the metadata, written at the end."""
 
     overflow: Counter[str] = field(default_factory=Counter)
@@ -188,7 +188,7 @@ class Recorder:
         """Why recording failed or waits."""
         self.failed = False
         """Whether an error occurred since the start."""
-        self.told = _Told()
+        self.dropped = _Dropped()
         self.snapshots: list[Snapshot] = []
         self._choice = choice
         self._subscribe = subscribe
@@ -255,7 +255,7 @@ class Recorder:
         """Queue one message; never waits. The payload is copied, since its memory may be overwritten."""
         stamp_ns = self._stamp_ns(publish_ns)
         if not type_name:
-            self.told.no_type[topic] += 1
+            self.dropped.no_type[topic] += 1
         elif stamp_ns <= 0:  # a node on simulated time before the first /clock: the message has no time
             self.early += 1
         elif self._begun_ns:
@@ -337,7 +337,7 @@ class Recorder:
     def status(self) -> dict[str, Any]:
         """Return the values that ``ic bag status`` shows."""
         writer, cache = self._writer, self._cache
-        told: dict[str, Any] = {
+        status: dict[str, Any] = {
             "path": str(self.path),
             "state": self.state,
             "error": self.error,
@@ -345,14 +345,14 @@ class Recorder:
             "messages": self.count,
             "queued_bytes": self._queue.bytes,
             "lost": self.lost_by() or self.lost(),
-            "overflow": dict(self.told.overflow),
+            "overflow": dict(self.dropped.overflow),
         }
         if writer is not None:
-            told |= {"bytes": writer.bytes, "files": writer.parts}
+            status |= {"bytes": writer.bytes, "files": writer.parts}
         if cache is not None:
-            told |= {"cached_bytes": cache.bytes, "cached_s": round(cache.span_s, 1)}
-            told["snapshots"] = [{"path": str(s.path), "state": s.state, "words": s.words} for s in self.snapshots]
-        return told
+            status |= {"cached_bytes": cache.bytes, "cached_s": round(cache.span_s, 1)}
+            status["snapshots"] = [{"path": str(s.path), "state": s.state, "words": s.words} for s in self.snapshots]
+        return status
 
     def summary(self) -> str:
         """One line on the content of the recording."""
@@ -366,7 +366,7 @@ class Recorder:
         """Why messages are not recorded; empty when recording works."""
         if self.state in (FAILED, DISK_FULL):
             return self.error
-        if overflow := self.told.overflow:
+        if overflow := self.dropped.overflow:
             return f"{self.summary()}; the disk is too slow, dropped: {_counts(overflow)}"
         return ""
 
@@ -414,12 +414,12 @@ class Recorder:
         if self._paused or self._state in (DISK_FULL, FAILED):
             if qos.latched:
                 self._not_written.append(entry)
-            self._count(self.told.paused if self._paused else self.told.disk_full, topic)
+            self._count(self.dropped.paused if self._paused else self.dropped.disk_full, topic)
             return
         if self._cache is not None:
             self._cache.add(entry, time.monotonic())
         elif not self._queue.put(entry):
-            self.told.overflow[topic] += 1
+            self.dropped.overflow[topic] += 1
             return
         self.counts[topic] += 1
 
@@ -465,7 +465,7 @@ class Recorder:
                     self._writer.flush()
                 if now >= next_custom:
                     next_custom = now + _KEEP_CUSTOM_S
-                    self._tell(self._writer)
+                    self._set_custom(self._writer)
                     self._writer.keep_custom()
             except DiskFullError as error:
                 self._stop(DISK_FULL, str(error))
@@ -479,7 +479,7 @@ class Recorder:
     def _write(self, entry: Entry) -> None:
         try:
             if self._writer is None or self._state != RECORDING:
-                self._count(self.told.disk_full, entry.topic)
+                self._count(self.dropped.disk_full, entry.topic)
                 if entry.qos.latched:
                     self._not_written.append(entry)
                 return
@@ -491,7 +491,7 @@ class Recorder:
 
     def _end_part(self) -> None:
         if self._writer is not None and self._state == RECORDING and not self._writer.part_is_empty:
-            self._tell(self._writer)
+            self._set_custom(self._writer)
             self._writer.end_part()
 
     def _look_for_space(self) -> None:
@@ -506,7 +506,7 @@ class Recorder:
         if self._state == RECORDING and free < reserve:
             words = f"only {free / 1e6:.0f} MB are free where {self.path} is, {reserve / 1e6:.0f} MB are the reserve"
             if self._writer is not None:
-                self._tell(self._writer)
+                self._set_custom(self._writer)
                 self._writer.end_part()
             self._stop(DISK_FULL, f"{words}: not recording; the bag is complete up to here")
         elif self._state == DISK_FULL and free >= reserve + _ROOM_AGAIN:
@@ -525,7 +525,7 @@ class Recorder:
             with BagWriter(snapshot.path, self.options.compressed, level=_LEVEL) as writer:
                 for entry in content:
                     writer.write(entry.topic, entry.type_name, entry.payload, entry.stamp_ns, entry.qos)
-                self._tell(writer)
+                self._set_custom(writer)
         except BagError as error:
             snapshot.words, snapshot.state = str(error), "failed"
             self.failed = True
@@ -535,14 +535,14 @@ class Recorder:
             snapshot.words, snapshot.state = f"{len(content)} messages, {span_s:.1f} s", "done"
             log.info("snapshot %s: %s", snapshot.path, snapshot.words)
 
-    def _tell(self, writer: BagWriter) -> None:
+    def _set_custom(self, writer: BagWriter) -> None:
         for key, value in (
             ("lost", self.lost()),
             ("lost_by", self.lost_by()),
-            ("overflow", self.told.overflow),
-            ("paused", self.told.paused),
-            ("disk_full", self.told.disk_full),
-            ("no_type", self.told.no_type),
+            ("overflow", self.dropped.overflow),
+            ("paused", self.dropped.paused),
+            ("disk_full", self.dropped.disk_full),
+            ("no_type", self.dropped.no_type),
             ("parameters", self._parameters),
         ):
             if value or key in ("lost", "parameters"):
@@ -554,7 +554,7 @@ class Recorder:
             self._state = ENDED
             return
         try:
-            self._tell(self._writer)
+            self._set_custom(self._writer)
             self._writer.close()
             if self._state != FAILED:
                 self._state = ENDED

@@ -94,7 +94,7 @@ def test_taking_never_waits_for_the_disk_and_what_is_left_out_is_told(
         recorder.take("/scan", BOOL, bytes([index]) * 1_000_000, 2 * S + index)
     recorder.take("/estop", BOOL, YES, 3 * S)  # latched values always find a place
     assert not disk.go.is_set()  # and all that time nothing was written
-    left_out = recorder.told.overflow["/scan"]
+    left_out = recorder.dropped.overflow["/scan"]
     assert 10 <= left_out <= 18
     disk.go.set()
     recorder.close()
