@@ -79,7 +79,7 @@ class FoxgloveBridgeNode(Node[FoxgloveBridgeConfig]):
                 time.sleep(_LEAST_S)  # limits the cost of a client that connects and disconnects without end
             if self.use_sim_time and (now_ns := self.clock.now_ns()) != sent_ns:
                 sent_ns = now_ns
-                self.server.tell_time(now_ns)
+                self.server.send_time(now_ns)
             self.server.wake.wait(_TIME_S if self.use_sim_time else max(next_s - time.monotonic(), 0.0))
 
     def reconcile(self) -> None:

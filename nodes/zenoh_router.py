@@ -35,9 +35,9 @@ class ZenohRouterNode(Node[ZenohRouterConfig]):
         except (ZenohError, FileNotFoundError) as error:
             raise NodeError(str(error)) from None
         self.log.info("router %s", self.session.info.zid())
-        self.timer(1.0, self.tell)
+        self.timer(1.0, self.report)
 
-    def tell(self) -> None:
+    def report(self) -> None:
         """Report the connected peers."""
         info = self.session.info
         self.diagnose("link", OK, f"{len(info.peers_zid())} peers, {len(info.routers_zid())} other routers")

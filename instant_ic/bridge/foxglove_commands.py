@@ -22,13 +22,13 @@ class Commands:
     Args:
         node: publishes the commands.
         gate: checks them.
-        tell: called with a client's number, a text for that client, and its level.
+        notify: called with a client's number, a text for that client, and its level.
     """
 
-    def __init__(self, node: Node[Any], gate: CommandGate, tell: Callable[[int, str, int], None]) -> None:
+    def __init__(self, node: Node[Any], gate: CommandGate, notify: Callable[[int, str, int], None]) -> None:
         self._node = node
         self._gate = gate
-        self._tell = tell
+        self._notify = notify
         self._channels: dict[tuple[int, int], ClientChannel] = {}
         self._told: dict[int, str] = {}
         self._drive: Publisher = node.publisher(DRIVE, message_type("TwistStamped"), SENSOR)
@@ -41,7 +41,7 @@ class Commands:
         if kinds is None or name not in kinds or channel.encoding not in ("cdr", "json"):
             known = "; ".join(f"{topic} ({' or '.join(names)})" for topic, names in _COMMAND_TYPES.items())
             what = f"{channel.topic:.100} {channel.schema_name:.100} {channel.encoding:.20}"
-            self._tell(client, f"{what} is not accepted; only {known}, cdr or json", ERROR)
+            self._notify(client, f"{what} is not accepted; only {known}, cdr or json", ERROR)
             return
         self._channels[client, channel.id] = channel
 
@@ -106,7 +106,7 @@ class Commands:
         if self._told.get(client) == words:
             return
         self._told[client] = words
-        self._tell(client, words, ERROR)
+        self._notify(client, words, ERROR)
         self._node.call_soon(self._node.diagnose, "commands", ERROR, words)
 
 

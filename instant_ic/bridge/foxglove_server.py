@@ -256,7 +256,7 @@ class FoxgloveServer:
 
     # -- from any thread -------------------------------------------------------------------------
 
-    def tell_time(self, now_ns: int) -> None:
+    def send_time(self, now_ns: int) -> None:
         """Send the simulated time to the clients."""
         with self._lock:
             self._time_ns = now_ns

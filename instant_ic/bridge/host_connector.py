@@ -117,7 +117,7 @@ class ConnectingLink(HostLink):
     def _farewell(self) -> None:
         with self._lock:
             if self._connection is not None and self._connection.session.up:
-                self._connection.session.end("closing", f"{self.side.name} ends", tell=True)
+                self._connection.session.end("closing", f"{self.side.name} ends", inform=True)
                 self._flush()
             if self._dealer is not None:
                 self._dealer.disable_monitor()

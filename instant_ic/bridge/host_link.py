@@ -95,7 +95,7 @@ class Connection:
     address: str = ""
     file: int = -1
     remote: Any = None
-    told: str = ""
+    reported: str = ""
 
 
 class HostLink(ABC):

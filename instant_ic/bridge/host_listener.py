@@ -55,7 +55,7 @@ class ListeningLink(HostLink):
         host, port = check_endpoint(endpoint, listening=True)
         super().__init__(side, exports, store, on_event, times)
         self._by_route: dict[bytes, Connection] = {}
-        self._told: dict[tuple[str, str], tuple[float, int]] = {}
+        self._reported: dict[tuple[str, str], tuple[float, int]] = {}
         self.wanted_driver = ""
         self._next_list_s = 0.0
         self._list_problem = ""
@@ -107,7 +107,7 @@ class ListeningLink(HostLink):
     def _farewell(self) -> None:
         with self._lock:
             for route, connection in list(self._by_route.items()):
-                self._handle(connection, connection.session.end("closing", f"{self.side.name} ends", tell=True))
+                self._handle(connection, connection.session.end("closing", f"{self.side.name} ends", inform=True))
                 self._send(route, connection)
 
     # -- the door ----------------------------------------------------------------------------------
@@ -131,15 +131,15 @@ class ListeningLink(HostLink):
         """Report a rejected host with its tries: once a minute per address and key, ten times a minute in all."""
         self.strangers += 1
         who = (address, fingerprint(key) if key else "without a key")
-        told_s, times = self._told.get(who, (-_STRANGER_S, 0))
+        reported_s, times = self._reported.get(who, (-_STRANGER_S, 0))
         now = time.monotonic()
-        if len(self._told) >= 1000:
-            self._told.clear()
-        lately = sum(now - other_s < _STRANGER_S for other_s, _ in self._told.values())
-        if now - told_s < _STRANGER_S or lately >= _STRANGERS_A_MINUTE:
-            self._told[who] = (told_s, times + 1)
+        if len(self._reported) >= 1000:
+            self._reported.clear()
+        lately = sum(now - other_s < _STRANGER_S for other_s, _ in self._reported.values())
+        if now - reported_s < _STRANGER_S or lately >= _STRANGERS_A_MINUTE:
+            self._reported[who] = (reported_s, times + 1)
             return
-        self._told[who] = (now, 0)
+        self._reported[who] = (now, 0)
         self._emit("", Stranger(*who, times + 1))
 
     def _cut_off_revoked(self) -> None:
@@ -150,7 +150,7 @@ class ListeningLink(HostLink):
             reason = f"{self.side.name} no longer allows this host's key"
             if peer is not None:  # its role or name has changed: it reconnects with the new one
                 reason = f"{self.side.name} has changed what this host may do"
-            events = connection.session.end("replaced" if peer else "revoked", reason, tell=True)
+            events = connection.session.end("replaced" if peer else "revoked", reason, inform=True)
             self._handle(connection, events)
             self._send(route, connection)
 
@@ -191,7 +191,7 @@ class ListeningLink(HostLink):
             return None
         for old_route, old in list(self._by_route.items()):
             if old.peer.public_key == peer.public_key:  # it restarted, or lost a link before we noticed
-                self._handle(old, old.session.end("replaced", "a newer link uses the same key", tell=True))
+                self._handle(old, old.session.end("replaced", "a newer link uses the same key", inform=True))
                 self._send(old_route, old)
         connection = Connection(peer, self._new_session(peer, connecting=False, may_send=peer.role == "driver"))
         connection.address = str(frame.get("Peer-Address"))
@@ -239,8 +239,8 @@ class ListeningLink(HostLink):
             if each.session.drives != (each is holder):
                 self._handle(each, each.session.set_drives(each is holder))
             text = "" if each is holder else f"{who} drives {self.side.name}; this host's commands are dropped"
-            if each.told != text:
-                each.told = text
+            if each.reported != text:
+                each.reported = text
                 each.session.notify("driver", text)
 
     @property

@@ -293,13 +293,13 @@ class Session:
             return self.end("timeout", f"nothing heard for {silent_s:.1f} s")
         return []
 
-    def end(self, code: str, reason: str, tell: bool = False) -> list[Event]:
-        """End the link from this side; ``tell`` sends the reason to the other host."""
+    def end(self, code: str, reason: str, inform: bool = False) -> list[Event]:
+        """End the link from this side; ``inform`` sends the reason to the other host."""
         if self.ended is not None:
             return []
         self.up = False
         self._replies.clear()
-        if tell:
+        if inform:
             self._replies.append(Bye(code, reason))
         for topic, counts in self.outbox.counts.items():
             self.memory.counts_out.setdefault(topic, TopicCounts()).add(counts)
@@ -348,7 +348,7 @@ class Session:
         try:
             return self._take(decode(data))
         except ProtocolError as error:
-            return self.end("protocol", str(error), tell=True)
+            return self.end("protocol", str(error), inform=True)
 
     def _take(self, message: Message) -> list[Event]:
         now = self.clocks.mono_ns()
@@ -401,7 +401,7 @@ class Session:
             "version",
             f"{message.name} uses bridge protocol version {message.version}, {self.side.name} version {VERSION}: "
             "install the same Instant IC on both",
-            tell=True,
+            inform=True,
         )
 
     def _begin(self, message: Hello | Welcome) -> list[Event]:

@@ -36,20 +36,20 @@ _LEFT_OUT = {
 def info(args: argparse.Namespace) -> int:
     """Print the contents of a bag: size, times, topics, losses, bookmarks."""
     with BagReader(Path(args.bag)) as reader:
-        told = _info(reader)
+        summary = _info(reader)
     if args.json:
-        print(json.dumps(told, indent=2))
+        print(json.dumps(summary, indent=2))
         return 0
-    print(f"bag:      {told['path']}")
-    print(f"size:     {told['bytes'] / 1e6:.1f} MB{', ' + told['compression'] if told['compression'] else ''}")
-    print(f"start:    {datetime.fromtimestamp(told['start_ns'] / 1e9, UTC):%Y-%m-%d %H:%M:%S.%f} UTC")
-    print(f"duration: {told['duration_s']:.3f} s")
-    print(f"messages: {told['messages']}")
-    if len(told["files"]) > 1:
+    print(f"bag:      {summary['path']}")
+    print(f"size:     {summary['bytes'] / 1e6:.1f} MB{', ' + summary['compression'] if summary['compression'] else ''}")
+    print(f"start:    {datetime.fromtimestamp(summary['start_ns'] / 1e9, UTC):%Y-%m-%d %H:%M:%S.%f} UTC")
+    print(f"duration: {summary['duration_s']:.3f} s")
+    print(f"messages: {summary['messages']}")
+    if len(summary["files"]) > 1:
         print("files:")
-        for file in told["files"]:
+        for file in summary["files"]:
             print(f"  {file['name']}  {file['bytes'] / 1e6:.1f} MB  {file['duration_s']:.3f} s  {file['messages']}")
-    topics = told["topics"]
+    topics = summary["topics"]
     width, type_width = (max([len(topic[key]) for topic in topics], default=0) for key in ("topic", "type"))
     for topic in topics:
         hz = f"{topic['rate_hz']:8.2f} Hz" if topic["rate_hz"] else " " * 11
@@ -59,14 +59,14 @@ def info(args: argparse.Namespace) -> int:
             f"  {topic['topic']:<{width}}  {topic['type']:<{type_width}}  {topic['messages']:>7} {hz}"
             f"  {topic['qos']}{lost}{f' ({by})' if by else ''}"
         )
-    for mark in told["bookmarks"]:
+    for mark in summary["bookmarks"]:
         print(f"bookmark: {mark['at_s']:.3f} s  {mark['name']}")
     for key, words in _LEFT_OUT.items():
-        if told[key]:
-            print(f"{words}: {', '.join(f'{topic} {n}' for topic, n in sorted(told[key].items()))}")
-    if told["recovered_from"]:
-        print(f"recovered from {told['recovered_from']}")
-    for name in told["unlisted"]:
+        if summary[key]:
+            print(f"{words}: {', '.join(f'{topic} {n}' for topic, n in sorted(summary[key].items()))}")
+    if summary["recovered_from"]:
+        print(f"recovered from {summary['recovered_from']}")
+    for name in summary["unlisted"]:
         print(
             f"{name} is in the folder but not in the index: its recording was cut short. Run ic bag recover {args.bag}"
         )

@@ -43,14 +43,14 @@ def _attended(name: str, attend: Callable[[Node[Any]], Terminal]) -> type[Node[A
 
 def _recorder_terminal(node: Node[Any]) -> Terminal:
     def line() -> str:
-        told = node.commands["status"]()
-        words = f"{told['state']}  {told['messages']} messages  {told['topics']} topics"
-        if "bytes" in told:
-            words += f"  {told['bytes'] / 1e6:.1f} MB  {told['files']} files   [space] pause"
+        status = node.commands["status"]()
+        words = f"{status['state']}  {status['messages']} messages  {status['topics']} topics"
+        if "bytes" in status:
+            words += f"  {status['bytes'] / 1e6:.1f} MB  {status['files']} files   [space] pause"
         else:
-            words += f"  last {told['cached_s']:g} s in memory   [s] snapshot [space] pause"
-        left_out = sum(told["overflow"].values())
-        return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if told["lost"] else "")
+            words += f"  last {status['cached_s']:g} s in memory   [s] snapshot [space] pause"
+        left_out = sum(status["overflow"].values())
+        return words + (f"   LEFT OUT {left_out}" if left_out else "") + ("   LOST" if status["lost"] else "")
 
     # The recorder may only be used from the node's thread.
     keys = {" ": lambda: node.call_soon(node.commands["toggle"])}
@@ -63,11 +63,11 @@ def _player_terminal(node: Node[Any]) -> Terminal:
     do = node.commands
 
     def line() -> str:
-        told = do["status"]()
-        done = told["position_s"] / max(told["length_s"], 1e-9)
+        status = do["status"]()
+        done = status["position_s"] / max(status["length_s"], 1e-9)
         bar = "█" * round(20 * done) + "·" * (20 - round(20 * done))
         return (
-            f"{told['state']:<7} {bar} {told['position_s']:.1f} / {told['length_s']:.1f} s  x{told['rate']:.2g}"
+            f"{status['state']:<7} {bar} {status['position_s']:.1f} / {status['length_s']:.1f} s  x{status['rate']:.2g}"
             "   [space] pause [→] step [↑↓] rate [←] back 5 s [q] quit"
         )
 

@@ -29,12 +29,12 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
             yield draw
         return
     began_s = time.monotonic()
-    told = [0]
+    printed = [0]
 
-    def tell(share: float) -> None:
+    def print_share(share: float) -> None:
         tenth = int(share * 10)
-        if tenth > told[0] and time.monotonic() - began_s > _QUIET_S:
-            told[0] = tenth
+        if tenth > printed[0] and time.monotonic() - began_s > _QUIET_S:
+            printed[0] = tenth
             print(f"{what}: {10 * tenth} % after {time.monotonic() - began_s:.0f} s", file=sys.stderr, flush=True)
 
-    yield tell
+    yield print_share

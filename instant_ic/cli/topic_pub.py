@@ -96,14 +96,14 @@ def _wait_for_clock(observer: Observer, seconds: float) -> None:
 
 def _wait_for_readers(publisher: Publisher, wanted: int, seconds: float) -> None:
     deadline_s = time.monotonic() + seconds
-    told = False
+    warned = False
     while publisher.subscriber_count < wanted:
         if time.monotonic() > deadline_s:
             raise UserError(
                 f"{publisher.topic}: {publisher.subscriber_count} of {wanted} subscribers within {seconds:g} s; "
                 "use -w 0 to publish without them"
             )
-        if not told and time.monotonic() > deadline_s - seconds + 0.5:
-            told = True
+        if not warned and time.monotonic() > deadline_s - seconds + 0.5:
+            warned = True
             print(f"Waiting for at least {wanted} matching subscription(s)...", file=sys.stderr, flush=True)
         time.sleep(0.01)

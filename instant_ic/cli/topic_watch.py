@@ -138,17 +138,17 @@ def _watch(observer: Observer, duration_s: float, take: Callable[[Received], Non
     observer.hint()
     width = max(len(topic) for topic in observer.topics) if len(observer.topics) > 1 else 0
 
-    def tell() -> None:
+    def print_lines() -> None:
         for topic in observer.topics:
             print(f"{topic:<{width}}  {line(topic)}" if width else line(topic), flush=True)
 
     next_s = time.monotonic() + 1.0
-    told_s = 0.0
+    printed_s = 0.0
     for batch in observer.batches(duration_s, 0.1):
         for received in batch:
             take(received)
         if time.monotonic() >= next_s:
-            told_s, next_s = time.monotonic(), next_s + 1.0
-            tell()
-    if time.monotonic() - told_s > 0.2:
-        tell()
+            printed_s, next_s = time.monotonic(), next_s + 1.0
+            print_lines()
+    if time.monotonic() - printed_s > 0.2:
+        print_lines()

@@ -168,7 +168,7 @@ def test_stranger_with_ever_new_keys_does_not_flood_the_log(ends, keys):
         for index in range(3000):
             a.link._turn_away("10.0.0.9", index.to_bytes(32, "little"))
     assert a.link.strangers == 3000 and 10 <= len(a.of(Stranger)) <= 40
-    assert len(a.link._told) <= 1000
+    assert len(a.link._reported) <= 1000
 
 
 def test_viewer_sees_and_sends_nothing(ends, keys):

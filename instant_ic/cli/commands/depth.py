@@ -167,12 +167,12 @@ def check(args: argparse.Namespace) -> int:
     known = depth[depth > 0]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     if args.json:
-        told = {
+        summary = {
             "manifest": asdict(manifest), "provider": model.provider, "notes": model.notes, "threads": args.threads,
             "inputs": model.inputs, "outputs": model.outputs, "depth_shape": depth.shape, "depth_range": [low, high],
             "known": known.size / depth.size, "load_s": load_s, "first_s": first_s, "seconds": seconds,
         }  # fmt: skip
-        print(json.dumps(told, indent=1))
+        print(json.dumps(summary, indent=1))
         return 0
     for key, value in asdict(manifest).items():
         print(f"{key:>14}  {value if value != '' else '-'}")

@@ -64,12 +64,12 @@ def evaluate_recordings(args: argparse.Namespace) -> int:
     try:
         with console.status("starting") as status:
 
-            def tell(text: str) -> None:
+            def show_progress(text: str) -> None:
                 status.update(text)
                 if not console.is_terminal:
                     console.print(text)
 
-            summary = run(args.pcap, args.panorama, args.out, args.timeout, tell, args.same_place)
+            summary = run(args.pcap, args.panorama, args.out, args.timeout, show_progress, args.same_place)
     except (FileNotFoundError, FileExistsError, StackError) as error:
         console.print(f"ic evaluate recordings: {error}", style="red", markup=False)
         return 1

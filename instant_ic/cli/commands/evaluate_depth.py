@@ -102,9 +102,9 @@ def evaluate_depth(args: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     errors: list[dict[str, str]] = []
     warnings: list[str] = []
-    with progress("depth") as tell:
+    with progress("depth") as advance:
         for done, (image, truth) in enumerate(pairs):
-            tell(done / len(pairs))
+            advance(done / len(pairs))
             try:
                 if args.depth and truth is None:
                     raise PairError(f"{image}: no depth file has this stem")
@@ -120,7 +120,7 @@ def evaluate_depth(args: argparse.Namespace) -> int:
             with _written():
                 for sheet in sheets:
                     sheet.add(scored)
-        tell(1.0)
+        advance(1.0)
     with _written():
         for sheet in sheets:
             sheet.close()

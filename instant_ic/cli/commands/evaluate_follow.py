@@ -61,14 +61,14 @@ def run(args: argparse.Namespace) -> int:
             task = progress.add_task("starting", total=args.episodes)
             contacts = 0
 
-            def tell(episode: follow.Episode) -> None:
+            def show_progress(episode: follow.Episode) -> None:
                 nonlocal contacts
                 contacts += episode.contacts + episode.people_contacts
                 progress.update(task, advance=1, description=f"driving, {contacts} contacts")
                 if not console.is_terminal:
                     console.print(f"episode {episode.index}: {'reached' if episode.reached else episode.reason}")
 
-            episodes = follow.evaluate(args.episodes, args.seed, args.jobs, tell, args.timeout)
+            episodes = follow.evaluate(args.episodes, args.seed, args.jobs, show_progress, args.timeout)
     except (ValueError, RuntimeError, TimeoutError) as error:
         console.print(f"ic evaluate follow: {error}", style="red", markup=False)
         return 1

@@ -173,7 +173,7 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
     with Progress(*columns, TimeRemainingColumn(), console=console, speed_estimate_period=day_s) as progress:
         task = progress.add_task("driving", total=planned - known)
 
-        def tell(drive: teleop.Drive) -> None:
+        def show_progress(drive: teleop.Drive) -> None:
             drives.append(drive)
             if args.json:
                 teleop_results.save(args.json, teleop_results.in_order(drives), settings)
@@ -185,7 +185,7 @@ def _drive_all(args: argparse.Namespace, console: Any, settings: Any, drives: li
 
         try:
             with _stopped_by_sigterm():
-                teleop.evaluate(settings, args.jobs, tell, args.timeout, tuple(drives))
+                teleop.evaluate(settings, args.jobs, show_progress, args.timeout, tuple(drives))
         except (ValueError, RuntimeError, TimeoutError) as error:
             if not drives:
                 raise

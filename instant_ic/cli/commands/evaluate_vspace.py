@@ -89,10 +89,10 @@ def run(args: argparse.Namespace) -> int:
         with Progress(*columns, console=console) as progress:
             task = progress.add_task("starting", total=None)
 
-            def tell(words: str, done: int, total: int) -> None:
+            def show_progress(words: str, done: int, total: int) -> None:
                 progress.update(task, description=words, completed=done, total=total)
 
-            report = vspace.evaluate(args.world, settings, start, tell)
+            report = vspace.evaluate(args.world, settings, start, show_progress)
     except ValueError as error:
         raise UserError(f"ic evaluate vspace: {error}", 2) from error
     figures = report.figures()

@@ -216,8 +216,8 @@ def train(args: argparse.Namespace) -> int:
         space = _space(config, rgb, depth, sigma, args)
     except KeyframeError as error:
         raise UserError(f"{args.panorama}{f' with {args.depth}' if args.depth else ''}: {error}") from error
-    with progress("training") as tell:
-        ended = _train(space, args, tell)
+    with progress("training") as advance:
+        ended = _train(space, args, advance)
     file, status = space.save(args.out), space.status
     if status.warning:
         print(f"warning: {status.warning}", file=sys.stderr)
@@ -276,7 +276,7 @@ def _space(config: VirtualSpaceConfig, rgb: Any, depth: Any, sigma: float, args:
     return space
 
 
-def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
+def _train(space: VirtualSpace, args: argparse.Namespace, advance: Any) -> bool:
     """Train to the end and report the progress; return whether the user ended it early."""
     from instant_ic.geometry.poses import pose_matrix
 
@@ -286,7 +286,7 @@ def _train(space: VirtualSpace, args: argparse.Namespace, tell: Any) -> bool:
     try:
         while not space.status.converged and space.status.train_seconds < deadline:
             space.train(budget_ms=200)
-            tell(space.status.iterations / total)
+            advance(space.status.iterations / total)
             begin = time.monotonic()
             if begin >= next_preview or space.status.converged:
                 write_picture(preview, space.render(pose_matrix(x=0.5), *_SIZES["perspective"], math.pi / 2).rgb)
@@ -395,7 +395,7 @@ def video(args: argparse.Namespace) -> int:
         raise UserError(f"--size of a video must be even (got {width}x{height})", 2)
     assert space.keyframe is not None
     writer, known = None, 0.0
-    with progress("rendering") as tell:
+    with progress("rendering") as advance:
         for number, pose in enumerate(poses):
             try:
                 view = space.render(space.keyframe.map_from_camera @ pose, width, height, math.radians(args.fov))
@@ -407,7 +407,7 @@ def video(args: argparse.Namespace) -> int:
                     raise UserError(f"{args.out}: cannot be written")
             writer.write(view.rgb[..., ::-1])
             known += view.mean_confidence / len(poses)
-            tell((number + 1) / len(poses))
+            advance((number + 1) / len(poses))
     assert writer is not None
     writer.release()
     print(f"wrote {args.out}: {len(poses)} frames, {known:.0%} known")
