@@ -8,10 +8,13 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
+import logging
 import math
+import os
 import secrets
 import ssl
 import stat
+import sys
 from collections import OrderedDict, deque
 from dataclasses import dataclass
 from enum import Enum
@@ -28,6 +31,7 @@ MAX_WAIT_S = 4.0  # bounds the wait of a user who shares his address with an att
 _MOST_SESSIONS = 256
 _MOST_ADDRESSES = 1024
 _MOST_DOUBLINGS = 8
+logger = logging.getLogger("instant_ic.console")
 
 
 class AccessError(ValueError):
@@ -202,6 +206,28 @@ class Access:
     def close_session(self, cookie: str) -> None:
         """Sign a page out."""
         self._sessions.pop(_digest(cookie), None)
+
+
+def offer_sign_in(access: Access, url: str, file: Path) -> None:
+    """Write the address with the token to a file that only its owner can read, and show it on the terminal.
+
+    The token is never logged, because the log goes to ``/rosout`` and into bags.
+
+    Raises:
+        AccessError: the file cannot be written.
+    """
+    try:
+        file.unlink(missing_ok=True)  # left by a console that was killed
+        if not access.made_token:
+            return
+        with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as out:
+            out.write(f"{url}\n")
+    except OSError as error:
+        raise AccessError(f"cannot write the address with the token to {file}: {error.strerror}") from error
+    logger.info("the address with the token is in %s", file)
+    if sys.stdout.isatty():  # `ic run console`; the launcher shows the address itself
+        sys.stdout.write(f"sign in at {url}\n")
+        sys.stdout.flush()
 
 
 def _digest(text: str) -> bytes:

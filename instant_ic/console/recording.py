@@ -34,13 +34,13 @@ class RecordingDesk:
 
     Args:
         ask: see :class:`Ask`.
-        tell: called with the page's ``recording`` message every ``poll_s`` and after each command.
+        report: called with the page's ``recording`` message every ``poll_s`` and after each command.
         poll_s: period of the recorder's status, s.
     """
 
-    def __init__(self, ask: Ask, tell: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
+    def __init__(self, ask: Ask, report: Callable[[dict[str, Any]], None], poll_s: float = 1.0) -> None:
         self._ask = ask
-        self._tell = tell
+        self._report = report
         self._poll_s = poll_s
         self._wishes: queue.Queue[Callable[[], str] | None] = queue.Queue(maxsize=20)
         self._bookmarks: deque[dict[str, Any]] = deque(maxlen=MAX_BOOKMARKS)
@@ -95,7 +95,7 @@ class RecordingDesk:
                 wish = self._wishes.get(timeout=max(due - time.monotonic(), 0.0))
             except queue.Empty:
                 due = time.monotonic() + self._poll_s
-                self._tell(self._told())
+                self._report(self.status())
                 continue
             if wish is None:
                 return
@@ -119,23 +119,24 @@ class RecordingDesk:
     def _snap(self) -> str:
         return f"Saving the last minute: {_name(self._ask('snapshot', reason='operator')['path'])}"
 
-    def _told(self) -> dict[str, Any]:
-        told: dict[str, Any] = {"notice": self._notice, "bookmarks": list(self._bookmarks)}
+    def status(self) -> dict[str, Any]:
+        """Ask the recorder for its state and return the page's ``recording`` message."""
+        message: dict[str, Any] = {"notice": self._notice, "bookmarks": list(self._bookmarks)}
         try:
             status = self._ask("status")
         except RecorderError as error:
             self._recording = {}
-            return told | {"recorder": "missing", "text": str(error), "state": "none"}
+            return message | {"recorder": "missing", "text": str(error), "state": "none"}
         recording = status.get("recording")
         if recording is None:
             text = f"The recorder writes {_name(status.get('path', ''))} continuously. It cannot be started or stopped."
-            return told | {"recorder": "missing", "text": text, "state": "none"}
+            return message | {"recorder": "missing", "text": text, "state": "none"}
         self._recording, self._asked_s = recording, time.monotonic()
         found = [
-            {"name": _name(made.get("path", "")), "state": made.get("state", ""), "words": made.get("words", "")}
+            {"name": _name(made.get("path", "")), "state": made.get("state", ""), "text": made.get("words", "")}
             for made in status.get("snapshots", [])[-MAX_SNAPSHOTS:]
         ]
-        return told | {
+        return message | {
             "recorder": "ok",
             "text": recording.get("error", "") or status.get("error", ""),
             "state": recording.get("state", "idle"),

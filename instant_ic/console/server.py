@@ -216,6 +216,12 @@ class ConsoleServer:
         return self._tls is None and not is_loopback(self.config.host)
 
     @property
+    def warnings(self) -> list[str]:
+        """What the log should warn about: access that the parameters leave open."""
+        unguarded = "anyone on the network may drive, because server.access.sign_in is never"
+        return [PLAIN_HTTP] * self.plain_http + [unguarded] * self.access.unguarded
+
+    @property
     def sign_in_url(self) -> str:
         """Address of the page, with the token if this start made one; opening it signs in."""
         token = self.access.made_token

@@ -8,6 +8,7 @@ import pytest
 
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import FrameKind, Look, ViewConfig
+from instant_ic.console.config import ConsoleConfig
 from instant_ic.geometry.poses import matrix_from_quaternion, pose_matrix
 from instant_ic.msg import (
     BatteryState,
@@ -30,7 +31,8 @@ from instant_ic.msg import (
     twist_message,
     twist_values,
 )
-from nodes.console import ConsoleConfig, ConsoleNode
+
+from nodes.console import ConsoleNode
 
 START = 1_000_000_000
 MS = 1_000_000
@@ -70,8 +72,8 @@ class FakeServer:
 def setup():
     with LockstepBus(START) as bus:
         node = bus.add(ConsoleNode, ConsoleConfig(view=ViewConfig(virtual_rate_hz=10, real_rate_hz=1)))
-        node.server = FakeServer(bus.clock)
-        yield bus, node, node.server
+        node.feed.server = FakeServer(bus.clock)
+        yield bus, node, node.feed.server
 
 
 def control(bus, mode, **values):
@@ -145,10 +147,10 @@ def view_message(bus, request_id, fov=1.8, near_m=0.7):
 
 def test_plain_http_on_a_network_address_is_a_fault_on_the_page(setup):
     _, node, server = setup
-    node.send_health()
+    node.feed.send_health()
     assert "network" not in [fault["name"] for fault in server.texts["health"]["faults"]]
     server.plain_http = True
-    node.send_health()
+    node.feed.send_health()
     (fault,) = [fault for fault in server.texts["health"]["faults"] if fault["name"] == "network"]
     assert fault["level"] == "warn" and "Plain HTTP" in fault["text"]
 

@@ -17,9 +17,10 @@ from instant_ic.bus.control import ControlServer
 from instant_ic.bus.lockstep import LockstepBus
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
 from instant_ic.console.access import AccessConfig
+from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.recording import MAX_BOOKMARKS, RecorderError, RecordingDesk
 from instant_ic.msg import grid_message
-from nodes.console import ConsoleConfig, ConsoleNode
+from nodes.console import ConsoleNode
 
 WAIT_S = 20.0
 
@@ -113,7 +114,7 @@ def test_bookmarks_are_listed_with_their_place_in_the_recording(desk):
 def test_a_recorder_that_records_all_the_time_is_no_recorder_for_the_button():
     told = []
     made = RecordingDesk(lambda command, **arguments: {"path": "/d/drive"}, told.append)
-    told.append(made._told())
+    told.append(made.status())
     assert told[0]["recorder"] == "missing" and "drive continuously" in told[0]["text"]
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from control_world import BEAMS, LIDAR_MAX_M, LIDAR_MIN_M, Base, World, corridor, draw_map, matrix, rectangle
 
 from instant_ic.bus.lockstep import LockstepBus, Record
+from instant_ic.console.config import ConsoleConfig
 from instant_ic.console.server import ServerConfig
 from instant_ic.control.states import Mode
 from instant_ic.experiments.teleop_stack import SilentPage
@@ -39,7 +40,7 @@ from instant_ic.msg import (
     twist_values,
 )
 from nodes.arbiter import ArbiterNode
-from nodes.console import ConsoleConfig, ConsoleNode
+from nodes.console import ConsoleNode
 from nodes.navigator import NavigatorNode
 from nodes.virtual_robot import VirtualRobotNode
 
@@ -101,8 +102,7 @@ class RateWorld:
             self.bus.add(node)
         self.arbiter = self.bus.add(ArbiterNode)
         self.console = self.bus.add(ConsoleNode, ConsoleConfig(server=ServerConfig(port=0)))
-        self.console.server.stop()
-        self.console.server = SilentPage()
+        self.console.feed.server = SilentPage()
         static = draw_map(walls, (-2, -1.2, length_m - 2, 1.2))
         self.bus.publish("/map", grid_message(static.occupancy, 0.05, static.origin, "map", self.now), latched=True)
         mounts = [("velodyne", 0.6), ("camera", 1.2)]

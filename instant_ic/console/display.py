@@ -1,0 +1,113 @@
+"""What the page shows: the mode, the newest camera image and rendered view, and where that view is displayed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from instant_ic.console.protocol import FrameKind
+from instant_ic.console.scene import Scene
+from instant_ic.console.view import Lead, LeadConfig
+from instant_ic.geometry.poses import Matrix
+from instant_ic.msg import ControlState, Pose, ShownPictures, header, pose_message, to_time
+
+MODES: dict[int, str] = {
+    ControlState.REAL: "real",
+    ControlState.VIRTUAL: "virtual",
+    ControlState.STOPPED: "stopped",
+    ControlState.ENTERING: "entering",
+    ControlState.RETURNING: "returning",
+}
+
+
+class Display:
+    """State of the page's main image, reported to the arbiter by :meth:`report`.
+
+    Attributes:
+        mode: name of the control mode; ``none`` without an arbiter.
+        shown: ``real`` (camera image), ``virtual`` (rendered view) or ``none``.
+        lead: share of the way at which the view is displayed.
+    """
+
+    def __init__(self, lead: LeadConfig, scene: Scene) -> None:
+        self.lead = Lead(lead)
+        self.mode = self.shown = "none"
+        self._scene = scene
+        self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
+        self._image_stamp_ns = 0
+        self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
+        self._rendered: tuple[Matrix, bool] | None = None  # its camera pose, and whether it carries depth
+        self._displayed = pose_message(np.eye(4))  # pose from which the page shows it
+        self._lost_ns: int | None = None  # when the driver was last lost, steady clock
+
+    @property
+    def with_vbot(self) -> bool:
+        """Whether the v-bot's view is shown or soon will be."""
+        return self.mode in ("entering", "virtual", "returning")
+
+    @property
+    def foreground(self) -> tuple[FrameKind, ...]:
+        """Kinds of images that the page shows or soon will."""
+        if self.mode in ("entering", "returning"):  # the switch may come at any moment
+            return FrameKind.VIEW, FrameKind.PANORAMA
+        return (FrameKind.VIEW if self.shown == "virtual" else FrameKind.PANORAMA,)
+
+    def changes_mode(self, control: ControlState) -> bool:
+        """Whether a new state of the arbiter changes the mode that the page shows."""
+        return self.mode not in ("none", MODES.get(int(control.mode)))
+
+    def step(self, control: ControlState | None, now_ns: int) -> None:
+        """Follow the arbiter's newest state; None: there is none."""
+        if control is None:
+            self.mode = self.shown = "none"
+        else:
+            self.mode = MODES.get(int(control.mode), "none")
+            self.shown = "virtual" if int(control.shown) == ControlState.SHOWN_VIRTUAL else "real"
+        self.lead.step(now_ns / 1e9, self.mode == "virtual")
+        self._displayed = self._view_pose()
+
+    def take_image(self, stamp_ns: int, now_ns: int) -> None:
+        """Note a camera image."""
+        self._image_ns, self._image_stamp_ns = now_ns, stamp_ns
+
+    def take_view(self, request_id: int, delay_s: float, camera: Matrix, has_depth: bool, now_ns: int) -> None:
+        """Note a view rendered for the driver at the pose ``camera``."""
+        self._view = request_id, now_ns, delay_s
+        self._rendered = camera, has_depth
+        self._displayed = self._view_pose()
+
+    def lose_driver(self, now_ns: int) -> None:
+        """Note the loss of the driver. His return shows in his commands."""
+        self._lost_ns = now_ns
+
+    def image_age_s(self, now_ns: int) -> float:
+        """Age of the newest camera image since its arrival; infinite without one."""
+        return math.inf if self._image_ns is None else (now_ns - self._image_ns) / 1e9
+
+    def report(self, stamp_ns: int, now_ns: int) -> ShownPictures:
+        """Return the available images, their age and the loss of the driver. Any thread may call it."""
+        lost_ns = self._lost_ns
+        view_id, came_ns, delay_s = self._view
+        return ShownPictures(
+            header=header("map", stamp_ns),
+            picture_stamp=to_time(self._image_stamp_ns),
+            picture_age_s=self.image_age_s(now_ns),
+            view_id=view_id,
+            view_pose=self._displayed,
+            view_age_s=math.inf if view_id == 0 else (now_ns - came_ns) / 1e9,
+            view_delay_s=delay_s,
+            # Steady clock: if the system clock is set back, new commands must not look older than the loss.
+            operator_lost=to_time(0 if lost_ns is None else stamp_ns - (now_ns - lost_ns)),
+        )
+
+    def _view_pose(self) -> Pose:
+        """Pose from which the page shows the newest view, moved towards the v-bot's present pose."""
+        if self._rendered is None:
+            return self._displayed
+        camera, has_depth = self._rendered
+        shown, vbot = camera.copy(), self._scene.vbot_pose()
+        if has_depth and vbot is not None and self.lead.share > 0:
+            now = (vbot @ self._scene.camera_mount())[:2, 3]
+            shown[:2, 3] = self.lead.displayed(camera[:2, 3], now)
+        return pose_message(shown)

@@ -1,0 +1,51 @@
+"""Faults for the operator: the nodes' diagnoses, and nodes whose heartbeat is missing."""
+
+from __future__ import annotations
+
+from instant_ic.msg import DiagnosticArray, NodeStatus
+
+TIMEOUT_S = 3.0
+MAX_FAULTS = 4
+OK, WARN, ERROR = 0, 1, 2  # diagnostic_msgs/DiagnosticStatus
+
+
+class FaultList:
+    """Newest diagnoses and heartbeats; ``now_s`` is the steady clock."""
+
+    def __init__(self) -> None:
+        self._diagnoses: dict[str, tuple[int, str, float]] = {}
+        self._heartbeats: dict[str, tuple[float, bool]] = {}
+
+    @property
+    def nodes(self) -> list[str]:
+        """Nodes that have sent a heartbeat."""
+        return sorted(self._heartbeats)
+
+    def take_diagnoses(self, message: DiagnosticArray, now_s: float) -> None:
+        """Store the newest diagnosis of each name."""
+        for status in message.status:
+            self._diagnoses[status.name] = (int(status.level), status.message, now_s)
+
+    def take_heartbeat(self, message: NodeStatus, now_s: float) -> None:
+        """Note a node's heartbeat. A node that announced its shutdown does not count as missing."""
+        self._heartbeats[message.node] = (now_s, int(message.state) == NodeStatus.STOPPING)
+
+    def worst(self, now_s: float) -> list[dict[str, str]]:
+        """Return the worst present fault of each node, worst first: ``level`` (warn, error), ``name``, ``text``."""
+        found = [
+            (level, name.partition(":")[0], text)
+            for name, (level, text, seen_s) in self._diagnoses.items()
+            if level >= WARN and now_s - seen_s < TIMEOUT_S
+        ]
+        found += [
+            (ERROR, name, "does not answer")
+            for name, (seen_s, stopping) in self._heartbeats.items()
+            if not stopping and now_s - seen_s > TIMEOUT_S
+        ]
+        worst: dict[str, tuple[int, str]] = {}
+        for level, name, text in sorted(found, key=lambda fault: -fault[0]):
+            worst.setdefault(name, (level, text))
+        return [
+            {"level": "error" if level >= ERROR else "warn", "name": name, "text": text}
+            for name, (level, text) in list(worst.items())[:MAX_FAULTS]
+        ]

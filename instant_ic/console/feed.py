@@ -1,0 +1,207 @@
+"""Feeds the page with images, state, plan, health and maps, and requests rendered views. Knows no bus."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from instant_ic.console import page_messages as page
+from instant_ic.console.config import ConsoleConfig
+from instant_ic.console.display import Display
+from instant_ic.console.faults import ERROR, OK, WARN, FaultList
+from instant_ic.console.gridimage import GridLayers
+from instant_ic.console.protocol import FrameKind
+from instant_ic.console.scene import Newest, Scene
+from instant_ic.console.server import PLAIN_HTTP, ConsoleServer
+from instant_ic.console.view_requests import ViewRequests
+from instant_ic.geometry.transforms import TransformBuffer
+from instant_ic.msg import (
+    CompressedImage,
+    ControlState,
+    DiagnosticArray,
+    NodeStatus,
+    Odometry,
+    RenderedView,
+    ShownPictures,
+    ViewRequest,
+    VspaceStatus,
+    matrix_from_pose,
+    stamp_ns,
+)
+
+IMAGE_TIMEOUT_S = 2.0
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Newest messages of the topics that are read when something is sent."""
+
+    control: Newest  # ControlState
+    vbot: Newest  # Odometry
+    trajectory: Newest  # Path
+    path: Newest  # Path
+    subgoal: Newest  # PoseStamped
+    vspace: Newest  # VspaceStatus
+    battery: Newest  # BatteryState
+
+
+class Clock(Protocol):
+    """Time of the stack's stamps, and a steady clock."""
+
+    def now_ns(self) -> int:
+        """Present time for stamps."""
+
+    def steady_ns(self) -> int:
+        """Time that is never set back."""
+
+
+class Outputs(Protocol):
+    """Receiver of what the page needs from the stack."""
+
+    def request_view(self, request: ViewRequest) -> None:
+        """Request a rendered view."""
+
+    def report_shown(self, shown: ShownPictures) -> None:
+        """Report to the arbiter which images are available. Called on any thread."""
+
+
+class PageFeed:
+    """Sends to the page's server what comes from the stack.
+
+    Args:
+        config: parameters of the console.
+        server: the page's server.
+        tf: transform tree.
+        inputs: newest messages.
+        outputs: receiver of requests and reports.
+        clock: see :class:`Clock`.
+        diagnose: sets a diagnosis: name, level, text, values.
+    """
+
+    def __init__(
+        self,
+        config: ConsoleConfig,
+        server: ConsoleServer,
+        tf: TransformBuffer,
+        inputs: Inputs,
+        outputs: Outputs,
+        clock: Clock,
+        diagnose: Callable[..., None],
+    ) -> None:
+        self.server = server
+        self.scene = Scene(tf, inputs.control, inputs.vbot, config.camera_mount.xyz)
+        self.display = Display(config.lead, self.scene)
+        self.requests = ViewRequests(config.view, self.scene, self.display)
+        self.grids, self.faults = GridLayers(), FaultList()
+        self._state_period_ns = 1e9 / config.state_rate_hz
+        self._state_sent_ns = 0
+        self._inputs, self._outputs, self._clock, self._diagnose = inputs, outputs, clock, diagnose
+
+    # ---- messages ----------------------------------------------------------------------------------
+
+    def take_panorama(self, message: CompressedImage) -> None:
+        """Forward a panorama unchanged, with the camera's rotation at its stamp."""
+        stamp = stamp_ns(message)
+        self.display.take_image(stamp, self._clock.steady_ns())
+        self.report_shown()
+        header = page.panorama_header(self._captured_ms(stamp), self.scene.lookup("map", "camera", stamp))
+        self.server.send_frame(FrameKind.PANORAMA, header, bytes(message.data))
+
+    def take_view(self, message: RenderedView) -> None:
+        """Forward a rendered view, then request the next one."""
+        if not (0 < message.fov_rad < math.pi):
+            self._diagnose("view", ERROR, f"rendered view dropped: its field of view is {message.fov_rad:.3g} rad")
+            return
+        depth, near_m = page.has_depth(message), message.depth_near_m
+        fault = f"depth images with an invalid range of {near_m:.3g} m: views stay at their rendered position"
+        self._check("depth", depth or not len(message.depth_png), fault)
+        request_id, now_ns = int(message.request_id), self._clock.steady_ns()
+        client, delay_s = self.requests.answered(request_id, now_ns)
+        if client is None:
+            self.display.take_view(request_id, delay_s, matrix_from_pose(message.pose), depth, now_ns)
+            self.report_shown()
+        header = page.view_header(self._captured_ms(stamp_ns(message)), message, self.scene.camera_mount())
+        self.server.send_frame(FrameKind.VIEW, header, bytes(message.image.data), client=client)
+        self._request_view()
+
+    def take_control(self, message: ControlState) -> None:
+        """Send a change of mode at once, because both robots keep moving."""
+        if self.display.changes_mode(message):
+            self.send_state()
+
+    def take_vbot(self, message: Odometry) -> None:
+        """Send each step of the v-bot at once: the timer would add half a period on average."""
+        if self.display.with_vbot:
+            self.send_state()
+
+    def take_diagnostics(self, message: DiagnosticArray) -> None:
+        """Store the nodes' diagnoses."""
+        self.faults.take_diagnoses(message, self._clock.steady_ns() / 1e9)
+
+    def take_heartbeat(self, message: NodeStatus) -> None:
+        """Note a node's heartbeat."""
+        self.faults.take_heartbeat(message, self._clock.steady_ns() / 1e9)
+
+    def lose_driver(self) -> None:
+        """Report a lost driver to the arbiter at once. Called on the server's thread."""
+        self.display.lose_driver(self._clock.steady_ns())
+        self.report_shown()
+
+    # ---- timers --------------------------------------------------------------------------------------
+
+    def send_state_if_due(self) -> None:
+        """Send the state, unless a step of the v-bot has just triggered it."""
+        if self._clock.steady_ns() - self._state_sent_ns > 0.6 * self._state_period_ns:
+            self.send_state()
+
+    def send_state(self) -> None:
+        """Send mode, poses and commands; request a view if one is due."""
+        self._state_sent_ns = self._clock.steady_ns()
+        control, vbot = self._inputs.control.message, self._inputs.vbot.message
+        self.display.step(control, self._state_sent_ns)
+        self.server.show(*self.display.foreground)
+        self.server.publish("state", page.state_message(self.server.now_ms(), self.display, self.scene, control, vbot))
+        self.report_shown()
+        self._request_view()
+
+    def send_plan(self) -> None:
+        """Send trajectory, path and subgoal."""
+        newest = (self._inputs.trajectory.message, self._inputs.path.message, self._inputs.subgoal.message)
+        self.server.publish("plan", page.plan_message(self.display, self.scene, *newest))
+
+    def send_health(self) -> None:
+        """Send virtual space, battery and faults; faults carry the text of the node that found them."""
+        age_s = self.display.image_age_s(self._clock.steady_ns())
+        self._check("camera", age_s <= IMAGE_TIMEOUT_S, "no image from the camera", age_s=age_s)
+        self._check("controller", self._inputs.control.message is not None, "no state from the arbiter")
+        self._check("pose", self.scene.robot_pose() is not None, "the robot's pose is unknown")
+        faults = self.faults.worst(self._clock.steady_ns() / 1e9)
+        if self.server.plain_http:  # on the page only, not as a diagnosis: the node itself works
+            faults.append({"level": "warn", "name": "network", "text": PLAIN_HTTP})
+        newest = self._inputs.vspace.message, self._inputs.battery.message
+        self.server.publish("health", page.health_message(*newest, faults, self.faults.nodes))
+
+    def send_grids(self) -> None:
+        """Send map and costmap if they have changed."""
+        for kind, image in self.grids.changed():
+            self.server.send_frame(kind, image.header, image.png)
+
+    def report_shown(self) -> None:
+        """Report the available images and the loss of the driver. Any thread may call it."""
+        self._outputs.report_shown(self.display.report(self._clock.now_ns(), self._clock.steady_ns()))
+
+    def _request_view(self) -> None:
+        status = self._inputs.vspace.message
+        renders = status is not None and int(status.state) in (VspaceStatus.TRAINING, VspaceStatus.READY)
+        request = self.requests.next(renders, self.server.watching, self._clock.now_ns(), self._clock.steady_ns())
+        if request is not None:
+            self._outputs.request_view(request)
+
+    def _check(self, name: str, fine: bool, fault: str, **values: Any) -> None:
+        self._diagnose(name, OK if fine else WARN, "" if fine else fault, **values)
+
+    def _captured_ms(self, stamp: int) -> float:
+        """Convert a stamp to the server's clock in ms; a stamp in the future counts as now."""
+        return self.server.now_ms() - max((self._clock.now_ns() - stamp) / 1e6, 0.0)

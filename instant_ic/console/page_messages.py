@@ -1,0 +1,140 @@
+"""Messages to the page, made from the stack's ROS messages; docs/console.md lists their fields."""
+
+from __future__ import annotations
+
+import base64
+import math
+from typing import Any
+
+import numpy as np
+
+from instant_ic.console.display import Display
+from instant_ic.console.scene import Scene, planar
+from instant_ic.geometry.poses import Matrix, quaternion_from_matrix
+from instant_ic.msg import (
+    BatteryState,
+    ControlState,
+    Odometry,
+    Path,
+    PoseStamped,
+    RenderedView,
+    VspaceStatus,
+    matrix_from_pose,
+    twist_values,
+)
+
+VSPACE_STATES: dict[int, str] = {
+    VspaceStatus.EMPTY: "empty",
+    VspaceStatus.TRAINING: "training",
+    VspaceStatus.READY: "ready",
+    VspaceStatus.FAILED: "failed",
+}
+
+
+def state_message(
+    at_ms: float, display: Display, scene: Scene, control: ControlState | None, vbot: Odometry | None
+) -> dict[str, Any]:
+    """Return the ``state`` message: mode, poses and commands."""
+    moving = vbot if display.shown == "virtual" and vbot is not None else control and control.robot_twist
+    state: dict[str, Any] = {
+        "at_ms": at_ms,
+        "mode": display.mode,
+        "shown": display.shown,
+        "lead": round(display.lead.share, 3),
+        "robot": planar(scene.robot_pose()),
+        "vbot": planar(scene.vbot_pose()) if display.with_vbot else None,
+        "twist": [0.0, 0.0] if moving is None else [finite(value) or 0.0 for value in twist_values(moving)],
+    }
+    if control is None:
+        return state
+    return state | {
+        "reason": control.reason,
+        "estop": bool(control.estop),
+        "blocked": bool(control.blocked),
+        "transitions": int(control.transitions),
+        "command": [finite(value) for value in twist_values(control.operator_command)],
+        "applied": [finite(value) for value in twist_values(control.applied_command)],
+        "pose_gap_m": finite(control.pose_gap_m),
+        "yaw_gap_rad": finite(control.yaw_gap_rad),
+        "time_to_obstacle_s": finite(control.time_to_obstacle_s),
+    }
+
+
+def plan_message(
+    display: Display, scene: Scene, trajectory: Path | None, path: Path | None, subgoal: PoseStamped | None
+) -> dict[str, Any]:
+    """Return the ``plan`` message; path and subgoal belong to the virtual mode."""
+    virtual = display.mode == "virtual"
+    return {
+        "trajectory": scene.points(trajectory),
+        "path": scene.points(path) if virtual else [],
+        "subgoal": planar(matrix_from_pose(subgoal)) if virtual and subgoal is not None else None,
+    }
+
+
+def health_message(
+    vspace: VspaceStatus | None, battery: BatteryState | None, faults: list[dict[str, str]], nodes: list[str]
+) -> dict[str, Any]:
+    """Return the ``health`` message."""
+    return {"vspace": _vspace(vspace), "battery": _battery(battery), "faults": faults, "nodes": nodes}
+
+
+def _vspace(status: VspaceStatus | None) -> dict[str, Any] | None:
+    if status is None:
+        return None
+    return {
+        "state": VSPACE_STATES.get(int(status.state), "empty"),
+        "psnr_db": finite(status.psnr_db) or 0.0,
+        "expected_psnr_db": finite(status.expected_psnr_db) or 0.0,
+        "unseen_share": finite(status.unseen_share) or 0.0,
+        "radius_m": finite(status.ready_radius_m) or 0.0,
+        "train_seconds": finite(status.train_seconds) or 0.0,
+        "message": status.message,
+    }
+
+
+def _battery(battery: BatteryState | None) -> dict[str, Any] | None:
+    voltage = None if battery is None else finite(battery.voltage)
+    if battery is None or voltage is None:
+        return None
+    share = finite(battery.percentage)  # 0..1; NaN where unknown (sensor_msgs/BatteryState)
+    return {"voltage": voltage, "percent": None if share is None else 100.0 * share}
+
+
+def panorama_header(captured_ms: float, map_from_camera: Matrix | None) -> dict[str, Any]:
+    """Return the header of a panorama's frame."""
+    rotation = None if map_from_camera is None else quaternion_from_matrix(map_from_camera).tolist()
+    return {"captured_ms": captured_ms, "q": rotation}
+
+
+def has_depth(view: RenderedView) -> bool:
+    """Whether a view carries depth of a valid range."""
+    return bool(len(view.depth_png)) and math.isfinite(view.depth_near_m) and view.depth_near_m > 0
+
+
+def view_header(captured_ms: float, view: RenderedView, mount: Matrix) -> dict[str, Any]:
+    """Return the header of a rendered view's frame; ``mount``: base_from_camera."""
+    camera, depth = matrix_from_pose(view.pose), has_depth(view)
+    return {
+        "captured_ms": captured_ms,
+        "q": quaternion_from_matrix(camera).tolist(),
+        "p": camera[:3, 3].tolist(),
+        "fov": float(view.fov_rad),
+        "confidence": finite(view.confidence),
+        "mask": _base64(view.confidence_png),
+        "depth": _base64(view.depth_png) if depth else "",
+        "depth_near_m": float(view.depth_near_m) if depth else 0.0,
+        "mount": mount[:3, 3].tolist(),
+        "render_ms": finite(view.render_ms),
+        "request_id": int(view.request_id),
+    }
+
+
+def finite(value: Any) -> float | None:
+    """Return a number for JSON; None for infinity and NaN."""
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def _base64(data: np.ndarray[Any, Any]) -> str:
+    return base64.b64encode(bytes(data)).decode("ascii")

@@ -1,0 +1,81 @@
+"""Poses of both robots and of the camera's mount, from the transform tree or else from the arbiter."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from instant_ic.geometry.poses import Matrix, pose2_from_matrix, transform_points
+from instant_ic.geometry.transforms import TransformBuffer, TransformError
+from instant_ic.msg import Path, path_array, matrix_from_pose
+
+
+class Newest(Protocol):
+    """Holder of a topic's newest message."""
+
+    @property
+    def message(self) -> Any:
+        """The newest message; None if there is none or it is too old."""
+
+
+class Scene:
+    """Poses for the page, all in the map frame.
+
+    Args:
+        tf: transform tree.
+        control: newest ControlState.
+        vbot: newest odometry of the v-bot.
+        camera_xyz: position of the camera on the robot while the tree lacks its mount, m.
+    """
+
+    def __init__(self, tf: TransformBuffer, control: Newest, vbot: Newest, camera_xyz: tuple[float, float, float]) -> None:
+        self._tf, self._control, self._vbot = tf, control, vbot
+        self._camera_xyz = camera_xyz
+
+    def lookup(self, target: str, source: str, stamp_ns: int | None = None) -> Matrix | None:
+        """Return ``target_from_source`` at ``stamp_ns``, else the newest one; None if the tree has a gap."""
+        for when in (stamp_ns, None):
+            try:
+                return self._tf.lookup(target, source, when)
+            except TransformError:
+                continue
+        return None
+
+    def robot_pose(self) -> Matrix | None:
+        """Return map_from_base of the r-bot; the arbiter's estimate if the tree has a gap."""
+        pose = self.lookup("map", "base_link")
+        control = self._control.message
+        return matrix_from_pose(control.robot_pose) if pose is None and control is not None else pose
+
+    def vbot_pose(self) -> Matrix | None:
+        """Return map_from_base of the v-bot; the arbiter's estimate until the v-bot publishes its own."""
+        if self._vbot.message is not None:
+            return matrix_from_pose(self._vbot.message)
+        control = self._control.message
+        return None if control is None else matrix_from_pose(control.vbot_pose)
+
+    def camera_mount(self) -> Matrix:
+        """Return base_from_camera with the identity as rotation: look directions are relative to the heading."""
+        mount = np.eye(4)
+        base_from_camera = self.lookup("base_link", "camera")
+        mount[:3, 3] = self._camera_xyz if base_from_camera is None else base_from_camera[:3, 3]
+        return mount
+
+    def points(self, path: Path | None) -> list[list[float]]:
+        """Return the points [x, y] of a path in the map frame, rounded to 1 mm; empty without a path."""
+        if path is None or not path.poses:
+            return []
+        xyz = np.pad(path_array(path)[:, :2], ((0, 0), (0, 1)))
+        if path.header.frame_id not in ("", "map"):
+            map_from_frame = self.lookup("map", path.header.frame_id)
+            if map_from_frame is None:
+                return []
+            xyz = transform_points(map_from_frame, xyz).astype(np.float64)
+        points: list[list[float]] = xyz[np.isfinite(xyz).all(axis=1), :2].round(3).tolist()
+        return points
+
+
+def planar(pose: Matrix | None) -> list[float] | None:
+    """Return [x, y, yaw] of a pose, m and rad; None without one."""
+    return None if pose is None else [round(float(value), 4) for value in pose2_from_matrix(pose)]
