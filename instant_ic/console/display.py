@@ -28,6 +28,7 @@ class Display:
         mode: name of the control mode; ``none`` without an arbiter.
         shown: ``real`` (camera image), ``virtual`` (rendered view) or ``none``.
         lead: share of the way at which the view is displayed.
+        image_stamp_ns: stamp of the newest camera image; 0 without one.
     """
 
     def __init__(self, lead: LeadConfig, scene: Scene) -> None:
@@ -35,7 +36,7 @@ class Display:
         self.mode = self.shown = "none"
         self._scene = scene
         self._image_ns: int | None = None  # arrival of the newest camera image, steady clock
-        self._image_stamp_ns = 0
+        self.image_stamp_ns = 0
         self._view = (0, 0, 0.0)  # driver's newest view: request id, arrival (steady ns), delay (s)
         self._rendered: tuple[Matrix, bool] | None = None  # its camera pose, and whether it carries depth
         self._displayed = pose_message(np.eye(4))  # pose from which the page shows it
@@ -69,7 +70,7 @@ class Display:
 
     def take_image(self, stamp_ns: int, now_ns: int) -> None:
         """Note a camera image."""
-        self._image_ns, self._image_stamp_ns = now_ns, stamp_ns
+        self._image_ns, self.image_stamp_ns = now_ns, stamp_ns
 
     def take_view(self, request_id: int, delay_s: float, camera: Matrix, has_depth: bool, now_ns: int) -> None:
         """Note a view rendered for the driver at the pose ``camera``."""
@@ -91,7 +92,7 @@ class Display:
         view_id, came_ns, delay_s = self._view
         return ShownPictures(
             header=header("map", stamp_ns),
-            picture_stamp=to_time(self._image_stamp_ns),
+            picture_stamp=to_time(self.image_stamp_ns),
             picture_age_s=self.image_age_s(now_ns),
             view_id=view_id,
             view_pose=self._displayed,

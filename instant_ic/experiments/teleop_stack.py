@@ -307,8 +307,7 @@ class SimulatedStack:
         camera = make_node("theta_camera", None, words).config
         mount = pose_matrix(*camera.camera_mount.pose)
         self.nodes["console"].tf_broadcast_static("base_link", "camera", mount)
-        self.nodes["console"].server.stop()
-        self.nodes["console"].server = self.page
+        self.nodes["console"].feed.server = self.page
         if config.method == "shared":
             from instant_ic.experiments.teleop_shared import SharedControl
 

@@ -88,7 +88,7 @@ def test_lidar_driver(bus):
 def test_console(bus):
     node = bus.add(node_class("console"))
     node.set_parameters({"view.width": 640})
-    assert node.views.config.width == 640
+    assert node.feed.requests.config.width == 640
 
 
 def test_depth_estimator_takes_fewer_pictures(bus):

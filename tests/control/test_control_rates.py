@@ -93,8 +93,8 @@ def test_a_lost_camera_stops_the_robot_by_its_own_rhythm_and_within_a_bounded_di
     assert made.base.v > 0.2  # driveable, without a stop at each image
     assert all(speed > 0.2 for t, speed in made.speeds if t > made.time_s - 1.5)
     # Right after an image: the next never comes.
-    newest = made.console._picture_stamp
-    assert made.run(1.5 / camera_hz + 0.1, lambda: made.console._picture_stamp != newest)
+    newest = made.console.feed.display.image_stamp_ns
+    assert made.run(1.5 / camera_hz + 0.1, lambda: made.console.feed.display.image_stamp_ns != newest)
     made.silent.add("camera")
     began_s, began_x = made.time_s, made.base.pose[0]
     assert made.run(2.0, lambda: twist_values(made.state.applied_command) == NOTHING)
