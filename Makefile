@@ -1,6 +1,6 @@
 # make run    set everything up in .venv/ and start the simulated stack
 # make test   format, lint, types and all tests
-# make check  format, lint, types and the word list (scripts/check_words.py)
+# make check  format, lint, types and the word list (scripts/check_words.py); the page too, where Node.js is installed
 # make lock   write requirements.lock anew after a change of constraints.txt or pyproject.toml (needs network)
 # make fuzz   a million mutated inputs for each parser of outside bytes: hours (ARGS="--jobs 4 --target glb --count 1000")
 # make clean  take away what these made
@@ -29,6 +29,7 @@ check: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python scripts/check_words.py
+	scripts/check_js.sh
 
 fuzz: $(STAMP)
 	$(BIN)/python -m tests.fuzz $(ARGS)
@@ -57,5 +58,5 @@ chromium:
 	@scripts/ensure_chromium.sh
 
 clean:
-	rm -rf $(VENV) build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) tests/console/js/node_modules build dist runs .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

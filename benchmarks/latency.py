@@ -86,7 +86,7 @@ addEventListener("keydown", (event) => {
     const pressed = performance.timeOrigin + event.timeStamp, sign = signs[event.code] ?? 0;
     presses.push({code: event.code, sign, pressed, from: last, forward: 0, first: 0, view: 0, turn: 0, draws: []});
 }, true);
-addEventListener("drawn", ({detail}) => {
+addEventListener("rendered", ({detail}) => {
     const now = performance.timeOrigin + performance.now(), press = presses.at(-1);
     if (!detail.view || !detail.pose) return;
     if (press?.from && detail.blend > 0.99) {
@@ -265,7 +265,7 @@ def part(virtual: bool, args: argparse.Namespace) -> dict[str, Any]:
                 page = browser.new_page(viewport={"width": args.width, "height": args.height})
                 page.add_init_script(WATCH)
                 page.goto(f"http://127.0.0.1:{port}/")
-                shows = f'body[data-driver="you"][data-blend="{int(virtual)}.00"][data-picture="live"]'
+                shows = f'body[data-driver="you"][data-blend="{int(virtual)}.00"][data-image="live"]'
                 page.locator(shows).wait_for(timeout=args.wait * 1000)
                 page.wait_for_timeout(2000)
                 rows = press_keys(page, robot, ["KeyW", "KeyA", "KeyS", "KeyD"] if virtual else ["KeyW", "KeyS"], args)

@@ -154,7 +154,7 @@ def drive(stack: SimulatedStack, page: Any, told: Page, operator: Operator, args
             raise RuntimeError(f"the drive has not finished after {LONGEST_S:g} s: {state and state.reason}")
         if ready_s is None:
             ready = state is not None and int(state.mode) == ControlState.REAL and vspace_ready(stack)
-            drives = page.locator('body[data-driver="you"][data-picture="live"]').count() > 0
+            drives = page.locator('body[data-driver="you"][data-image="live"]').count() > 0
             ready_s = now if ready and drives else None
             continue
         frames.append(page.screenshot(type="png"))

@@ -90,7 +90,7 @@ class Demo:
         self.button = False  # e-stop button on the robot
         self.forced_mode: str | None = None
         self.faults: list[dict[str, str]] = []
-        self.pictures = True
+        self.images = True
         self.depth: bytes | None = None  # sent instead of the views' own depth
         self.tint = (1.0, 1.0, 1.0)  # gains of the rendered view: blue, green, red
         self.keyframe: Pose | None = None  # trained pose of the virtual space; what it did not see is noise
@@ -182,10 +182,10 @@ class Demo:
         due = 0.0
         while not self._stop.wait(0.01):
             now = time.monotonic()
-            if now >= due and self.pictures:
+            if now >= due and self.images:
                 due = now + 1.0 / self.config.panorama_hz
                 self._send_panorama()
-            if self.pictures and self._views.due(now, virtual=self.mode == "virtual"):
+            if self.images and self._views.due(now, virtual=self.mode == "virtual"):
                 self._send_view(self._views.asked(now))
 
     def place(self, x: float, y: float, yaw: float) -> None:
@@ -195,7 +195,7 @@ class Demo:
 
     def reset(self) -> None:
         """Restore the initial state, with the mode forced to REAL; for tests that share a demo."""
-        self.forced_mode, self.faults, self.pictures = "real", [], True
+        self.forced_mode, self.faults, self.images = "real", [], True
         self.recorder.missing, self.recorder.error, self.recorder.state = False, "", "idle"
         self.place(0.0, 0.0, 0.0)
         self.commands.clear()

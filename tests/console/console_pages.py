@@ -119,8 +119,8 @@ def picture_of(page):
     from PIL import Image
 
     # A machine that is too slow for new pictures makes the page grey them; what they show is the same.
-    plain = "#picture { filter: none !important; transition: none !important }"
-    page.add_style_tag(content=f"body > :not(#picture) {{ visibility: hidden !important }} {plain}")
+    plain = "#view { filter: none !important; transition: none !important }"
+    page.add_style_tag(content=f"body > :not(#view) {{ visibility: hidden !important }} {plain}")
     shot = page.screenshot(type="png")
     page.evaluate("document.head.lastElementChild.remove()")
     return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), float)

@@ -26,7 +26,7 @@ pytestmark = BROWSER_TEST
 def test_page_draws_picture_and_map_without_errors(open_page, demo, query, viewer):
     page = open_page(query)
     expect_body(page, "viewer", viewer)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     expect_body(page, "map", "drawn")
     expect_body(page, "mode", "real")
     map_pixels = page.evaluate(
@@ -49,7 +49,7 @@ def test_page_draws_picture_and_map_without_errors(open_page, demo, query, viewe
 
 def test_passage_to_the_rendered_view_and_back(open_page, demo):
     page = open_page(bypass_csp=True)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     demo.forced_mode = "real"
     real = picture_of(page)
     demo.forced_mode = "virtual"
@@ -67,7 +67,7 @@ def test_passage_to_the_rendered_view_and_back(open_page, demo):
 
 def test_looking_round_by_drag_turns_the_picture_at_once_and_tells_the_robot(open_page, demo):
     page = open_page(bypass_csp=True)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     before = picture_of(page)
     page.mouse.move(480, 300)
     page.mouse.down()
@@ -115,10 +115,10 @@ def test_old_panorama_is_aimed_anew_when_the_robot_turns(open_page, sharp_demo):
     demo = sharp_demo
     demo.forced_mode = "real"
     page = open_page(at=demo, bypass_csp=True)
-    expect_body(page, "picture", "live")
-    demo.pictures = False
+    expect_body(page, "image", "live")
+    demo.images = False
     page.wait_for_timeout(300)
-    page.add_style_tag(content="#picture { filter: none !important }")  # grey when old: here too soon
+    page.add_style_tag(content="#view { filter: none !important }")  # grey when old: here too soon
     demo.place(0.0, 0.0, 0.5)
     wait_alike(page, lambda: room_seen(demo.robot, 0.0, math.radians(-10)))
 
@@ -142,7 +142,7 @@ def test_the_page_asks_for_a_token_and_a_watchers_has_nothing_to_drive_with(brow
             page.get_by_text("Wrong token.").wait_for()
             page.get_by_label("Token").fill(token)
             page.get_by_role("button", name="Sign in").click()
-            expect_body(page, "picture", "live")
+            expect_body(page, "image", "live")
         expect_body(driver, "driver", "you")
         expect_body(watcher, "driver", "other")
         assert not watcher.locator("#take").is_visible() and not watcher.locator("#stick").is_visible()

@@ -257,14 +257,14 @@ def test_controls_held_through_a_stop_are_told_to_be_let_go(driver, shared_demo)
 
 
 def test_faults_and_a_silent_camera_are_told(driver, shared_demo):
-    expect_body(driver, "picture", "live")
+    expect_body(driver, "image", "live")
     text = "<img src=x onerror=alert(1)> no packets"
     shared_demo.faults = [{"level": "error", "name": "vlp16_driver", "text": text}]
     driver.locator("#faults li").wait_for()
     assert driver.locator("#faults li").inner_text() == f"LiDAR {text}"  # as text, not as HTML
     assert driver.locator("#faults li").get_attribute("title") == f"vlp16_driver: {text}"
-    shared_demo.pictures = False
-    expect_body(driver, "picture", "stale")
+    shared_demo.images = False
+    expect_body(driver, "image", "stale")
     shared_demo.reset()
-    expect_body(driver, "picture", "live")
+    expect_body(driver, "image", "live")
     driver.locator("#faults li").wait_for(state="detached")

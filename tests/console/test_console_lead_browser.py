@@ -10,7 +10,7 @@ from console_pages import BROWSER_TEST, WAIT_MS, expect_body, make_demo, picture
 pytestmark = BROWSER_TEST
 DRAWN = """
     window.drawn = [];
-    addEventListener("drawn", ({detail: {place, view, blend}}) => drawn.push({place, view, blend}));
+    addEventListener("rendered", ({detail: {place, view, blend}}) => drawn.push({place, view, blend}));
 """
 A = (2.0, 0.0)  # a box with its edges 1 m ahead
 B = (2.1, 0.04)  # 10 cm ahead, 4 cm to the left
@@ -39,10 +39,10 @@ def place(page, demo, to):
 
 def open_virtual(open_page, demo, viewer):
     """A page that shows the view from ``A``, and gets no other one any more."""
-    demo.forced_mode, demo.pictures, demo.depth = "virtual", True, None
+    demo.forced_mode, demo.images, demo.depth = "virtual", True, None
     page = open_page(f"?viewer={viewer}", at=demo, bypass_csp=True)
     page.evaluate(DRAWN)
-    page.add_style_tag(content="#picture { filter: none !important }")  # old pictures turn grey
+    page.add_style_tag(content="#view { filter: none !important }")  # old pictures turn grey
     expect_body(page, "blend", "1.00")
     still_at(page, demo, A)
     return page
@@ -50,12 +50,12 @@ def open_virtual(open_page, demo, viewer):
 
 def still_at(page, demo, at):
     """Until the newest view is from there, in the page's own direction (10° down), and is shown from there."""
-    demo.pictures = True
+    demo.images = True
     place(page, demo, at)
     seen = "([x, y]) => Math.hypot(drawn.at(-1).view.p[0] - x, drawn.at(-1).view.p[1] - y) < 0.002"
     page.wait_for_function(f"(at) => ({seen})(at) && drawn.at(-1).view.q[1] > 0.08", arg=list(at), timeout=WAIT_MS)
     wait_until(lambda: demo.lead.share == 1.0, page, "the switch")
-    demo.pictures = False
+    demo.images = False
     page.wait_for_timeout(400)  # one that was on its way
 
 
@@ -88,12 +88,12 @@ def test_a_view_drawn_at_one_place_is_shown_from_the_vbots_place_now(open_page, 
 # is at 1 s, from 3 s on the robots are about to be the same again, and at 4.5 s the camera is shown: by then the newest
 # picture, 0.15 s old, is of the same place as the view.
 DRIVE = """async () => {
-    const {Pictures} = await import("/static/pictures.js");
+    const {Images} = await import("/static/images.js");
     const viewer = {name: "none", setView() {}, setPanorama() {}, sample() {}}, frames = [];
     let now = 0, state = null;
-    const pictures = new Pictures(viewer, {serverNow: () => now, acknowledge() {}});
-    pictures.colourReleaseMs = 0;
-    pictures.leadMaxM = 0.3;
+    const images = new Images(viewer, {serverNow: () => now, acknowledge() {}});
+    images.colourReleaseMs = 0;
+    images.leadMaxM = 0.3;
     const at = (ms) => 0.0003 * Math.max(ms, 0), q = [0, 0, 0, 1], lead = (ms) => Math.min(Math.max(ms / 800, 0), 1);
     for (; now < 5000; now += 10) {
         const mode = now < 1000 || now >= 4500 ? "real" : now < 3000 ? "virtual" : "returning";
@@ -103,11 +103,11 @@ DRIVE = """async () => {
             state = {at_ms: now, mode, shown, robot: pose, vbot: pose, twist: [0.3, 0], lead: share};
         }
         if (now % 100 === 0)
-            pictures.view = {p: [at(now - 150), 0, 1.2], q, mount: [0, 0, 1.2], fov: 1.5, aspect: 1.6, hasDepth: true,
+            images.view = {p: [at(now - 150), 0, 1.2], q, mount: [0, 0, 1.2], fov: 1.5, aspect: 1.6, hasDepth: true,
                 captured_ms: now};
-        pictures.panorama = {q, captured_ms: now - 150};
-        const {moved, blend} = pictures.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
-        frames.push({now, mode, vbot: at(now), view: pictures.view.p[0], place: pictures.place[0], moved, blend});
+        images.panorama = {q, captured_ms: now - 150};
+        const {moved, blend} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 10);
+        frames.push({now, mode, vbot: at(now), view: images.view.p[0], place: images.place[0], moved, blend});
     }
     return frames;
 }"""
@@ -140,19 +140,19 @@ def test_the_shown_place_keeps_up_with_the_vbot_and_goes_gently_to_and_from_the_
 def test_a_view_is_never_shown_from_farther_off_than_the_limit(driver):
     moved = driver.evaluate(
         """async () => {
-            const {Pictures} = await import("/static/pictures.js");
-            const pictures = new Pictures({name: "none", sample() {}}, {serverNow: () => 0, acknowledge() {}});
-            pictures.leadMaxM = 0.3;
-            pictures.view = {p: [0, 0, 1.2], q: [0, 0, 0.70710678, 0.70710678], mount: [0.1, 0, 1.2], fov: 1.5,
+            const {Images} = await import("/static/images.js");
+            const images = new Images({name: "none", sample() {}}, {serverNow: () => 0, acknowledge() {}});
+            images.leadMaxM = 0.3;
+            images.view = {p: [0, 0, 1.2], q: [0, 0, 0.70710678, 0.70710678], mount: [0.1, 0, 1.2], fov: 1.5,
                 aspect: 1.6, hasDepth: true, captured_ms: 0};
-            const state = (x) => ({at_ms: 0, mode: "virtual", vbot: [x, 0, 0], twist: [0, 0], lead: 1});
+            const state = (x) => ({at_ms: 0, mode: "virtual", shown: "virtual", vbot: [x, 0, 0], twist: [0, 0], lead: 1});
             const seen = (state) => {
-                for (let i = 0; i < 100; i++) pictures.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 50);
-                const {moved} = pictures.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 50);
-                return {moved, place: pictures.place};
+                for (let i = 0; i < 100; i++) images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 50);
+                const {moved} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 50);
+                return {moved, place: images.place};
             };
             const found = [0.1, 0.8, 1.5].map((x) => seen(state(x)));
-            pictures.view.hasDepth = false;
+            images.view.hasDepth = false;
             found.push(seen(state(0.1)));
             return found;
         }"""

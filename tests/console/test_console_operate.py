@@ -114,7 +114,7 @@ def test_picture_panorama_and_map_are_saved(driver, shared_demo):
         shown = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), float)
         if (found := likeness_of(shown, seen)) > 0.9:
             break
-    assert re.fullmatch(r"picture_\d{8}_\d{6}\.png", name) and data[:4] == b"\x89PNG"
+    assert re.fullmatch(r"view_\d{8}_\d{6}\.png", name) and data[:4] == b"\x89PNG"
     assert shown.shape == (600, 960, 3) and found > 0.9  # of the panorama's few pixels
     driver.locator("#more-open").click()
     name, data = saved(driver, driver.get_by_role("button", name="Save the panorama").click)

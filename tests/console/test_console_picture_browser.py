@@ -38,8 +38,8 @@ WATCH = """
     window.seen = [];
     const small = new OffscreenCanvas(48, 30).getContext("2d", {willReadFrequently: true});
     small.imageSmoothingQuality = "high";
-    addEventListener("drawn", ({detail}) => {
-        small.drawImage(document.getElementById("picture"), 0, 0, 48, 30);
+    addEventListener("rendered", ({detail}) => {
+        small.drawImage(document.getElementById("view"), 0, 0, 48, 30);
         const rgb = btoa(String.fromCharCode(...small.getImageData(0, 0, 48, 30).data));
         const [pitch, yaw] = [detail.view?.q[1], detail.pose?.[2]];
         window.seen.push({rgb, pitch, yaw, blend: detail.blend});
@@ -73,7 +73,7 @@ def passages():
 
 def never_grey(page):
     """Old pictures turn grey, and on a slow machine they are old."""
-    page.add_style_tag(content="#picture { filter: none !important }")
+    page.add_style_tag(content="#view { filter: none !important }")
 
 
 def pass_to(page, demo, mode):
@@ -89,7 +89,7 @@ def test_a_tinted_view_has_the_cameras_colours_at_the_switch_and_the_camera_the_
     demo.tint = TINT
     page = open_page(f"?viewer={viewer}", at=demo, bypass_csp=True)
     expect_body(page, "viewer", viewer)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     wait_until(lambda: demo.server.gate.driver is not None, page, "the lease")
     never_grey(page)
     page.wait_for_timeout(500)
@@ -112,7 +112,7 @@ def test_the_matched_colour_is_let_go_of(open_page, passages):
     demo = passages(dissolve_ms=100, colour_release_s=2)
     demo.tint = TINT
     page = open_page(at=demo, bypass_csp=True)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     never_grey(page)
     page.wait_for_timeout(300)
     real = picture_of(page).mean(axis=(0, 1))
@@ -169,7 +169,7 @@ def test_the_picture_never_jumps_at_a_switch_and_the_rest_of_the_pose_is_eased_o
     demo = passages()
     demo.place(0.5, 0.3, 0.2)
     page = open_page(at=demo, bypass_csp=True)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     page.wait_for_timeout(500)
     page.evaluate(WATCH)
     # Views are made where this page looks: 10° down.
@@ -198,7 +198,7 @@ def test_the_picture_never_jumps_at_a_switch_and_the_rest_of_the_pose_is_eased_o
 def test_reduced_motion_cuts(open_page, passages):
     demo = passages()
     page = open_page(at=demo, reduced_motion="reduce")
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     page.evaluate(WATCH)
     pass_to(page, demo, "virtual")
     pass_to(page, demo, "real")
@@ -241,10 +241,10 @@ def look_pictureless(open_page, demo, **options):
     """A page that gets no new pictures any more: what turns now is turned by the page."""
     demo.forced_mode = "real"
     page = open_page(at=demo, bypass_csp=True, **options)
-    expect_body(page, "picture", "live")
+    expect_body(page, "image", "live")
     never_grey(page)
     page.wait_for_timeout(500)
-    demo.pictures = False
+    demo.images = False
     return page
 
 
@@ -265,7 +265,7 @@ def test_finger_turns_the_picture_and_two_zoom_it(open_page, sharp_demo):
     def fingers(*points):
         page.evaluate(
             """(points) => {
-            const picture = document.getElementById("picture");
+            const picture = document.getElementById("view");
             picture.setPointerCapture = () => {};
             for (const [kind, id, x, y] of points)
                 picture.dispatchEvent(new PointerEvent(

@@ -1,8 +1,11 @@
+// @ts-check
 // Hold to drive: keyboard, touch stick and gamepad. Any event that may hide a release counts as a release.
 
+/** @import { Link } from "./link.js" */
 import { clamp } from "./math.js";
 
 const SEND_MS = 50;
+/** @type {Record<string, [number, number]>} Forward and left. */
 const KEYS = {
   KeyW: [1, 0], ArrowUp: [1, 0],
   KeyS: [-1, 0], ArrowDown: [-1, 0],
@@ -10,12 +13,12 @@ const KEYS = {
   KeyD: [0, -1], ArrowRight: [0, -1],
 };
 
-/** Whether a key event goes to a text field. */
+/** Whether a key event goes to a text field. @param {Event} event */
 export function isTyping(event) {
   return event.target instanceof HTMLInputElement && event.target.type === "text";
 }
 
-/** Whether a key event drives; keys of a focused slider belong to the slider. */
+/** Whether a key event drives; keys of a focused slider belong to the slider. @param {KeyboardEvent} event */
 export function isDriveKey(event) {
   if (isTyping(event)) return false;
   const slider = event.target instanceof HTMLInputElement && event.code.startsWith("Arrow");
@@ -24,16 +27,19 @@ export function isDriveKey(event) {
 
 /** Event "stop" (detail: reason) when anything but a released key or stick ends a drive. */
 export class Drive extends EventTarget {
+  /** @param {Link} link */
   constructor(link) {
     super();
     this.link = link;
     this.scale = 0.7;
     this.limits = { linear: 0, angular: 0 };
     this.enabled = false;
+    /** @type {[number, number]} m/s, rad/s */
     this.command = [0, 0];
+    /** @type {Set<string>} */
     this._held = new Set();
     this._stick = [0, 0];
-    this._timer = null;
+    this._timer = 0;
     window.addEventListener("keydown", (event) => this._keyDown(event));
     window.addEventListener("keyup", (event) => this._keyUp(event));
     window.addEventListener("blur", () => this.stop("the window lost focus"));
@@ -45,8 +51,8 @@ export class Drive extends EventTarget {
     link.addEventListener("lost", () => this.stop("the link was lost"));
   }
 
-  /** Releases all keys and the stick, and sends zero at once. */
-  stop(why) {
+  /** Releases all keys and the stick, and sends zero at once. @param {string} why text for the operator; empty: none */
+  stop(why = "") {
     const moving = this.command[0] !== 0 || this.command[1] !== 0;
     this._held.clear();
     this._stick = [0, 0];
@@ -54,28 +60,31 @@ export class Drive extends EventTarget {
     if (moving && why) this.dispatchEvent(new CustomEvent("stop", { detail: why }));
   }
 
-  /** Whether a key of this direction (KeyW, KeyA, KeyS, KeyD) is held. */
+  /** Whether a key of this direction is held. @param {string} code KeyW, KeyA, KeyS or KeyD */
   holds(code) {
     const [forward, left] = KEYS[code];
     return [...this._held].some((held) => KEYS[held][0] === forward && KEYS[held][1] === left);
   }
 
+  /** @param {boolean} enabled */
   setEnabled(enabled) {
     if (this.enabled && !enabled) this.stop();
     this.enabled = enabled;
   }
 
+  /** @param {number} scale share of the limits, 0.1 to 1 */
   setScale(scale) {
     this.scale = clamp(scale, 0.1, 1);
     this._update();
   }
 
-  /** Stick position: forward and left, each in [-1, 1]. */
+  /** Sets the stick, each axis in [-1, 1]. @param {number} forward @param {number} left */
   setStick(forward, left) {
     this._stick = this.enabled ? [forward, left] : [0, 0];
     this._update();
   }
 
+  /** @param {KeyboardEvent} event */
   _keyDown(event) {
     if (!isDriveKey(event)) return;
     // While a system key is held, the browser may suppress the key-up event.
@@ -86,6 +95,7 @@ export class Drive extends EventTarget {
     this._update();
   }
 
+  /** @param {KeyboardEvent} event */
   _keyUp(event) {
     if (event.key === "Meta") return this.stop("a system key was pressed");
     if (this._held.delete(event.code)) this._update();
@@ -108,10 +118,10 @@ export class Drive extends EventTarget {
     if (!changed) return;
     this._send();
     const active = linear !== 0 || angular !== 0;
-    if (active && this._timer === null) this._timer = setInterval(() => this._send(), SEND_MS);
-    if (!active && this._timer !== null) {
+    if (active && !this._timer) this._timer = setInterval(() => this._send(), SEND_MS);
+    if (!active && this._timer) {
       clearInterval(this._timer);
-      this._timer = null;
+      this._timer = 0;
     }
   }
 
@@ -120,17 +130,20 @@ export class Drive extends EventTarget {
   }
 }
 
-/** On-screen stick: `element` holds a child with class "knob". */
+/** On-screen stick: `element` holds a child with class "knob". @param {HTMLElement} element @param {Drive} drive */
 export function attachStick(element, drive) {
-  const knob = element.querySelector(".knob");
+  const knob = /** @type {HTMLElement} */ (element.querySelector(".knob"));
+  /** @type {number | null} */
   let pointer = null;
 
+  /** @param {PointerEvent} event */
   const release = (event) => {
     if (event.pointerId !== pointer) return;
     pointer = null;
     knob.style.transform = "";
     drive.setStick(0, 0);
   };
+  /** @param {PointerEvent} event */
   const move = (event) => {
     if (event.pointerId !== pointer) return;
     const box = element.getBoundingClientRect();
@@ -148,19 +161,19 @@ export function attachStick(element, drive) {
   element.addEventListener("pointerdown", (event) => {
     if (pointer !== null) return;
     pointer = event.pointerId;
-    element.setPointerCapture(pointer);
+    element.setPointerCapture(event.pointerId);
     event.preventDefault();
     move(event);
   });
   element.addEventListener("pointermove", move);
-  for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) element.addEventListener(end, release);
+  for (const end of /** @type {const} */ (["pointerup", "pointercancel", "lostpointercapture"])) element.addEventListener(end, release);
   drive.addEventListener("stop", () => {
     pointer = null;
     knob.style.transform = "";
   });
 }
 
-/** Axis of a stick, [-1, 1], with a dead zone around its centre. */
+/** Axis of a stick, [-1, 1], with a dead zone around its centre. @param {number} value */
 export function deadZone(value) {
   const size = Math.abs(value);
   return size < 0.12 ? 0 : (Math.sign(value) * (size - 0.12)) / 0.88;

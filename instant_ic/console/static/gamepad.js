@@ -1,6 +1,10 @@
+// @ts-check
 // Gamepad with the browser's standard layout: hold a shoulder button and drive with the left stick, look with the right.
 
+/** @import { Drive } from "./drive.js" */
+/** @import { Look } from "./look.js" */
 import { deadZone } from "./drive.js";
+import { mark } from "./dom.js";
 import { radians } from "./math.js";
 
 const POLL_MS = 20;
@@ -10,14 +14,17 @@ const STEP = 10; // percent of the speed limit
 
 /**
  * Events: "drive" (the shoulder button was pressed), "stop", "centre", "scale" (detail: percent to add),
- * "tell" (detail: text). It drives only if the window has focus and the button was pressed after it gained focus.
+ * "notice" (detail: text). It drives only if the window has focus and the button was pressed after it gained focus.
  */
 export class Gamepads extends EventTarget {
+  /** @param {Drive} drive @param {Look} look */
   constructor(drive, look) {
     super();
     this.drive = drive;
     this.look = look;
-    this._index = null; // of the active pad
+    /** @type {number | null} Index of the active pad. */
+    this._index = null;
+    /** @type {Set<number>} */
     this._held = new Set();
     this._driving = false;
     this._last = performance.now();
@@ -30,22 +37,23 @@ export class Gamepads extends EventTarget {
     setInterval(() => this._poll(), POLL_MS);
   }
 
+  /** @param {Gamepad} pad */
   _connect(pad) {
     if (pad.mapping !== "standard") {
-      this._tell(`Gamepad ${pad.id} cannot drive: the browser does not know its layout.`);
+      this._emit("notice", `Gamepad ${pad.id} cannot drive: the browser does not know its layout.`);
       return;
     }
     if (this._index !== null) return;
     this._index = pad.index;
     this._held = pressed(pad); // a button held already was not pressed for driving
-    this._state("ready");
-    this._tell("Gamepad connected: hold a shoulder button and drive with the left stick.");
+    mark("pad", "ready");
+    this._emit("notice", "Gamepad connected: hold a shoulder button and drive with the left stick.");
   }
 
   _lose() {
     this._index = null;
     this._driving = false;
-    this._state("none");
+    mark("pad", "none");
     this.drive.stop("the gamepad was disconnected");
   }
 
@@ -58,43 +66,37 @@ export class Gamepads extends EventTarget {
     const held = pressed(pad), fresh = [...held].filter((button) => !this._held.has(button));
     this._held = held;
     const focused = document.hasFocus() && !document.hidden;
-    if (fresh.includes(STOP)) this._say("stop"); // also without focus
-    if (!focused) return this._letGo();
-    if (!this.drive.enabled) this._letGo(); // not the driver, or an emergency stop
-    if (fresh.includes(CENTRE)) this._say("centre");
-    if (fresh.includes(FASTER)) this._say("scale", STEP);
-    if (fresh.includes(SLOWER)) this._say("scale", -STEP);
+    if (fresh.includes(STOP)) this._emit("stop"); // also without focus
+    if (!focused) return this._release();
+    if (!this.drive.enabled) this._release(); // not the driver, or an emergency stop
+    if (fresh.includes(CENTRE)) this._emit("centre");
+    if (fresh.includes(FASTER)) this._emit("scale", STEP);
+    if (fresh.includes(SLOWER)) this._emit("scale", -STEP);
     const [yaw, pitch] = [deadZone(-pad.axes[2]), deadZone(-pad.axes[3])];
     if (yaw || pitch) this.look.turn(yaw * LOOK_RATE * seconds, pitch * LOOK_RATE * seconds);
     if (fresh.some((button) => SHOULDERS.includes(button))) {
       this._driving = true;
-      this._say("drive");
+      this._emit("drive");
     }
-    if (!SHOULDERS.some((button) => held.has(button))) this._letGo();
+    if (!SHOULDERS.some((button) => held.has(button))) this._release();
     if (this._driving) this.drive.setStick(deadZone(-pad.axes[1]), deadZone(-pad.axes[0]));
-    this._state(this._driving ? "driving" : "ready");
+    mark("pad", this._driving ? "driving" : "ready");
   }
 
-  _letGo() {
+  _release() {
     if (!this._driving) return;
     this._driving = false;
     this.drive.setStick(0, 0);
-    this._state("ready");
+    mark("pad", "ready");
   }
 
-  _state(state) {
-    document.body.dataset.pad = state;
-  }
-
-  _say(kind, detail) {
+  /** @param {string} kind @param {string | number} [detail] */
+  _emit(kind, detail) {
     this.dispatchEvent(new CustomEvent(kind, { detail }));
-  }
-
-  _tell(words) {
-    this._say("tell", words);
   }
 }
 
+/** @param {Gamepad} pad @returns {Set<number>} */
 function pressed(pad) {
   return new Set(pad.buttons.flatMap((button, index) => (button.pressed ? [index] : [])));
 }

@@ -1,13 +1,21 @@
+// @ts-check
 // The predicted trajectory as a ribbon on the floor, and the compass tape.
 
+/** @import { Mat3, Vec3 } from "./math.js" */
+import { context2d } from "./dom.js";
 import { degrees, rotate, wrapAngle } from "./math.js";
 
+/** @type {Record<number, string>} Degrees to the right. */
+const NAMES = { 0: "AHEAD", 90: "RIGHT", "-90": "LEFT", "-180": "BEHIND" };
 const NEAREST_M = 0.25;
 const REACH_M = 4; // the nearby floor is out of view, so the arc is extended to here
 const STEP_M = 0.1;
 
-/** `points`, extended along the arc of their last bend to REACH_M from the start. */
-function extended(points) {
+/**
+ * Returns `points`, extended along the arc of their last bend to REACH_M from the start.
+ * @param {[number, number][]} points @returns {[number, number][]}
+ */
+export function extended(points) {
   let length = 0;
   for (let i = 1; i < points.length; i++)
     length += Math.hypot(points[i][0] - points[i - 1][0], points[i][1] - points[i - 1][1]);
@@ -30,12 +38,15 @@ function extended(points) {
 
 /**
  * Draws `trajectory` (map frame, [[x, y], ...]) on the floor as seen by the shown camera.
- * `camera`: {lookFromMap: 3x3, position: [x, y, z]}; `tanHalf` of the shown field of view.
+ * @param {HTMLCanvasElement} canvas @param {[number, number][]} trajectory
+ * @param {{lookFromMap: Mat3, position: Vec3}} camera @param {[number, number]} tanHalf of the shown field of view
+ * @param {number} halfWidth m @param {string} colour
  */
 export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour) {
-  const context = canvas.getContext("2d");
+  const context = context2d(canvas);
   context.clearRect(0, 0, canvas.width, canvas.height);
-  if (!trajectory || trajectory.length < 2) return;
+  if (trajectory.length < 2) return;
+  /** @param {number} x @param {number} y @returns {[number, number] | null} */
   const project = (x, y) => {
     const p = rotate(camera.lookFromMap, [x - camera.position[0], y - camera.position[1], -camera.position[2]]);
     if (p[0] < NEAREST_M) return null;
@@ -45,7 +56,8 @@ export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour
     ];
   };
   trajectory = extended(trajectory);
-  const left = [], right = [];
+  /** @type {[number, number][]} */
+  const left = [], /** @type {[number, number][]} */ right = [];
   for (let i = 0; i < trajectory.length; i++) {
     const before = trajectory[Math.max(i - 1, 0)], after = trajectory[Math.min(i + 1, trajectory.length - 1)];
     const length = Math.hypot(after[0] - before[0], after[1] - before[1]);
@@ -59,7 +71,7 @@ export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour
     }
   }
   if (left.length < 2) return;
-  const near = Math.max(left[0][1], right[0][1]), far = Math.min(left.at(-1)[1], right.at(-1)[1]);
+  const near = Math.max(left[0][1], right[0][1]), far = Math.min(left[left.length - 1][1], right[right.length - 1][1]);
   const fade = context.createLinearGradient(0, Math.min(near, canvas.height), 0, far);
   fade.addColorStop(0, `${colour}66`);
   fade.addColorStop(1, `${colour}08`);
@@ -77,9 +89,12 @@ export function drawGuide(canvas, trajectory, camera, tanHalf, halfWidth, colour
   }
 }
 
-/** Tape of directions relative to the robot: 0 is straight ahead. */
+/**
+ * Tape of directions relative to the robot: 0 is straight ahead.
+ * @param {HTMLCanvasElement} canvas @param {number} lookYaw @param {string} colour
+ */
 export function drawCompass(canvas, lookYaw, colour) {
-  const context = canvas.getContext("2d");
+  const context = context2d(canvas);
   const { width, height } = canvas, ratio = devicePixelRatio;
   context.clearRect(0, 0, width, height);
   const perDegree = width / 150, look = -degrees(lookYaw); // right is positive on the tape
@@ -91,7 +106,7 @@ export function drawCompass(canvas, lookYaw, colour) {
     const side = Math.abs(x - width / 2) / (width / 2);
     context.globalAlpha = 1 - side ** 2;
     context.fillStyle = mark === 0 ? colour : "#a3adb8";
-    const name = { 0: "AHEAD", 90: "RIGHT", "-90": "LEFT", "-180": "BEHIND" }[mark];
+    const name = NAMES[mark];
     context.fillRect(x - ratio / 2, height - (mark % 45 ? 7 : 12) * ratio, ratio, (mark % 45 ? 7 : 12) * ratio);
     if (name) context.fillText(name, x, 18 * ratio);
     else if (mark % 45 === 0) context.fillText(`${Math.abs(mark)}°`, x, 18 * ratio);

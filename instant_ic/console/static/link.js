@@ -1,28 +1,33 @@
-// The WebSocket: reconnects, measures round trip and clock offset, decodes binary frames.
+// @ts-check
+// The WebSocket: reconnects, keeps the server's clock, and passes on checked messages and frames.
+
+/** @import { Frame, Pong } from "./messages.js" */
+import { ServerClock } from "./clock.js";
+import { decodeFrame, MessageError, parseMessage } from "./messages.js";
 
 const PING_MS = 50; // the server counts a driver as lost after beat_timeout_s (0.25 s)
 const SILENCE_MS = 1000; // the link counts as lost after this silence
-const PREFIX_BYTES = 12;
-const VERSION = 1;
-
-export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4;
+const FIRST_RETRY_MS = 250, LAST_RETRY_MS = 2000;
 
 /**
- * Events: "open", "lost" (once for each loss), "signed-out" (the server requires a token), "message" (detail: object), "frame"
- * (detail: frame). A frame is {kind, sequence, header, payload: Blob}; its consumer must call acknowledge(frame).
+ * Events: "open", "lost" (once for each loss), "signed-out" (the server requires a token), "message" (detail: Message),
+ * "frame" (detail: Frame). The consumer of a frame must call acknowledge(frame).
  */
 export class Link extends EventTarget {
+  /** @param {string} url */
   constructor(url) {
     super();
     this.url = url;
-    this.roundTripMs = null;
+    this.clock = new ServerClock();
+    /** @type {number | null} Delay of the last drive command. */
     this.commandAgeMs = null;
     this.commandHz = 0; // drive commands accepted in the last second
     this.away = false; // the operator does something else, such as typing
     this.connected = false;
-    this._offsetMs = null;
-    this._samples = [];
-    this._retryMs = 250;
+    this.everConnected = false;
+    /** @type {WebSocket | null} */
+    this._socket = null;
+    this._retryMs = FIRST_RETRY_MS;
     this._heard = 0;
     this._sequence = 0;
     this._connect();
@@ -34,23 +39,24 @@ export class Link extends EventTarget {
 
   /** Present time of the server's clock, ms; null before the first answer. */
   serverNow() {
-    return this._offsetMs === null ? null : performance.now() + this._offsetMs;
+    return this.clock.at(performance.now());
   }
 
-  /** Quality of the link by median and 90th percentile of the round trip: "good", "fair", "poor"; null if unknown. */
+  get roundTripMs() {
+    return this.clock.roundTripMs;
+  }
+
+  /** Quality of the link: "good", "fair", "poor"; null if unknown. */
   get quality() {
-    if (!this.connected || this._samples.length < 10) return null;
-    const sorted = this._samples.slice(-60).map((sample) => sample.roundTrip).sort((a, b) => a - b);
-    const usual = sorted[sorted.length >> 1], slow = sorted[Math.floor(sorted.length * 0.9)];
-    if (usual <= 80 && slow <= 150) return "good";
-    return usual <= 200 && slow <= 400 ? "fair" : "poor";
+    return this.connected ? this.clock.quality : null;
   }
 
+  /** @param {{type: string, [field: string]: unknown}} message */
   send(message) {
     if (this._socket?.readyState === WebSocket.OPEN) this._socket.send(JSON.stringify(message));
   }
 
-  /** Sends a drive command (m/s, rad/s); returns false without a link. */
+  /** Sends a drive command; returns false without a link. @param {number} linear m/s @param {number} angular rad/s */
   drive(linear, angular) {
     const time_ms = this.serverNow();
     if (!this.connected || time_ms === null) return false;
@@ -58,26 +64,26 @@ export class Link extends EventTarget {
     return true;
   }
 
+  /** @param {Pick<Frame, "kind" | "sequence">} frame */
   acknowledge(frame) {
     this.send({ type: "ack", kind: frame.kind, seq: frame.sequence });
   }
 
   _connect() {
     const socket = new WebSocket(this.url);
+    let opened = false;
     this._socket = socket;
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
-      this._retryMs = 250;
+      opened = true;
+      this._retryMs = FIRST_RETRY_MS;
       this._heard = performance.now();
-      this._samples = [];
-      this._offsetMs = null;
+      this.clock.reset();
       this._ping();
     };
     socket.onmessage = (event) => {
       if (socket === this._socket) this._receive(event.data);
     };
-    let opened = false;
-    socket.addEventListener("open", () => { opened = true; });
     socket.onclose = () => {
       if (!opened) this._askWhy();
       if (socket === this._socket) this._reconnect();
@@ -88,7 +94,7 @@ export class Link extends EventTarget {
     this._lose();
     this._socket = null;
     setTimeout(() => this._connect(), this._retryMs);
-    this._retryMs = Math.min(this._retryMs * 2, 2000);
+    this._retryMs = Math.min(this._retryMs * 2, LAST_RETRY_MS);
   }
 
   /** Asks by an ordinary request why the WebSocket was refused; a WebSocket gives a page no reason. */
@@ -124,44 +130,40 @@ export class Link extends EventTarget {
     this.send({ type: "ping", client_ms: performance.now(), away: leaving || document.hidden || this.away });
   }
 
+  /** @param {string | ArrayBuffer} data */
   _receive(data) {
     this._heard = performance.now();
-    if (typeof data === "string") {
-      const message = JSON.parse(data);
+    try {
+      if (typeof data !== "string") {
+        this.dispatchEvent(new CustomEvent("frame", { detail: decodeFrame(data) }));
+        return;
+      }
+      const message = parseMessage(data);
       if (message.type === "pong") this._pong(message);
       else this.dispatchEvent(new CustomEvent("message", { detail: message }));
-    } else {
-      const frame = decodeFrame(data);
-      if (frame) this.dispatchEvent(new CustomEvent("frame", { detail: frame }));
+    } catch (error) {
+      if (!(error instanceof MessageError)) throw error;
+      console.error(`message of the server dropped: ${error.message}`);
     }
   }
 
+  /** @param {Pong} message */
   _pong(message) {
-    const now = performance.now();
-    const roundTrip = now - message.client_ms;
-    this._samples.push({ roundTrip, offset: message.server_ms + roundTrip / 2 - now });
-    if (this._samples.length > 100) this._samples.shift();
-    // The fastest answer was delayed least, so its offset is the most accurate.
-    this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
-    const recent = this._samples.slice(-40).map((s) => s.roundTrip).sort((a, b) => a - b);
-    this.roundTripMs = recent[recent.length >> 1];
+    this.clock.take(message.client_ms, message.server_ms, performance.now());
     this.commandAgeMs = message.command_age_ms;
     this.commandHz = message.command_hz;
-    if (!this.connected) {
-      this.connected = true;
-      this.dispatchEvent(new Event("open"));
-    }
+    if (this.connected) return;
+    this.connected = this.everConnected = true;
+    this.dispatchEvent(new Event("open"));
   }
 }
 
-function decodeFrame(buffer) {
-  const view = new DataView(buffer);
-  if (buffer.byteLength < PREFIX_BYTES || view.getUint8(0) !== VERSION) {
-    console.error(`frame of ${buffer.byteLength} bytes, version ${view.getUint8(0)}: not understood`);
-    return null;
-  }
-  const headerEnd = PREFIX_BYTES + view.getUint32(8, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, PREFIX_BYTES, headerEnd - PREFIX_BYTES)));
-  const payload = new Blob([new Uint8Array(buffer, headerEnd)]);
-  return { kind: view.getUint8(1), sequence: view.getUint32(4, true), header, payload };
+/**
+ * Calls `handle` with the detail of each event of this name.
+ * @template T
+ * @param {EventTarget} target @param {string} name @param {(detail: T) => void} handle
+ */
+export function onDetail(target, name, handle) {
+  target.addEventListener(name, (event) => handle(/** @type {CustomEvent<T>} */ (event).detail));
 }
+

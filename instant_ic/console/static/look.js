@@ -1,3 +1,4 @@
+// @ts-check
 // Look direction relative to the robot's heading: mouse or finger drag, wheel, keys.
 
 import { isTyping } from "./drive.js";
@@ -6,18 +7,22 @@ import { clamp, radians, wrapAngle } from "./math.js";
 const MAX_PITCH = radians(80);
 const MIN_VFOV = radians(25), MAX_VFOV = radians(85);
 const KEY_RATE = radians(70); // per second
+/** @type {Record<string, [number, number]>} Left and up. */
 const KEYS = { KeyJ: [1, 0], KeyL: [-1, 0], KeyI: [0, 1], KeyK: [0, -1] };
 const REST_PITCH = radians(-10); // a little floor in front of the robot
 const CENTRE_MS = 350;
 
 export class Look {
-  /** `element` receives the drags. */
+  /** @param {HTMLElement} element receives the drags */
   constructor(element) {
     this.yaw = 0;
     this.pitch = REST_PITCH;
     this.vfov = radians(60);
+    /** @type {Set<string>} */
     this._held = new Set();
+    /** @type {{yaw: number, pitch: number, start: number} | null} */
     this._centring = null;
+    /** @type {Map<number, [number, number]>} Pixels. */
     this._pointers = new Map();
     element.addEventListener("pointerdown", (event) => {
       element.setPointerCapture(event.pointerId);
@@ -26,7 +31,7 @@ export class Look {
       element.classList.add("dragging");
     });
     element.addEventListener("pointermove", (event) => this._drag(event, element));
-    for (const end of ["pointerup", "pointercancel", "lostpointercapture"])
+    for (const end of /** @type {const} */ (["pointerup", "pointercancel", "lostpointercapture"]))
       element.addEventListener(end, (event) => {
         this._pointers.delete(event.pointerId);
         if (this._pointers.size === 0) element.classList.remove("dragging");
@@ -50,17 +55,18 @@ export class Look {
     this._centring = { yaw: this.yaw, pitch: this.pitch, start: performance.now() };
   }
 
-  /** Turns by angles in radians, left and up. */
+  /** Turns by angles in radians, left and up. @param {number} yaw @param {number} pitch */
   turn(yaw, pitch) {
     this._centring = null;
     this._turn(yaw, pitch);
   }
 
+  /** @param {number} factor of the field of view */
   zoom(factor) {
     this.vfov = clamp(this.vfov * factor, MIN_VFOV, MAX_VFOV);
   }
 
-  /** Advances by `seconds`. */
+  /** Advances the motion of keys and centring. @param {number} seconds */
   step(seconds) {
     for (const code of this._held) {
       this.turn(KEYS[code][0] * KEY_RATE * seconds, KEYS[code][1] * KEY_RATE * seconds);
@@ -74,11 +80,13 @@ export class Look {
     }
   }
 
+  /** @param {number} yaw @param {number} pitch */
   _turn(yaw, pitch) {
     this.yaw = wrapAngle(this.yaw + yaw);
     this.pitch = clamp(this.pitch + pitch, -MAX_PITCH, MAX_PITCH);
   }
 
+  /** @param {PointerEvent} event @param {HTMLElement} element */
   _drag(event, element) {
     const last = this._pointers.get(event.pointerId);
     if (!last) return;

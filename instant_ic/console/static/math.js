@@ -1,18 +1,24 @@
+// @ts-check
 // Rotations as 3x3 row-major arrays, x forward, y left, z up; angles counter-clockwise, radians.
+
+/** @typedef {[number, number, number]} Vec3 */
+/** @typedef {number[]} Mat3 Nine numbers. */
 
 export const identity = [1, 0, 0, 0, 1, 0, 0, 0, 1];
 
+/** @param {number} angle @returns {Mat3} */
 export function rotationZ(angle) {
   const c = Math.cos(angle), s = Math.sin(angle);
   return [c, -s, 0, s, c, 0, 0, 0, 1];
 }
 
-/** Rotation of the line of sight: left by `yaw`, up by `pitch`. */
+/** Rotation of the line of sight: left by `yaw`, up by `pitch`. @param {number} yaw @param {number} pitch */
 export function lookRotation(yaw, pitch) {
   const c = Math.cos(pitch), s = Math.sin(pitch);
   return multiply(rotationZ(yaw), [c, 0, -s, 0, 1, 0, s, 0, c]);
 }
 
+/** @param {Mat3} a @param {Mat3} b @returns {Mat3} */
 export function multiply(a, b) {
   const m = new Array(9);
   for (let i = 0; i < 3; i++)
@@ -21,10 +27,12 @@ export function multiply(a, b) {
   return m;
 }
 
+/** @param {Mat3} m @returns {Mat3} */
 export function transpose(m) {
   return [m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]];
 }
 
+/** @param {Mat3} m @param {Vec3} v @returns {Vec3} */
 export function rotate(m, v) {
   return [
     m[0] * v[0] + m[1] * v[1] + m[2] * v[2],
@@ -33,7 +41,7 @@ export function rotate(m, v) {
   ];
 }
 
-/** Rotation matrix of a quaternion [x, y, z, w]. */
+/** Rotation matrix of a quaternion. @param {[number, number, number, number]} q x, y, z, w @returns {Mat3} */
 export function fromQuaternion([x, y, z, w]) {
   return [
     1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
@@ -42,13 +50,26 @@ export function fromQuaternion([x, y, z, w]) {
   ];
 }
 
+/** The same angle in [-π, π]. @param {number} angle */
 export function wrapAngle(angle) {
   return angle - 2 * Math.PI * Math.round(angle / (2 * Math.PI));
 }
 
+/** @param {number} value @param {number} low @param {number} high */
 export function clamp(value, low, high) {
   return Math.min(Math.max(value, low), high);
 }
 
+/**
+ * Place of a direction in a panorama, 0..1: from the left, from the top. The centre looks forward, columns run clockwise.
+ * @param {Vec3} direction unit vector
+ * @returns {[number, number]}
+ */
+export function panoramaPlace([x, y, z]) {
+  return [0.5 - Math.atan2(y, x) / (2 * Math.PI), 0.5 - Math.asin(clamp(z, -1, 1)) / Math.PI];
+}
+
+/** @param {number} radians */
 export const degrees = (radians) => (radians * 180) / Math.PI;
+/** @param {number} angle degrees */
 export const radians = (angle) => (angle * Math.PI) / 180;

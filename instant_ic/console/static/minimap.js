@@ -1,46 +1,75 @@
+// @ts-check
 // Map in the corner: walls, costs, both robots, path, subgoal and predicted trajectory.
+
+/** @import { GridHeader, Plan } from "./messages.js" */
+/** @import { Vec3 } from "./math.js" */
+import { context2d } from "./dom.js";
+
+/** @typedef {{image: HTMLCanvasElement, header: GridHeader}} Layer */
+/**
+ * @typedef {object} MapScene
+ * @property {boolean} virtual whether the v-bot is shown
+ * @property {Vec3 | null} robot x, y, yaw
+ * @property {Vec3 | null} vbot
+ * @property {Pick<Plan, "trajectory" | "path" | "subgoal">} plan
+ * @property {[number, number]} footprint length, width
+ * @property {number} lookYaw
+ * @property {number} hfov
+ */
 
 const COLOURS = { real: "#45c4b0", virtual: "#f0ac45", path: "#8fb8ff", goal: "#ffffff" };
 const RADIUS_M = 3.5; // half the width shown in the small map
 
 export class MiniMap {
+  /** @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
     this.canvas = canvas;
-    this.context = canvas.getContext("2d");
+    this.context = context2d(canvas);
     this.large = false;
+    this.changed = true; // must be drawn, although no pose has changed
+    /** @type {{floor: Layer | null, costs: Layer | null, walls: Layer | null}} */
     this._layers = { floor: null, costs: null, walls: null };
   }
 
-  /** `bitmap` holds grey cells (gridimage.py), `header` their resolution and position. */
+  /** Sets a layer of grey cells (gridimage.py). @param {"map" | "costmap"} name @param {ImageBitmap} bitmap @param {GridHeader} header */
   setLayer(name, bitmap, header) {
-    const paints = name === "map" ? { floor: paintFloor, walls: paintWalls } : { costs: paintCosts };
-    for (const [layer, paint] of Object.entries(paints)) this._layers[layer] = { image: painted(bitmap, paint), header };
+    this.changed = true;
+    if (name === "costmap") {
+      this._layers.costs = { image: coloured(bitmap, costColour), header };
+      return;
+    }
+    this._layers.floor = { image: coloured(bitmap, floorColour), header };
+    this._layers.walls = { image: coloured(bitmap, wallColour), header };
   }
 
   get hasMap() {
     return this._layers.walls !== null;
   }
 
-  /** `scene`: mode, robot, vbot ([x, y, yaw] or null), plan, footprint [length, width], lookYaw, hfov. */
+  /** @param {MapScene} scene */
   draw(scene) {
+    this.changed = false;
     const { context, canvas } = this;
     const { width, height } = canvas;
     context.setTransform(1, 0, 0, 1, 0, 0);
     context.clearRect(0, 0, width, height);
-    const shown = scene.mode === "virtual" ? scene.vbot ?? scene.robot : scene.robot ?? scene.vbot;
+    const shown = scene.virtual ? scene.vbot ?? scene.robot : scene.robot ?? scene.vbot;
     if (!shown) return this._say("No pose yet");
     const scale = this._place(shown, width, height);
     for (const layer of Object.values(this._layers)) if (layer) this._drawLayer(layer);
     const pixel = 1 / scale;
     this._cone(shown, scene, 1.7);
     this._line(scene.plan.path, COLOURS.path, 2 * pixel, [6 * pixel, 5 * pixel]);
-    this._line(scene.plan.trajectory, scene.mode === "virtual" ? COLOURS.virtual : COLOURS.real, 3 * pixel, []);
+    this._line(scene.plan.trajectory, scene.virtual ? COLOURS.virtual : COLOURS.real, 3 * pixel, []);
     if (scene.plan.subgoal) this._goal(scene.plan.subgoal, pixel);
     if (scene.robot) this._robot(scene.robot, scene.footprint, COLOURS.real, pixel, true);
-    if (scene.vbot && scene.mode === "virtual") this._robot(scene.vbot, scene.footprint, COLOURS.virtual, pixel, false);
+    if (scene.vbot && scene.virtual) this._robot(scene.vbot, scene.footprint, COLOURS.virtual, pixel, false);
   }
 
-  /** Scales the canvas to metres and returns pixels per metre. Small: heading up; large: north up with the whole map. */
+  /**
+   * Scales the canvas to metres and returns pixels per metre. Small: heading up; large: north up with the whole map.
+   * @param {Vec3} shown @param {number} width @param {number} height
+   */
   _place([x, y, yaw], width, height) {
     const context = this.context;
     if (this.large && this._layers.walls) {
@@ -60,6 +89,7 @@ export class MiniMap {
     return scale;
   }
 
+  /** @param {Layer} layer */
   _drawLayer({ image, header }) {
     const context = this.context;
     const h = header.height * header.resolution;
@@ -71,8 +101,9 @@ export class MiniMap {
     context.restore();
   }
 
+  /** @param {[number, number][]} points @param {string} colour @param {number} width @param {number[]} dash */
   _line(points, colour, width, dash) {
-    if (!points || points.length < 2) return;
+    if (points.length < 2) return;
     const context = this.context;
     context.save();
     context.strokeStyle = colour;
@@ -85,6 +116,7 @@ export class MiniMap {
     context.restore();
   }
 
+  /** @param {Vec3} goal @param {number} pixel m */
   _goal([x, y], pixel) {
     const context = this.context;
     context.strokeStyle = COLOURS.goal;
@@ -96,6 +128,7 @@ export class MiniMap {
     context.stroke();
   }
 
+  /** @param {Vec3} pose @param {MapScene} scene @param {number} length m */
   _cone([x, y, yaw], scene, length) {
     const context = this.context;
     const middle = yaw + scene.lookYaw;
@@ -109,6 +142,7 @@ export class MiniMap {
     context.fill();
   }
 
+  /** @param {Vec3} pose @param {[number, number]} footprint @param {string} colour @param {number} pixel @param {boolean} solid */
   _robot([x, y, yaw], [length, width], colour, pixel, solid) {
     const context = this.context;
     context.save();
@@ -133,6 +167,7 @@ export class MiniMap {
     context.restore();
   }
 
+  /** @param {string} text */
   _say(text) {
     const { context, canvas } = this;
     context.fillStyle = "#a3adb8";
@@ -142,19 +177,23 @@ export class MiniMap {
   }
 }
 
-function painted(bitmap, paint) {
+/** @param {ImageBitmap} bitmap @param {(cell: number) => number[]} colour of a cell */
+function coloured(bitmap, colour) {
   const image = document.createElement("canvas");
   image.width = bitmap.width;
   image.height = bitmap.height;
-  const context = image.getContext("2d", { willReadFrequently: true });
+  const context = context2d(image, { willReadFrequently: true });
   context.drawImage(bitmap, 0, 0);
   const cells = context.getImageData(0, 0, image.width, image.height);
-  for (let i = 0; i < cells.data.length; i += 4) cells.data.set(paint(cells.data[i]), i);
+  for (let i = 0; i < cells.data.length; i += 4) cells.data.set(colour(cells.data[i]), i);
   context.putImageData(cells, 0, 0);
   return image;
 }
 
 // Colours [r, g, b, alpha] of a cell: 0..100, 255 unknown.
-const paintFloor = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : [0, 0, 0, 0]);
-const paintWalls = (cell) => (cell >= 50 && cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
-const paintCosts = (cell) => (cell <= 100 ? [255, 110, 80, 0.6 * cell] : [0, 0, 0, 0]);
+/** @param {number} cell */
+const floorColour = (cell) => (cell < 50 ? [150, 165, 180, 70 - cell] : [0, 0, 0, 0]);
+/** @param {number} cell */
+const wallColour = (cell) => (cell >= 50 && cell <= 100 ? [226, 232, 238, 120 + 1.3 * cell] : [0, 0, 0, 0]);
+/** @param {number} cell */
+const costColour = (cell) => (cell <= 100 ? [255, 110, 80, 0.6 * cell] : [0, 0, 0, 0]);

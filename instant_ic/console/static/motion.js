@@ -1,5 +1,7 @@
+// @ts-check
 // Pose of the shown robot at render time, between and beyond the state messages.
 
+/** @import { Vec3 } from "./math.js" */
 import { clamp, wrapAngle } from "./math.js";
 
 const EXTRAPOLATION_MS = 200;
@@ -9,12 +11,15 @@ const EASED_RAD = 0.2, EASED_M = 0.3; // the same between the two robots
 
 export class Motion {
   constructor() {
-    this.pose = null; // [x, y, yaw] in the map frame; null: unknown
+    /** @type {Vec3 | null} x, y, yaw in the map frame; null: unknown. */
+    this.pose = null;
     this.easeMs = 400;
+    /** @type {Vec3 | null} */
     this._followed = null;
-    this._residual = [0, 0, 0]; // remaining offset of the other robot's pose
+    /** @type {Vec3} Remaining offset of the other robot's pose. */
+    this._residual = [0, 0, 0];
     this._easedMs = 0;
-    this._robot = null;
+    this._robot = "";
   }
 
   get yaw() {
@@ -29,11 +34,13 @@ export class Motion {
   /**
    * Advances by `elapsedMs`. `robot`: name of the shown robot; when it changes, the difference between the two poses is
    * eased out. `pose` and `twist` [m/s, rad/s] are `ageMs` old.
+   * @param {string} robot @param {Vec3 | null | undefined} pose @param {[number, number]} twist
+   * @param {number} ageMs @param {number} elapsedMs
    */
   follow(robot, pose, twist, ageMs, elapsedMs) {
     if (!pose) return;
     const target = moved(pose, twist, clamp(ageMs, 0, EXTRAPOLATION_MS) / 1000);
-    if (robot !== this._robot && this._robot !== null && this.pose !== null) {
+    if (robot !== this._robot && this._robot && this.pose !== null) {
       const apart = difference(this.pose, target);
       this._residual = size(apart) < EASED_M && Math.abs(apart[2]) < EASED_RAD ? apart : [0, 0, 0];
       this._easedMs = 0;
@@ -43,7 +50,7 @@ export class Motion {
     // Move on at the velocity and smooth only the remaining error, so that steady motion is shown without lag.
     const went = this._followed && moved(this._followed, twist, ageMs < EXTRAPOLATION_MS ? elapsedMs / 1000 : 0);
     const left = went ? difference(target, went) : null;
-    if (left === null || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
+    if (!went || !left || size(left) > SNAP_M || Math.abs(left[2]) > SNAP_RAD) this._followed = target;
     else this._followed = sum(went, left, 1 - Math.exp(-elapsedMs / SMOOTHING_MS));
     this._easedMs += elapsedMs; // elapsed, not absolute: after a short hang the page continues where it was
     const t = this.easeMs > 0 ? clamp(this._easedMs / this.easeMs, 0, 1) : 1;
@@ -51,10 +58,14 @@ export class Motion {
   }
 }
 
+/** @param {Vec3} pose */
 const size = ([x, y]) => Math.hypot(x, y);
+/** @param {Vec3} a @param {Vec3} b @returns {Vec3} */
 const difference = (a, b) => [a[0] - b[0], a[1] - b[1], wrapAngle(a[2] - b[2])];
+/** @param {Vec3} a @param {Vec3} b @param {number} share @returns {Vec3} */
 const sum = (a, b, share) => [a[0] + share * b[0], a[1] + share * b[1], wrapAngle(a[2] + share * b[2])];
 
+/** @param {Vec3} pose @param {[number, number]} twist @param {number} seconds @returns {Vec3} */
 function moved([x, y, yaw], [v, w], seconds) {
   const middle = yaw + (w * seconds) / 2;
   return [x + v * seconds * Math.cos(middle), y + v * seconds * Math.sin(middle), wrapAngle(yaw + w * seconds)];

@@ -1,55 +1,72 @@
+// @ts-check
 // Record button, snapshot of the last minute and bookmarks: commands to the server, and their results.
 
-import { announce, toast } from "./hud.js";
+/** @import { Drive } from "./drive.js" */
+/** @import { Link } from "./link.js" */
+/** @import { RecordingStatus } from "./messages.js" */
+import { byId, elementOf, mark, write } from "./dom.js";
+import { announce, replaceItems, toast } from "./hud.js";
+import { bytesText, clockText, recorderText, recordText } from "./texts.js";
 
-const byId = (id) => document.getElementById(id);
-const BUSY = { ending: "Saving…", "disk full": "Disk full", failed: "Failed", paused: "Paused" };
+const RUNNING = ["recording", "disk full", "paused"];
+
+/** @type {RecordingStatus} */
+const NO_ANSWER = {
+  type: "recording", recorder: "missing", state: "none", text: "The recorder has not answered yet.", bookmarks: [], snapshots: [],
+  notice: { number: 0, text: "", level: "ok" }, path: null, seconds: null, bytes: null, free_bytes: null, cached_s: null,
+};
 
 export class Recording {
-  /** While a bookmark's name is typed, `drive` is stopped and the link reports "away", which keeps the robot stopped. */
+  /**
+   * While a bookmark's name is typed, `drive` is stopped and the link reports "away", which keeps the robot stopped.
+   * @param {Link} link @param {Drive} drive
+   */
   constructor(link, drive) {
     this.link = link;
     this.drive = drive;
     this.mayRecord = true;
-    this._told = { recorder: "missing", state: "none", text: "The recorder has not answered yet.", bookmarks: [], snapshots: [] };
+    this._status = NO_ANSWER;
+    /** @type {number | null} */
     this._notice = null;
+    const name = elementOf("mark-name", HTMLInputElement);
     byId("record").addEventListener("click", () => this.toggle());
-    byId("snapshot").addEventListener("click", () => this._wish({ type: "snapshot" }));
+    byId("snapshot").addEventListener("click", () => this._send({ type: "snapshot" }));
     byId("mark").addEventListener("click", () => this.mark());
     byId("marks-open").addEventListener("click", () => this._openMarks());
     byId("marks").addEventListener("close", () => { link.away = false; });
     byId("mark-form").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.mark(byId("mark-name").value.trim());
-      byId("mark-name").value = "";
+      this.mark(name.value.trim());
+      name.value = "";
     });
   }
 
   get running() {
-    return ["recording", "disk full", "paused"].includes(this._told.state);
+    return RUNNING.includes(this._status.state);
   }
 
   toggle() {
-    if (this._told.recorder !== "ok" && this.mayRecord) toast(this._told.text);
-    else this._wish({ type: "record", on: !this.running });
+    if (this._status.recorder !== "ok" && this.mayRecord) toast(this._status.text);
+    else this._send({ type: "record", on: !this.running });
   }
 
   /** Sets a bookmark; without a name it gets a number. */
-  mark(name) {
-    this._wish({ type: "bookmark", name: name || `Mark ${this._told.bookmarks.length + 1}` });
+  mark(name = "") {
+    this._send({ type: "bookmark", name: name || `Mark ${this._status.bookmarks.length + 1}` });
   }
 
-  /** Shows a "recording" message. */
-  take(message) {
-    this._told = { bookmarks: [], snapshots: [], ...message };
-    const { number, text } = message.notice;
+  /** Shows the recorder's status. @param {RecordingStatus} status */
+  take(status) {
+    this._status = status;
+    const { number, text } = status.notice;
     if (this._notice !== null && number !== this._notice) toast(text);
     this._notice = number;
     this._showButton();
     this._showLists();
   }
 
-  _wish(message) {
+  /** @param {{type: string, [field: string]: unknown}} message */
+  _send(message) {
     if (!this.mayRecord) toast("This sign-in can watch and save images, but not record.");
     else if (!this.link.connected) toast("No connection to the server. Nothing was recorded or bookmarked.");
     else this.link.send(message);
@@ -58,54 +75,35 @@ export class Recording {
   _openMarks() {
     this.drive.stop("the bookmark dialog is open");
     this.link.away = true;
-    byId("marks").showModal();
+    elementOf("marks", HTMLDialogElement).showModal();
   }
 
   _showButton() {
-    const { recorder, state, seconds, bytes, text } = this._told, button = byId("record");
-    const amount = `${clock(seconds ?? 0)} · ${megabytes(bytes ?? 0)}`;
-    const shown = state === "recording" ? amount : BUSY[state] ?? "Record";
-    const usable = recorder === "ok" && this.mayRecord;
-    if (document.body.dataset.recording !== state) announce(state === "recording" ? "Recording" : BUSY[state] ?? "");
-    document.body.dataset.recording = state;
+    const { recorder, state, path, text } = this._status, button = byId("record"), shown = recordText(this._status);
+    if (document.body.dataset.recording !== state) announce(state === "recording" ? "Recording" : recorderText(state));
+    mark("recording", state);
     write(byId("record-text"), shown);
-    button.setAttribute("aria-pressed", this.running);
-    button.setAttribute("aria-disabled", !usable);
+    button.setAttribute("aria-pressed", String(this.running));
+    button.setAttribute("aria-disabled", String(recorder !== "ok" || !this.mayRecord));
     button.setAttribute("aria-label", this.running ? `Stop recording (${shown})` : shown);
-    button.title = text || (this.running ? this._told.path : "Record the drive (R)");
+    button.title = text || (this.running && path ? path : "Record the drive (R)");
   }
 
   _showLists() {
-    const { bookmarks, snapshots, free_bytes, cached_s } = this._told;
-    const marks = bookmarks.map(({ at, name, seconds, recording }) =>
-      `${at}  ${name}` + (recording ? `  (${clock(seconds)} in ${recording})` : ""));
-    list(byId("marks-list"), marks.reverse(), "None yet.");
-    list(byId("snapshots-list"), snapshots.map(({ name, state, words }) => `${name}: ${words || state}`).reverse(), "None yet.");
-    const room = free_bytes == null ? "" : ` · ${megabytes(free_bytes)} free on disk`;
-    write(byId("record-more"), cached_s === undefined ? this._told.text : `The last ${Math.round(cached_s)} s are in memory${room}`);
+    const { bookmarks, snapshots, free_bytes, cached_s, text } = this._status;
+    list(byId("marks-list"), bookmarks.map((one) =>
+      `${one.at}  ${one.name}` + (one.recording ? `  (${clockText(one.seconds)} in ${one.recording})` : "")));
+    list(byId("snapshots-list"), (snapshots ?? []).map((one) => `${one.name}: ${one.text || one.state}`));
+    const room = free_bytes === null ? "" : ` · ${bytesText(free_bytes)} free on disk`;
+    write(byId("record-more"), cached_s === null ? text : `The last ${Math.round(cached_s)} s are in memory${room}`);
   }
 }
 
-function clock(seconds) {
-  const whole = Math.floor(seconds ?? 0), minutes = Math.floor(whole / 60);
-  return `${minutes}:${String(whole % 60).padStart(2, "0")}`;
-}
-
-function megabytes(bytes) {
-  return bytes < 1e9 ? `${Math.round(bytes / 1e6)} MB` : `${(bytes / 1e9).toFixed(1)} GB`;
-}
-
-function write(element, text) {
-  if (element.textContent !== text) element.textContent = text;
-}
-
-function list(element, lines, none) {
-  const key = lines.join("\n");
-  if (element.dataset.key === key) return;
-  element.dataset.key = key;
-  element.replaceChildren(...(lines.length ? lines : [none]).map((line) => {
+/** Lists lines, newest first. @param {HTMLElement} element @param {string[]} lines */
+function list(element, lines) {
+  replaceItems(element, lines.length ? lines.reverse() : ["None yet."], (line) => {
     const item = document.createElement("li");
     item.textContent = line;
     return item;
-  }));
+  });
 }

@@ -1,35 +1,40 @@
+// @ts-check
 // Saves the view, the panorama and the map as files on the operator's machine.
 
 import { toast } from "./hud.js";
 
-/** Saves the shown view without the overlay, at the window's full resolution. `draw` renders it into the canvas. */
-export function savePicture(canvas, draw) {
+/**
+ * Saves the shown view without the overlay, at the window's full resolution. `render` renders it into the canvas.
+ * @param {HTMLCanvasElement} canvas @param {() => void} render
+ */
+export function saveView(canvas, render) {
   const { width, height } = canvas;
   canvas.width = Math.round(canvas.clientWidth * devicePixelRatio);
   canvas.height = Math.round(canvas.clientHeight * devicePixelRatio);
-  draw(); // WebGL discards the image after the task that rendered it
+  render(); // WebGL discards the image after the task that rendered it
   canvas.toBlob((blob) => {
-    if (blob) hand(blob, `picture_${stamp()}.png`);
+    if (blob) download(blob, `view_${stamp()}.png`);
     else toast("Not saved: the browser could not encode the image.");
   }, "image/png");
   canvas.width = width;
   canvas.height = height;
-  draw();
+  render();
 }
 
-/** Saves a file of the server: `path` under /export/. */
+/** Saves a file of the server. @param {string} path under /export/ */
 export async function saveFile(path) {
   try {
     const answer = await fetch(`/export/${path}`, { cache: "no-store" });
     if (!answer.ok) return toast(`Not saved: ${(await answer.text()).trim()}`);
     const name = /filename="([^"]+)"/.exec(answer.headers.get("Content-Disposition") ?? "")?.[1] ?? path;
-    hand(await answer.blob(), name);
+    download(await answer.blob(), name);
   } catch (error) {
-    toast(`Not saved: ${error.message}`);
+    toast(`Not saved: ${error instanceof Error ? error.message : error}`);
   }
 }
 
-function hand(blob, name) {
+/** @param {Blob} blob @param {string} name */
+function download(blob, name) {
   const link = document.createElement("a");
   link.href = URL.createObjectURL(blob);
   link.download = name;
@@ -39,7 +44,8 @@ function hand(blob, name) {
 }
 
 function stamp() {
-  const now = new Date(), two = (value) => String(value).padStart(2, "0");
-  const day = `${now.getFullYear()}${two(now.getMonth() + 1)}${two(now.getDate())}`;
+  /** @param {number} value */
+  const two = (value) => String(value).padStart(2, "0");
+  const now = new Date(), day = `${now.getFullYear()}${two(now.getMonth() + 1)}${two(now.getDate())}`;
   return `${day}_${two(now.getHours())}${two(now.getMinutes())}${two(now.getSeconds())}`;
 }

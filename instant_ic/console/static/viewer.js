@@ -1,4 +1,7 @@
+// @ts-check
 // The view in WebGL 2: panorama and rendered view in one projection and one pass.
+
+/** @import { Scene } from "./images.js" */
 
 const VERTEX = `#version 300 es
 out vec2 screen;
@@ -112,13 +115,16 @@ void main() {
 }`;
 
 /** Size of the samples, cells; each is the mean of SAMPLE_FINE × SAMPLE_FINE pixels. */
-export const SAMPLE = [40, 24], SAMPLE_FINE = 4;
+export const SAMPLE = /** @type {const} */ ([40, 24]), SAMPLE_FINE = 4;
 /** Largest motion over depth; nearer surfaces are moved by no more than this. */
 export const MOST_PARALLAX = 0.5;
 const MOST_REST_MS = 100; // longest pause between two frames that the CPU renders
 
-/** Throws when WebGL 2 is missing. */
+/** @typedef {{image: ImageBitmap, near_m: number}} Depth Grey; value v is the depth near_m * 255 / v along the axis. */
+/** @typedef {{1: number[], 2: number[], weights: number[]}} Samples Colours by kind of image. */
+
 export class GlViewer {
+  /** Throws when WebGL 2 is missing. @param {HTMLCanvasElement} canvas */
   constructor(canvas) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("WebGL 2 is missing");
@@ -132,10 +138,12 @@ export class GlViewer {
     this.lost = false;
     canvas.addEventListener("webglcontextlost", () => { this.lost = true; });
     this._program = link(gl, VERTEX, FRAGMENT);
+    /** @type {Map<string, WebGLUniformLocation | null>} */
     const places = new Map();
+    /** @param {string} name @returns {WebGLUniformLocation | null} */
     this._at = (name) => {
       if (!places.has(name)) places.set(name, gl.getUniformLocation(this._program, name));
-      return places.get(name);
+      return places.get(name) ?? null;
     };
     this._panorama = this._texture(0, gl.REPEAT);
     this._view = this._texture(1, gl.CLAMP_TO_EDGE);
@@ -148,8 +156,11 @@ export class GlViewer {
     this._hasMask = false;
     this._perInverse = 0; // 1/m; 0: depth unknown
     this._viewSize = [1, 1];
-    this._fence = null; // signalled when the CPU has rendered the last frame
-    this._drawnAt = 0;
+    /** @type {WebGLSync | null} Signalled when the CPU has rendered the last frame. */
+    this._fence = null;
+    /** @type {WebGLFramebuffer | null} */
+    this._samples = null;
+    this._renderedAt = 0;
     this._restUntil = 0;
     gl.useProgram(this._program);
     gl.uniform1i(this._at("panorama"), 0);
@@ -158,36 +169,35 @@ export class GlViewer {
     gl.uniform1i(this._at("depth"), 3);
   }
 
+  /** @param {ImageBitmap} bitmap */
   setPanorama(bitmap) {
     this._upload(0, this._panorama, bitmap);
     this._hasPanorama = true;
   }
 
   /**
-   * `mask`: small grey image, bright where the view was seen; null: everywhere.
-   * `depth`: {picture, near_m}: small grey image; value v is the depth near_m * 255 / v along the axis; null: unknown.
+   * @param {ImageBitmap} bitmap
+   * @param {OffscreenCanvas | null} mask small grey image, bright where the view was seen; null: everywhere
+   * @param {Depth | null} depth null: unknown
    */
-  setView(bitmap, mask = null, depth = null) {
+  setView(bitmap, mask, depth) {
     this._upload(1, this._view, bitmap);
     this._viewSize = [bitmap.width, bitmap.height];
     this.gl.generateMipmap(this.gl.TEXTURE_2D); // to blur unseen places
     this._hasMask = mask !== null;
     if (mask) this._upload(2, this._mask, mask);
     this._perInverse = depth ? 1 / depth.near_m : 0;
-    if (depth) this._upload(3, this._depth, depth.picture);
+    if (depth) this._upload(3, this._depth, depth.image);
   }
 
-  /**
-   * `scene`: tanHalf, panoramaFromLook, viewFromLook, viewTanHalf, blend, panoramaColour, viewColour; `moved`: motion of
-   * the camera since the view was rendered [forward, left, up] in the view's frame, m; null: none.
-   */
-  draw(scene) {
+  /** @param {Scene} scene */
+  render(scene) {
     const gl = this.gl;
-    this._draw(scene, this.canvas.width, this.canvas.height, 0);
+    this._render(scene, this.canvas.width, this.canvas.height, 0);
     if (!this.slow) return;
     if (this._fence) gl.deleteSync(this._fence);
     this._fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
-    this._drawnAt = performance.now();
+    this._renderedAt = performance.now();
     gl.flush();
   }
 
@@ -202,7 +212,7 @@ export class GlViewer {
       gl.deleteSync(this._fence);
       this._fence = null;
       const now = performance.now();
-      this._restUntil = now + Math.min(now - this._drawnAt, MOST_REST_MS);
+      this._restUntil = now + Math.min(now - this._renderedAt, MOST_REST_MS);
     }
     return performance.now() < this._restUntil;
   }
@@ -210,14 +220,16 @@ export class GlViewer {
   /**
    * Returns panorama and view without colour matching, small and in the same projection: {1: panorama, 2: view} with
    * 3 values per cell, 0..1, and `weights`, which are 0 where the view shows no seen place.
+   * @param {Scene} scene @returns {Samples}
    */
   sample(scene) {
     const gl = this.gl, width = SAMPLE[0] * SAMPLE_FINE, height = SAMPLE[1] * SAMPLE_FINE;
-    this._sampled ??= this._target(width, height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this._sampled);
+    this._samples ??= this._target(width, height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this._samples);
     const pixels = new Uint8Array(4 * width * height);
+    /** @param {number} only */
     const read = (only) => {
-      this._draw({ ...scene, blend: 1 }, width, height, only);
+      this._render({ ...scene, blend: 1 }, width, height, only);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
       return cells(pixels);
     };
@@ -226,7 +238,8 @@ export class GlViewer {
     return { 1: panorama.colours, 2: view.colours, weights: view.alpha };
   }
 
-  _draw(scene, width, height, only) {
+  /** @param {Scene} scene @param {number} width @param {number} height @param {number} only see the shader */
+  _render(scene, width, height, only) {
     const gl = this.gl;
     gl.viewport(0, 0, width, height);
     gl.uniform1i(this._at("only"), only);
@@ -256,6 +269,7 @@ export class GlViewer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  /** @param {number} width @param {number} height */
   _target(width, height) {
     const gl = this.gl, buffer = gl.createFramebuffer(), pixels = gl.createRenderbuffer();
     gl.bindRenderbuffer(gl.RENDERBUFFER, pixels);
@@ -265,6 +279,7 @@ export class GlViewer {
     return buffer;
   }
 
+  /** @param {number} unit @param {number} wrap */
   _texture(unit, wrap) {
     const gl = this.gl, texture = gl.createTexture();
     gl.activeTexture(gl.TEXTURE0 + unit);
@@ -277,6 +292,7 @@ export class GlViewer {
     return texture;
   }
 
+  /** @param {number} unit @param {WebGLTexture} texture @param {ImageBitmap | OffscreenCanvas} bitmap */
   _upload(unit, texture, bitmap) {
     const gl = this.gl;
     gl.activeTexture(gl.TEXTURE0 + unit);
@@ -285,7 +301,11 @@ export class GlViewer {
   }
 }
 
-/** Averages RGBA pixels over the cells: {colours: 3 per cell, alpha: 1 per cell}, 0..1. */
+/**
+ * Averages RGBA pixels over the cells: 3 colours and 1 alpha per cell, 0..1.
+ * @param {Uint8Array | Uint8ClampedArray} pixels
+ * @returns {{colours: number[], alpha: number[]}}
+ */
 export function cells(pixels) {
   const [columns, rows] = SAMPLE, fine = SAMPLE_FINE, share = 1 / (255 * fine * fine);
   const colours = new Array(3 * columns * rows).fill(0), alpha = new Array(columns * rows).fill(0);
@@ -297,10 +317,13 @@ export function cells(pixels) {
   return { colours, alpha };
 }
 
+/** @param {WebGL2RenderingContext} gl @param {string} vertexSource @param {string} fragmentSource */
 function link(gl, vertexSource, fragmentSource) {
   const program = gl.createProgram();
-  for (const [type, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
+  for (const { type, source } of [
+    { type: gl.VERTEX_SHADER, source: vertexSource }, { type: gl.FRAGMENT_SHADER, source: fragmentSource }]) {
     const shader = gl.createShader(type);
+    if (!shader) throw new Error("the WebGL context is lost");
     gl.shaderSource(shader, source);
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(`shader: ${gl.getShaderInfoLog(shader)}`);

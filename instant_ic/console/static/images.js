@@ -1,9 +1,35 @@
+// @ts-check
 // The newest panorama and rendered view, and the scene composed of them.
 
+/** @import { Colour } from "./colour.js" */
+/** @import { FlatViewer } from "./flatviewer.js" */
+/** @import { Link } from "./link.js" */
+/** @import { Look } from "./look.js" */
+/** @import { Mat3, Vec3 } from "./math.js" */
+/** @import { PanoramaFrame, PanoramaHeader, State, ViewFrame, ViewHeader } from "./messages.js" */
+/** @import { Settings } from "./settings.js" */
+/** @import { Depth, GlViewer } from "./viewer.js" */
 import { coloured, fitColour, plain, Releasing } from "./colour.js";
-import { PANORAMA, VIEW } from "./link.js";
+import { offscreen } from "./dom.js";
 import { fromQuaternion, identity, lookRotation, multiply, rotate, rotationZ, transpose } from "./math.js";
+import { PANORAMA, VIEW } from "./messages.js";
 import { Motion, SMOOTHING_MS } from "./motion.js";
+
+/** @typedef {GlViewer | FlatViewer} Viewer */
+/** @typedef {1 | 2} Kind PANORAMA or VIEW. */
+/** @typedef {Omit<ViewHeader, "mask" | "depth"> & {aspect: number, hasDepth: boolean}} View */
+/**
+ * @typedef {object} Scene
+ * @property {[number, number]} tanHalf of the shown field of view: horizontal, vertical
+ * @property {Mat3} mapFromLook
+ * @property {Mat3} panoramaFromLook
+ * @property {Mat3} viewFromLook
+ * @property {[number, number]} viewTanHalf of the rendered view
+ * @property {Vec3 | null} moved motion of the camera since the view was rendered: forward, left, up in its frame, m
+ * @property {number} blend 0 panorama, 1 view
+ * @property {Colour} panoramaColour
+ * @property {Colour} viewColour
+ */
 
 const STALE_MS = 2000;
 // Longest wait for an image made after the change of mode; afterwards the best available is shown.
@@ -12,11 +38,14 @@ const RELEASE_STEP_MS = 100; // the matched colour fades in steps too small to b
 const LEAST_M = 0.0005; // smallest motion of a view that is rendered
 const ELSEWHERE_M = 1; // a view rendered farther away shows another place
 
-export class Pictures {
+export class Images {
+  /** @param {Viewer} viewer @param {Link} link */
   constructor(viewer, link) {
     this.viewer = viewer;
     this.link = link;
-    this.panorama = null; // header of the newest one
+    /** @type {PanoramaHeader | null} */
+    this.panorama = null;
+    /** @type {View | null} */
     this.view = null;
     this.blend = 0;
     this.dissolveMs = 250;
@@ -24,8 +53,10 @@ export class Pictures {
     this.changed = true;
     this.motion = new Motion();
     this.leadMaxM = 0; // largest distance by which a view is moved from its rendered position; 0: never moved
-    this.place = null; // position [x, y] in the map frame from which the view is shown
-    this._now = null; // position of the v-bot's camera
+    /** @type {[number, number] | null} Position in the map frame from which the view is shown. */
+    this.place = null;
+    /** @type {[number, number] | null} Position of the v-bot's camera. */
+    this._now = null;
     this._lead = 0; // 0: rendered position, 1: present position of the v-bot
     this._virtual = false;
     // Time since which images of each kind are made at the shown robot; server's clock.
@@ -36,28 +67,27 @@ export class Pictures {
     this._toward = 0;
     this._colours = { [PANORAMA]: new Releasing(), [VIEW]: new Releasing() };
     this._colouredAt = 0;
+    /** @type {Record<Kind, number[]>} */
     this._arrivals = { [PANORAMA]: [], [VIEW]: [] };
   }
 
-  /** Time in which a colour matched at a switch fades out; 0: colours are not matched. */
+  /** @param {Settings} settings */
+  configure(settings) {
+    this.dissolveMs = settings.dissolveMs;
+    this.motion.easeMs = settings.easeMs;
+    this.leadMaxM = settings.leadMaxM;
+    this.colourReleaseMs = settings.colourReleaseMs;
+  }
+
+  /** Time in which a colour matched at a switch fades out; 0: colours are not matched. @param {number} value */
   set colourReleaseMs(value) {
     for (const colour of Object.values(this._colours)) colour.releaseMs = value;
   }
 
-  /** Decodes an image frame, passes it to the viewer, then acknowledges it. */
+  /** Decodes an image, passes it to the viewer, then acknowledges it. @param {PanoramaFrame | ViewFrame} frame */
   async take(frame) {
     try {
-      const { mask: maskText, depth: depthText, ...header } = frame.header;
-      const [bitmap, mask, depth] = await Promise.all([
-        decoded(frame.payload), decodedMask(maskText), decodedDepth(depthText, header.depth_near_m)]);
-      if (frame.kind === PANORAMA) {
-        this.viewer.setPanorama(bitmap);
-        this.panorama = header;
-      } else {
-        this.viewer.setView(bitmap, mask, depth);
-        this.view = { ...header, aspect: bitmap.width / bitmap.height, hasDepth: depth !== null };
-      }
-      depth?.picture.close();
+      const bitmap = frame.kind === VIEW ? await this._takeView(frame) : await this._takePanorama(frame);
       if (this.viewer.name === "webgl") bitmap.close();
       this.changed = true;
       const arrivals = this._arrivals[frame.kind];
@@ -65,13 +95,32 @@ export class Pictures {
       if (arrivals.length > 30) arrivals.shift();
     } catch (error) {
       this.decodeErrors++;
-      console.warn(`picture ${frame.sequence} of kind ${frame.kind}: ${error}`);
+      console.warn(`image ${frame.sequence} of kind ${frame.kind}: ${error}`);
     } finally {
       this.link.acknowledge(frame);
     }
   }
 
-  /** Images of a kind per second, over the last 3 s. */
+  /** @param {PanoramaFrame} frame */
+  async _takePanorama(frame) {
+    const bitmap = await decoded(frame.payload);
+    this.viewer.setPanorama(bitmap);
+    this.panorama = frame.header;
+    return bitmap;
+  }
+
+  /** @param {ViewFrame} frame */
+  async _takeView(frame) {
+    const { mask: maskText, depth: depthText, ...header } = frame.header;
+    const [bitmap, mask, depth] = await Promise.all([
+      decoded(frame.payload), decodedMask(maskText), decodedDepth(depthText, header.depth_near_m)]);
+    this.viewer.setView(bitmap, mask, depth);
+    this.view = { ...header, aspect: bitmap.width / bitmap.height, hasDepth: depth !== null };
+    depth?.image.close();
+    return bitmap;
+  }
+
+  /** Images of a kind per second, over the last 3 s. @param {Kind} kind */
   rate(kind) {
     const now = performance.now();
     const recent = this._arrivals[kind].filter((t) => now - t < 3000);
@@ -95,23 +144,30 @@ export class Pictures {
     return age !== null && age > STALE_MS;
   }
 
-  /** Advances by `elapsedMs` and returns the scene for the viewer. `state` is the newest state message. */
+  /**
+   * Advances by `elapsedMs` and returns the scene for the viewer.
+   * @param {State | null} state newest state message
+   * @param {Pick<Look, "yaw" | "pitch">} look @param {[number, number]} tanHalf @param {number} elapsedMs
+   * @returns {Scene}
+   */
   scene(state, look, tanHalf, elapsedMs) {
     const now = performance.now();
     const starts = this._step(state, elapsedMs);
     this._follow(state, elapsedMs);
     const lookTurn = lookRotation(look.yaw, look.pitch);
     const mapFromLook = multiply(rotationZ(this.motion.yaw ?? 0), lookTurn);
-    const relative = (header) => multiply(transpose(fromQuaternion(header.q)), mapFromLook);
-    const panoramaKnown = this.panorama?.q && this.motion.yaw !== null;
+    /** @param {[number, number, number, number]} q */
+    const relative = (q) => multiply(transpose(fromQuaternion(q)), mapFromLook);
+    const q = this.motion.yaw === null ? null : this.panorama?.q;
     const viewTan = this.view ? Math.tan(this.view.fov / 2) : 1;
+    /** @type {Scene} */
     const scene = {
       tanHalf,
       mapFromLook,
-      panoramaFromLook: panoramaKnown ? relative(this.panorama) : lookTurn,
-      viewFromLook: this.view ? relative(this.view) : identity,
+      panoramaFromLook: q ? relative(q) : lookTurn,
+      viewFromLook: this.view ? relative(this.view.q) : identity,
       viewTanHalf: [viewTan, viewTan / (this.view?.aspect ?? 1)],
-      moved: this.view ? this._moved(state, elapsedMs) : null,
+      moved: this.view ? this._moved(this.view, state, elapsedMs) : null,
       blend: this.blend * this.blend * (3 - 2 * this.blend),
       panoramaColour: plain,
       viewColour: plain,
@@ -126,15 +182,16 @@ export class Pictures {
   /**
    * Motion of the camera since the view was rendered, in the view's frame; null: too small to be seen. `state.lead` is the
    * share of the way to the v-bot's present position; at a switch it is 0, so that each image is where it was made.
+   * @param {View} view @param {State | null} state @param {number} elapsedMs @returns {Vec3 | null}
    */
-  _moved(state, elapsedMs) {
-    const { p, q, mount, hasDepth } = this.view, own = this.motion.own;
+  _moved({ p, q, mount, hasDepth }, state, elapsedMs) {
+    const own = this.motion.own;
     this._lead += ((state?.lead ?? 0) - this._lead) * (1 - Math.exp(-elapsedMs / SMOOTHING_MS));
-    if (mount && own && this._virtual) {
+    if (own && this._virtual) {
       const [x, y] = rotate(rotationZ(own[2]), mount);
       this._now = [own[0] + x, own[1] + y];
     }
-    this.place = p.slice(0, 2);
+    this.place = [p[0], p[1]];
     if (!hasDepth || !this._now || this.leadMaxM <= 0) return null;
     const way = [this._now[0] - p[0], this._now[1] - p[1]], far = Math.hypot(...way);
     const share = far > ELSEWHERE_M ? 0 : Math.min(this._lead, this.leadMaxM / far);
@@ -143,7 +200,10 @@ export class Pictures {
     return rotate(transpose(fromQuaternion(q)), [share * way[0], share * way[1], 0]);
   }
 
-  /** Advances the dissolve; returns true when one starts from an image that was shown alone. */
+  /**
+   * Advances the dissolve; returns true when one starts from an image that was shown alone.
+   * @param {State | null} state @param {number} elapsedMs
+   */
   _step(state, elapsedMs) {
     const virtual = shows(state) === "virtual";
     const at = state?.at_ms ?? 0;
@@ -170,22 +230,24 @@ export class Pictures {
     return starts;
   }
 
-  /** Whether the newest image of a kind may be shown: it was made since the switch, or the wait is over. */
+  /** Whether the newest image of a kind may be shown: made since the switch, or the wait is over. @param {Kind} kind */
   _fits(kind) {
     const header = kind === VIEW ? this.view : this.panorama;
     if (!header) return kind === PANORAMA;
-    return header.captured_ms >= this._since[kind] || this.link.serverNow() - this._changedAt > WAIT_MS[kind];
+    return header.captured_ms >= this._since[kind] || (this.link.serverNow() ?? 0) - this._changedAt > WAIT_MS[kind];
   }
 
-  /** Matches the colours of the new image to the old one; both show the same place. */
+  /** Matches the colours of the new image to the old one; both show the same place. @param {Scene} scene @param {number} now */
   _match(scene, now) {
     if (this._colours[VIEW].releaseMs <= 0) return;
     const seen = this.viewer.sample(scene);
+    /** @type {[Kind, Kind]} */
     const [comes, goes] = this._toward ? [VIEW, PANORAMA] : [PANORAMA, VIEW];
     const shown = coloured(seen[goes], this._colours[goes].at(now));
     this._colours[comes].set(fitColour(seen[comes], shown, seen.weights), now);
   }
 
+  /** @param {number} now */
   _release(now) {
     const active = Object.values(this._colours).some((colour) => colour.active);
     if (!active || now - this._colouredAt < RELEASE_STEP_MS) return;
@@ -193,30 +255,34 @@ export class Pictures {
     this.changed = true;
   }
 
-  /** Updates the pose of the shown robot between the state messages. */
+  /** Updates the pose of the shown robot between the state messages. @param {State | null} state @param {number} elapsedMs */
   _follow(state, elapsedMs) {
-    const robot = shows(state) === "virtual" ? "virtual" : "real";
-    const pose = robot === "virtual" ? (state.vbot ?? state.robot) : state?.robot;
+    const robot = shows(state), pose = robot === "virtual" ? (state?.vbot ?? state?.robot) : state?.robot;
     const age = state ? (this.link.serverNow() ?? state.at_ms) - state.at_ms : 0;
     this.motion.follow(robot, pose, state?.twist ?? [0, 0], age, elapsedMs);
   }
 }
 
-/** Which robot the operator sees and drives: "real" or "virtual". */
-export const shows = (state) => state?.shown ?? (state?.mode === "virtual" ? "virtual" : "real");
+/** Which robot the operator sees and drives. @param {State | null} state @returns {"real" | "virtual"} */
+export const shows = (state) => (state?.shown === "virtual" ? "virtual" : "real");
 
+/** @param {Blob} blob */
 const decoded = (blob) => createImageBitmap(blob, { colorSpaceConversion: "none" });
 
+/** @param {string} text base64 */
 const decodedPng = (text) =>
   decoded(new Blob([Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0))], { type: "image/png" }));
 
-/** Decodes the depth image of a view (base64 PNG); null if it is missing or unusable. */
+/**
+ * Decodes the depth image of a view (base64 PNG); null if it is missing or unusable.
+ * @param {string} text @param {number} near_m @returns {Promise<Depth | null>}
+ */
 async function decodedDepth(text, near_m) {
   if (!text || !(near_m > 0)) return null;
   try {
-    return { picture: await decodedPng(text), near_m };
+    return { image: await decodedPng(text), near_m };
   } catch (error) {
-    console.warn(`the depth of a view cannot be read, it is shown from where it was drawn: ${error}`);
+    console.warn(`the depth of a view cannot be decoded; the view stays at its rendered position: ${error}`);
     return null;
   }
 }
@@ -224,12 +290,12 @@ async function decodedDepth(text, near_m) {
 /**
  * Decodes the mask of a view (base64 PNG); null if all of it was seen. The mask is much coarser than the view, so each
  * pixel takes the minimum of its neighbourhood: then no unseen place shows at the edges.
+ * @param {string} text
  */
 async function decodedMask(text) {
   if (!text) return null;
   const bitmap = await decodedPng(text);
-  const { width, height } = bitmap, canvas = new OffscreenCanvas(width, height);
-  const context = canvas.getContext("2d", { willReadFrequently: true });
+  const { width, height } = bitmap, context = offscreen(width, height);
   context.drawImage(bitmap, 0, 0);
   bitmap.close();
   const image = context.getImageData(0, 0, width, height), seen = image.data.filter((_, i) => i % 4 === 0);
@@ -241,5 +307,5 @@ async function decodedMask(text) {
       image.data.fill(least, 4 * (y * width + x), 4 * (y * width + x) + 3);
     }
   context.putImageData(image, 0, 0);
-  return canvas;
+  return context.canvas;
 }

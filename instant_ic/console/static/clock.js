@@ -1,0 +1,56 @@
+// @ts-check
+// Estimate of the server's clock and quality of the link, from the round trips of pings.
+
+const KEPT = 100;
+const QUALITY_SAMPLES = 10;
+
+export class ServerClock {
+  constructor() {
+    /** @type {{roundTrip: number, offset: number}[]} */
+    this._samples = [];
+    /** @type {number | null} */
+    this._offsetMs = null;
+  }
+
+  /** Forgets all round trips: a new connection may lead to a restarted server. */
+  reset() {
+    this._samples = [];
+    this._offsetMs = null;
+  }
+
+  /**
+   * Notes an answer that arrived at `nowMs` of this page's clock.
+   * @param {number} sentMs @param {number} serverMs @param {number} nowMs
+   */
+  take(sentMs, serverMs, nowMs) {
+    const roundTrip = nowMs - sentMs;
+    this._samples.push({ roundTrip, offset: serverMs + roundTrip / 2 - nowMs });
+    if (this._samples.length > KEPT) this._samples.shift();
+    // The fastest answer was delayed least, so its offset is the most accurate.
+    this._offsetMs = this._samples.reduce((a, b) => (b.roundTrip < a.roundTrip ? b : a)).offset;
+  }
+
+  /** Time of the server's clock at `nowMs`, ms; null before the first answer. @param {number} nowMs */
+  at(nowMs) {
+    return this._offsetMs === null ? null : nowMs + this._offsetMs;
+  }
+
+  /** Median round trip of the last 40 answers, ms; null before the first. */
+  get roundTripMs() {
+    const recent = this._sorted(40);
+    return recent[recent.length >> 1] ?? null;
+  }
+
+  /** Quality of the link by median and 90th percentile of the round trip; null until it is known. */
+  get quality() {
+    if (this._samples.length < QUALITY_SAMPLES) return null;
+    const sorted = this._sorted(60), usual = sorted[sorted.length >> 1], slow = sorted[Math.floor(sorted.length * 0.9)];
+    if (usual <= 80 && slow <= 150) return "good";
+    return usual <= 200 && slow <= 400 ? "fair" : "poor";
+  }
+
+  /** @param {number} count */
+  _sorted(count) {
+    return this._samples.slice(-count).map((sample) => sample.roundTrip).sort((a, b) => a - b);
+  }
+}

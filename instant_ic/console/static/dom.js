@@ -1,0 +1,40 @@
+// @ts-check
+// Access to the page's elements.
+
+/** Element of index.html by its id; an error if it is missing. @param {string} id */
+export function byId(id) {
+  const element = document.getElementById(id);
+  if (!element) throw new Error(`index.html has no element #${id}`);
+  return element;
+}
+
+/** @template {Element} T @param {string} id @param {new () => T} type @returns {T} */
+export function elementOf(id, type) {
+  const element = byId(id);
+  if (!(element instanceof type)) throw new Error(`#${id} of index.html is no ${type.name}`);
+  return element;
+}
+
+/** 2D context of a canvas. @param {HTMLCanvasElement} canvas @param {CanvasRenderingContext2DSettings} [options] */
+export function context2d(canvas, options) {
+  const context = canvas.getContext("2d", options);
+  if (!context) throw new Error("2D canvas is missing");
+  return context;
+}
+
+/** 2D context of a canvas outside the page, for reading pixels. @param {number} width @param {number} height */
+export function offscreen(width, height) {
+  const context = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  if (!context) throw new Error("2D canvas is missing");
+  return context;
+}
+
+/** Sets an element's text if it has changed: screen readers would repeat it. @param {Element} element @param {string} text */
+export function write(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** Sets a data attribute of the page, for styles and tests, if it has changed. @param {string} name @param {string} value */
+export function mark(name, value) {
+  if (document.body.dataset[name] !== value) document.body.dataset[name] = value;
+}

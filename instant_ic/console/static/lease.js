@@ -1,0 +1,67 @@
+// @ts-check
+// The right to drive: who has it, and how this page gets it and gives it back.
+
+/** @import { Link } from "./link.js" */
+/** @import { Session } from "./messages.js" */
+
+export const WATCH_ONLY = "This sign-in can watch and stop the robot, but not drive it.";
+export const OTHER_DRIVES = "Another operator is driving. Press Take over to drive.";
+
+/** Event "change" when the server has reported the session, or the link was lost. */
+export class Lease extends EventTarget {
+  /** @param {Link} link */
+  constructor(link) {
+    super();
+    this.link = link;
+    this.mayDrive = true; // false: signed in to watch
+    /** @type {Session["driver"]} */
+    this.driver = "none";
+    this.clients = 0;
+    this.estop = false;
+    this._handedOver = false; // the operator gave the lease back
+    link.addEventListener("open", () => {
+      if (this.mayDrive) this._request(false);
+    });
+    link.addEventListener("lost", () => {
+      this.driver = "none";
+      this.dispatchEvent(new Event("change"));
+    });
+  }
+
+  /** Whether drive commands of this page count. */
+  get drives() {
+    return this.driver === "you" && !this.estop;
+  }
+
+  /** @param {Session} session */
+  take(session) {
+    // The lease timed out and was not given back: request it again. Keys must be pressed again.
+    if (this.driver === "you" && session.driver === "none" && !this._handedOver) this._request(false);
+    this.driver = session.driver;
+    this.clients = session.clients;
+    this.estop = session.estop;
+    this.dispatchEvent(new Event("change"));
+  }
+
+  /** Requests the lease if nobody drives; otherwise returns the reason for the operator. */
+  request() {
+    if (!this.mayDrive) return WATCH_ONLY;
+    if (this.driver === "none") this._request(false);
+    return this.driver === "other" ? OTHER_DRIVES : "";
+  }
+
+  takeOver() {
+    this._handedOver = false;
+    this._request(true);
+  }
+
+  handOver() {
+    this._handedOver = true;
+    this.link.send({ type: "yield" });
+  }
+
+  /** @param {boolean} take */
+  _request(take) {
+    this.link.send({ type: "lease", take });
+  }
+}

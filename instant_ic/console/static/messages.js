@@ -1,0 +1,199 @@
+// @ts-check
+// Messages of the server, checked where they arrive; docs/console.md lists their fields.
+
+/** @template T @typedef {(value: unknown, name: string) => T} Reader */
+
+/** A message that violates the protocol; the text names the field. */
+export class MessageError extends Error {}
+
+/** @param {string} name @param {string} wanted @param {unknown} value @returns {never} */
+function refuse(name, wanted, value) {
+  throw new MessageError(`${name} must be ${wanted} (got ${String(JSON.stringify(value)).slice(0, 40)})`);
+}
+
+/** @type {Reader<number>} */
+const number = (value, name) =>
+  typeof value === "number" && Number.isFinite(value) ? value : refuse(name, "a finite number", value);
+
+/** @type {Reader<string>} */
+const text = (value, name) => (typeof value === "string" ? value : refuse(name, "a text", value));
+
+/** @type {Reader<boolean>} */
+const flag = (value, name) => (typeof value === "boolean" ? value : refuse(name, "true or false", value));
+
+/** @template {string} T @param {...T} values @returns {Reader<T>} */
+const oneOf = (...values) => (value, name) =>
+  values.find((known) => known === value) ?? refuse(name, `one of ${values.join(", ")}`, value);
+
+/** A field that may be missing or null. @template T @param {Reader<T>} read @returns {Reader<T | null>} */
+const optional = (read) => (value, name) => (value === null || value === undefined ? null : read(value, name));
+
+/** @template T @param {Reader<T>} read @returns {Reader<T[]>} */
+const list = (read) => (value, name) =>
+  Array.isArray(value) ? value.map((one, i) => read(one, `${name}[${i}]`)) : refuse(name, "a list", value);
+
+/** @param {unknown} value @param {string} name @param {number} length */
+function numbers(value, name, length) {
+  const found = list(number)(value, name);
+  return found.length === length ? found : refuse(name, `${length} numbers`, value);
+}
+
+/** @type {Reader<[number, number]>} */
+const pair = (value, name) => /** @type {[number, number]} */ (numbers(value, name, 2));
+/** @type {Reader<[number, number, number]>} */
+const triple = (value, name) => /** @type {[number, number, number]} */ (numbers(value, name, 3));
+/** @type {Reader<[number, number, number, number]>} */
+const quaternion = (value, name) => /** @type {[number, number, number, number]} */ (numbers(value, name, 4));
+
+/**
+ * Reads an object; fields that are not listed are dropped.
+ * @template {Record<string, Reader<unknown>>} F
+ * @param {F} fields
+ * @returns {Reader<{[K in keyof F]: ReturnType<F[K]>}>}
+ */
+const object = (fields) => (value, name) => {
+  if (typeof value !== "object" || value === null || Array.isArray(value)) return refuse(name, "an object", value);
+  const given = /** @type {Record<string, unknown>} */ (value);
+  const read = Object.entries(fields).map(([key, reader]) => [key, reader(given[key], `${name}.${key}`)]);
+  return Object.fromEntries(read);
+};
+
+const page = object({
+  dissolve_ms: optional(number),
+  ease_ms: optional(number),
+  colour_release_s: optional(number),
+  lead_max_m: optional(number),
+  footprint: optional(pair),
+  camera: optional(triple),
+});
+const hello = object({
+  type: oneOf("hello"), max_linear: number, max_angular: number, may_drive: flag, page,
+});
+const pong = object({
+  type: oneOf("pong"), client_ms: number, server_ms: number, command_age_ms: optional(number), command_hz: number,
+});
+const session = object({
+  type: oneOf("session"), driver: oneOf("you", "other", "none"), clients: number, estop: flag,
+});
+const state = object({
+  type: oneOf("state"),
+  at_ms: number,
+  mode: oneOf("real", "entering", "virtual", "returning", "stopped", "none"),
+  shown: oneOf("real", "virtual", "none"),
+  lead: number,
+  robot: optional(triple),
+  vbot: optional(triple),
+  twist: pair,
+  reason: optional(text),
+  estop: optional(flag),
+  command: optional(list(optional(number))),
+});
+const plan = object({
+  type: oneOf("plan"), trajectory: list(pair), path: list(pair), subgoal: optional(triple),
+});
+const vspace = object({
+  state: oneOf("empty", "training", "ready", "failed"),
+  psnr_db: number,
+  expected_psnr_db: number,
+  unseen_share: number,
+  radius_m: number,
+  train_seconds: number,
+  message: text,
+});
+const health = object({
+  type: oneOf("health"),
+  vspace: optional(vspace),
+  battery: optional(object({ voltage: number, percent: optional(number) })),
+  faults: list(object({ level: oneOf("warn", "error"), name: text, text })),
+});
+const recording = object({
+  type: oneOf("recording"),
+  recorder: oneOf("ok", "missing"),
+  text,
+  state: text,
+  path: optional(text),
+  seconds: optional(number),
+  bytes: optional(number),
+  free_bytes: optional(number),
+  cached_s: optional(number),
+  snapshots: optional(list(object({ name: text, state: text, text }))),
+  bookmarks: list(object({ name: text, at: text, seconds: optional(number), recording: text })),
+  notice: object({ number, text, level: text }),
+});
+const refused = object({
+  type: oneOf("refused"), reason: oneOf("not_driver", "watch_only", "old", "out_of_order", "stopped"), text,
+});
+const error = object({ type: oneOf("error"), text });
+
+/** @typedef {ReturnType<typeof hello>} Hello */
+/** @typedef {ReturnType<typeof pong>} Pong */
+/** @typedef {ReturnType<typeof session>} Session */
+/** @typedef {ReturnType<typeof state>} State */
+/** @typedef {ReturnType<typeof plan>} Plan */
+/** @typedef {ReturnType<typeof health>} Health */
+/** @typedef {ReturnType<typeof vspace>} Vspace */
+/** @typedef {ReturnType<typeof recording>} RecordingStatus */
+/** @typedef {ReturnType<typeof refused>} Refused */
+/** @typedef {Hello | Pong | Session | State | Plan | Health | RecordingStatus | Refused | ReturnType<typeof error>} Message */
+
+/** @type {Record<string, Reader<Message>>} */
+const MESSAGES = { hello, pong, session, state, plan, health, recording, refused, error };
+
+/**
+ * Parses a text message; throws MessageError, which names the wrong field.
+ * @param {string} json
+ * @returns {Message}
+ */
+export function parseMessage(json) {
+  const value = parsed(json);
+  const type = typeof value === "object" && value !== null && "type" in value ? String(value.type) : "";
+  const read = Object.hasOwn(MESSAGES, type) ? MESSAGES[type] : undefined;
+  return read ? read(value, type) : refuse("type", `one of ${Object.keys(MESSAGES).join(", ")}`, type);
+}
+
+/** @param {string} json @returns {unknown} */
+function parsed(json) {
+  try {
+    return JSON.parse(json);
+  } catch (fault) {
+    throw new MessageError(`not valid JSON: ${fault}`);
+  }
+}
+
+// ---- binary frames -------------------------------------------------------------------------------
+
+export const PANORAMA = 1, VIEW = 2, MAP = 3, COSTMAP = 4;
+const PREFIX_BYTES = 12;
+const VERSION = 1;
+
+const panoramaHeader = object({ captured_ms: number, q: optional(quaternion) });
+const viewHeader = object({
+  captured_ms: number, q: quaternion, p: triple, fov: number, mask: text, depth: text, depth_near_m: number, mount: triple,
+});
+const gridHeader = object({ resolution: number, width: number, height: number, x: number, y: number });
+
+/** @typedef {ReturnType<typeof panoramaHeader>} PanoramaHeader */
+/** @typedef {ReturnType<typeof viewHeader>} ViewHeader */
+/** @typedef {ReturnType<typeof gridHeader>} GridHeader */
+/** @typedef {{kind: 1, sequence: number, header: PanoramaHeader, payload: Blob}} PanoramaFrame */
+/** @typedef {{kind: 2, sequence: number, header: ViewHeader, payload: Blob}} ViewFrame */
+/** @typedef {{kind: 3 | 4, sequence: number, header: GridHeader, payload: Blob}} GridFrame */
+/** @typedef {PanoramaFrame | ViewFrame | GridFrame} Frame */
+
+/** Decodes a binary frame; throws MessageError. @param {ArrayBuffer} buffer @returns {Frame} */
+export function decodeFrame(buffer) {
+  const view = new DataView(buffer), size = buffer.byteLength;
+  if (size < PREFIX_BYTES) return refuse("frame", `at least ${PREFIX_BYTES} bytes long`, size);
+  if (view.getUint8(0) !== VERSION) return refuse("frame.version", String(VERSION), view.getUint8(0));
+  const kind = view.getUint8(1), sequence = view.getUint32(4, true), headerEnd = PREFIX_BYTES + view.getUint32(8, true);
+  if (headerEnd > size) return refuse("frame", `at least ${headerEnd} bytes long`, size);
+  const header = parsed(new TextDecoder().decode(new Uint8Array(buffer, PREFIX_BYTES, headerEnd - PREFIX_BYTES)));
+  const payload = new Blob([new Uint8Array(buffer, headerEnd)]);
+  switch (kind) {
+    case PANORAMA: return { kind, sequence, header: panoramaHeader(header, "panorama"), payload };
+    case VIEW: return { kind, sequence, header: viewHeader(header, "view"), payload };
+    case MAP:
+    case COSTMAP: return { kind, sequence, header: gridHeader(header, "grid"), payload };
+    default: return refuse("frame.kind", "1 to 4", kind);
+  }
+}

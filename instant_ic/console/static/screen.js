@@ -1,0 +1,182 @@
+// @ts-check
+// Renders the page once per frame of the display: main image, trajectory, compass and map; each only if it has changed.
+
+/** @import { Settings } from "./settings.js" */
+/** @import { Plan, State } from "./messages.js" */
+/** @import { Images, Scene, Viewer } from "./images.js" */
+/** @import { Lease } from "./lease.js" */
+/** @import { Link } from "./link.js" */
+/** @import { Look } from "./look.js" */
+/** @import { Vec3 } from "./math.js" */
+import { byId, elementOf, mark } from "./dom.js";
+import { drawCompass, drawGuide } from "./guide.js";
+import { showLatency } from "./hud.js";
+import { shows } from "./images.js";
+import { radians, transpose } from "./math.js";
+import { MiniMap } from "./minimap.js";
+import { saveView } from "./save.js";
+import { DEFAULTS } from "./settings.js";
+
+const LOOK_MS = 100; // shortest interval between two look messages
+const MAX_FOV = radians(149);
+const LATENCY_MS = 250;
+const SLOW_FRAME_MS = 45; // shortest frame time when the CPU renders, with fewer pixels
+const SLOW_PIXELS = 0.5;
+const SLOW_MAP_MS = 200;
+const COLOURS = { real: "#45c4b0", entering: "#45c4b0", virtual: "#f0ac45", returning: "#f0ac45", stopped: "#ff6b57", none: "#a3adb8" };
+
+export class Screen {
+  /** @param {Viewer} viewer @param {Images} images @param {Look} look @param {Link} link @param {Lease} lease */
+  constructor(viewer, images, look, link, lease) {
+    this.viewer = viewer;
+    this.images = images;
+    this.look = look;
+    this.link = link;
+    this.lease = lease;
+    this.minimap = new MiniMap(elementOf("map-canvas", HTMLCanvasElement));
+    /** @type {State | null} The newest state message. */
+    this.state = null;
+    /** @type {Pick<Plan, "trajectory" | "path" | "subgoal">} The newest plan message. */
+    this.plan = { trajectory: [], path: [], subgoal: null };
+    /** @type {Settings} */
+    this.settings = DEFAULTS;
+    this._guide = elementOf("guide", HTMLCanvasElement);
+    this._compass = elementOf("compass-tape", HTMLCanvasElement);
+    this._frameAt = performance.now();
+    this._latencyAt = this._mapAt = this._lookAt = 0;
+    this._sentLook = this._viewKey = this._guideKey = this._mapKey = "";
+    link.addEventListener("open", () => { this._sentLook = ""; });
+    document.addEventListener("visibilitychange", () => { this._frameAt = performance.now(); });
+  }
+
+  /** Sends the look direction, and renders what has changed. @param {number} now ms of this page's clock */
+  frame(now) {
+    const sinceFrame = now - this._frameAt;
+    if (this.viewer.slow && (this.viewer.busy || sinceFrame < (this.images.changed ? SLOW_FRAME_MS / 2 : SLOW_FRAME_MS))) return;
+    const elapsed = Math.min(sinceFrame, 200);
+    this._frameAt = now;
+    this.look.step(elapsed / 1000);
+    const tanHalf = this._tanHalf();
+    this._sendLook(tanHalf, now);
+    const scene = this.images.scene(this.state, this.look, tanHalf, elapsed);
+    this._renderView(scene);
+    this._drawOverlay(scene, tanHalf);
+    this._drawMap(tanHalf, now);
+    if (now - this._latencyAt > LATENCY_MS) {
+      this._latencyAt = now;
+      showLatency(this.link, this.images);
+      mark("image", this.images.shown ? (this.images.stale ? "stale" : "live") : "none");
+    }
+    // For tests and debugging.
+    mark("blend", scene.blend.toFixed(2));
+    mark("map", this.minimap.hasMap ? "drawn" : "none");
+  }
+
+  enlargeMap() {
+    const large = this.minimap.large = byId("map").classList.toggle("large");
+    byId("map-size").setAttribute("aria-label", large ? "Shrink the map" : "Enlarge the map");
+    this.minimap.changed = true;
+  }
+
+  /** Saves the shown view as a file. */
+  save() {
+    const render = () => this.viewer.render(this.images.scene(this.state, this.look, this._tanHalf(), 0));
+    saveView(this.viewer.canvas, render);
+    this._viewKey = "";
+  }
+
+  /** Tangents of half the shown field of view: horizontal, vertical. @returns {[number, number]} */
+  _tanHalf() {
+    const { clientWidth, clientHeight } = this.viewer.canvas, tanV = Math.tan(this.look.vfov / 2);
+    return [(tanV * clientWidth) / Math.max(clientHeight, 1), tanV];
+  }
+
+  /** @param {[number, number]} tanHalf @param {number} now */
+  _sendLook(tanHalf, now) {
+    if (!this.link.connected || now - this._lookAt < LOOK_MS) return;
+    const { yaw, pitch } = this.look;
+    const [hfov, vfov] = tanHalf.map((tan) => Math.min(2 * Math.atan(tan), MAX_FOV));
+    const key = rounded([yaw, pitch, hfov, vfov], 3) + this.lease.driver;
+    if (key === this._sentLook) return;
+    this._sentLook = key;
+    this._lookAt = now;
+    this.link.send({ type: "look", yaw, pitch, hfov, vfov });
+  }
+
+  /**
+   * Renders if a new image arrived, the direction changed by half a pixel, or the window size changed.
+   * @param {Scene} scene
+   */
+  _renderView(scene) {
+    const { viewer, images, look } = this;
+    const moved = scene.blend > 0 ? rounded(scene.moved, 3) : "";
+    const key = rounded([...scene.mapFromLook, look.yaw, look.vfov], 4) + moved;
+    const resized = fit(viewer.canvas, viewer.slow ? SLOW_PIXELS : 1);
+    if (viewer.lost || !(resized || images.changed || key !== this._viewKey)) return;
+    this._viewKey = key;
+    images.changed = false;
+    viewer.render(scene);
+    // For measurements: the rendered image and its position.
+    const { motion, view, panorama, place } = images;
+    const detail = { shown: shows(this.state), pose: motion.pose, blend: scene.blend, view, panorama, place };
+    dispatchEvent(new CustomEvent("rendered", { detail }));
+  }
+
+  /** @param {Scene} scene @param {[number, number]} tanHalf */
+  _drawOverlay(scene, tanHalf) {
+    const { look } = this, position = this._cameraPosition(), colour = COLOURS[this.state?.mode ?? "none"];
+    const trajectory = position && this.link.connected ? this.plan.trajectory : [];
+    // Without a trajectory nothing in the overlay can move.
+    const place = trajectory.length && position ? rounded([...scene.mapFromLook, ...position], 3) + trajectory.join() : "";
+    const key = [place, colour, rounded([look.yaw, look.vfov], 3)].join();
+    const guideResized = fit(this._guide, this.viewer.slow ? SLOW_PIXELS : 1), compassResized = fit(this._compass);
+    if (!guideResized && !compassResized && key === this._guideKey) return;
+    this._guideKey = key;
+    const camera = { lookFromMap: transpose(scene.mapFromLook), position: position ?? [0, 0, 0] };
+    drawGuide(this._guide, trajectory, camera, tanHalf, this.settings.footprint[1] / 2, colour);
+    drawCompass(this._compass, look.yaw, colour);
+  }
+
+  /** @param {[number, number]} tanHalf @param {number} now */
+  _drawMap(tanHalf, now) {
+    const { minimap, state, plan, look } = this;
+    const resized = fit(minimap.canvas);
+    if (this.viewer.slow && !resized && !minimap.changed && now - this._mapAt < SLOW_MAP_MS) return;
+    const poses = [rounded(state?.robot, 2), rounded(state?.vbot, 2)];
+    const key = [state?.mode, ...poses, JSON.stringify(plan), rounded([look.yaw, look.vfov], 2)].join(";");
+    if (!resized && !minimap.changed && key === this._mapKey) return;
+    this._mapKey = key;
+    this._mapAt = now;
+    minimap.draw({
+      virtual: shows(state) === "virtual",
+      robot: state?.robot ?? null,
+      vbot: state?.vbot ?? null,
+      plan,
+      footprint: this.settings.footprint,
+      lookYaw: look.yaw,
+      hfov: 2 * Math.atan(tanHalf[0]),
+    });
+  }
+
+  /** Position of the shown camera in the map frame; null: unknown. @returns {Vec3 | null} */
+  _cameraPosition() {
+    const { motion, blend, place } = this.images, [cx, cy, cz] = this.settings.camera;
+    if (!motion.pose) return null;
+    if (blend > 0.5 && place) return [place[0], place[1], cz];
+    const [x, y, yaw] = motion.pose;
+    return [x + Math.cos(yaw) * cx - Math.sin(yaw) * cy, y + Math.sin(yaw) * cx + Math.cos(yaw) * cy, cz];
+  }
+}
+
+/** @param {readonly number[] | null | undefined} values @param {number} digits */
+const rounded = (values, digits) => (values ? values.map((value) => value.toFixed(digits)).join() : "");
+
+/** Gives a canvas the size of its element; returns whether it changed. @param {HTMLCanvasElement} canvas */
+function fit(canvas, pixels = 1) {
+  const ratio = Math.min(devicePixelRatio, 2) * pixels;
+  const width = Math.round(canvas.clientWidth * ratio), height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width === width && canvas.height === height) return false;
+  canvas.width = width;
+  canvas.height = height;
+  return true;
+}

@@ -1,0 +1,79 @@
+// What the page accepts from the server.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+const { decodeFrame, MessageError, parseMessage } = await import("../../../instant_ic/console/static/messages.js");
+const { settingsOf } = await import("../../../instant_ic/console/static/settings.js");
+
+const STATE = {
+  type: "state", at_ms: 5, mode: "virtual", shown: "virtual", lead: 0.5, robot: [1, 2, 0.1], vbot: null, twist: [0.2, 0],
+};
+const HELLO = { type: "hello", max_linear: 0.4, max_angular: 0.8, may_drive: true, page: {} };
+
+test("fields without a value are null, and unknown fields are dropped", () => {
+  const state = parseMessage(JSON.stringify({ ...STATE, later: 1 }));
+  assert.deepEqual([state.vbot, state.reason, state.estop, state.command], [null, null, null, null]);
+  assert.ok(!("later" in state));
+});
+
+for (const [what, change, text] of [
+  ["a mode that does not exist", { mode: "flying" }, /state\.mode must be one of real, .* \(got "flying"\)/],
+  ["a pose with two numbers", { robot: [1, 2] }, /state\.robot must be 3 numbers/],
+  ["a text for a number", { lead: "0" }, /state\.lead must be a finite number \(got "0"\)/],
+  ["a list with a hole", { twist: [0.1, null] }, /state\.twist\[1\] must be a finite number/],
+  ["a missing field", { at_ms: undefined }, /state\.at_ms must be/],
+]) {
+  test(`${what} is refused by its name`, () => {
+    assert.throws(() => parseMessage(JSON.stringify({ ...STATE, ...change })), (error) =>
+      error instanceof MessageError && text.test(error.message));
+  });
+}
+
+test("what is no message at all is refused", () => {
+  for (const json of ["", "{", "null", "[]", "5", '{"type": 5}', '{"type": "toString"}', '{"type": "hello", "page": []}']) {
+    assert.throws(() => parseMessage(json), MessageError, json);
+  }
+});
+
+function frame(kind, header, { version = 1, length } = {}) {
+  const json = new TextEncoder().encode(JSON.stringify(header)), buffer = new ArrayBuffer(12 + json.length + 2);
+  const view = new DataView(buffer), bytes = new Uint8Array(buffer);
+  view.setUint8(0, version);
+  view.setUint8(1, kind);
+  view.setUint32(4, 7, true);
+  view.setUint32(8, length ?? json.length, true);
+  bytes.set(json, 12);
+  bytes.set([0xff, 0xd8], 12 + json.length);
+  return buffer;
+}
+
+test("a frame's parts are those of the layout in protocol.py", async () => {
+  const decoded = decodeFrame(frame(1, { captured_ms: 3, q: [0, 0, 0, 1] }));
+  assert.deepEqual([decoded.kind, decoded.sequence, decoded.header], [1, 7, { captured_ms: 3, q: [0, 0, 0, 1] }]);
+  assert.deepEqual([...new Uint8Array(await decoded.payload.arrayBuffer())], [0xff, 0xd8]);
+});
+
+test("frames that cannot be decoded are refused", () => {
+  const header = { captured_ms: 3, q: null };
+  for (const [buffer, text] of [
+    [frame(1, header, { version: 2 }), /version must be 1/],
+    [frame(9, header), /kind must be 1 to 4/],
+    [frame(1, header, { length: 999 }), /at least 1011 bytes/],
+    [frame(2, header), /view\.q must be a list/],
+    [frame(3, header), /grid\.resolution must be a finite number/],
+    [frame(1, header, { length: 4 }), /not valid JSON/],
+  ]) assert.throws(() => decodeFrame(buffer), text);
+});
+
+test("settings: the server's values, else the defaults; no motion for those who asked for none", () => {
+  const plain = settingsOf(parseMessage(JSON.stringify(HELLO)), false);
+  assert.deepEqual([plain.dissolveMs, plain.easeMs, plain.colourReleaseMs, plain.leadMaxM], [250, 400, 6000, 0]);
+  assert.deepEqual(plain.limits, { linear: 0.4, angular: 0.8 });
+  const page = { dissolve_ms: 100, ease_ms: 0, colour_release_s: 0, lead_max_m: 0.3, footprint: [1, 2] };
+  const given = settingsOf(parseMessage(JSON.stringify({ ...HELLO, page })), false);
+  assert.deepEqual([given.dissolveMs, given.easeMs, given.colourReleaseMs, given.leadMaxM], [100, 0, 0, 0.3]);
+  assert.deepEqual(given.footprint, [1, 2]);
+  const reduced = settingsOf(parseMessage(JSON.stringify({ ...HELLO, page })), true);
+  assert.deepEqual([reduced.dissolveMs, reduced.easeMs], [0, 0]);
+});
