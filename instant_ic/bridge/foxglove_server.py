@@ -24,13 +24,13 @@ from instant_ic.bridge import foxglove_protocol as protocol
 from instant_ic.bridge.commands import CommandGate
 from instant_ic.bridge.foxglove_commands import Commands
 from instant_ic.bridge.foxglove_parameters import Parameters
-from instant_ic.bridge.web_access import refusal
 from instant_ic.bus import ERROR, OK, WARN, Node, Subscription
 from instant_ic.bus.qos import PRESETS, RELIABLE
 from instant_ic.bus.registry import NodeInfo, TopicInfo
 from instant_ic.bus.transport import Received
 from instant_ic.config.ranges import Range, check_ranges
 from instant_ic.msg import MessageError, typestore
+from instant_ic.web_access import TokenBucket, refusal
 
 _START_S = 10.0
 _END_S = 2.0
@@ -448,13 +448,10 @@ class FoxgloveServer:
 
     async def _receive(self, client: _Client) -> None:
         """Receive a client's messages until it leaves, or exceeds the message rate or size."""
-        tokens, at_s = _MAX_MESSAGES_PER_S, time.monotonic()
+        bucket = TokenBucket(_MAX_MESSAGES_PER_S, _MAX_MESSAGES_PER_S)
         while True:
             message = await client.socket.receive()
-            now_s = time.monotonic()
-            tokens = min(_MAX_MESSAGES_PER_S, tokens + (now_s - at_s) * _MAX_MESSAGES_PER_S) - 1.0
-            at_s = now_s
-            if tokens < 0:
+            if not bucket.take(time.monotonic()):
                 await self._end(client, f"more than {_MAX_MESSAGES_PER_S:g} messages a second")
                 return
             try:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import ipaddress
 import logging
 import math
 import os
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Annotated
 
 from instant_ic.config.ranges import Positive, Range, check_ranges
+from instant_ic.web_access import is_loopback
 
 COOKIE = "instant_ic_session"
 SIGN_IN = ("auto", "always", "never")
@@ -96,16 +96,6 @@ def read_token(file: str) -> str:
             f"`python3 -c 'import secrets; print(secrets.token_urlsafe())' > {path}`"
         )
     return text
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a server bound to ``host`` is reachable from this machine only."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def tls_context(config: AccessConfig) -> ssl.SSLContext | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
-import math
 import socket
 import ssl
 import time
@@ -18,6 +17,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from aiohttp import web
+
+from instant_ic.web_access import TokenBucket
 
 HEADERS_S = 5.0  # time for a TLS handshake, for a request's headers, and for its body
 STALL_S = 30.0  # a client that takes no data for this time is disconnected
@@ -30,40 +31,6 @@ CONNECTIONS_PER_S = 20.0  # of one address; a page opens about six
 BURST_CONNECTIONS = 64.0
 _MOST_ADDRESSES = 1024
 logger = logging.getLogger("instant_ic.console")
-
-
-class TokenBucket:
-    """Token bucket: ``rate`` tokens a second on average, ``burst`` at once. The caller passes the time.
-
-    Args:
-        rate: tokens added each second.
-        burst: capacity.
-        first: tokens at the start; default ``burst``.
-    """
-
-    __slots__ = ("_at", "_tokens", "burst", "rate")
-
-    def __init__(self, rate: float, burst: float, first: float | None = None) -> None:
-        self.rate, self.burst = rate, burst
-        self._tokens, self._at = burst if first is None else first, -math.inf
-
-    def take(self, now: float, amount: float = 1.0) -> bool:
-        """Take ``amount`` tokens if available, else none; return whether they were taken."""
-        if self._at > -math.inf:
-            self._tokens = min(self.burst, self._tokens + (now - self._at) * self.rate)
-        self._at = now
-        if amount > self._tokens:
-            return False
-        self._tokens -= amount
-        return True
-
-    def give_back(self) -> None:
-        """Return one token to the bucket."""
-        self._tokens = min(self.burst, self._tokens + 1.0)
-
-    def wait_s(self) -> float:
-        """Seconds from the last :meth:`take` until one token is available."""
-        return max(0.0, 1.0 - self._tokens) / self.rate
 
 
 class AddressBuckets:

@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import html
 import io
-import ipaddress
 import json
 import logging
 import threading
@@ -26,7 +25,7 @@ from urllib.parse import quote, urlsplit
 from aiohttp import WSCloseCode, WSMsgType, web
 
 from instant_ic.config.ranges import Positive, PositiveInt, Range, check_ranges
-from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, is_loopback, tls_context
+from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, tls_context
 from instant_ic.console.connections import (
     CLOSE_S,
     HEADERS_S,
@@ -34,7 +33,6 @@ from instant_ic.console.connections import (
     Connection,
     Limits,
     Listener,
-    TokenBucket,
     network_of,
 )
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
@@ -42,6 +40,7 @@ from instant_ic.console.log_rate import limit_logs
 from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, whole, words
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
+from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
 
 STATIC = Path(__file__).parent / "static"
 MAX_CLIENT_MESSAGE = 4096
@@ -801,27 +800,6 @@ async def _secure_headers(request: web.Request, response: web.StreamResponse) ->
     """Add the security headers to every response, errors included."""
     for name, value in SECURITY_HEADERS.items():
         response.headers.setdefault(name, value)
-
-
-def host_allowed(host: str, allowed: tuple[str, ...]) -> bool:
-    """Whether a Host header names this machine.
-
-    A foreign site can point its own name at 127.0.0.1 (DNS rebinding); then its Origin equals its Host.
-    But it cannot make a browser send an IP literal or "localhost".
-    """
-    try:
-        name = urlsplit(f"//{host}").hostname
-    except ValueError:
-        return False
-    if not name:
-        return False
-    if name == "localhost" or name in {entry.lower() for entry in allowed}:
-        return True
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def origin_allowed(origin: str | None, host: str) -> bool:

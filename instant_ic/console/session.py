@@ -11,8 +11,9 @@ from typing import Any
 
 from aiohttp import web
 
-from instant_ic.console.connections import Connection, TokenBucket
+from instant_ic.console.connections import Connection
 from instant_ic.console.protocol import Frame, FrameKind, encode_frame
+from instant_ic.web_access import TokenBucket
 
 MAX_REPLIES = 256  # pending, about one second of a page's traffic; a client with more does not read
 # Smallest first: an image must not delay the state, nor a map an image.

@@ -15,13 +15,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from instant_ic.bridge import foxglove_server
 from instant_ic.bridge.parameter_guard import never_set
-from instant_ic.bridge.web_access import is_loopback, refusal
 from instant_ic.bus import LATCHED, RELIABLE
 from instant_ic.bus.control import NodeControl
 from instant_ic.bus.node import Node
 from instant_ic.bus.node_files import node_class
 from instant_ic.msg import String, deserialize
 from instant_ic.paths import node_names
+from instant_ic.web_access import is_loopback, refusal
 
 DRIVE, STOP = "/operator/cmd_vel", "/operator/estop"
 

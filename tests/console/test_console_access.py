@@ -10,7 +10,8 @@ import aiohttp
 import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, ServerConfig
-from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, is_loopback, read_token
+from instant_ic.console.access import COOKIE, Access, AccessConfig, AccessError, Role, read_token
+from instant_ic.web_access import is_loopback
 
 DRIVE, WATCH = "drive-token-0123456789", "watch-token-0123456789"
 

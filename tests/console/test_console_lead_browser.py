@@ -145,7 +145,8 @@ def test_a_view_is_never_shown_from_farther_off_than_the_limit(driver):
             images.leadMaxM = 0.3;
             images.view = {p: [0, 0, 1.2], q: [0, 0, 0.70710678, 0.70710678], mount: [0.1, 0, 1.2], fov: 1.5,
                 aspect: 1.6, hasDepth: true, captured_ms: 0};
-            const state = (x) => ({at_ms: 0, mode: "virtual", shown: "virtual", vbot: [x, 0, 0], twist: [0, 0], lead: 1});
+            const virtual = {at_ms: 0, mode: "virtual", shown: "virtual", twist: [0, 0], lead: 1};
+            const state = (x) => ({...virtual, vbot: [x, 0, 0]});
             const seen = (state) => {
                 for (let i = 0; i < 100; i++) images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 50);
                 const {moved} = images.scene(state, {yaw: 0, pitch: 0}, [1, 0.6], 50);

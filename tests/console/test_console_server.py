@@ -9,7 +9,8 @@ import pytest
 
 from instant_ic.console import ConsoleClient, ConsoleError, ConsoleServer, FrameKind, ServerConfig
 from instant_ic.console.drive import DriveConfig
-from instant_ic.console.server import OWN_S, host_allowed, origin_allowed
+from instant_ic.console.server import OWN_S, origin_allowed
+from instant_ic.web_access import host_allowed
 
 WAIT_S = 20.0
 # The watchdog is long where a test does not look at it: a busy machine must not trip it.

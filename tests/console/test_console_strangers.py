@@ -18,11 +18,12 @@ from test_console_access import DRIVE, WATCH, Nobody, certificate, token_file
 from instant_ic.console import ConsoleClient, ConsoleServer, FrameKind, ServerConfig
 from instant_ic.console import connections as connections_module
 from instant_ic.console.access import AccessConfig
-from instant_ic.console.connections import AddressBuckets, TokenBucket, network_of
+from instant_ic.console.connections import AddressBuckets, network_of
 from instant_ic.console.drive import DriveConfig
 from instant_ic.console.log_rate import LogRate
 from instant_ic.console.server import WATCHER_SHARE
 from instant_ic.console.session import MAX_REPLIES
+from instant_ic.web_access import TokenBucket
 
 __all__ = ["certificate"]  # a fixture
 WAIT_S = 60.0

@@ -419,7 +419,8 @@ def _console_errors() -> tuple[type[BaseException], ...]:
 
 def _parse_http_headers() -> Callable[[bytes], object]:
     """What the console reads of a request itself: Host, Origin, session cookie, token."""
-    from instant_ic.console.server import host_allowed, origin_allowed
+    from instant_ic.console.server import origin_allowed
+    from instant_ic.web_access import host_allowed
 
     def parse(data: bytes) -> None:
         first, _, second = data.decode("latin-1").partition("\n")
