@@ -1,7 +1,7 @@
 """Operator's console: a web page, its server and a Python client.
 
-The package depends on neither the bus nor the messages. :class:`ConsoleServer` takes a :class:`Backend` and
-plain values; :mod:`nodes.console` connects it to the topics.
+The package does not depend on the bus. :class:`ConsoleServer` takes a :class:`Backend` and plain values;
+:class:`~instant_ic.console.feed.PageFeed` feeds it with messages; :mod:`nodes.console` connects both to the topics.
 """
 
 from instant_ic.console.client import ConsoleClient

@@ -108,13 +108,13 @@ class Demo:
         self._slow_due = 0.0
         self._noise = np.random.default_rng(0)
         self._directions = equirect_directions(self.config.panorama_width, self.config.panorama_width // 2)
-        self._drawn, self._drawn_from = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
+        self._panorama, self._panorama_camera = b"", np.zeros((4, 4))  # last panorama (JPEG) and its camera pose
         self.recorder = DemoRecorder()
-        self._desk = RecordingDesk(self.recorder.ask, lambda told: self.server.publish("recording", told), 0.2)
+        self._desk = RecordingDesk(self.recorder.ask, lambda status: self.server.publish("recording", status), 0.2)
         self._stop = threading.Event()
         self._threads = [
             threading.Thread(target=run, name=f"console-demo-{run.__name__}", daemon=True)
-            for run in (self._move, self._draw)
+            for run in (self._move, self._send_images)
         ]
 
     def on_drive(self, linear: float, angular: float) -> None:
@@ -176,9 +176,9 @@ class Demo:
             now = time.monotonic()
             self.step(min(now - last, 0.2))
             last = now
-            self._tell()
+            self._publish_state()
 
-    def _draw(self) -> None:
+    def _send_images(self) -> None:
         due = 0.0
         while not self._stop.wait(0.01):
             now = time.monotonic()
@@ -210,8 +210,8 @@ class Demo:
         v, w = (0.0, 0.0) if stopped else self._command
         before = self.mode
         if stopped:
-            words = "emergency stop button is pressed: release it, then release the stop here"
-            self.mode, self.reason = "stopped", words if self.button else "emergency stop: release it to continue"
+            text = "emergency stop button is pressed: release it, then release the stop here"
+            self.mode, self.reason = "stopped", text if self.button else "emergency stop: release it to continue"
         elif self.forced_mode is not None:
             self.mode, self.reason = self.forced_mode, ""
         elif self.mode == "stopped":
@@ -256,7 +256,7 @@ class Demo:
         speed = min(0.4, 1.5 * distance) * max(0.0, math.cos(turn)) if far else 0.0
         self.robot = _moved(self.robot, speed, float(np.clip(2.5 * turn, -1.2, 1.2)), seconds)
 
-    def _tell(self) -> None:
+    def _publish_state(self) -> None:
         now = time.monotonic()
         v, w = self._command
         self.server.publish(
@@ -280,10 +280,10 @@ class Demo:
         self.server.show(FrameKind.VIEW if self.mode == "virtual" else FrameKind.PANORAMA)
         if now >= self._slow_due:
             self._slow_due = now + 0.5
-            self._tell_health()
+            self._publish_health()
         self.server.publish("plan", self.plan)
 
-    def _tell_health(self) -> None:
+    def _publish_health(self) -> None:
         vspace = {"state": "ready", "psnr_db": 27.4, "train_seconds": 9.0, "message": ""}
         vspace |= {"expected_psnr_db": 25.6, "unseen_share": 0.03, "radius_m": 2.0}
         battery = {"voltage": 24.6, "percent": 81.0}
@@ -292,11 +292,11 @@ class Demo:
     def _send_panorama(self) -> None:
         captured_ms = self.server.now_ms()
         camera = _camera(self.robot)
-        if not np.array_equal(self._drawn_from, camera):  # a standing robot sees the same image
-            self._drawn = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
-            self._drawn_from = camera
+        if not np.array_equal(self._panorama_camera, camera):  # a standing robot sees the same image
+            self._panorama = _jpeg(demo_world.shade(_position(camera), _turned(self._directions, camera)))
+            self._panorama_camera = camera
         header = {"captured_ms": captured_ms, "q": quaternion_from_matrix(camera).tolist()}
-        self.server.send_frame(FrameKind.PANORAMA, header, self._drawn)
+        self.server.send_frame(FrameKind.PANORAMA, header, self._panorama)
 
     def _send_view(self, request_id: int) -> None:
         captured_ms = self.server.now_ms()
@@ -304,14 +304,12 @@ class Demo:
         shape = view_shape(look, self.config.view)
         camera = _camera(self.vbot if self.mode == "virtual" else self.robot) @ look.rotation()
         directions = _turned(perspective_directions(shape.width, shape.height, shape.fov_rad), camera)
-        picture, mask = demo_world.shade(_position(camera), directions), b""
+        image, mask = demo_world.shade(_position(camera), directions), b""
         if self.keyframe is not None:
             seen = demo_world.seen(_position(_camera(self.keyframe)), _position(camera), directions)
-            picture = np.where(seen[..., None] > 0, picture, self._noise.integers(0, 256, picture.shape)).astype(
-                np.uint8
-            )
+            image = np.where(seen[..., None] > 0, image, self._noise.integers(0, 256, image.shape)).astype(np.uint8)
             mask = _mask(seen)
-        picture = np.clip(picture * np.array(self.tint), 0, 255).astype(np.uint8)
+        image = np.clip(image * np.array(self.tint), 0, 255).astype(np.uint8)
         depth, near_m = encode_depth(demo_world.distances(_position(camera), directions), shape.fov_rad)
         header = {
             "captured_ms": captured_ms,
@@ -326,7 +324,7 @@ class Demo:
             "render_ms": 20.0,
             "request_id": request_id,
         }
-        self.server.send_frame(FrameKind.VIEW, header, _jpeg(picture))
+        self.server.send_frame(FrameKind.VIEW, header, _jpeg(image))
         self._views.answered(request_id)
 
 
@@ -345,12 +343,12 @@ def _turned(directions: NDArray[np.float32], camera: NDArray[np.float64]) -> NDA
     return turned
 
 
-def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+def _jpeg(image: NDArray[np.uint8]) -> bytes:
     import cv2
 
-    ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 88])
+    ok, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 88])
     if not ok:
-        raise ValueError(f"JPEG encoder failed on an image of shape {picture.shape}")
+        raise ValueError(f"JPEG encoder failed on an image of shape {image.shape}")
     return bytes(data.tobytes())
 
 
@@ -359,10 +357,7 @@ def _mask(seen: NDArray[np.float32]) -> bytes:
 
     height, width = seen.shape
     small = cv2.resize(seen, (64, max(1, round(64 * height / width))), interpolation=cv2.INTER_AREA)
-    ok, data = cv2.imencode(".png", np.rint(255 * small).astype(np.uint8))
-    if not ok:
-        raise ValueError(f"PNG encoder failed on a mask of shape {small.shape}")
-    return bytes(data.tobytes())
+    return grey_png(np.rint(255 * small).astype(np.uint8))
 
 
 def _moved(pose: Pose, v: float, w: float, seconds: float) -> Pose:

@@ -109,7 +109,7 @@ def whole(message: dict[str, Any], key: str) -> int:
     return value
 
 
-def words(message: dict[str, Any], key: str, max_length: int) -> str:
+def short_text(message: dict[str, Any], key: str, max_length: int) -> str:
     """Return ``message[key]``, a text of 1 to ``max_length`` printable characters; raise ProtocolError otherwise."""
     value = message.get(key)
     if not isinstance(value, str) or not 1 <= len(value.strip()) <= max_length or not value.isprintable():

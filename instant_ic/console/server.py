@@ -37,7 +37,7 @@ from instant_ic.console.connections import (
 )
 from instant_ic.console.drive import DriveConfig, DriveGate, Verdict
 from instant_ic.console.log_rate import limit_logs
-from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, whole, words
+from instant_ic.console.protocol import FrameKind, ProtocolError, flag, number, parse_text, short_text, whole
 from instant_ic.console.session import PendingFrame, Session
 from instant_ic.console.view import MAX_FOV_RAD, Look
 from instant_ic.web_access import TokenBucket, host_allowed, is_loopback
@@ -495,7 +495,7 @@ class ConsoleServer:
         self._looks.pop(session.number, None)
         self._own = {key: at for key, at in self._own.items() if key[0] != session.number}
         self._emit_due()
-        self._tell_session()
+        self._send_session()
 
     def _end(self, session: Session, code: WSCloseCode, reason: str) -> None:
         """Drop a session at once, then close its socket whatever the client does."""
@@ -546,7 +546,7 @@ class ConsoleServer:
         for kind, frame in self._frames.items():
             session.put_frame(kind, frame)
         session.set_foreground(self._foreground, 1.0 / self.config.background_picture_hz)
-        self._tell_session()
+        self._send_session()
 
     async def _read_forever(self, session: Session) -> None:
         limit = self.config.max_messages_per_s
@@ -644,13 +644,13 @@ class ConsoleServer:
         before = self.gate.driver
         self.gate.request(session.number, now, take=take)
         self._emit_due()
-        self._tell_session(None if self.gate.driver != before else session)
+        self._send_session(None if self.gate.driver != before else session)
 
     def _on_yield(self, session: Session, message: dict[str, Any], now: float) -> None:
         before = self.gate.driver
         self.gate.leave(session.number, now)
         self._emit_due()
-        self._tell_session(None if self.gate.driver != before else session)
+        self._send_session(None if self.gate.driver != before else session)
 
     def _on_estop(self, session: Session, message: dict[str, Any], now: float) -> None:
         self._stop_robot(f"client {session.number}")
@@ -662,7 +662,7 @@ class ConsoleServer:
         self.backend.on_estop(True)
         self._emit_due()
         if news:
-            self._tell_session()
+            self._send_session()
         logger.warning("emergency stop from %s", who)
 
     def _on_estop_release(self, session: Session, message: dict[str, Any], now: float) -> None:
@@ -672,7 +672,7 @@ class ConsoleServer:
             )
             return
         self.backend.on_estop(False)
-        self._tell_session()
+        self._send_session()
         logger.warning("emergency stop released by client %d", session.number)
 
     def _on_look(self, session: Session, message: dict[str, Any], now: float) -> None:
@@ -704,7 +704,7 @@ class ConsoleServer:
             self.backend.on_snapshot()
 
     def _on_bookmark(self, session: Session, message: dict[str, Any], now: float) -> None:
-        name = words(message, "name", MAX_BOOKMARK)
+        name = short_text(message, "name", MAX_BOOKMARK)
         if self._may_drive(session):
             self.backend.on_bookmark(name)
 
@@ -729,7 +729,7 @@ class ConsoleServer:
             if self.gate.watchdog_trips != trips:
                 logger.warning("no drive command for %.2f s: published zero", self.config.drive.watchdog_s)
             if (self.gate.driver, self.gate.watchdog_trips) != (driver, trips):
-                self._tell_session()
+                self._send_session()
 
     def _emit_due(self, *, wake: bool = True) -> None:
         now = time.monotonic()
@@ -742,7 +742,7 @@ class ConsoleServer:
         if wake:
             self._gate_wake.set()
 
-    def _tell_session(self, only: Session | None = None) -> None:
+    def _send_session(self, only: Session | None = None) -> None:
         """Send the state of the lease to all clients, or to one."""
         for session in list(self._sessions.values()) if only is None else [only]:
             driver = self.gate.driver
