@@ -45,6 +45,10 @@ function makeViewer() {
 // ---- from the server -----------------------------------------------------------------------------
 
 link.addEventListener("open", showBanner);
+link.addEventListener("lost", () => {
+  drive.setEnabled(false); // the lease stays as it was on the page: the banner says what has happened
+  showBanner();
+});
 link.addEventListener("signed-out", () => location.reload()); // shows the sign-in form
 lease.addEventListener("change", () => {
   drive.setEnabled(lease.drives);

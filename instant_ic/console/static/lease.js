@@ -7,7 +7,7 @@
 export const WATCH_ONLY = "This sign-in can watch and stop the robot, but not drive it.";
 export const OTHER_DRIVES = "Another operator is driving. Press Take over to drive.";
 
-/** Event "change" when the server has reported the session, or the link was lost. */
+/** Event "change" when the server has reported the session. */
 export class Lease extends EventTarget {
   /** @param {Link} link */
   constructor(link) {
@@ -22,10 +22,7 @@ export class Lease extends EventTarget {
     link.addEventListener("open", () => {
       if (this.mayDrive) this._request(false);
     });
-    link.addEventListener("lost", () => {
-      this.driver = "none";
-      this.dispatchEvent(new Event("change"));
-    });
+    link.addEventListener("lost", () => { this.driver = "none"; });
   }
 
   /** Whether drive commands of this page count. */
