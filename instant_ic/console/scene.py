@@ -29,7 +29,9 @@ class Scene:
         camera_xyz: position of the camera on the robot while the tree lacks its mount, m.
     """
 
-    def __init__(self, tf: TransformBuffer, control: Newest, vbot: Newest, camera_xyz: tuple[float, float, float]) -> None:
+    def __init__(
+        self, tf: TransformBuffer, control: Newest, vbot: Newest, camera_xyz: tuple[float, float, float]
+    ) -> None:
         self._tf, self._control, self._vbot = tf, control, vbot
         self._camera_xyz = camera_xyz
 
